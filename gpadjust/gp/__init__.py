@@ -1,0 +1,21 @@
+"""The GPyTorch pieces: means, kernels and transforms that read the physics."""
+
+from gpadjust.gp.fixed_standardize import FixedStandardize
+from gpadjust.gp.fourier import FourierFeatures, FourierKernel
+from gpadjust.gp.inputs_kernel import InputsKernel
+from gpadjust.gp.physics_input import PhysicsInput
+from gpadjust.gp.physics_mean import PhysicsMean
+from gpadjust.gp.physics_scaled_kernel import PhysicsScaledKernel
+from gpadjust.gp.readers import PhysicsColumn, PhysicsOutput
+
+__all__ = [
+    "FixedStandardize",
+    "FourierFeatures",
+    "FourierKernel",
+    "InputsKernel",
+    "PhysicsColumn",
+    "PhysicsInput",
+    "PhysicsMean",
+    "PhysicsOutput",
+    "PhysicsScaledKernel",
+]

@@ -1,0 +1,5 @@
+"""Fitting the models."""
+
+from gpadjust.inference.fit import FitResult, fit
+
+__all__ = ["FitResult", "fit"]

@@ -1,0 +1,21 @@
+"""The BoTorch models: co-kriging and ridge regression adjustment, and what they are compared with."""
+
+from gpadjust.models.adjusted_functions import AdjustedFunctions
+from gpadjust.models.adjustment_gp import AdjustmentGP
+from gpadjust.models.ar1 import AR1, AR1Kernel
+from gpadjust.models.baselines import BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust.models.cka import CKA
+from gpadjust.models.rra import RRA
+
+__all__ = [
+    "AR1",
+    "CKA",
+    "RRA",
+    "AR1Kernel",
+    "AdjustedFunctions",
+    "AdjustmentGP",
+    "BiasGP",
+    "PhysicsMeanGP",
+    "ScaleGP",
+    "ZeroMeanGP",
+]

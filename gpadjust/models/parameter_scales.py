@@ -1,0 +1,100 @@
+"""Typical sizes of a model's hyper-parameters, read off its training data.
+
+Initial values and search ranges are multiples of them, so that a fit does not depend on the units
+of inputs, targets or physics.
+"""
+
+from __future__ import annotations
+
+import torch
+from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+from gpytorch.kernels import Kernel, ScaleKernel
+from torch import Tensor
+
+from gpadjust.gp import InputsKernel, PhysicsScaledKernel
+
+
+def parameter_scales(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor]:
+    """Return the typical value of each lengthscale, outputscale and noise of a model.
+
+    The keys are names of raw parameters, the values tensors of the (transformed) parameter's
+    shape: the range of the inputs for a lengthscale; the mean square of the targets' residual
+    from the prior mean for noise and outputscales, divided by the mean square of the physics for
+    the outputscale of a :class:`~gpadjust.gp.PhysicsScaledKernel`. Parameters of other kinds are
+    left out.
+    """
+    inputs, targets = _training_set(model)
+    with torch.no_grad():
+        residual = targets - model.mean_module(inputs)
+        unit = residual.square().mean(-1)
+        unit = unit.where(unit > 0, torch.full_like(unit, 1e-12))
+        ranges = inputs.amax(-2, keepdim=True) - inputs.amin(-2, keepdim=True)
+        ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
+        sizes: dict[str, Tensor] = {}
+        _visit(model.covar_module, "covar_module", inputs, ranges, unit, unit, sizes)
+        for name, noise in model.likelihood.named_parameters():
+            if name.endswith("raw_noise"):
+                sizes[f"likelihood.{name}"] = unit.unsqueeze(-1).expand(noise.shape)
+    return sizes
+
+
+def set_initial_values(
+    model: BatchedMultiOutputGPyTorchModel, *given: torch.nn.Module | None
+) -> None:
+    """Set lengthscales to half the inputs' range and variances to fractions of the residual's.
+
+    Args:
+        model: The model to initialise.
+        given: Modules that the user brought, whose parameters stay as they are.
+    """
+    share = {"raw_lengthscale": 0.5, "raw_outputscale": 0.5, "raw_noise": 0.01}
+    keep = {id(p) for module in given if module is not None for p in module.parameters()}
+    named = dict(model.named_parameters())
+    for name, size in parameter_scales(model).items():
+        if id(named[name]) not in keep:
+            set_value(model, name, share[name.rsplit(".", 1)[1]] * size)
+
+
+def set_value(model: torch.nn.Module, raw_name: str, value: Tensor) -> None:
+    """Set a parameter by its raw name and its (transformed) value."""
+    path, leaf = raw_name.rsplit(".", 1)
+    module = model.get_submodule(path)
+    with torch.no_grad():
+        getattr(module, leaf).copy_(getattr(module, f"{leaf}_constraint").inverse_transform(value))
+
+
+def _training_set(model: BatchedMultiOutputGPyTorchModel) -> tuple[Tensor, Tensor]:
+    """The transformed training inputs and targets, in whatever mode the model is."""
+    inputs = model.train_inputs[0]
+    if not model._has_transformed_inputs:
+        with torch.no_grad():
+            inputs = model.transform_inputs(inputs)
+    return inputs, model.train_targets
+
+
+def _visit(
+    module: torch.nn.Module,
+    name: str,
+    inputs: Tensor,
+    ranges: Tensor,
+    unit: Tensor,
+    outer: Tensor,
+    sizes: dict[str, Tensor],
+) -> None:
+    """Walk down a kernel, following what each level does to its inputs and its scale."""
+    scale = outer
+    if isinstance(module, PhysicsScaledKernel):
+        power = module.physics(inputs).square().mean(-1)
+        scale = (outer / power).where(power > 0, torch.ones_like(outer))
+    if isinstance(module, Kernel) and module.active_dims is not None:
+        ranges = ranges.index_select(-1, module.active_dims)
+    if isinstance(module, ScaleKernel):
+        sizes[f"{name}.raw_outputscale"] = scale.expand(module.raw_outputscale.shape)
+    if isinstance(module, InputsKernel):
+        ranges = ranges[..., : module.num_inputs]
+    if isinstance(module, Kernel) and module.has_lengthscale:
+        shape = module.raw_lengthscale.shape
+        size = ranges if shape[-1] == ranges.shape[-1] else ranges.mean(-1, keepdim=True)
+        sizes[f"{name}.raw_lengthscale"] = size.expand(shape)
+    for child_name, child in module.named_children():
+        _visit(child, f"{name}.{child_name}", inputs, ranges, unit, scale, sizes)

@@ -1,0 +1,16 @@
+"""Physics: the crude models f_p that a user brings, as torch modules."""
+
+from gpadjust.physics.base import Physics
+from gpadjust.physics.black_box import BlackBoxPhysics
+from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.function import FunctionPhysics, as_physics
+from gpadjust.physics.ode import ODEPhysics
+
+__all__ = [
+    "BlackBoxPhysics",
+    "FunctionPhysics",
+    "ODEPhysics",
+    "Physics",
+    "PhysicsError",
+    "as_physics",
+]

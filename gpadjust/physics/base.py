@@ -1,0 +1,303 @@
+"""The interface of a physics, and what all of them share."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from copy import deepcopy
+from operator import index
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.memo import RowMemo, row_keys
+
+
+class Physics(torch.nn.Module, ABC):
+    r"""The crude model :math:`f_p : \mathbb{R}^d \to \mathbb{R}^m` of a system.
+
+    A subclass says in `evaluate` what the outputs of some rows are; calling the physics adds
+    batch shapes, the choice of columns, checks, and a memo.
+
+    - *Memo.* A result that needs no gradient is remembered, and each distinct row is evaluated
+      once: fitting a GP asks for the same rows at every step. The memo is dropped when a parameter
+      or buffer of the physics changes. It cannot see other changes, such as a plain attribute:
+      call `forget()` after those. A physics must therefore be deterministic.
+    - *Gradients.* A result that needs a gradient, in X or in a parameter, is evaluated anew.
+    - *Copies.* A deep copy of a physics without parameters and buffers is the physics itself, so
+      that a simulator's handle outlives the copies that GP libraries make of their models.
+
+    Args:
+        inputs: The columns of X that the physics reads, in its order; negative ones count from
+            the end. Default: all.
+        memo: The most rows to remember; 0 switches the memo off.
+        name: The name in messages. Default: the class's.
+
+    Attributes:
+        num_outputs: `m`; None until the first call if it is not known before.
+
+    Raises:
+        TypeError: If `inputs` holds something else than whole numbers.
+        ValueError: If `inputs` is empty or `memo` is negative.
+
+    Example:
+        >>> class Drag(Physics):
+        ...     def evaluate(self, X):
+        ...         return -0.5 * X * X.abs()
+        >>> drag = Drag(inputs=[-1])
+        >>> drag(torch.tensor([[7.0, 1.0], [7.0, 2.0]]))
+        tensor([[-0.5000],
+                [-2.0000]])
+    """
+
+    def __init__(
+        self,
+        *,
+        inputs: Sequence[int] | None = None,
+        memo: int = 100_000,
+        name: str | None = None,
+    ) -> None:
+        super().__init__()
+        if memo < 0:
+            raise ValueError(f"memo must be a number of rows, 0 for no memo; found {memo}.")
+        self.inputs = None if inputs is None else _column_numbers(inputs)
+        self.name = type(self).__name__ if name is None else name
+        self.num_outputs: int | None = None
+        self._memo = RowMemo(memo)
+        self._memo_state: list[Tensor] = []
+        self._warned: set[str] = set()
+
+    @abstractmethod
+    def evaluate(self, X: Tensor) -> Tensor:
+        """The outputs of some rows, without memo and checks.
+
+        Args:
+            X: `N x d`, the columns `inputs` only, `N >= 1`.
+
+        Returns:
+            `N x m` outputs, or `N` if `m` is 1.
+        """
+
+    def forward(self, X: Tensor) -> Tensor:
+        """The outputs of the physics.
+
+        Args:
+            X: `batch_shape x n x d`, floating point.
+
+        Returns:
+            `batch_shape x n x m`, of X's dtype. Dimensions along which X is expanded (stride 0)
+            are evaluated once, and the result is expanded along them.
+
+        Raises:
+            TypeError: If X is not a floating-point tensor.
+            ValueError: If X has fewer than two dimensions or lacks a column of `inputs`.
+            PhysicsError: If the physics fails, or returns something else than finite outputs.
+        """
+        self._check_input(X)
+        once = _without_copies(X)
+        columns = once if self.inputs is None else once[..., list(self.inputs)]
+        rows = columns.reshape(-1, columns.shape[-1])
+        try:
+            Y = self._evaluate_rows(rows)
+        except PhysicsError as error:
+            if error.inputs is None:
+                numbers = torch.arange(len(rows)).reshape(once.shape[:-1])
+                origin = numbers.expand(X.shape[:-1]).flatten()
+                error.relocate(origin)
+                error.inputs = rows.detach()[origin[list(error.rows)]]
+            raise
+        m = Y.shape[-1]
+        return Y.reshape(*once.shape[:-1], m).expand(*X.shape[:-1], m)
+
+    def forget(self) -> None:
+        """Empties the memo; call it after a change that the physics cannot see."""
+        self._memo.clear()
+
+    def extra_repr(self) -> str:
+        """The settings that `repr` shows."""
+        return (
+            f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}, "
+            f"memo={self._memo.capacity}"
+        )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """The physics itself if it has no parameters and buffers, else a copy, its memo empty."""
+        if not self._state():
+            return self
+        copy = type(self).__new__(type(self))
+        memo[id(self)] = copy
+        copy.__dict__.update(deepcopy(self.__dict__, memo))
+        return copy
+
+    def _state(self) -> list[Tensor]:
+        """What the outputs depend on besides X, as far as torch knows."""
+        return [*self.parameters(), *self.buffers()]
+
+    def _check_input(self, X: Tensor) -> None:
+        if not torch.is_tensor(X) or not X.is_floating_point():
+            found = X.dtype if torch.is_tensor(X) else type(X).__name__
+            raise TypeError(
+                f"Physics {self.name!r} takes a floating-point tensor X; found {found}. Convert "
+                "with torch.as_tensor(X, dtype=torch.float64)."
+            )
+        if X.dim() < 2 or X.shape[-1] == 0:
+            raise ValueError(
+                f"Physics {self.name!r} takes X of shape batch_shape x n x d; found "
+                f"{tuple(X.shape)}. For a single point use X.unsqueeze(0)."
+            )
+        d = X.shape[-1]
+        absent = [i for i in self.inputs or () if not -d <= i < d]
+        if absent:
+            raise ValueError(
+                f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X of shape "
+                f"{tuple(X.shape)} has {d} column(s), so there is no column {absent}. Pass X with "
+                "all its columns, or correct inputs."
+            )
+
+    def _evaluate_rows(self, rows: Tensor) -> Tensor:
+        if len(rows) == 0:
+            if self.num_outputs is None:
+                raise PhysicsError(
+                    f"Physics {self.name!r} was given no rows before its number of outputs was "
+                    "known; call it on at least one row first."
+                )
+            return rows.new_empty(0, self.num_outputs)
+        if torch.is_grad_enabled() and (
+            rows.requires_grad or any(p.requires_grad for p in self.parameters())
+        ):
+            return self._differentiate(rows)
+        return self._recall(rows)
+
+    def _differentiate(self, rows: Tensor) -> Tensor:
+        """`N x m` outputs with their autograd graph."""
+        return self._call(rows)
+
+    def _recall(self, rows: Tensor) -> Tensor:
+        """`N x m` outputs without a graph, from the memo as far as it knows them."""
+        if self._memo.capacity == 0:
+            return self._call_without_graph(rows)
+        self._forget_if_stale(rows)
+        numbers: dict[bytes, int] = {}
+        inverse = torch.tensor([numbers.setdefault(k, len(numbers)) for k in row_keys(rows)])
+        keys = list(numbers)
+        slots = self._memo.lookup(keys)
+        known = slots >= 0
+        if known.all():
+            return self._memo.gather(slots[inverse])
+
+        new = (~known).nonzero().flatten()
+        first = torch.from_numpy(np.unique(inverse.numpy(), return_index=True)[1])
+        new_keys = [keys[i] for i in new.tolist()]
+        try:
+            values = self._call_without_graph(rows[first[new]])
+        except PhysicsError as error:
+            if error.partial is not None:
+                partial, error.partial = self._check_shape(error.partial, len(new)), None
+                good = partial.isfinite().all(-1).nonzero().flatten()
+                self._memo.store([new_keys[i] for i in good.tolist()], partial[good].to(rows))
+            if error.inputs is None:
+                order = torch.full_like(slots, -1)
+                order[new] = torch.arange(len(new))
+                error.relocate(order[inverse])
+            raise
+        distinct = values.new_empty(len(keys), values.shape[1])
+        distinct[new] = values
+        if known.any():
+            distinct[known] = self._memo.gather(slots[known])
+        self._memo.store(new_keys, values)
+        return distinct[inverse]
+
+    def _forget_if_stale(self, rows: Tensor) -> None:
+        # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
+        # The empty tensor stands for the dtype and device of what is remembered.
+        state = [*self._state(), rows.new_empty(0)]
+        if len(state) != len(self._memo_state) or not all(map(_same, state, self._memo_state)):
+            self._memo.clear()
+            self._memo_state = [tensor.detach().clone() for tensor in state]
+
+    def _call_without_graph(self, rows: Tensor) -> Tensor:
+        Y = self._call(rows)
+        if Y.requires_grad:
+            self._warn_once(
+                f"Physics {self.name!r} depends on a tensor that requires grad but is not one of "
+                "its parameters; it is taken as a constant. To learn it, make it a parameter of a "
+                "torch.nn.Module and pass that module; else call requires_grad_(False) on it."
+            )
+        return Y.detach()
+
+    def _call(self, rows: Tensor) -> Tensor:
+        """Evaluates all rows, and checks the result: `N x m`, finite, of the dtype of `rows`."""
+        try:
+            Y = self.evaluate(rows)
+        except PhysicsError:
+            raise
+        except Exception as error:
+            raise PhysicsError(
+                f"Physics {self.name!r} raised {type(error).__name__}: {error}. The call was for "
+                f"{len(rows)} row(s):",
+                range(len(rows)),
+            ) from error
+        Y = self._check_shape(Y, len(rows))
+        bad = (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError(
+                f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} row(s), "
+                "expected finite numbers. Mend the physics there, or keep such inputs out:",
+                bad,
+                partial=Y.detach(),
+            )
+        return Y.to(rows)
+
+    def _check_shape(self, Y: Tensor, n: int) -> Tensor:
+        expected = f"a real tensor of shape ({n}, m) or ({n},), one row per row of X"
+        if not torch.is_tensor(Y) or Y.is_complex():
+            found = Y.dtype if torch.is_tensor(Y) else type(Y).__name__
+            raise PhysicsError(f"Physics {self.name!r} returned {found}, expected {expected}.")
+        if Y.dim() not in (1, 2) or len(Y) != n or Y.shape[-1] == 0:
+            raise PhysicsError(
+                f"Physics {self.name!r} returned shape {tuple(Y.shape)}, expected {expected}. For "
+                "a constant return X.new_full((X.shape[0],), value)."
+            )
+        Y = Y.unsqueeze(-1) if Y.dim() == 1 else Y
+        if self.num_outputs not in (None, Y.shape[1]):
+            raise PhysicsError(
+                f"Physics {self.name!r} returned {Y.shape[1]} output(s), expected "
+                f"{self.num_outputs} as before; the number must not depend on the rows."
+            )
+        self.num_outputs = Y.shape[1]
+        return Y
+
+    def _warn_once(self, message: str) -> None:
+        if message not in self._warned:
+            self._warned.add(message)
+            warnings.warn(message, UserWarning, stacklevel=2)
+
+
+def _without_copies(X: Tensor) -> Tensor:
+    # Of the copies of an expanded leaf, each has a gradient of its own.
+    if X.requires_grad and X.is_leaf:
+        return X
+    for dim in range(X.dim() - 1):
+        if X.shape[dim] > 1 and X.stride(dim) == 0:
+            X = X.narrow(dim, 0, 1)
+    return X
+
+
+def _column_numbers(inputs: Sequence[int]) -> tuple[int, ...]:
+    try:
+        columns = tuple(index(i) for i in inputs)
+    except TypeError:
+        raise TypeError(
+            f"inputs must be a sequence of column numbers, such as [0, 2]; found {inputs!r}."
+        ) from None
+    if not columns:
+        raise ValueError("inputs is empty; name at least one column of X, or None for all.")
+    return columns
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)

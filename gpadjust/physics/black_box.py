@@ -1,0 +1,204 @@
+"""A NumPy function or simulator as physics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from gpadjust.physics.base import Physics
+from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.external_call import ExternalCall
+from gpadjust.physics.finite_difference import central_difference
+from gpadjust.physics.lost_callable import LostCallable, can_pickle
+from gpadjust.physics.row_calls import call_rows
+
+NumpyFunction = Callable[[NDArray[np.float64]], ArrayLike]
+
+
+class BlackBoxPhysics(Physics):
+    """Physics given as a NumPy function or a simulator.
+
+    Simulations of single rows (`batched=False`) run in parallel, with no change of code, inside
+
+        with joblib.parallel_config(backend="loky", n_jobs=4):
+            ...
+
+    or any other backend of joblib, a cluster's included. Rows that succeed are remembered even
+    when others fail.
+
+    A pickle holds the function if it can be pickled. If not, as with a handle of a running
+    simulator, the loaded physics still answers the rows in its memo; for new ones set
+    `physics.function` again.
+
+    Args:
+        function: Maps a float64 array of rows `N x d` to `N x m`, or `N` if `m` is 1; with
+            `batched=False`, one row `(d,)` to `(m,)` or a scalar.
+        batched: Whether the function takes all rows at once.
+        gradient: Where the gradient in X comes from. `"finite-difference"`: central differences,
+            `2 d` evaluations per row in the backward pass, which the memo does not keep. A
+            callable: the Jacobian, from rows `N x d` to `N x m x d`. None: no gradient, the
+            outputs are constants to autograd. Second derivatives are not available.
+        fd_step: The step of the finite differences in the units of X, one for all columns or one
+            for each. Default: `eps^(1/3) max(1, |x|)`.
+        inputs: The columns of X that the function reads. Default: all.
+        memo: The most rows to remember; 0 switches the memo off.
+        name: The name in messages. Default: the function's.
+
+    Raises:
+        TypeError: If `function` is not callable.
+        ValueError: If `gradient` or `fd_step` is none of the above.
+
+    Example:
+        >>> physics = BlackBoxPhysics(lambda x: np.sin(x[0]) * x[1], batched=False)
+        >>> X = torch.tensor([[0.0, 2.0]], dtype=torch.float64, requires_grad=True)
+        >>> physics(X).sum().backward()
+        >>> X.grad
+        tensor([[2.0000, 0.0000]], dtype=torch.float64)
+    """
+
+    def __init__(
+        self,
+        function: NumpyFunction,
+        *,
+        batched: bool = True,
+        gradient: Literal["finite-difference"] | NumpyFunction | None = "finite-difference",
+        fd_step: float | Sequence[float] | None = None,
+        inputs: Sequence[int] | None = None,
+        memo: int = 100_000,
+        name: str | None = None,
+    ) -> None:
+        if not callable(function):
+            raise TypeError(f"function must be callable; found {type(function).__name__}.")
+        if not (gradient is None or gradient == "finite-difference" or callable(gradient)):
+            raise ValueError(
+                "gradient must be 'finite-difference', a callable that returns the Jacobian "
+                f"N x m x d, or None for no gradient; found {gradient!r}."
+            )
+        steps = [] if fd_step is None else np.atleast_1d(fd_step).tolist()
+        if not all(math.isfinite(h) and h > 0 for h in steps):
+            raise ValueError(f"fd_step must be positive, in the units of X; found {fd_step}.")
+        name = name or getattr(function, "__name__", type(function).__name__)
+        super().__init__(inputs=inputs, memo=memo, name=name)
+        self.function = function
+        self.batched = batched
+        self.gradient = gradient
+        self.fd_step = fd_step
+
+    def evaluate(self, X: Tensor) -> Tensor:
+        """The function's outputs.
+
+        Args:
+            X: `N x d`.
+
+        Returns:
+            `N x m`, or `N` if the function returns such.
+
+        Raises:
+            PhysicsError: If single rows fail. It carries the outputs of the others.
+        """
+        rows = _to_numpy(X)
+        Y = np.array(self.function(rows), dtype=np.float64) if self.batched else self._stack(rows)
+        return torch.from_numpy(Y).to(X.device)
+
+    def _stack(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        results = call_rows(self.function, rows)
+        errors = {i: y for i, y in enumerate(results) if isinstance(y, Exception)}
+        outputs = {i: y for i, y in enumerate(results) if not isinstance(y, Exception)}
+        lengths = {len(y) for y in outputs.values()}
+        if len(lengths) > 1:
+            m = len(next(iter(outputs.values())))
+            raise PhysicsError(
+                f"Physics {self.name!r} returned {m} output(s) for its first row, but another "
+                "number elsewhere; expected the same for every row:",
+                [i for i, y in outputs.items() if len(y) != m],
+            )
+        Y = np.full((len(rows), *lengths), np.nan)
+        for i, y in outputs.items():
+            Y[i] = y
+        if errors:
+            first = next(iter(errors.values()))
+            raise PhysicsError(
+                f"Physics {self.name!r} raised {type(first).__name__}: {first}, in the first of "
+                f"{len(errors)} failed row(s) of {len(rows)}. Mend the function there, or keep "
+                "such inputs out; the other rows are done:",
+                errors,
+                partial=torch.from_numpy(Y) if outputs else None,
+            ) from first
+        return Y
+
+    def _differentiate(self, rows: Tensor) -> Tensor:
+        if not rows.requires_grad:
+            return self._recall(rows)
+        if self.gradient is None:
+            self._warn_once(
+                f"No gradient flows through physics {self.name!r}, which has gradient=None, "
+                "though X requires grad. Optimise acquisition functions with "
+                "optimize_acqf(..., options={'with_grad': False}), or choose "
+                "gradient='finite-difference'."
+            )
+            return self._recall(rows)
+        d = rows.shape[1]
+        if self.fd_step is not None and np.size(self.fd_step) not in (1, d):
+            raise ValueError(
+                f"fd_step of physics {self.name!r} has {np.size(self.fd_step)} entries, expected "
+                f"1 or {d}, one for each column that the function reads."
+            )
+        return ExternalCall.apply(rows, self._recall, self._jacobian)
+
+    def _jacobian(self, rows: Tensor) -> Tensor:
+        if callable(self.gradient):
+            return self._user_jacobian(self.gradient, rows)
+        n, d = rows.shape
+        step = None if self.fd_step is None else torch.tensor(self.fd_step, dtype=torch.float64)
+        try:
+            return central_difference(self._call, rows.double().cpu(), step).to(rows)
+        except PhysicsError as error:
+            error.rows = tuple(sorted({i // d % n for i in error.rows}))
+            error.inputs = rows[list(error.rows)]
+            error.add_note(
+                "This was in the finite differences around these rows. Make fd_step smaller, or "
+                "pass gradient=None or the Jacobian as gradient."
+            )
+            raise
+
+    def _user_jacobian(self, gradient: NumpyFunction, rows: Tensor) -> Tensor:
+        try:
+            J = np.array(gradient(_to_numpy(rows)), dtype=np.float64)
+        except PhysicsError:
+            raise
+        except Exception as error:
+            raise PhysicsError(
+                f"The gradient of physics {self.name!r} raised {type(error).__name__}: {error}."
+            ) from error
+        expected = (len(rows), self.num_outputs, rows.shape[1])
+        if J.shape != expected or not np.isfinite(J).all():
+            raise PhysicsError(
+                f"The gradient of physics {self.name!r} returned a Jacobian of shape {J.shape}, "
+                f"expected shape N x m x d = {expected} and finite numbers."
+            )
+        return torch.from_numpy(J).to(rows)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for a pickle, without callables that cannot be pickled."""
+        state = self.__dict__.copy()
+        for attribute in ("function", "gradient"):
+            if not can_pickle(state[attribute]):
+                state[attribute] = LostCallable(self.name, attribute)
+        return state
+
+    def __copy__(self) -> Self:
+        """A shallow copy, which is no pickle: it keeps the function."""
+        copy = type(self).__new__(type(self))
+        copy.__dict__.update(self.__dict__)
+        return copy
+
+
+def _to_numpy(X: Tensor) -> NDArray[np.float64]:
+    # A copy: a simulator may write to its input.
+    return X.detach().cpu().double().numpy().copy()

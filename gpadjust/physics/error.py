@@ -1,0 +1,61 @@
+"""The error of a physics that cannot be evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+_SHOWN = 5
+
+
+class PhysicsError(RuntimeError):
+    """A physics failed, or gave something other than one finite row of outputs per input row.
+
+    Args:
+        message: What was found, what was expected, and the way out.
+        rows: The failing rows, as indices into the rows that were asked for.
+        partial: `N x m` outputs when only some rows failed, not finite in those; the others are
+            memoised before the error is raised, so that the next attempt does not pay for them.
+
+    Attributes:
+        rows: Indices of the failing rows, counted over the flattened leading dimensions of X;
+            empty if unknown.
+        inputs: `len(rows) x d` inputs of those rows, or None if unknown.
+
+    Example:
+        >>> error = PhysicsError("physics 'pendulum' returned NaN.", rows=[7])
+        >>> error.rows
+        (7,)
+        >>> print(error)
+        physics 'pendulum' returned NaN.
+          row 7
+    """
+
+    def __init__(
+        self, message: str, rows: Iterable[int] = (), *, partial: Tensor | None = None
+    ) -> None:
+        super().__init__(message)
+        self.rows: tuple[int, ...] = tuple(rows)
+        self.inputs: Tensor | None = None
+        self.partial = partial
+
+    def relocate(self, origin: Tensor) -> None:
+        """Restates `rows` as positions in a longer list, whose entry `i` is row `origin[i]` here.
+
+        Args:
+            origin: `N` integers; -1 marks an entry that is none of the rows.
+        """
+        failed = torch.isin(origin, torch.tensor(self.rows, dtype=origin.dtype))
+        self.rows = tuple(failed.nonzero().flatten().tolist())
+
+    def __str__(self) -> str:
+        """The message, then the first failing rows with their inputs."""
+        lines = [str(self.args[0])]
+        for position, row in enumerate(self.rows[:_SHOWN]):
+            values = "" if self.inputs is None else f": {self.inputs[position].tolist()}"
+            lines.append(f"  row {row}{values}")
+        if len(self.rows) > _SHOWN:
+            lines.append(f"  and {len(self.rows) - _SHOWN} more")
+        return "\n".join(lines)

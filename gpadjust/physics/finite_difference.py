@@ -1,0 +1,41 @@
+"""The Jacobian of a function of rows by finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def central_difference(
+    function: Callable[[Tensor], Tensor], X: Tensor, step: Tensor | None = None
+) -> Tensor:
+    r"""The Jacobian :math:`\partial f_k / \partial x_j \approx (f_k(x + h_j e_j) - f_k(x - h_j
+    e_j)) / 2 h_j` of a function at some rows, in one call of the function.
+
+    Args:
+        function: Maps `2 d N x d` rows to `2 d N x m` outputs. Row `i` of them is row
+            `i // d % N` of X, moved along column `i % d`.
+        X: `N x d`.
+        step: :math:`h`, broadcastable to `N x d`, in the columns' units. Default:
+            :math:`\epsilon^{1/3} \max(1, |x|)`, which balances truncation against rounding for
+            functions that vary on the scale of 1 and :math:`|x|`.
+
+    Returns:
+        `N x m x d`.
+
+    Example:
+        >>> X = torch.tensor([[3.0, 2.0]], dtype=torch.float64)
+        >>> central_difference(lambda X: X[:, :1] * X[:, 1:] ** 2, X)
+        tensor([[[ 4.0000, 12.0000]]], dtype=torch.float64)
+    """
+    n, d = X.shape
+    if step is None:
+        step = torch.finfo(X.dtype).eps ** (1 / 3) * X.abs().clamp(min=1.0)
+    moves = torch.diag_embed(step.expand(n, d))
+    sides = torch.stack([X.unsqueeze(1) + moves, X.unsqueeze(1) - moves])
+    # The distance that rounding left, not 2 h.
+    width = (sides[0] - sides[1]).diagonal(dim1=-2, dim2=-1)
+    upper, lower = function(sides.reshape(-1, d)).reshape(2, n, d, -1)
+    return ((upper - lower) / width.unsqueeze(-1)).mT

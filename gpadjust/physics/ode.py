@@ -1,0 +1,149 @@
+"""An equation of motion as physics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+from torchdiffeq import odeint
+
+from gpadjust.physics.base import Physics
+from gpadjust.physics.error import PhysicsError
+
+FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
+ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
+
+
+class ODEPhysics(Physics):
+    r"""One time step of an equation of motion, differentiable by autograd.
+
+    With :math:`x = (s, a)`, a state and an action that is held during the step :math:`h`,
+
+    .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
+
+    or :math:`s(h) - s` with `difference=True`.
+
+    Args:
+        rhs: The time derivative :math:`g`, from the state `N x state_dim` and the action `N x a`
+            (`a` may be 0) to `N x state_dim`. The parameters of a `torch.nn.Module` become
+            parameters of the physics.
+        step: The duration of the step, in the time unit of `rhs`.
+        state_dim: The number of leading columns that hold the state; the others hold the action.
+        substeps: Integration steps within the step, for the fixed-step methods.
+        method: A method of `torchdiffeq.odeint`. The adaptive ones control one step size for all
+            rows of a batch together, so that a row's result depends, within the tolerances, on
+            the rows it is evaluated with; hence the default.
+        rtol: Relative tolerance of the adaptive methods.
+        atol: Absolute tolerance of the adaptive methods, in the unit of the state.
+        difference: Whether the output is the change of the state instead of the new state.
+        inputs: The columns of X that hold state and action, in this order. Default: all.
+        memo: The most rows to remember; 0 switches the memo off.
+        name: The name in messages. Default: that of `rhs`.
+
+    Raises:
+        TypeError: If `rhs` is not callable.
+        ValueError: If `step`, `substeps` or `state_dim` is not positive, or `method` is unknown.
+
+    Example:
+        >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
+        >>> decay(torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=torch.float64))
+        tensor([[0.3679],
+                [1.0000]], dtype=torch.float64)
+    """
+
+    def __init__(
+        self,
+        rhs: Callable[[Tensor, Tensor], Tensor],
+        step: float,
+        state_dim: int,
+        *,
+        substeps: int = 10,
+        method: str = "rk4",
+        rtol: float = 1e-7,
+        atol: float = 1e-9,
+        difference: bool = False,
+        inputs: Sequence[int] | None = None,
+        memo: int = 100_000,
+        name: str | None = None,
+    ) -> None:
+        if not callable(rhs):
+            raise TypeError(f"rhs must be callable; found {type(rhs).__name__}.")
+        if not (math.isfinite(step) and step > 0):
+            raise ValueError(f"step must be a positive duration; found {step}.")
+        if state_dim < 1:
+            raise ValueError(f"state_dim must be at least 1; found {state_dim}.")
+        if substeps < 1:
+            raise ValueError(f"substeps must be at least 1; found {substeps}.")
+        if method not in FIXED_STEP + ADAPTIVE_STEP:
+            raise ValueError(
+                f"Unknown method {method!r}; use one with a fixed step, {', '.join(FIXED_STEP)}, "
+                f"or an adaptive one, {', '.join(ADAPTIVE_STEP)}."
+            )
+        name = name or getattr(rhs, "__name__", type(rhs).__name__)
+        super().__init__(inputs=inputs, memo=memo, name=name)
+        self.rhs = rhs
+        self.step = float(step)
+        self.state_dim = state_dim
+        self.substeps = substeps
+        self.method = method
+        self.rtol = rtol
+        self.atol = atol
+        self.difference = difference
+        self.num_outputs = state_dim
+
+    def evaluate(self, X: Tensor) -> Tensor:
+        """The state after the step, or its change.
+
+        Args:
+            X: `N x (state_dim + a)`, states and actions.
+
+        Returns:
+            `N x state_dim`.
+
+        Raises:
+            PhysicsError: If X has fewer than `state_dim` columns, or `rhs` returns something else
+                than one time derivative per state.
+        """
+        if X.shape[1] < self.state_dim:
+            raise PhysicsError(
+                f"Physics {self.name!r} needs {self.state_dim} state column(s), then the action; "
+                f"found rows with {X.shape[1]} column(s). Correct state_dim or inputs."
+            )
+        state, action = X[:, : self.state_dim], X[:, self.state_dim :]
+
+        def derivative(t: Tensor, state: Tensor) -> Tensor:
+            rate = self.rhs(state, action)
+            if not torch.is_tensor(rate) or rate.shape != state.shape:
+                found = tuple(rate.shape) if torch.is_tensor(rate) else type(rate).__name__
+                raise PhysicsError(
+                    f"The rhs of physics {self.name!r} returned {found}, expected a tensor of the "
+                    f"state's shape {tuple(state.shape)}: one time derivative per state variable."
+                )
+            return rate
+
+        options = {}
+        if self.method in FIXED_STEP:
+            # A grid of our own: torchdiffeq's step_size rounds up to one substep too many.
+            options["grid_constructor"] = lambda *_: X.new_tensor(self._times(self.substeps))
+        path: Tensor = odeint(
+            derivative,
+            state,
+            X.new_tensor(self._times(1)),
+            rtol=self.rtol,
+            atol=self.atol,
+            method=self.method,
+            options=options,
+        )
+        return path[-1] - state if self.difference else path[-1]
+
+    def extra_repr(self) -> str:
+        """The settings that `repr` shows."""
+        return (
+            f"{super().extra_repr()}, step={self.step}, state_dim={self.state_dim}, "
+            f"method={self.method!r}, difference={self.difference}"
+        )
+
+    def _times(self, intervals: int) -> list[float]:
+        return [self.step * i / intervals for i in range(intervals + 1)]

@@ -1,0 +1,56 @@
+"""Row-by-row calls of a NumPy function, in parallel where joblib is told so."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import ArrayLike, NDArray
+
+RowFunction = Callable[[NDArray[np.float64]], ArrayLike]
+
+
+def call_rows(
+    function: RowFunction, X: NDArray[np.float64]
+) -> list[NDArray[np.float64] | Exception]:
+    """Calls a function on each row; a row that fails does not stop the others.
+
+    The calls go through `joblib.Parallel(n_jobs=None)`: one after the other, unless a
+    `joblib.parallel_config` says otherwise.
+
+    Args:
+        function: Maps a row `(d,)` to a scalar or `(m,)`.
+        X: `N x d`.
+
+    Returns:
+        For each row its outputs `(m,)`, or the exception it raised.
+
+    Example:
+        >>> call_rows(lambda x: 1 / int(x[0]), np.array([[2.0], [0.0]]))
+        [array([0.5]), ZeroDivisionError('division by zero')]
+    """
+    results: list[NDArray[np.float64] | Exception] = Parallel(n_jobs=None)(
+        delayed(_call_row)(function, x) for x in X
+    )
+    return results
+
+
+def _call_row(function: RowFunction, x: NDArray[np.float64]) -> NDArray[np.float64] | Exception:
+    try:
+        y = np.array(function(x.copy()), dtype=np.float64, ndmin=1)
+        if y.ndim > 1:
+            raise ValueError(f"expected a scalar or outputs of shape (m,), found {y.shape}")
+        return y
+    except Exception as error:
+        return error if _can_travel(error) else RuntimeError(f"{type(error).__name__}: {error}")
+
+
+def _can_travel(error: Exception) -> bool:
+    # An exception that does not survive a pickle would break the pool, and lose the other rows.
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return False
+    return True
