@@ -3,6 +3,7 @@
 from gpadjust.gp.fixed_standardize import FixedStandardize
 from gpadjust.gp.fourier import FourierFeatures, FourierKernel
 from gpadjust.gp.inputs_kernel import InputsKernel
+from gpadjust.gp.log_interval import LogInterval
 from gpadjust.gp.physics_input import PhysicsInput
 from gpadjust.gp.physics_mean import PhysicsMean
 from gpadjust.gp.physics_scaled_kernel import PhysicsScaledKernel
@@ -13,6 +14,7 @@ __all__ = [
     "FourierFeatures",
     "FourierKernel",
     "InputsKernel",
+    "LogInterval",
     "PhysicsColumn",
     "PhysicsInput",
     "PhysicsMean",

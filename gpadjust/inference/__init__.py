@@ -1,5 +1,5 @@
 """Fitting the models."""
 
-from gpadjust.inference.fit import FitResult, fit
+from gpadjust.inference.fitting import FitResult, fit
 
 __all__ = ["FitResult", "fit"]

@@ -6,15 +6,14 @@ import math
 
 import numpy as np
 import torch
-from gpytorch.constraints import Interval
 from torch import Tensor
 
+from gpadjust.gp import LogInterval
 from gpadjust.inference.objective import Objective
-from gpadjust.models.parameter_scales import parameter_scales
+from gpadjust.models.parameter_scales import BOUNDS, constraint_of, kind, parameter_scales
 
-# Ranges as multiples of a parameter's typical size: of starts, and of the bounds of the search.
-_STARTS = {"lengthscale": (0.05, 10.0), "outputscale": (1e-2, 1e2), "noise": (1e-7, 1e-1)}
-_BOUNDS = {"lengthscale": (1e-2, 1e3), "outputscale": (1e-6, 1e6), "noise": (1e-10, 1e1)}
+# Ranges of the starts as multiples of a parameter's typical size.
+_STARTS = {"lengthscale": (0.05, 50.0), "outputscale": (1e-2, 1e2), "noise": (1e-6, 1e-1)}
 
 
 class SearchSpace:
@@ -51,19 +50,42 @@ class SearchSpace:
 
     def draw(self, num_starts: int, generator: torch.Generator) -> Tensor:
         """Draw random settings, ``num_starts x B x p``."""
-        values = {}
+        values: dict[str, Tensor] = {}
+        multiples = self._draw_multiples(num_starts, generator)
         for name in self._objective.names:
-            parameter = self._parameters[name].detach()
-            shape = (num_starts, *parameter.shape)
-            if name in self._sizes:
-                low, high = (math.log(limit) for limit in _STARTS[_kind(name)])
-                share = torch.rand(shape, generator=generator, dtype=parameter.dtype)
-                values[name] = self._raw(name, (low + share * (high - low)).exp())
+            if name in multiples:
+                values[name] = self._raw(name, multiples[name])
             else:
+                parameter = self._parameters[name].detach()
+                shape = (num_starts, *parameter.shape)
                 noise = torch.randn(shape, generator=generator, dtype=parameter.dtype)
                 values[name] = parameter + noise
         settings = self._objective.flatten(values)
         return torch.minimum(torch.maximum(settings, self.lower), self.upper)
+
+    def _draw_multiples(self, num_starts: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw values as multiples of the typical sizes.
+
+        A function with a lengthscale of r times the data's range looks linear there, with a
+        variation of 1 / r of its standard deviation: so half of the starts raise the outputscale
+        by up to r^2.
+        """
+        multiples: dict[str, Tensor] = {}
+        for name in self._objective.names:
+            if name in self._sizes:
+                parameter = self._parameters[name].detach()
+                low, high = (math.log(limit) for limit in _STARTS[kind(name)])
+                shape = (num_starts, *parameter.shape)
+                share = torch.rand(shape, generator=generator, dtype=parameter.dtype)
+                multiples[name] = (low + share * (high - low)).exp()
+        for name, multiple in multiples.items():
+            if kind(name) == "outputscale":
+                path = name.removesuffix("raw_outputscale") + "base_kernel.raw_lengthscale"
+                if path in multiples:
+                    stretch = multiples[path].amin((-1, -2)).clamp_min(1.0)
+                    power = torch.rand(multiple.shape, generator=generator, dtype=multiple.dtype)
+                    multiple *= stretch.pow((4 * power - 2).clamp_min(0.0))
+        return multiples
 
     @property
     def unit_bounds(self) -> list[tuple[float, float]]:
@@ -84,37 +106,22 @@ class SearchSpace:
 
     def _bound(self, name: str, side: int) -> Tensor:
         parameter = self._parameters[name].detach()
+        constraint = constraint_of(self._objective.model, name)
+        if isinstance(constraint, LogInterval) or (constraint and not constraint.enforced):
+            limit = (constraint.lower_bound, constraint.upper_bound)[side]
+            return constraint.inverse_transform(limit.to(parameter)).expand_as(parameter)
         if name in self._sizes:
-            return self._raw(name, torch.full_like(parameter, _BOUNDS[_kind(name)][side]))
-        constraint = self._constraint(name)
-        limit = torch.tensor((-math.inf, math.inf)[side], dtype=parameter.dtype)
-        if constraint is not None and not constraint.enforced:
-            limit = (constraint.lower_bound, constraint.upper_bound)[side].to(parameter)
-        return limit.expand_as(parameter)
+            return self._raw(name, torch.full_like(parameter, BOUNDS[kind(name)][side]))
+        return torch.full_like(parameter, (-math.inf, math.inf)[side])
 
     def _raw(self, name: str, multiple: Tensor) -> Tensor:
-        """The raw parameter at a multiple of its typical size above its lower constraint."""
+        """The raw parameter at a multiple of its typical size, within its constraint."""
         value = multiple * self._sizes[name]
-        constraint = self._constraint(name)
+        constraint = constraint_of(self._objective.model, name)
         if constraint is None:
             return value
-        floor, ceiling = constraint.lower_bound, constraint.upper_bound
-        if _kind(name) == "noise":
-            value = floor + value
-        if ceiling.isfinite().all():
-            margin = 1e-6 * (ceiling - floor)
-            value = torch.minimum(torch.maximum(value, floor + margin), ceiling - margin)
-        elif floor.isfinite().all():
-            value = torch.maximum(value, floor * (1 + 1e-6))
+        lower, upper = constraint.lower_bound, constraint.upper_bound
+        margin = 1e-6 * torch.where(upper.isfinite(), upper - lower, lower.abs())
+        value = torch.minimum(torch.maximum(value, lower + margin), upper - margin)
         raw: Tensor = constraint.inverse_transform(value)
         return raw
-
-    def _constraint(self, name: str) -> Interval | None:
-        path, leaf = name.rsplit(".", 1) if "." in name else ("", name)
-        module = self._objective.model.get_submodule(path)
-        constraint = getattr(module, f"{leaf}_constraint", None)
-        return constraint if isinstance(constraint, Interval) else None
-
-
-def _kind(name: str) -> str:
-    return name.rsplit("raw_", 1)[1]

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from typing import Any, Literal
 
 import torch
-from botorch.models import SingleTaskGP
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.models.utils import add_output_dim, gpt_posterior_settings
@@ -20,7 +19,6 @@ from gpytorch.likelihoods import Likelihood
 from linear_operator import to_dense, to_linear_operator
 from torch import Size, Tensor
 from torch.nn import Module
-from typing_extensions import Self
 
 from gpadjust.gp import (
     FixedStandardize,
@@ -30,7 +28,8 @@ from gpadjust.gp import (
     PhysicsMean,
     PhysicsScaledKernel,
 )
-from gpadjust.models.defaults import default_likelihood, make_kernel, output_dimensions
+from gpadjust.models.defaults import default_likelihood, make_kernel
+from gpadjust.models.multi_output_gp import MultiOutputGP
 from gpadjust.models.parameter_scales import set_initial_values
 from gpadjust.models.training_data import check_training_data
 from gpadjust.physics import Physics, as_physics
@@ -38,7 +37,7 @@ from gpadjust.physics import Physics, as_physics
 Component = Literal["rho", "delta"]
 
 
-class AdjustmentGP(SingleTaskGP):
+class AdjustmentGP(MultiOutputGP):
     r"""A BoTorch model of :math:`f_a(x) = \rho(x) f_p(x) + \delta(x)`, the base of its special cases.
 
     With :math:`\rho \sim GP(1, k_\rho)` and :math:`\delta \sim GP(0, k_\delta)` the prior is
@@ -90,7 +89,7 @@ class AdjustmentGP(SingleTaskGP):
         d, f_p = X.shape[-1] - m, X[..., -m:]
         batch_shape = self.get_batch_dimensions(train_X, train_Y)[1]
         if isinstance(outcome_transform, _DefaultType):
-            outcome_transform = residual_scale(train_Y - f_p)
+            outcome_transform = residual_scale(train_Y, f_p)
         shift, scale = _affine(outcome_transform, train_Y, X)
         offset = _center(center, f_p)
         to_outputs = (lambda t: t.mT) if m > 1 else (lambda t: t.squeeze(-1))
@@ -108,14 +107,12 @@ class AdjustmentGP(SingleTaskGP):
             train_X,
             train_Y,
             train_Yvar,
-            likelihood=likelihood
-            or default_likelihood(train_Yvar, (train_Y - f_p) / scale, batch_shape),
+            likelihood=likelihood or default_likelihood(train_Yvar, batch_shape),
             covar_module=terms[0] if len(terms) == 1 else terms[0] + terms[1],
             mean_module=PhysicsMean(mean),
             outcome_transform=outcome_transform,
             input_transform=transform,
         )
-        self._subset_batch_dict = output_dimensions(self)
         given = (rho_covar_module, delta_covar_module, likelihood)
         set_initial_values(self, *(module for module in given if isinstance(module, Module)))
 
@@ -158,13 +155,6 @@ class AdjustmentGP(SingleTaskGP):
         column: PhysicsColumn = (self.mean_module if rho is None else rho).physics
         return column
 
-    def condition_on_observations(self, X: Tensor, Y: Tensor, **kwargs: Any) -> Self:
-        """Condition on new observations; see BoTorch. No posterior has to be called before."""
-        if self.prediction_strategy is None:
-            with torch.no_grad():
-                AdjustmentGP.posterior(self, X)
-        return super().condition_on_observations(X, Y, **kwargs)
-
     def _adjustment(self, X: Tensor, component: Component) -> GPyTorchPosterior:
         """The posterior of rho or delta at ``X``; f_p is not evaluated there."""
         self.eval()
@@ -184,9 +174,7 @@ class AdjustmentGP(SingleTaskGP):
         with_dim: tuple[Tensor, int] = add_output_dim(X, self._input_batch_shape)
         return with_dim
 
-    def _as_posterior(
-        self, mvn: MultivariateNormal, output_dim: int | None
-    ) -> GPyTorchPosterior:
+    def _as_posterior(self, mvn: MultivariateNormal, output_dim: int | None) -> GPyTorchPosterior:
         """The posterior of a batch of independent outputs."""
         if output_dim is not None:
             mvn = MultitaskMultivariateNormal.from_batch_mvn(mvn, task_dim=output_dim)
@@ -240,19 +228,24 @@ class AdjustmentGP(SingleTaskGP):
         )
 
 
-def residual_scale(residual: Tensor) -> FixedStandardize:
-    """The default outcome transform: divide by the root mean square of ``y - f_p``.
+def residual_scale(train_Y: Tensor, mean: Tensor) -> FixedStandardize:
+    """The default outcome transform: divide by the root mean square of ``train_Y - mean``.
 
     Args:
-        residual: ``batch_shape x n x m``. Where it is all zero the scale is 1.
+        train_Y: Targets, ``batch_shape x n x m``.
+        mean: The prior mean at the training inputs, of the same shape. Where it meets the targets
+            exactly, the scale is a millionth of theirs (or 1 if they are zero).
     """
-    rms = residual.square().mean(-2, keepdim=True).sqrt()
-    return FixedStandardize.of(torch.zeros_like(rms), rms.where(rms > 0, torch.ones_like(rms)))
+
+    def rms(values: Tensor) -> Tensor:
+        return values.square().mean(-2, keepdim=True).sqrt()
+
+    scale, size = rms(train_Y - mean), rms(train_Y)
+    tiny = 1e-6 * size.where(size > 0, torch.full_like(size, 1e6))
+    return FixedStandardize.of(torch.zeros_like(scale), scale.where(scale > 0, tiny))
 
 
-def _affine(
-    transform: Standardize | None, train_Y: Tensor, X: Tensor
-) -> tuple[Tensor, Tensor]:
+def _affine(transform: Standardize | None, train_Y: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
     """Shift and scale (``batch_shape x 1 x m``) that an outcome transform puts on the targets."""
     if transform is None:
         return torch.zeros_like(train_Y[..., :1, :]), torch.ones_like(train_Y[..., :1, :])

@@ -6,22 +6,24 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from botorch.models import SingleTaskGP
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
-from gpytorch.constraints import GreaterThan
+from gpytorch.constraints import Interval
 from gpytorch.kernels import Kernel
-from gpytorch.likelihoods import HadamardGaussianLikelihood
+from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
+from gpytorch.likelihoods.noise_models import MultitaskHomoskedasticNoise
 from gpytorch.means import ZeroMean
 from linear_operator import to_dense
+from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 from typing_extensions import Self
 
 from gpadjust.gp import FixedStandardize, InputsKernel
-from gpadjust.models.defaults import NOISE_FLOOR, make_kernel, output_dimensions, scaled_rbf
-from gpadjust.models.parameter_scales import set_initial_values
+from gpadjust.models.defaults import make_kernel, scaled_rbf, wide
+from gpadjust.models.multi_output_gp import MultiOutputGP
+from gpadjust.models.parameter_scales import BOUNDS, set_initial_values
 from gpadjust.models.training_data import check_training_data
 from gpadjust.physics import Physics, as_physics
 
@@ -105,7 +107,42 @@ class AR1Kernel(Kernel):
         )
 
 
-class AR1(SingleTaskGP):
+class LevelLikelihood(_GaussianLikelihoodBase):
+    """Gaussian noise with one variance per level, told by the last column of the inputs.
+
+    Unlike GPyTorch's ``HadamardGaussianLikelihood`` it broadcasts over the batches that fantasies
+    add.
+
+    Args:
+        noise_constraint: The constraint of the variances.
+        batch_shape: Batch shape of the variances, ``batch_shape x 2``.
+    """
+
+    def __init__(self, noise_constraint: Interval, batch_shape: Size) -> None:
+        super().__init__(
+            MultitaskHomoskedasticNoise(
+                num_tasks=2, noise_constraint=noise_constraint, batch_shape=batch_shape
+            )
+        )
+
+    @property
+    def noise(self) -> Tensor:
+        """The variances of the low and of the high level, ``batch_shape x 2``."""
+        noise: Tensor = self.noise_covar.noise
+        return noise
+
+    def _shaped_noise_covar(
+        self, base_shape: Size, *params: Any, **kwargs: Any
+    ) -> DiagLinearOperator:
+        inputs = params[0] if isinstance(params[0], Tensor) else params[0][0]
+        high = inputs[..., -1]
+        low_noise, high_noise = self.noise[..., :1], self.noise[..., 1:]
+        noise = low_noise + high * (high_noise - low_noise)
+        shape = torch.broadcast_shapes(noise.shape, base_shape)
+        return DiagLinearOperator(noise.expand(shape))
+
+
+class AR1(MultiOutputGP):
     r"""Auto-regressive co-kriging, :math:`f_2(x) = \rho f_1(x) + \delta(x)` with a constant rho.
 
     The classic of multi-fidelity modelling (Kennedy and O'Hagan 2000; Wannawas and Faisal 2023,
@@ -181,23 +218,18 @@ class AR1(SingleTaskGP):
                 low_Y.mean(-2, keepdim=True),
                 spread.where(spread > 0, torch.ones_like(spread)),
             )
-        targets = Y
-        if outcome_transform is not None:
-            targets, _ = outcome_transform.train()(Y, X=X)
         d = transform(X).shape[-1] - 1
-        low_kernel = make_kernel(
-            low_covar_module or scaled_rbf, "low_covar_module", d, batch_shape
-        )
+        low_kernel = make_kernel(low_covar_module or scaled_rbf, "low_covar_module", d, batch_shape)
         delta_kernel = make_kernel(
             delta_covar_module or scaled_rbf, "delta_covar_module", d, batch_shape
         )
         Yvar = likelihood = None
         if train_Yvar is None:
-            likelihood = _level_noise(targets, batch_shape)
+            likelihood = LevelLikelihood(wide(), batch_shape)
         else:
             # f_p is known without error; GPyTorch raises this to its own minimum.
-            Yvar = torch.cat([NOISE_FLOOR * low_Y.var(-2, keepdim=True).expand_as(low_Y),
-                              train_Yvar], dim=-2)
+            low_Yvar = BOUNDS["noise"][0] * low_Y.var(-2, keepdim=True).expand_as(low_Y)
+            Yvar = torch.cat([low_Yvar, train_Yvar], dim=-2)
         super().__init__(
             X,
             Y,
@@ -210,7 +242,6 @@ class AR1(SingleTaskGP):
             outcome_transform=outcome_transform,
             input_transform=transform,
         )
-        self._subset_batch_dict = output_dimensions(self)
         set_initial_values(self, low_covar_module, delta_covar_module)
 
     @property
@@ -240,14 +271,3 @@ def _samples(train_X: Tensor, bounds: Tensor | None, num_low: int, seed: int) ->
         raise ValueError(f"Expected num_low >= 2 samples of f_p, got {num_low}.")
     points = draw_sobol_samples(bounds, n=num_low, q=1, seed=seed).squeeze(-2)
     return points.expand(*train_X.shape[:-2], num_low, d)
-
-
-def _level_noise(targets: Tensor, batch_shape: Size) -> HadamardGaussianLikelihood:
-    """One noise variance per level, above a floor relative to the targets' mean square."""
-    power = targets.square().mean(-2)
-    power = power.where(power > 0, torch.ones_like(power)).reshape(*batch_shape, 1)
-    constraint = GreaterThan(0.0, transform=torch.exp, inv_transform=torch.log)
-    constraint.lower_bound = NOISE_FLOOR * power
-    return HadamardGaussianLikelihood(
-        num_tasks=2, task_feature_index=-1, noise_constraint=constraint, batch_shape=batch_shape
-    )

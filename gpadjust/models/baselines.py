@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 
-from botorch.models import SingleTaskGP
+import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.posteriors import GPyTorchPosterior
@@ -19,15 +19,15 @@ from gpadjust.models.adjustment_gp import AdjustmentGP, residual_scale
 from gpadjust.models.defaults import (
     default_likelihood,
     make_kernel,
-    output_dimensions,
     scaled_rbf,
 )
+from gpadjust.models.multi_output_gp import MultiOutputGP
 from gpadjust.models.parameter_scales import set_initial_values
 from gpadjust.models.training_data import check_training_data
 from gpadjust.physics import Physics
 
 
-class ZeroMeanGP(SingleTaskGP):
+class ZeroMeanGP(MultiOutputGP):
     r"""A Gaussian process without physics, :math:`f \sim GP(0, k)`.
 
     Args:
@@ -60,22 +60,18 @@ class ZeroMeanGP(SingleTaskGP):
         check_training_data(train_X, train_Y, train_Yvar)
         batch_shape = self.get_batch_dimensions(train_X, train_Y)[1]
         if isinstance(outcome_transform, _DefaultType):
-            outcome_transform = residual_scale(train_Y)
-        targets = train_Y
-        if outcome_transform is not None:
-            targets, _ = outcome_transform.train()(train_Y, X=train_X)
+            outcome_transform = residual_scale(train_Y, torch.zeros_like(train_Y))
         d = self.transform_inputs(train_X, input_transform).shape[-1]
         super().__init__(
             train_X,
             train_Y,
             train_Yvar,
-            likelihood=likelihood or default_likelihood(train_Yvar, targets, batch_shape),
+            likelihood=likelihood or default_likelihood(train_Yvar, batch_shape),
             covar_module=make_kernel(covar_module or scaled_rbf, "covar_module", d, batch_shape),
             mean_module=ZeroMean(),
             outcome_transform=outcome_transform,
             input_transform=input_transform,
         )
-        self._subset_batch_dict = output_dimensions(self)
         set_initial_values(self, covar_module, likelihood)
 
 

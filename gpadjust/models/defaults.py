@@ -1,51 +1,38 @@
-"""What a model uses where the user says nothing: kernels, likelihood, and their bookkeeping."""
+"""What a model uses where the user says nothing: kernels and likelihood.
+
+Their initial values and bounds follow the data, see :mod:`gpadjust.models.parameter_scales`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import torch
-from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
-from gpytorch.constraints import GreaterThan, Positive
 from gpytorch.kernels import Kernel, RBFKernel, ScaleKernel
 from gpytorch.likelihoods import GaussianLikelihood, Likelihood
 from torch import Size, Tensor
 
-from gpadjust.gp import FourierFeatures
-
-NOISE_FLOOR = 1e-6  # of the residual's mean square; higher ones cap the accuracy
+from gpadjust.gp import LogInterval
 
 
-def log_positive() -> Positive:
-    """A positivity constraint by the exponential: steps in it are relative, whatever the units."""
-    return Positive(transform=torch.exp, inv_transform=torch.log)
+def wide() -> LogInterval:
+    """A constraint whose bounds are to be set from the data."""
+    return LogInterval(1e-12, 1e12)
 
 
 def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
     """An RBF kernel with one lengthscale per input and an outputscale."""
     base = RBFKernel(
-        ard_num_dims=num_inputs, batch_shape=batch_shape, lengthscale_constraint=log_positive()
+        ard_num_dims=num_inputs, batch_shape=batch_shape, lengthscale_constraint=wide()
     )
-    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=log_positive())
+    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=wide())
 
 
-def default_likelihood(
-    train_Yvar: Tensor | None, residual: Tensor, batch_shape: Size
-) -> Likelihood | None:
-    """A Gaussian likelihood with learnt noise above a floor relative to the residual.
-
-    Args:
-        train_Yvar: Known variances; with them the result is None, and BoTorch's default applies.
-        residual: ``y - f_p`` in the units of the targets, ``... x n x m``.
-        batch_shape: The model's batch shape, the outputs last.
-    """
+def default_likelihood(train_Yvar: Tensor | None, batch_shape: Size) -> Likelihood | None:
+    """Learnt Gaussian noise; or None, BoTorch's fixed noise, where the variances are known."""
     if train_Yvar is not None:
         return None
-    power = residual.square().mean(-2)
-    power = power.where(power > 0, torch.ones_like(power)).reshape(*batch_shape, 1)
-    constraint = GreaterThan(0.0, transform=torch.exp, inv_transform=torch.log)
-    constraint.lower_bound = NOISE_FLOOR * power
-    return GaussianLikelihood(batch_shape=batch_shape, noise_constraint=constraint)
+    return GaussianLikelihood(batch_shape=batch_shape, noise_constraint=wide())
 
 
 def make_kernel(
@@ -70,24 +57,3 @@ def make_kernel(
             "it and to the kernels inside it."
         )
     return kernel
-
-
-def output_dimensions(model: BatchedMultiOutputGPyTorchModel) -> dict[str, int]:
-    """Where in each batched parameter and buffer the outputs lie, for ``subset_output``."""
-    batch_shape = model._aug_batch_shape
-    if model.num_outputs == 1:
-        return {}
-    shared = {
-        f"{name}.{buffer}"
-        for name, module in model.named_modules()
-        if isinstance(module, FourierFeatures)
-        for buffer, _ in module.named_buffers()
-    }
-    dimensions = {}
-    for part in ("mean_module", "covar_module", "likelihood"):
-        module = getattr(model, part)
-        for name, tensor in [*module.named_parameters(), *module.named_buffers()]:
-            full_name = f"{part}.{name}"
-            if tensor.shape[: len(batch_shape)] == batch_shape and full_name not in shared:
-                dimensions[full_name] = len(batch_shape) - 1 - tensor.dim()
-    return dimensions

@@ -8,10 +8,16 @@ from __future__ import annotations
 
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+from gpytorch.constraints import Interval
 from gpytorch.kernels import Kernel, ScaleKernel
 from torch import Tensor
 
-from gpadjust.gp import InputsKernel, PhysicsScaledKernel
+from gpadjust.gp import InputsKernel, LogInterval, PhysicsScaledKernel
+
+# Multiples of the typical sizes. Noise below a millionth of the residual's mean square is not
+# told from none, and a higher floor would cap the accuracy.
+INITIAL = {"lengthscale": 0.5, "outputscale": 0.5, "noise": 1e-2}
+BOUNDS = {"lengthscale": (1e-2, 1e3), "outputscale": (1e-6, 1e6), "noise": (1e-6, 1e1)}
 
 
 def parameter_scales(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor]:
@@ -27,7 +33,7 @@ def parameter_scales(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor
     with torch.no_grad():
         residual = targets - model.mean_module(inputs)
         unit = residual.square().mean(-1)
-        unit = unit.where(unit > 0, torch.full_like(unit, 1e-12))
+        unit = unit.where(unit > 0, torch.ones_like(unit))
         ranges = inputs.amax(-2, keepdim=True) - inputs.amin(-2, keepdim=True)
         ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
         sizes: dict[str, Tensor] = {}
@@ -41,26 +47,37 @@ def parameter_scales(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor
 def set_initial_values(
     model: BatchedMultiOutputGPyTorchModel, *given: torch.nn.Module | None
 ) -> None:
-    """Set lengthscales to half the inputs' range and variances to fractions of the residual's.
+    """Set initial values, and bounds of the search, to multiples of the typical sizes.
 
     Args:
         model: The model to initialise.
         given: Modules that the user brought, whose parameters stay as they are.
     """
-    share = {"raw_lengthscale": 0.5, "raw_outputscale": 0.5, "raw_noise": 0.01}
     keep = {id(p) for module in given if module is not None for p in module.parameters()}
     named = dict(model.named_parameters())
     for name, size in parameter_scales(model).items():
-        if id(named[name]) not in keep:
-            set_value(model, name, share[name.rsplit(".", 1)[1]] * size)
+        if id(named[name]) in keep:
+            continue
+        lower, upper = BOUNDS[kind(name)]
+        constraint = constraint_of(model, name)
+        if isinstance(constraint, LogInterval):
+            # One bound for all outputs, as BoTorch's optimiser wants it.
+            constraint.lower_bound = lower * size.amin()
+            constraint.upper_bound = upper * size.amax()
+        with torch.no_grad():
+            named[name].copy_(constraint.inverse_transform(INITIAL[kind(name)] * size))
 
 
-def set_value(model: torch.nn.Module, raw_name: str, value: Tensor) -> None:
-    """Set a parameter by its raw name and its (transformed) value."""
-    path, leaf = raw_name.rsplit(".", 1)
-    module = model.get_submodule(path)
-    with torch.no_grad():
-        getattr(module, leaf).copy_(getattr(module, f"{leaf}_constraint").inverse_transform(value))
+def kind(name: str) -> str:
+    """What a raw parameter is: ``"lengthscale"``, ``"outputscale"``, ``"noise"`` or another."""
+    return name.rsplit(".", 1)[-1].removeprefix("raw_")
+
+
+def constraint_of(model: torch.nn.Module, name: str) -> Interval | None:
+    """The constraint of a parameter, by its name."""
+    path, _, leaf = name.rpartition(".")
+    constraint = getattr(model.get_submodule(path), f"{leaf}_constraint", None)
+    return constraint if isinstance(constraint, Interval) else None
 
 
 def _training_set(model: BatchedMultiOutputGPyTorchModel) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,7 @@ from torch import Size, Tensor
 from gpadjust.gp import FourierFeatures, FourierKernel
 from gpadjust.models.adjusted_functions import AdjustedFunctions, AdjustmentFeatures
 from gpadjust.models.adjustment_gp import AdjustmentGP, Component
-from gpadjust.models.defaults import log_positive
+from gpadjust.models.defaults import wide
 from gpadjust.physics import Physics
 
 
@@ -102,11 +102,9 @@ class RRA(AdjustmentGP):
                 FourierFeatures(num_features, num_inputs, seed),
                 ard_num_dims=num_inputs,
                 batch_shape=batch_shape,
-                lengthscale_constraint=log_positive(),
+                lengthscale_constraint=wide(),
             )
-            return ScaleKernel(
-                base, batch_shape=batch_shape, outputscale_constraint=log_positive()
-            )
+            return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=wide())
 
         super().__init__(
             train_X,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Self
 
@@ -62,6 +61,8 @@ class BlackBoxPhysics(Physics):
         tensor([[2.0000, 0.0000]], dtype=torch.float64)
     """
 
+    _shape_hint = "For a function of a single row pass batched=False."
+
     def __init__(
         self,
         function: NumpyFunction,
@@ -80,8 +81,8 @@ class BlackBoxPhysics(Physics):
                 "gradient must be 'finite-difference', a callable that returns the Jacobian "
                 f"N x m x d, or None for no gradient; found {gradient!r}."
             )
-        steps = [] if fd_step is None else np.atleast_1d(fd_step).tolist()
-        if not all(math.isfinite(h) and h > 0 for h in steps):
+        steps = np.array(1.0 if fd_step is None else fd_step)
+        if steps.size == 0 or not (np.isfinite(steps) & (steps > 0)).all():
             raise ValueError(f"fd_step must be positive, in the units of X; found {fd_step}.")
         name = name or getattr(function, "__name__", type(function).__name__)
         super().__init__(inputs=inputs, memo=memo, name=name)
@@ -159,8 +160,9 @@ class BlackBoxPhysics(Physics):
         try:
             return central_difference(self._call, rows.double().cpu(), step).to(rows)
         except PhysicsError as error:
-            error.rows = tuple(sorted({i // d % n for i in error.rows}))
-            error.inputs = rows[list(error.rows)]
+            if error.inputs is None:
+                error.rows = tuple(sorted({i // d % n for i in error.rows}))
+                error.inputs = rows[list(error.rows)]
             error.add_note(
                 "This was in the finite differences around these rows. Make fd_step smaller, or "
                 "pass gradient=None or the Jacobian as gradient."

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 
 class ExternalCall(torch.autograd.Function):
     """A function of rows whose Jacobian is computed elsewhere, when the backward pass asks for it.
 
     Call `ExternalCall.apply(X, value, jacobian)`: X is `N x d`, `value(X)` is `N x m` and
-    `jacobian(X)` is `N x m x d`. It is differentiable once.
+    `jacobian(X)` is `N x m x d`. A second derivative in X raises a `NotImplementedError`.
 
     Example:
         >>> X = torch.tensor([[3.0]], requires_grad=True)
@@ -36,8 +35,24 @@ class ExternalCall(torch.autograd.Function):
         return value(X.detach())
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         """The gradient in X, `N x d`."""
         (X,) = ctx.saved_tensors
-        return torch.einsum("nm,nmd->nd", grad, ctx.jacobian(X.detach())), None, None
+        J = _Jacobian.apply(X, ctx.jacobian)
+        return torch.einsum("nm,nmd->nd", grad, J), None, None
+
+
+class _Jacobian(torch.autograd.Function):
+    # A node of its own: `once_differentiable` would drop the second derivative without a word
+    # where the incoming gradient is a constant.
+
+    @staticmethod
+    def forward(ctx: Any, X: Tensor, jacobian: Callable[[Tensor], Tensor]) -> Tensor:
+        return jacobian(X.detach())
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> NoReturn:
+        raise NotImplementedError(
+            "BlackBoxPhysics has first derivatives only; for second ones write the physics in "
+            "torch, as FunctionPhysics."
+        )

@@ -11,8 +11,10 @@ from torch import Tensor
 def central_difference(
     function: Callable[[Tensor], Tensor], X: Tensor, step: Tensor | None = None
 ) -> Tensor:
-    r"""The Jacobian :math:`\partial f_k / \partial x_j \approx (f_k(x + h_j e_j) - f_k(x - h_j
-    e_j)) / 2 h_j` of a function at some rows, in one call of the function.
+    r"""The Jacobian of a function at some rows, by central differences in one call.
+
+    .. math:: \frac{\partial f_k}{\partial x_j} \approx
+        \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
 
     Args:
         function: Maps `2 d N x d` rows to `2 d N x m` outputs. Row `i` of them is row

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gpadjust.physics.base import Physics
@@ -27,6 +26,7 @@ class FunctionPhysics(Physics):
         TypeError: If `function` is not callable.
 
     Example:
+        >>> import torch
         >>> physics = FunctionPhysics(lambda X: X[:, 0] * X[:, 1], name="power")
         >>> physics(torch.tensor([[230.0, 2.0], [230.0, 3.0]], dtype=torch.float64))
         tensor([[460.],
@@ -71,7 +71,11 @@ class FunctionPhysics(Physics):
             raise
         if isinstance(Y, np.ndarray | np.generic):
             raise PhysicsError(use_black_box)
-        if X.requires_grad and torch.is_grad_enabled() and not getattr(Y, "requires_grad", True):
+        return Y
+
+    def _differentiate(self, rows: Tensor) -> Tensor:
+        Y = super()._differentiate(rows)
+        if rows.requires_grad and not Y.requires_grad:
             self._warn_once(
                 f"No gradient flows through physics {self.name!r}: X requires grad, its outputs "
                 "do not. Wrap the function as BlackBoxPhysics(function) for finite differences; "
@@ -87,6 +91,7 @@ def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
         TypeError: If `physics` is neither, or a class instead of an instance of it.
 
     Example:
+        >>> import torch
         >>> as_physics(torch.sin)
         FunctionPhysics(name='sin', inputs=None, num_outputs=None, memo=100000)
     """

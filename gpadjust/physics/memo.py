@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import repeat
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from gpadjust.physics.error import PhysicsError
 
 
 def row_keys(rows: Tensor) -> list[bytes]:
@@ -28,8 +30,7 @@ def row_keys(rows: Tensor) -> list[bytes]:
     # Adding zero turns -0.0 into 0.0: they are equal, but their bytes are not.
     table = np.ascontiguousarray(rows.detach().cpu().double().numpy() + 0.0)
     row_bytes = np.dtype((np.void, table.itemsize * table.shape[1]))
-    keys: list[bytes] = table.view(row_bytes).ravel().tolist()
-    return keys
+    return cast(list[bytes], table.view(row_bytes).ravel().tolist())
 
 
 class RowMemo:
@@ -43,12 +44,14 @@ class RowMemo:
 
     Example:
         >>> memo = RowMemo(capacity=100)
-        >>> X = torch.tensor([[1.0], [2.0]])
-        >>> memo.store(row_keys(X), X**2)
-        >>> slots = memo.lookup(row_keys(torch.tensor([[2.0], [3.0]])))
-        >>> slots
-        tensor([ 1, -1])
-        >>> memo.gather(slots[:1])
+        >>> def square(X):
+        ...     print(f"{len(X)} new row(s)")
+        ...     return X**2
+        >>> memo.recall(torch.tensor([[2.0], [2.0]]), square)
+        1 new row(s)
+        tensor([[4.],
+                [4.]])
+        >>> memo.recall(torch.tensor([[2.0]]), square)
         tensor([[4.]])
     """
 
@@ -64,6 +67,51 @@ class RowMemo:
         """Forgets every row."""
         self._slots: dict[bytes, int] = {}
         self._values: Tensor | None = None
+
+    def recall(self, rows: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
+        """The values of some rows, of which a function is asked for those not remembered.
+
+        Args:
+            rows: `N x d`, `N >= 1`.
+            evaluate: Maps the distinct unknown rows `k x d` to values `k x m`. If it raises a
+                `PhysicsError` with a `partial` result, the finite rows of that are remembered.
+
+        Returns:
+            `N x m`, a copy.
+
+        Raises:
+            PhysicsError: That of `evaluate`, its `rows` restated as indices into `rows`.
+        """
+        if self.capacity == 0:
+            return evaluate(rows)
+        numbers: dict[bytes, int] = {}
+        inverse = torch.tensor([numbers.setdefault(k, len(numbers)) for k in row_keys(rows)])
+        keys = list(numbers)
+        slots = self.lookup(keys)
+        known = slots >= 0
+        if known.all():
+            return self.gather(slots[inverse])
+
+        first = torch.from_numpy(np.unique(inverse.numpy(), return_index=True)[1])
+        new = (~known).nonzero().flatten()
+        try:
+            values = evaluate(rows[first[new]])
+        except PhysicsError as error:
+            if error.partial is not None:
+                partial, error.partial = error.partial, None
+                good = partial.isfinite().all(-1)
+                self.store([keys[i] for i in new[good.cpu()].tolist()], partial[good])
+            if error.inputs is None:
+                order = torch.full_like(slots, -1)
+                order[new] = torch.arange(len(new))
+                error.relocate(order[inverse])
+            raise
+        distinct = values.new_empty(len(keys), values.shape[1])
+        distinct[new] = values
+        if known.any():
+            distinct[known] = self.gather(slots[known])
+        self.store([keys[i] for i in new.tolist()], values)
+        return distinct[inverse]
 
     def lookup(self, keys: Sequence[bytes]) -> Tensor:
         """Finds where the values of some rows are kept.

@@ -126,11 +126,11 @@ class ODEPhysics(Physics):
         options = {}
         if self.method in FIXED_STEP:
             # A grid of our own: torchdiffeq's step_size rounds up to one substep too many.
-            options["grid_constructor"] = lambda *_: X.new_tensor(self._times(self.substeps))
+            options["grid_constructor"] = lambda *_: self._times(self.substeps, X)
         path: Tensor = odeint(
             derivative,
             state,
-            X.new_tensor(self._times(1)),
+            self._times(1, X),
             rtol=self.rtol,
             atol=self.atol,
             method=self.method,
@@ -145,5 +145,5 @@ class ODEPhysics(Physics):
             f"method={self.method!r}, difference={self.difference}"
         )
 
-    def _times(self, intervals: int) -> list[float]:
-        return [self.step * i / intervals for i in range(intervals + 1)]
+    def _times(self, intervals: int, X: Tensor) -> Tensor:
+        return torch.linspace(0.0, self.step, intervals + 1, dtype=X.dtype, device=X.device)

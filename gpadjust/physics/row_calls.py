@@ -39,7 +39,7 @@ def call_rows(
 
 def _call_row(function: RowFunction, x: NDArray[np.float64]) -> NDArray[np.float64] | Exception:
     try:
-        y = np.array(function(x.copy()), dtype=np.float64, ndmin=1)
+        y = np.array(function(x), dtype=np.float64, ndmin=1)
         if y.ndim > 1:
             raise ValueError(f"expected a scalar or outputs of shape (m,), found {y.shape}")
         return y

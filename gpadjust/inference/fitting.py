@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,8 @@ from torch import Tensor
 from gpadjust.inference.objective import Objective
 from gpadjust.inference.search_space import SearchSpace
 
+_TOLERANCE = 1e-8  # relative decrease of the objective below which L-BFGS stops
+_SMALL_GRADIENT = 1e-2  # in unit coordinates, relative to the objective
 _INFEASIBLE = 1e10  # what the optimiser sees where the likelihood cannot be evaluated
 
 
@@ -36,7 +39,7 @@ class FitResult:
 def fit(
     model: BatchedMultiOutputGPyTorchModel | ModelListGP,
     *,
-    num_starts: int = 4,
+    num_starts: int = 8,
     num_screened: int | None = None,
     max_iterations: int = 500,
     seed: int = 0,
@@ -137,6 +140,17 @@ def _best(objective: Objective, starts: Tensor, num_starts: int) -> tuple[Tensor
     return starts.gather(0, index), values.gather(0, order)
 
 
+def _converged(info: Any, space: SearchSpace) -> bool:
+    """Whether L-BFGS converged: by its own account, or stuck in rounding errors at a minimum."""
+    if info["success"]:
+        return True
+    lower, upper = np.asarray(space.unit_bounds).T
+    x, gradient = info["x"], info["jac"]
+    projected = x - np.clip(x - gradient, lower, upper)
+    stuck: bool = "ABNORMAL" in info["message"]
+    return stuck and bool(np.abs(projected).max() < _SMALL_GRADIENT * max(1.0, abs(info["fun"])))
+
+
 def _optimise(
     objective: Objective, space: SearchSpace, starts: Tensor, max_iterations: int
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -161,10 +175,11 @@ def _optimise(
         space.to_unit(starts.reshape(-1, num_parameters), every).numpy(),
         bounds=space.unit_bounds,
         maxiter=max_iterations,
+        factr=_TOLERANCE / np.finfo(float).eps,
         pass_batch_indices=True,
     )
     shape = (num_starts, num_problems)
-    converged = torch.tensor([bool(each["success"]) for each in info]).reshape(shape)
+    converged = torch.tensor([_converged(each, space) for each in info]).reshape(shape)
     values = torch.from_numpy(np.asarray(f, dtype=np.float64)).reshape(shape)
     settings = space.from_unit(torch.from_numpy(x), every).reshape(*shape, num_parameters)
     return settings, values, converged

@@ -1,0 +1,57 @@
+"""Settings and fixtures shared by the tests of the physics."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+torch.set_num_threads(1)
+
+
+class RowCounter:
+    """A torch function `x -> [sum(x^2), sin(x_0)]` that records the rows it is asked for."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[float, ...]] = []
+
+    def __call__(self, X: Tensor) -> Tensor:
+        self.rows += [tuple(row) for row in X.detach().tolist()]
+        return self.formula(X)
+
+    @staticmethod
+    def formula(X: Tensor) -> Tensor:
+        return torch.stack([X.square().sum(-1), X[..., 0].sin()], dim=-1)
+
+
+class NumpyRowCounter:
+    """The same function for a batch of NumPy rows, or for one."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[float, ...]] = []
+
+    def __call__(self, X: np.ndarray) -> np.ndarray:
+        self.rows += [tuple(row) for row in np.atleast_2d(X).tolist()]
+        return np.stack([np.square(X).sum(-1), np.sin(X[..., 0])], axis=-1)
+
+
+@pytest.fixture
+def counter() -> RowCounter:
+    return RowCounter()
+
+
+@pytest.fixture
+def numpy_counter() -> NumpyRowCounter:
+    return NumpyRowCounter()
+
+
+@pytest.fixture
+def points() -> Callable[..., Tensor]:
+    """Draws standard normal float64 numbers of a shape, the same ones each time."""
+
+    def draw(*shape: int, seed: int = 0) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    return draw

@@ -1,0 +1,359 @@
+"""NumPy functions and simulators as physics."""
+
+import copy
+import os
+import pickle
+import threading
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import joblib
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gpadjust.physics import BlackBoxPhysics, PhysicsError
+
+Points = Callable[..., Tensor]
+
+
+def waves(X: np.ndarray) -> np.ndarray:
+    """For rows or one row: `[sin(x_0) exp(x_1), x_0 x_1^2]`."""
+    return np.stack([np.sin(X[..., 0]) * np.exp(X[..., 1]), X[..., 0] * X[..., 1] ** 2], -1)
+
+
+def torch_waves(X: Tensor) -> Tensor:
+    return torch.stack([X[..., 0].sin() * X[..., 1].exp(), X[..., 0] * X[..., 1] ** 2], -1)
+
+
+def waves_jacobian(X: np.ndarray) -> np.ndarray:
+    x, y = X[:, 0], X[:, 1]
+    return np.stack(
+        [
+            np.stack([np.cos(x) * np.exp(y), np.sin(x) * np.exp(y)], -1),
+            np.stack([y**2, 2 * x * y], -1),
+        ],
+        1,
+    )
+
+
+class Handle:
+    """A simulator that cannot be pickled or copied."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+    def __call__(self, X: np.ndarray) -> np.ndarray:
+        with self.lock:
+            return waves(X)
+
+
+class TestValues:
+    @given(
+        batch=st.lists(st.integers(1, 3), max_size=2), n=st.integers(1, 4), batched=st.booleans()
+    )
+    def test_any_batch_shape_gives_the_plain_function(
+        self, batch: list[int], n: int, batched: bool
+    ) -> None:
+        X = torch.randn(*batch, n, 2, dtype=torch.float64)
+        assert torch.allclose(BlackBoxPhysics(waves, batched=batched)(X), torch_waves(X))
+
+    def test_scalar_per_row(self, points: Points) -> None:
+        X = points(3, 2)
+        expected = X.sum(-1, keepdim=True)
+        assert torch.allclose(BlackBoxPhysics(lambda x: x.sum(), batched=False)(X), expected)
+        assert torch.allclose(BlackBoxPhysics(lambda X: X.sum(-1))(X), expected)
+
+    def test_function_sees_float64_columns(self) -> None:
+        seen: list[np.ndarray] = []
+
+        def record(X: np.ndarray) -> np.ndarray:
+            seen.append(X)
+            return X[:, 0]
+
+        Y = BlackBoxPhysics(record, inputs=[1])(torch.tensor([[1.0, 2.0]], dtype=torch.float32))
+        assert Y.dtype == torch.float32
+        assert (seen[0].dtype, seen[0].tolist()) == (np.float64, [[2.0]])
+
+    @pytest.mark.parametrize("batched", [True, False])
+    def test_function_may_write_to_its_input_and_reuse_its_output(self, batched: bool) -> None:
+        buffer = np.zeros(1)
+
+        def vandal(x: np.ndarray) -> np.ndarray:
+            buffer[0] = x.flat[0]
+            x[:] = 99.0
+            return buffer
+
+        X = torch.tensor([[1.0]], dtype=torch.float64)
+        physics = BlackBoxPhysics(vandal, batched=batched, memo=0)
+        first = physics(X)
+        physics(X + 1)
+        assert X.item() == first.item() == 1.0
+
+    @pytest.mark.parametrize("batched", [True, False])
+    def test_each_row_is_evaluated_once(
+        self, batched: bool, numpy_counter: Any, points: Points
+    ) -> None:
+        physics = BlackBoxPhysics(numpy_counter, batched=batched)
+        X = points(4, 2)
+        physics(X.expand(3, 4, 2))
+        physics(X.requires_grad_())
+        physics(X[:2].repeat(2, 1))
+        assert len(numpy_counter.rows) == 4
+
+
+class TestGradients:
+    @pytest.mark.parametrize("batched", [True, False])
+    @pytest.mark.parametrize("gradient", ["finite-difference", waves_jacobian])
+    def test_agrees_with_autograd(self, batched: bool, gradient: Any, points: Points) -> None:
+        physics = BlackBoxPhysics(waves, batched=batched, gradient=gradient)
+        X, weights = points(3, 4, 2).requires_grad_(), points(3, 4, 2, seed=1)
+        (found,) = torch.autograd.grad((weights * physics(X)).sum(), X)
+        (expected,) = torch.autograd.grad((weights * torch_waves(X)).sum(), X)
+        assert torch.allclose(found, expected, rtol=1e-7, atol=1e-8)
+        assert torch.autograd.gradcheck(physics, X)
+
+    def test_expanded_and_repeated_rows(self, numpy_counter: Any, points: Points) -> None:
+        physics = BlackBoxPhysics(numpy_counter)
+        x = points(1, 2).requires_grad_()
+        physics(x.expand(3, 1, 2)).sum().backward()
+        once = x.grad.clone()
+        assert len(numpy_counter.rows) == 1 + 4
+        x.grad = None
+        physics(x.repeat(3, 1)).sum().backward()
+        assert torch.allclose(x.grad, once)
+        expected = 3 * (2 * x.detach() + torch.tensor([[1.0, 0.0]]) * x.detach().cos())
+        assert torch.allclose(once, expected)
+
+    def test_reaches_only_the_columns_that_are_read(self, points: Points) -> None:
+        X = points(3, 3).requires_grad_()
+        BlackBoxPhysics(lambda X: X[:, 0] ** 2, inputs=[2])(X).sum().backward()
+        assert torch.allclose(X.grad[:, 2], 2 * X[:, 2].detach())
+        assert X.grad[:, :2].abs().max() == 0
+
+    def test_finite_differences_stay_out_of_the_memo(
+        self, numpy_counter: Any, points: Points
+    ) -> None:
+        physics = BlackBoxPhysics(numpy_counter)
+        physics(points(3, 2).requires_grad_()).sum().backward()
+        assert len(numpy_counter.rows) == 3 + 2 * 2 * 3
+        assert len(physics._memo) == 3
+
+    def test_only_a_backward_pass_pays_for_the_gradient(
+        self, numpy_counter: Any, points: Points
+    ) -> None:
+        BlackBoxPhysics(numpy_counter)(points(3, 2).requires_grad_())
+        assert len(numpy_counter.rows) == 3
+
+    @pytest.mark.parametrize("fd_step", [0.5, [0.5, 0.25]])
+    def test_step(self, fd_step: Any, numpy_counter: Any) -> None:
+        physics = BlackBoxPhysics(numpy_counter, fd_step=fd_step)
+        X = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
+        physics(X).sum().backward()
+        h, k = np.broadcast_to(fd_step, 2)
+        assert set(numpy_counter.rows[1:]) == {(h, 0), (-h, 0), (0, k), (0, -k)}
+
+    def test_second_derivative_is_refused(self, points: Points) -> None:
+        X = points(3, 2).requires_grad_()
+        Y = BlackBoxPhysics(waves)(X).sum() + (X**3).sum()
+        (first,) = torch.autograd.grad(Y, X, create_graph=True)
+        with pytest.raises(NotImplementedError, match="first derivatives only"):
+            torch.autograd.grad(first.sum(), X)
+
+    def test_none_warns_once_and_is_a_constant(self, points: Points) -> None:
+        physics = BlackBoxPhysics(waves, gradient=None, name="mill")
+        X = points(3, 2).requires_grad_()
+        with pytest.warns(UserWarning, match="No gradient.*'mill'.*'with_grad': False"):
+            assert not physics(X).requires_grad
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert torch.allclose(physics(X), torch_waves(X))
+
+    def test_failure_in_finite_differences_names_the_row(self) -> None:
+        physics = BlackBoxPhysics(np.sqrt)
+        X = torch.tensor([[4.0, 1.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
+        X.requires_grad_()
+        Y = physics(X)
+        with (
+            np.errstate(invalid="ignore"),
+            pytest.raises(PhysicsError, match=r"(?s)NaN or inf.*row 1: \[0.0, 1.0\]") as caught,
+        ):
+            Y.sum().backward()
+        assert caught.value.rows == (1,)
+        assert "fd_step smaller" in caught.value.__notes__[0]
+
+    @pytest.mark.parametrize(
+        ("jacobian", "message"),
+        [
+            (lambda X: np.zeros((3, 2)), r"shape \(3, 2\), expected shape.*\(3, 2, 2\)"),
+            (lambda X: np.full((3, 2, 2), np.nan), "finite numbers"),
+            (lambda X: 1 / 0, "raised ZeroDivisionError"),
+        ],
+    )
+    def test_wrong_jacobian(
+        self, jacobian: Callable[..., Any], message: str, points: Points
+    ) -> None:
+        Y = BlackBoxPhysics(waves, gradient=jacobian, name="mill")(points(3, 2).requires_grad_())
+        with pytest.raises(PhysicsError, match="gradient of physics 'mill'.*" + message):
+            Y.sum().backward()
+
+
+class TestSettings:
+    @pytest.mark.parametrize("gradient", ["autograd", 1, True])
+    def test_unknown_gradient(self, gradient: Any) -> None:
+        with pytest.raises(ValueError, match=f"Jacobian.*None for no gradient; found {gradient!r}"):
+            BlackBoxPhysics(waves, gradient=gradient)
+
+    @pytest.mark.parametrize("fd_step", [0.0, -1.0, float("nan"), [0.1, 0.0], []])
+    def test_step_is_not_positive(self, fd_step: Any) -> None:
+        with pytest.raises(ValueError, match="fd_step must be positive"):
+            BlackBoxPhysics(waves, fd_step=fd_step)
+
+    def test_steps_for_other_columns(self, points: Points) -> None:
+        physics = BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
+        with pytest.raises(ValueError, match=r"fd_step of physics 'waves' has 3 entries.*1 or 2"):
+            physics(points(4, 2).requires_grad_())
+
+    def test_not_callable(self) -> None:
+        with pytest.raises(TypeError, match="function must be callable; found list"):
+            BlackBoxPhysics([])  # type: ignore[arg-type]
+
+
+class TestFailures:
+    def test_batch_names_its_rows(self, points: Points) -> None:
+        def broken(X: np.ndarray) -> np.ndarray:
+            raise OSError("no licence")
+
+        with pytest.raises(PhysicsError, match="raised OSError: no licence") as caught:
+            BlackBoxPhysics(broken)(points(3, 2))
+        assert caught.value.rows == (0, 1, 2)
+
+    def test_row_function_taken_for_a_batch_function(self, points: Points) -> None:
+        with pytest.raises(PhysicsError, match="single row pass batched=False"):
+            BlackBoxPhysics(lambda x: x[0] + x[1])(points(3, 2))
+
+    @pytest.mark.parametrize("grad", [False, True])
+    def test_good_rows_survive_failed_ones(self, grad: bool) -> None:
+        asked: list[float] = []
+
+        def fragile(x: np.ndarray) -> float:
+            asked.append(x[0])
+            if x[0] < 0:
+                raise ArithmeticError(f"below zero at {x[0]}")
+            return np.sqrt(x[0])
+
+        physics = BlackBoxPhysics(fragile, batched=False)
+        X = torch.tensor([[4.0], [-1.0], [9.0], [-2.0]], dtype=torch.float64, requires_grad=grad)
+        message = (
+            r"(?s)'fragile' raised ArithmeticError: below zero at -1.0.*2 failed row\(s\) of 4"
+            r".*row 1: \[-1.0\].*row 3: \[-2.0\]"
+        )
+        with pytest.raises(PhysicsError, match=message) as caught:
+            physics(X)
+        assert caught.value.rows == (1, 3)
+        assert isinstance(caught.value.__cause__, ArithmeticError)
+        assert physics(X[[0, 2]]).flatten().tolist() == [2.0, 3.0]
+        assert asked == [4.0, -1.0, 9.0, -2.0]
+
+    def test_every_row_failed(self, points: Points) -> None:
+        physics = BlackBoxPhysics(lambda x: 1 // 0, batched=False)
+        with pytest.raises(PhysicsError, match=r"ZeroDivisionError.*3 failed row\(s\) of 3"):
+            physics(points(3, 2))
+
+    def test_rows_of_different_length(self) -> None:
+        physics = BlackBoxPhysics(lambda x: np.zeros(int(x[0])), batched=False, name="tape")
+        with pytest.raises(PhysicsError, match=r"'tape' returned 2 output\(s\)") as caught:
+            physics(torch.tensor([[2.0], [3.0], [2.0]]))
+        assert caught.value.rows == (1,)
+
+    def test_row_of_a_wrong_shape(self, points: Points) -> None:
+        physics = BlackBoxPhysics(lambda x: np.zeros((2, 2)), batched=False)
+        with pytest.raises(PhysicsError, match=r"a scalar or outputs.*found \(2, 2\)"):
+            physics(points(1, 2))
+
+    def test_failed_rows_do_not_hide_a_new_number_of_outputs(self) -> None:
+        def fragile(x: np.ndarray) -> np.ndarray:
+            return np.zeros(int(x[0])) if x[0] else np.array([1 // 0])
+
+        physics = BlackBoxPhysics(fragile, batched=False)
+        physics(torch.tensor([[2.0]]))
+        with pytest.raises(PhysicsError, match=r"returned 3 output\(s\), expected 2"):
+            physics(torch.tensor([[3.0], [0.0]]))
+
+
+class TestParallel:
+    def test_threads_share_the_rows(self, points: Points) -> None:
+        barrier = threading.Barrier(2, timeout=10)
+
+        def simulate(x: np.ndarray) -> float:
+            barrier.wait()  # Only two calls at the same time get past this.
+            return x[0]
+
+        X = points(2, 2)
+        physics = BlackBoxPhysics(simulate, batched=False)
+        with joblib.parallel_config(backend="threading", n_jobs=2):
+            assert torch.equal(physics(X), X[:, :1])
+
+    def test_processes_share_the_rows(self, points: Points) -> None:
+        class UnpicklableError(Exception):
+            def __init__(self, code: int, reason: str) -> None:
+                super().__init__(f"{reason} ({code})")
+
+        def simulate(x: np.ndarray) -> float:
+            if x[0] < 0:
+                raise UnpicklableError(7, "diverged")
+            return float(os.getpid())
+
+        physics = BlackBoxPhysics(simulate, batched=False)
+        X = torch.tensor([[1.0], [-1.0], [2.0], [3.0]], dtype=torch.float64)
+        with (
+            joblib.parallel_config(backend="loky", n_jobs=2),
+            pytest.raises(PhysicsError, match=r"UnpicklableError: diverged \(7\)") as caught,
+        ):
+            physics(X)
+        assert caught.value.rows == (1,)
+        processes = physics(X[[0, 2, 3]])
+        assert os.getpid() not in processes.flatten().tolist()
+
+
+class TestCopies:
+    def test_deep_copy_keeps_a_handle(self, points: Points) -> None:
+        physics = BlackBoxPhysics(Handle())
+        assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
+
+    def test_shallow_copy_keeps_a_handle(self, points: Points) -> None:
+        physics = BlackBoxPhysics(Handle())
+        X = points(3, 2)
+        assert torch.allclose(copy.copy(physics)(X), torch_waves(X))
+
+    def test_pickle_of_a_function(self, points: Points) -> None:
+        physics = BlackBoxPhysics(waves, gradient=waves_jacobian)
+        loaded = pickle.loads(pickle.dumps(physics))
+        X = points(3, 2)
+        assert torch.allclose(loaded(X), torch_waves(X))
+        assert loaded.gradient is waves_jacobian
+
+    @pytest.mark.parametrize("batched", [True, False])
+    def test_pickle_of_a_handle_keeps_the_memo(self, batched: bool, points: Points) -> None:
+        physics = BlackBoxPhysics(Handle(), batched=batched, name="wind tunnel")
+        X = points(3, 2)
+        physics(X)
+        loaded = pickle.loads(pickle.dumps(physics))
+        assert torch.equal(loaded(X), physics(X))
+        message = r"function of physics 'wind tunnel'.*set physics.function = ... again"
+        with pytest.raises(PhysicsError, match=message):
+            loaded(X + 1)
+        loaded.function = waves
+        assert torch.allclose(loaded(X + 1), torch_waves(X + 1))
+        assert isinstance(physics.function, Handle)
+
+    def test_lost_gradient_is_not_taken_for_none(self, points: Points) -> None:
+        physics = BlackBoxPhysics(waves, gradient=lambda X: waves_jacobian(X))
+        loaded = pickle.loads(pickle.dumps(physics))
+        Y = loaded(points(3, 2).requires_grad_())
+        with pytest.raises(PhysicsError, match=r"set physics.gradient = ... again"):
+            Y.sum().backward()

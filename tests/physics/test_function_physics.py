@@ -1,0 +1,103 @@
+"""Torch functions as physics, and `as_physics`."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, as_physics
+
+Points = Callable[..., Tensor]
+
+
+def test_is_named_after_its_function() -> None:
+    assert FunctionPhysics(torch.sin).name == "sin"
+    assert FunctionPhysics(torch.nn.Tanh()).name == "Tanh"
+    assert FunctionPhysics(torch.sin, name="wave").name == "wave"
+
+
+def test_parameters_of_a_module_are_learnt(points: Points) -> None:
+    physics = FunctionPhysics(torch.nn.Linear(3, 2, dtype=torch.float64))
+    X = points(20, 3)
+    target = X @ points(3, 2, seed=1) + 1.0
+    optimizer = torch.optim.LBFGS(physics.parameters(), max_iter=50)
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        value = (physics(X) - target).square().mean()
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    assert torch.allclose(physics(X), target, atol=1e-4)
+    assert torch.allclose(physics.function.bias, torch.ones(2, dtype=torch.float64), atol=1e-4)
+
+
+def test_not_callable() -> None:
+    with pytest.raises(TypeError, match="function must be callable; found float"):
+        FunctionPhysics(1.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("grad", [False, True])
+@pytest.mark.parametrize(
+    "function", [lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()]
+)
+def test_numpy_result(function: Callable[..., Any], grad: bool, points: Points) -> None:
+    with pytest.raises(PhysicsError, match=r"'noodle' computes with NumPy.*BlackBoxPhysics\("):
+        FunctionPhysics(function, name="noodle")(points(3, 2).requires_grad_(grad))
+
+
+def test_numpy_inside_where_a_gradient_is_needed(points: Points) -> None:
+    physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
+    with pytest.raises(PhysicsError, match=r"computes with NumPy.*BlackBoxPhysics\(") as caught:
+        physics(points(3, 2).requires_grad_())
+    assert "Can't call numpy()" in str(caught.value.__cause__)
+
+
+def test_other_runtime_errors_are_not_taken_for_numpy(points: Points) -> None:
+    physics = FunctionPhysics(lambda X: X @ X)
+    with pytest.raises(PhysicsError, match="raised RuntimeError: mat1 and mat2"):
+        physics(points(3, 2))
+
+
+def test_missing_gradient_warns_once(points: Points) -> None:
+    physics = FunctionPhysics(lambda X: X.detach() ** 2, name="stone")
+    X = points(3, 2).requires_grad_()
+    with pytest.warns(UserWarning, match=r"No gradient flows through physics 'stone'.*BlackBox"):
+        assert torch.equal(physics(X), X.detach() ** 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        physics(X)
+
+
+def test_no_warning_where_a_gradient_flows(points: Points) -> None:
+    physics = FunctionPhysics(torch.sin)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        physics(points(3, 2).requires_grad_())
+        physics(points(3, 2))
+
+
+def test_as_physics_wraps_callables(points: Points) -> None:
+    X = points(3, 2)
+    assert isinstance(as_physics(torch.sin), FunctionPhysics)
+    assert torch.equal(as_physics(torch.sin)(X), X.sin())
+    assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
+
+
+def test_as_physics_takes_a_physics_as_it_is() -> None:
+    physics = BlackBoxPhysics(np.sin)
+    assert as_physics(physics) is physics
+
+
+@pytest.mark.parametrize(
+    ("thing", "found"), [(3.0, "a float"), (None, "a NoneType"), (torch.nn.Tanh, "the class Tanh")]
+)
+def test_as_physics_rejects_the_rest(thing: Any, found: str) -> None:
+    message = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
+    with pytest.raises(TypeError, match=message):
+        as_physics(thing)
