@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import torch
 from botorch.models.transforms.outcome import Standardize
 from torch import Tensor
-from typing_extensions import Self
 
 
 class FixedStandardize(Standardize):

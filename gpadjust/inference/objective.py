@@ -86,8 +86,10 @@ class Objective:
                 named[name].copy_(value.squeeze(0))
 
     def __call__(self, settings: Tensor) -> Tensor:
-        """Return the objective at ``settings`` (``k x B x p``): ``k x B``, infinite where the
-        covariance has no Cholesky factor."""
+        """Return the objective at ``settings`` (``k x B x p``) as ``k x B``.
+
+        It is infinite where the covariance has no Cholesky factor.
+        """
         if self.is_batched:
             return self._evaluate(self.unflatten(settings)).reshape(-1, self.num_problems)
         values = []

@@ -96,8 +96,7 @@ class SearchSpace:
         return list(zip(lower, upper, strict=True))
 
     def to_unit(self, settings: Tensor, problems: np.ndarray) -> Tensor:
-        """Map settings (``k x p``) of given problems (``k``) so that bounded parameters lie in
-        [0, 1]."""
+        """Map settings (``k x p``) of given problems (``k``): bounded parameters to [0, 1]."""
         return (settings - self._origin[problems]) / self.unit[problems]
 
     def from_unit(self, coordinates: Tensor, problems: np.ndarray) -> Tensor:

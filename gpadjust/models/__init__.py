@@ -1,4 +1,4 @@
-"""The BoTorch models: co-kriging and ridge regression adjustment, and what they are compared with."""
+"""The BoTorch models: the adjustments, and what they are compared with."""
 
 from gpadjust.models.adjusted_functions import AdjustedFunctions
 from gpadjust.models.adjustment_gp import AdjustmentGP

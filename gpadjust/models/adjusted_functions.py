@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import Module
 
-from gpadjust.gp import PhysicsMean
+from gpadjust.gp import FourierKernel, PhysicsColumn, PhysicsMean
 
 if TYPE_CHECKING:
     from gpadjust.models.rra import RRA
@@ -21,6 +21,10 @@ class AdjustmentFeatures(Module):
     Args:
         model: The RRA whose feature maps, mean and center it reads.
     """
+
+    rho: FourierKernel
+    delta: FourierKernel
+    column: PhysicsColumn
 
     def __init__(self, model: RRA) -> None:
         super().__init__()
@@ -44,9 +48,10 @@ class AdjustmentFeatures(Module):
 
     def user_units(self, targets: Tensor) -> Tensor:
         """Undo the shift and scale of the targets, ``... x n``."""
-        if isinstance(self.mean, PhysicsMean):
-            return targets * self.mean.physics.scale + self.mean.physics.offset
-        return targets * self.column.scale
+        values = targets * self.column.scale
+        if isinstance(self.mean, PhysicsMean) and isinstance(self.mean.physics, PhysicsColumn):
+            values = values + self.mean.physics.offset
+        return values
 
 
 class AdjustedFunctions(Module):

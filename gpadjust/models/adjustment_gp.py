@@ -38,7 +38,7 @@ Component = Literal["rho", "delta"]
 
 
 class AdjustmentGP(MultiOutputGP):
-    r"""A BoTorch model of :math:`f_a(x) = \rho(x) f_p(x) + \delta(x)`, the base of its special cases.
+    r"""The base of the models of :math:`f_a(x) = \rho(x) f_p(x) + \delta(x)`.
 
     With :math:`\rho \sim GP(1, k_\rho)` and :math:`\delta \sim GP(0, k_\delta)` the prior is
 
@@ -49,7 +49,9 @@ class AdjustmentGP(MultiOutputGP):
     :class:`~gpadjust.BiasGP`, :class:`~gpadjust.ScaleGP` and so on.
 
     The model is a ``SingleTaskGP`` whose input transform appends f_p to the inputs
-    (:class:`~gpadjust.gp.PhysicsInput`); its mean and kernel read those columns.
+    (:class:`~gpadjust.gp.PhysicsInput`); its mean and kernel read those columns. The arguments are
+    those of :class:`~gpadjust.CKA`, except that a kernel may also be given by a function of the
+    number of inputs (after their transform) and the batch shape, or be None.
     """
 
     _component: Component | None = None
@@ -68,14 +70,6 @@ class AdjustmentGP(MultiOutputGP):
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
     ) -> None:
-        r"""See :class:`~gpadjust.CKA` for the other arguments.
-
-        Args:
-            rho_covar_module: The kernel :math:`k_\rho`; or what makes it, given the number of
-                inputs (after their transform) and the batch shape; or None for
-                :math:`\rho \equiv 1`.
-            delta_covar_module: Likewise :math:`k_\delta`; or None for :math:`\delta \equiv 0`.
-        """
         check_training_data(train_X, train_Y, train_Yvar)
         transform = PhysicsInput(as_physics(physics), train_X.shape[-1], input_transform)
         with torch.no_grad():
@@ -123,13 +117,13 @@ class AdjustmentGP(MultiOutputGP):
         return physics
 
     @property
-    def rho_covar_module(self) -> Kernel | None:
+    def rho_covar_module(self) -> Any:
         r"""The kernel :math:`k_\rho` on the inputs, or None if the model has no rho."""
         kernel = self._kernel("rho")
         return None if kernel is None else kernel.base_kernel.base_kernel
 
     @property
-    def delta_covar_module(self) -> Kernel | None:
+    def delta_covar_module(self) -> Any:
         r"""The kernel :math:`k_\delta` on the inputs, or None if the model has no delta."""
         kernel = self._kernel("delta")
         return None if kernel is None else kernel.base_kernel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import torch
 from botorch.models.transforms.input import InputTransform
@@ -18,7 +18,6 @@ from gpytorch.means import ZeroMean
 from linear_operator import to_dense
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
-from typing_extensions import Self
 
 from gpadjust.gp import FixedStandardize, InputsKernel
 from gpadjust.models.defaults import make_kernel, scaled_rbf, wide
@@ -206,7 +205,6 @@ class AR1(MultiOutputGP):
                 f"Expected the low level with {train_X.shape[-1]} inputs and {train_Y.shape[-1]} "
                 f"outputs as the high one has, got {low_X.shape[-1]} and {low_Y.shape[-1]}."
             )
-        m = train_Y.shape[-1]
         batch_shape = self.get_batch_dimensions(train_X, train_Y)[1]
         transform = LevelInput(train_X.shape[-1], input_transform)
         low_level = torch.cat([low_X, torch.zeros_like(low_X[..., :1])], dim=-1)

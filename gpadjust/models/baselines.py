@@ -127,7 +127,7 @@ class BiasGP(PhysicsMeanGP):
     """
 
     def delta(self, X: Tensor) -> GPyTorchPosterior:
-        r"""The posterior of :math:`\delta` at raw ``X`` (``... x q x d``), in the targets' units."""
+        r"""The posterior of :math:`\delta` at raw ``X`` (``... x q x d``), in y's units."""
         return self._adjustment(X, "delta")
 
 

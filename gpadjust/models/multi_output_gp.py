@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import torch
 from botorch.models import SingleTaskGP
 from torch import Size, Tensor
-from typing_extensions import Self
 
 from gpadjust.gp import FourierFeatures
 

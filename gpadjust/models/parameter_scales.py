@@ -6,6 +6,8 @@ of inputs, targets or physics.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.constraints import Interval
@@ -73,8 +75,8 @@ def kind(name: str) -> str:
     return name.rsplit(".", 1)[-1].removeprefix("raw_")
 
 
-def constraint_of(model: torch.nn.Module, name: str) -> Interval | None:
-    """The constraint of a parameter, by its name."""
+def constraint_of(model: torch.nn.Module, name: str) -> Any:
+    """The GPyTorch constraint of a parameter, by its name, or None."""
     path, _, leaf = name.rpartition(".")
     constraint = getattr(model.get_submodule(path), f"{leaf}_constraint", None)
     return constraint if isinstance(constraint, Interval) else None

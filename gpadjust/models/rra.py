@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import pyro
 import pyro.distributions as dist
 import torch
+from botorch.acquisition.objective import PosteriorTransform
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
-from botorch.acquisition.objective import PosteriorTransform
-from botorch.models.utils import add_output_dim
 from botorch.posteriors import GPyTorchPosterior, Posterior
 from botorch.utils.types import DEFAULT, _DefaultType
-from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
+from gpytorch.distributions import MultivariateNormal
 from gpytorch.kernels import ScaleKernel
 from gpytorch.likelihoods import Likelihood
 from gpytorch.means import ZeroMean
@@ -125,16 +124,15 @@ class RRA(AdjustmentGP):
                 raise ValueError("prior='paper' is in the user's units: outcome_transform=None.")
             self.mean_module = ZeroMean()
             self._rho_mean = 0.0
-            for module in (self.rho_covar_module, self.delta_covar_module):
-                module.outputscale = torch.ones_like(module.outputscale)
-                module.raw_outputscale.requires_grad_(False)
+            for kernel_ in (self.rho_covar_module, self.delta_covar_module):
+                kernel_.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
 
     def rho(self, X: Tensor) -> GPyTorchPosterior:
-        r"""The posterior of the scaling :math:`\rho` at raw ``X`` (``... x q x d``), unitless."""
+        r"""The posterior of :math:`\rho` at raw ``X`` (``... x q x d``), without units."""
         return self._adjustment(X, "rho")
 
     def delta(self, X: Tensor) -> GPyTorchPosterior:
-        r"""The posterior of the bias :math:`\delta` at raw ``X`` (``... x q x d``), in y's units."""
+        r"""The posterior of :math:`\delta` at raw ``X`` (``... x q x d``), in y's units."""
         return self._adjustment(X, "delta")
 
     def weights(self) -> MultivariateNormal:
@@ -213,7 +211,8 @@ class RRA(AdjustmentGP):
         features = AdjustmentFeatures(self)
         with torch.no_grad():
             if X is None:
-                inputs, obs = self.train_inputs[0], features.user_units(self.train_targets)
+                inputs = self.train_inputs[0]
+                obs: Tensor | None = features.user_units(self.train_targets)
             else:
                 inputs = self.transform_inputs(X)
                 inputs = inputs.expand(*self._aug_batch_shape, *inputs.shape[-2:])

@@ -19,13 +19,13 @@ from gpadjust.physics.memo import RowMemo
 class Physics(torch.nn.Module, ABC):
     r"""The crude model :math:`f_p : \mathbb{R}^d \to \mathbb{R}^m` of a system.
 
-    A subclass says in `evaluate` what the outputs of some rows are; calling the physics adds
+    A subclass says in ``evaluate`` what the outputs of some rows are; calling the physics adds
     batch shapes, the choice of columns, checks, and a memo.
 
     - *Memo.* A result that needs no gradient is remembered, and each distinct row is evaluated
       once: fitting a GP asks for the same rows at every step. The memo is dropped when a parameter
       or buffer of the physics changes. It cannot see other changes, such as a plain attribute:
-      call `forget()` after those. A physics must therefore be deterministic. Looking a row up
+      call ``forget()`` after those. A physics must therefore be deterministic. Looking a row up
       costs about half a microsecond; switch the memo off for a function that is cheaper.
     - *Gradients.* A result that needs a gradient, in X or in a parameter, is evaluated anew.
     - *Copies.* A deep copy of a physics without parameters and buffers is the physics itself, so
@@ -38,11 +38,11 @@ class Physics(torch.nn.Module, ABC):
         name: The name in messages. Default: the class's.
 
     Attributes:
-        num_outputs: `m`; None until the first call if it is not known before.
+        num_outputs: ``m``; None until the first call if it is not known before.
 
     Raises:
-        TypeError: If `inputs` holds something else than whole numbers.
-        ValueError: If `inputs` is empty or `memo` is negative.
+        TypeError: If ``inputs`` holds something else than whole numbers.
+        ValueError: If ``inputs`` is empty or ``memo`` is negative.
 
     Example:
         >>> class Drag(Physics):
@@ -78,26 +78,26 @@ class Physics(torch.nn.Module, ABC):
         """The outputs of some rows, without memo and checks.
 
         Args:
-            X: `N x d`, the columns `inputs` only, `N >= 1`.
+            X: ``N x d``, the columns ``inputs`` only, ``N >= 1``.
 
         Returns:
-            `N x m` outputs, or `N` if `m` is 1.
+            ``N x m`` outputs, or ``N`` if ``m`` is 1.
         """
 
     def forward(self, X: Tensor) -> Tensor:
         """The outputs of the physics.
 
         Args:
-            X: `batch_shape x n x d`, floating point.
+            X: ``batch_shape x n x d``, floating point.
 
         Returns:
-            `batch_shape x n x m`, of X's dtype. Dimensions along which X is expanded (stride 0)
+            ``batch_shape x n x m``, of X's dtype. Dimensions along which X is expanded (stride 0)
             are evaluated once, and the result is expanded along them; the gradient is then right
             for the tensor that was expanded.
 
         Raises:
             TypeError: If X is not a floating-point tensor.
-            ValueError: If X has fewer than two dimensions or lacks a column of `inputs`.
+            ValueError: If X has fewer than two dimensions or lacks a column of ``inputs``.
             PhysicsError: If the physics fails, or returns something else than finite outputs.
         """
         self._check_input(X)
@@ -121,7 +121,7 @@ class Physics(torch.nn.Module, ABC):
         self._memo.clear()
 
     def extra_repr(self) -> str:
-        """The settings that `repr` shows."""
+        """The settings that ``repr`` shows."""
         return (
             f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}, "
             f"memo={self._memo.capacity}"
@@ -176,11 +176,11 @@ class Physics(torch.nn.Module, ABC):
         return self._recall(rows)
 
     def _differentiate(self, rows: Tensor) -> Tensor:
-        """`N x m` outputs with their autograd graph."""
+        """``N x m`` outputs with their autograd graph."""
         return self._call(rows)
 
     def _recall(self, rows: Tensor) -> Tensor:
-        """`N x m` outputs without a graph, from the memo as far as it knows them."""
+        """``N x m`` outputs without a graph, from the memo as far as it knows them."""
         self._forget_if_stale(rows)
         return self._memo.recall(rows, self._call_without_graph)
 
@@ -203,7 +203,7 @@ class Physics(torch.nn.Module, ABC):
         return Y.detach()
 
     def _call(self, rows: Tensor) -> Tensor:
-        """Evaluates all rows, and checks the result: `N x m`, finite, of the dtype of `rows`."""
+        """Evaluates all rows, and checks the result: ``N x m``, finite, of the dtype of ``rows``."""
         try:
             Y = self.evaluate(rows)
         except PhysicsError as error:

@@ -23,7 +23,7 @@ NumpyFunction = Callable[[NDArray[np.float64]], ArrayLike]
 class BlackBoxPhysics(Physics):
     """Physics given as a NumPy function or a simulator.
 
-    Simulations of single rows (`batched=False`) run in parallel, with no change of code, inside
+    Simulations of single rows (``batched=False``) run in parallel, with no change of code, inside
 
         with joblib.parallel_config(backend="loky", n_jobs=4):
             ...
@@ -33,25 +33,25 @@ class BlackBoxPhysics(Physics):
 
     A pickle holds the function if it can be pickled. If not, as with a handle of a running
     simulator, the loaded physics still answers the rows in its memo; for new ones set
-    `physics.function` again.
+    ``physics.function`` again.
 
     Args:
-        function: Maps a float64 array of rows `N x d` to `N x m`, or `N` if `m` is 1; with
-            `batched=False`, one row `(d,)` to `(m,)` or a scalar.
+        function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
+            ``batched=False``, one row ``(d,)`` to ``(m,)`` or a scalar.
         batched: Whether the function takes all rows at once.
-        gradient: Where the gradient in X comes from. `"finite-difference"`: central differences,
-            `2 d` evaluations per row in the backward pass, which the memo does not keep. A
-            callable: the Jacobian, from rows `N x d` to `N x m x d`. None: no gradient, the
+        gradient: Where the gradient in X comes from. ``"finite-difference"``: central differences,
+            ``2 d`` evaluations per row in the backward pass, which the memo does not keep. A
+            callable: the Jacobian, from rows ``N x d`` to ``N x m x d``. None: no gradient, the
             outputs are constants to autograd. Second derivatives are not available.
         fd_step: The step of the finite differences in the units of X, one for all columns or one
-            for each. Default: `eps^(1/3) max(1, |x|)`.
+            for each. Default: ``eps^(1/3) max(1, |x|)``.
         inputs: The columns of X that the function reads. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: the function's.
 
     Raises:
-        TypeError: If `function` is not callable.
-        ValueError: If `gradient` or `fd_step` is none of the above.
+        TypeError: If ``function`` is not callable.
+        ValueError: If ``gradient`` or ``fd_step`` is none of the above.
 
     Example:
         >>> physics = BlackBoxPhysics(lambda x: np.sin(x[0]) * x[1], batched=False)
@@ -95,10 +95,10 @@ class BlackBoxPhysics(Physics):
         """The function's outputs.
 
         Args:
-            X: `N x d`.
+            X: ``N x d``.
 
         Returns:
-            `N x m`, or `N` if the function returns such.
+            ``N x m``, or ``N`` if the function returns such.
 
         Raises:
             PhysicsError: If single rows fail. It carries the outputs of the others.

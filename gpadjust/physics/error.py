@@ -16,13 +16,13 @@ class PhysicsError(RuntimeError):
     Args:
         message: What was found, what was expected, and the way out.
         rows: The failing rows, as indices into the rows that were asked for.
-        partial: `N x m` outputs when only some rows failed, not finite in those; the others are
+        partial: ``N x m`` outputs when only some rows failed, not finite in those; the others are
             memoised before the error is raised, so that the next attempt does not pay for them.
 
     Attributes:
         rows: Indices of the failing rows, counted over the flattened leading dimensions of X;
             empty if unknown.
-        inputs: `len(rows) x d` inputs of those rows, or None if unknown.
+        inputs: ``len(rows) x d`` inputs of those rows, or None if unknown.
 
     Example:
         >>> error = PhysicsError("physics 'pendulum' returned NaN.", rows=[7])
@@ -42,10 +42,10 @@ class PhysicsError(RuntimeError):
         self.partial = partial
 
     def relocate(self, origin: Tensor) -> None:
-        """Restates `rows` as positions in a longer list, whose entry `i` is row `origin[i]` here.
+        """Restates ``rows`` as positions in a longer list, whose entry ``i`` is row ``origin[i]`` here.
 
         Args:
-            origin: `N` integers; -1 marks an entry that is none of the rows.
+            origin: ``N`` integers; -1 marks an entry that is none of the rows.
         """
         failed = torch.isin(origin, torch.tensor(self.rows, dtype=origin.dtype))
         self.rows = tuple(failed.nonzero().flatten().tolist())

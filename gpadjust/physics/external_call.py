@@ -12,8 +12,8 @@ from torch import Tensor
 class ExternalCall(torch.autograd.Function):
     """A function of rows whose Jacobian is computed elsewhere, when the backward pass asks for it.
 
-    Call `ExternalCall.apply(X, value, jacobian)`: X is `N x d`, `value(X)` is `N x m` and
-    `jacobian(X)` is `N x m x d`. A second derivative in X raises a `NotImplementedError`.
+    Call ``ExternalCall.apply(X, value, jacobian)``: X is ``N x d``, ``value(X)`` is ``N x m`` and
+    ``jacobian(X)`` is ``N x m x d``. A second derivative in X raises a ``NotImplementedError``.
 
     Example:
         >>> X = torch.tensor([[3.0]], requires_grad=True)
@@ -29,21 +29,21 @@ class ExternalCall(torch.autograd.Function):
         value: Callable[[Tensor], Tensor],
         jacobian: Callable[[Tensor], Tensor],
     ) -> Tensor:
-        """The values, `N x m`."""
+        """The values, ``N x m``."""
         ctx.save_for_backward(X)
         ctx.jacobian = jacobian
         return value(X.detach())
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        """The gradient in X, `N x d`."""
+        """The gradient in X, ``N x d``."""
         (X,) = ctx.saved_tensors
         J = _Jacobian.apply(X, ctx.jacobian)
         return torch.einsum("nm,nmd->nd", grad, J), None, None
 
 
 class _Jacobian(torch.autograd.Function):
-    # A node of its own: `once_differentiable` would drop the second derivative without a word
+    # A node of its own: ``once_differentiable`` would drop the second derivative without a word
     # where the incoming gradient is a constant.
 
     @staticmethod

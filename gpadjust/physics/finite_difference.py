@@ -17,15 +17,15 @@ def central_difference(
         \frac{f_k(x + h_j e_j) - f_k(x - h_j e_j)}{2 h_j}
 
     Args:
-        function: Maps `2 d N x d` rows to `2 d N x m` outputs. Row `i` of them is row
-            `i // d % N` of X, moved along column `i % d`.
-        X: `N x d`.
-        step: :math:`h`, broadcastable to `N x d`, in the columns' units. Default:
+        function: Maps ``2 d N x d`` rows to ``2 d N x m`` outputs. Row ``i`` of them is row
+            ``i // d % N`` of X, moved along column ``i % d``.
+        X: ``N x d``.
+        step: :math:`h`, broadcastable to ``N x d``, in the columns' units. Default:
             :math:`\epsilon^{1/3} \max(1, |x|)`, which balances truncation against rounding for
             functions that vary on the scale of 1 and :math:`|x|`.
 
     Returns:
-        `N x m x d`.
+        ``N x m x d``.
 
     Example:
         >>> X = torch.tensor([[3.0, 2.0]], dtype=torch.float64)

@@ -15,15 +15,15 @@ class FunctionPhysics(Physics):
     """Physics given as a torch function, differentiable by autograd.
 
     Args:
-        function: Maps rows `N x d` to outputs `N x m`, or `N` if `m` is 1. The parameters of a
-            `torch.nn.Module` become parameters of the physics: they are learnt with the GP's
+        function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. The parameters of a
+            ``torch.nn.Module`` become parameters of the physics: they are learnt with the GP's
             hyper-parameters by the marginal likelihood.
         inputs: The columns of X that the function reads. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: the function's.
 
     Raises:
-        TypeError: If `function` is not callable.
+        TypeError: If ``function`` is not callable.
 
     Example:
         >>> import torch
@@ -51,10 +51,10 @@ class FunctionPhysics(Physics):
         """The function's outputs.
 
         Args:
-            X: `N x d`.
+            X: ``N x d``.
 
         Returns:
-            `N x m` or `N`, as the function gives them.
+            ``N x m`` or ``N``, as the function gives them.
 
         Raises:
             PhysicsError: If the function computes with NumPy.
@@ -85,10 +85,10 @@ class FunctionPhysics(Physics):
 
 
 def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
-    """Takes a physics as it is, and wraps any other callable as a `FunctionPhysics`.
+    """Takes a physics as it is, and wraps any other callable as a ``FunctionPhysics``.
 
     Raises:
-        TypeError: If `physics` is neither, or a class instead of an instance of it.
+        TypeError: If ``physics`` is neither, or a class instead of an instance of it.
 
     Example:
         >>> import torch

@@ -26,7 +26,7 @@ class LostCallable:
         self.attribute = attribute
 
     def __call__(self, *arguments: Any) -> NoReturn:
-        """Raises a `PhysicsError` that says how to put the callable back."""
+        """Raises a ``PhysicsError`` that says how to put the callable back."""
         raise PhysicsError(
             f"The {self.attribute} of physics {self.owner!r} could not be pickled, so this loaded "
             f"copy only knows the rows in its memo; set physics.{self.attribute} = ... again."
@@ -34,7 +34,7 @@ class LostCallable:
 
 
 def can_pickle(value: object) -> bool:
-    """Whether `pickle.dumps` takes a value.
+    """Whether ``pickle.dumps`` takes a value.
 
     Example:
         >>> can_pickle(len), can_pickle(lambda: 0)

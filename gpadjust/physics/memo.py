@@ -17,10 +17,10 @@ def row_keys(rows: Tensor) -> list[bytes]:
     """One hashable key per row: equal rows, and only those, have equal keys.
 
     Args:
-        rows: `N x d`, `d >= 1`.
+        rows: ``N x d``, ``d >= 1``.
 
     Returns:
-        `N` keys, the float64 bytes of the rows.
+        ``N`` keys, the float64 bytes of the rows.
 
     Example:
         >>> keys = row_keys(torch.tensor([[0.0, 1.0], [-0.0, 1.0], [2.0, 1.0]]))
@@ -34,7 +34,7 @@ def row_keys(rows: Tensor) -> list[bytes]:
 
 
 class RowMemo:
-    """Remembers the output rows of a function, keyed by its input rows (see `row_keys`).
+    """Remembers the output rows of a function, keyed by its input rows (see ``row_keys``).
 
     When a new batch does not fit, it forgets everything and starts again with that batch. A deep
     copy is empty: what is copied is about to go its own way.
@@ -72,15 +72,15 @@ class RowMemo:
         """The values of some rows, of which a function is asked for those not remembered.
 
         Args:
-            rows: `N x d`, `N >= 1`.
-            evaluate: Maps the distinct unknown rows `k x d` to values `k x m`. If it raises a
-                `PhysicsError` with a `partial` result, the finite rows of that are remembered.
+            rows: ``N x d``, ``N >= 1``.
+            evaluate: Maps the distinct unknown rows ``k x d`` to values ``k x m``. If it raises a
+                ``PhysicsError`` with a ``partial`` result, the finite rows of that are remembered.
 
         Returns:
-            `N x m`, a copy.
+            ``N x m``, a copy.
 
         Raises:
-            PhysicsError: That of `evaluate`, its `rows` restated as indices into `rows`.
+            PhysicsError: That of ``evaluate``, its ``rows`` restated as indices into ``rows``.
         """
         if self.capacity == 0:
             return evaluate(rows)
@@ -117,7 +117,7 @@ class RowMemo:
         """Finds where the values of some rows are kept.
 
         Returns:
-            `N` slots for `gather`, -1 for rows it does not know.
+            ``N`` slots for ``gather``, -1 for rows it does not know.
         """
         slots = map(self._slots.get, keys, repeat(-1))
         return torch.from_numpy(np.fromiter(slots, dtype=np.int64, count=len(keys)))
@@ -126,10 +126,10 @@ class RowMemo:
         """The remembered values in some slots.
 
         Args:
-            slots: `N` slots, none of them -1.
+            slots: ``N`` slots, none of them -1.
 
         Returns:
-            `N x m` values, a copy.
+            ``N x m`` values, a copy.
 
         Raises:
             LookupError: If it remembers nothing.
@@ -139,11 +139,11 @@ class RowMemo:
         return self._values[slots]
 
     def store(self, keys: Sequence[bytes], values: Tensor) -> None:
-        """Remembers new rows, and no more than `capacity` of them.
+        """Remembers new rows, and no more than ``capacity`` of them.
 
         Args:
-            keys: `N` keys, distinct and unknown so far.
-            values: `N x m`, without an autograd graph.
+            keys: ``N`` keys, distinct and unknown so far.
+            values: ``N x m``, without an autograd graph.
         """
         if len(self) + len(keys) > self.capacity:
             self.clear()

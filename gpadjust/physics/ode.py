@@ -19,20 +19,20 @@ ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
 class ODEPhysics(Physics):
     r"""One time step of an equation of motion, differentiable by autograd.
 
-    With :math:`x = (s, a)`, a state and an action that is held during the step :math:`h`,
+    With :math:`x = (s, a)``, a state and an action that is held during the step :math:``h`,
 
     .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
 
-    or :math:`s(h) - s` with `difference=True`.
+    or :math:`s(h) - s` with ``difference=True``.
 
     Args:
-        rhs: The time derivative :math:`g`, from the state `N x state_dim` and the action `N x a`
-            (`a` may be 0) to `N x state_dim`. The parameters of a `torch.nn.Module` become
+        rhs: The time derivative :math:`g`, from the state ``N x state_dim`` and the action ``N x a``
+            (``a`` may be 0) to ``N x state_dim``. The parameters of a ``torch.nn.Module`` become
             parameters of the physics.
-        step: The duration of the step, in the time unit of `rhs`.
+        step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that hold the state; the others hold the action.
         substeps: Integration steps within the step, for the fixed-step methods.
-        method: A method of `torchdiffeq.odeint`. The adaptive ones control one step size for all
+        method: A method of ``torchdiffeq.odeint``. The adaptive ones control one step size for all
             rows of a batch together, so that a row's result depends, within the tolerances, on
             the rows it is evaluated with; hence the default.
         rtol: Relative tolerance of the adaptive methods.
@@ -40,11 +40,11 @@ class ODEPhysics(Physics):
         difference: Whether the output is the change of the state instead of the new state.
         inputs: The columns of X that hold state and action, in this order. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
-        name: The name in messages. Default: that of `rhs`.
+        name: The name in messages. Default: that of ``rhs``.
 
     Raises:
-        TypeError: If `rhs` is not callable.
-        ValueError: If `step`, `substeps` or `state_dim` is not positive, or `method` is unknown.
+        TypeError: If ``rhs`` is not callable.
+        ValueError: If ``step``, ``substeps`` or ``state_dim`` is not positive, or ``method`` is unknown.
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
@@ -97,13 +97,13 @@ class ODEPhysics(Physics):
         """The state after the step, or its change.
 
         Args:
-            X: `N x (state_dim + a)`, states and actions.
+            X: ``N x (state_dim + a)``, states and actions.
 
         Returns:
-            `N x state_dim`.
+            ``N x state_dim``.
 
         Raises:
-            PhysicsError: If X has fewer than `state_dim` columns, or `rhs` returns something else
+            PhysicsError: If X has fewer than ``state_dim`` columns, or ``rhs`` returns something else
                 than one time derivative per state.
         """
         if X.shape[1] < self.state_dim:
@@ -139,7 +139,7 @@ class ODEPhysics(Physics):
         return path[-1] - state if self.difference else path[-1]
 
     def extra_repr(self) -> str:
-        """The settings that `repr` shows."""
+        """The settings that ``repr`` shows."""
         return (
             f"{super().extra_repr()}, step={self.step}, state_dim={self.state_dim}, "
             f"method={self.method!r}, difference={self.difference}"

@@ -17,15 +17,15 @@ def call_rows(
 ) -> list[NDArray[np.float64] | Exception]:
     """Calls a function on each row; a row that fails does not stop the others.
 
-    The calls go through `joblib.Parallel(n_jobs=None)`: one after the other, unless a
-    `joblib.parallel_config` says otherwise.
+    The calls go through ``joblib.Parallel(n_jobs=None)``: one after the other, unless a
+    ``joblib.parallel_config`` says otherwise.
 
     Args:
-        function: Maps a row `(d,)` to a scalar or `(m,)`.
-        X: `N x d`.
+        function: Maps a row ``(d,)`` to a scalar or ``(m,)``.
+        X: ``N x d``.
 
     Returns:
-        For each row its outputs `(m,)`, or the exception it raised.
+        For each row its outputs ``(m,)``, or the exception it raised.
 
     Example:
         >>> call_rows(lambda x: 1 / int(x[0]), np.array([[2.0], [0.0]]))

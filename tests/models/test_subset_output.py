@@ -1,0 +1,79 @@
+"""Subsets of a model's outputs."""
+
+import pytest
+import torch
+from botorch.fit import fit_gpytorch_mll
+from botorch.models.transforms import Normalize, Standardize
+from gpytorch.mlls import ExactMarginalLogLikelihood
+
+from gpadjust import fit
+
+QUICK = {"num_screened": 8, "num_starts": 1}
+
+
+@pytest.fixture(params=["plain", "transformed", "known-noise", "batch"])
+def three_outputs(request, data, build, kind, crude_physics, shuffle):
+    """A model of three different outputs."""
+    batch = (2,) if request.param == "batch" else ()
+    X, Y = data(batch_shape=batch, num_outputs=2)
+    Y = torch.cat([Y, Y[..., :1].sin() + 3], dim=-1)
+    options = {}
+    if kind != "ZeroMeanGP":
+
+        def physics(X):
+            f_p = crude_physics(X)
+            return torch.cat([f_p, f_p[..., :1].cos() + 3], dim=-1)
+
+        options["physics"] = physics
+    if request.param == "transformed":
+        options["input_transform"] = Normalize(2)
+        options["outcome_transform"] = None if kind == "RRA-paper" else Standardize(3)
+    Yvar = 0.01 * torch.ones_like(Y) if request.param == "known-noise" else None
+    return shuffle(build(kind, X, Y, Yvar, **options))
+
+
+@pytest.mark.parametrize("indices", [[1], [2, 0]])
+def test_the_posterior_is_that_of_the_whole(three_outputs, uniform, indices):
+    Z = uniform(4, 2, high=2.0, seed=5)
+    whole, part = three_outputs.posterior(Z), three_outputs.subset_output(indices).posterior(Z)
+    torch.testing.assert_close(part.mean, whole.mean[..., indices], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(part.variance, whole.variance[..., indices], rtol=1e-9, atol=1e-9)
+    for name in ("rho", "delta"):
+        if callable(getattr(three_outputs, name, None)):
+            whole_mean = getattr(three_outputs, name)(Z).mean[..., indices]
+            part_mean = getattr(three_outputs.subset_output(indices), name)(Z).mean
+            torch.testing.assert_close(part_mean, whole_mean, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("indices", [[1], [2, 0]])
+def test_it_can_be_fitted_again(data, build, kind, crude_physics, uniform, indices):
+    X, Y = data(num_outputs=2)
+    Y = torch.cat([Y, Y[:, :1].sin() + 3], dim=-1)
+    options = {}
+    if kind != "ZeroMeanGP":
+        options["physics"] = lambda X: torch.cat(
+            [crude_physics(X), crude_physics(X)[..., :1].cos() + 3], dim=-1
+        )
+    whole = build(kind, X, Y, **options)
+    part = whole.subset_output(indices)
+    if kind != "ZeroMeanGP":
+        # A subset still reads all columns of f_p.
+        assert part.posterior(X).mean.shape == (len(X), len(indices))
+    refitted = whole.subset_output(indices)
+    fit(refitted, **QUICK)
+    fit(whole, **QUICK)
+    expected = whole.posterior(X).mean[:, indices]
+    torch.testing.assert_close(refitted.posterior(X).mean, expected, rtol=0.05, atol=0.05)
+    fit_gpytorch_mll(ExactMarginalLogLikelihood(part.likelihood, part))
+    assert (part.posterior(X).mean - Y[:, indices]).abs().mean() < Y.std()
+
+
+def test_the_whole_stays_as_it_is(three_outputs, uniform):
+    Z = uniform(4, 2)
+    before = three_outputs.posterior(Z).mean.detach()
+    part = three_outputs.subset_output([1])
+    with torch.no_grad():
+        for parameter in part.parameters():
+            parameter += 0.5
+    three_outputs.train()
+    torch.testing.assert_close(three_outputs.posterior(Z).mean.detach(), before)
