@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from paper import forrester
+from paper.report import report
 
 
 def main() -> None:
@@ -14,6 +15,9 @@ def main() -> None:
     forrester.add_arguments(
         experiments.add_parser("forrester", help="seven models of Forrester's function (figure 1)")
     )
+    experiments.add_parser(
+        "report", help="copy the results that are committed into the READMEs"
+    ).set_defaults(run=lambda arguments: report())
     arguments = parser.parse_args()
     arguments.run(arguments)
 

@@ -6,6 +6,7 @@ from typing import Self
 
 import torch
 from botorch.models.transforms.outcome import Standardize
+from botorch.posteriors import GPyTorchPosterior, Posterior, TransformedPosterior
 from torch import Tensor
 
 
@@ -30,3 +31,35 @@ class FixedStandardize(Standardize):
     def train(self, mode: bool = True) -> Self:
         """Stay in eval mode: there is nothing to estimate."""
         return super().train(False)
+
+    def untransform_posterior(
+        self, posterior: Posterior, X: Tensor | None = None
+    ) -> GPyTorchPosterior | TransformedPosterior:
+        """Bring a posterior back to the user's units; its variance is right however small."""
+        untransformed = super().untransform_posterior(posterior, X=X)
+        if type(untransformed) is GPyTorchPosterior:
+            return RescaledPosterior(untransformed.distribution, posterior, self._stdvs_sq)
+        return untransformed
+
+
+class RescaledPosterior(GPyTorchPosterior):
+    """A posterior in the user's units whose variance is computed in the model's.
+
+    GPyTorch raises every variance to an absolute minimum, which small units would fall below.
+
+    Args:
+        distribution: The distribution in the user's units.
+        scaled: The posterior in the model's units.
+        factor: What its variance is to be multiplied by, ``batch_shape x 1 x m``.
+    """
+
+    def __init__(self, distribution: object, scaled: GPyTorchPosterior, factor: Tensor) -> None:
+        super().__init__(distribution)
+        self._scaled = scaled
+        self._factor = factor
+
+    @property
+    def variance(self) -> Tensor:
+        """The posterior variance, ``batch_shape x q x m``."""
+        variance: Tensor = self._scaled.variance * self._factor
+        return variance

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,8 +47,9 @@ def fit(
 ) -> FitResult | list[FitResult]:
     """Fit a model's hyper-parameters by maximum marginal likelihood, in place.
 
-    Random starts are screened in one batch beside the model's current parameters; L-BFGS then runs
-    from the best of them, for all outputs in lockstep. Starts and bounds follow the data's scales,
+    Random starts, each with the best overall scale of its variances, are screened in one batch
+    beside the model's current parameters; L-BFGS then runs from the best of them, for all outputs
+    in lockstep. Starts and bounds follow the data's scales,
     so that units of inputs, targets and physics make no difference. The result is never less
     likely than the parameters that the model came with. Priors registered on the model are
     honoured (maximum a posteriori); parameters with ``requires_grad=False`` stay.
@@ -102,7 +104,9 @@ def fit(
     starts = objective.current()
     if num_screened:
         generator = torch.Generator().manual_seed(seed)
-        starts = torch.cat([starts, space.draw(num_screened, generator)])
+        drawn = space.draw(num_screened, generator)
+        factor = _in_chunks(objective, objective.best_scale, drawn)
+        starts = torch.cat([starts, space.rescaled(drawn, factor)])
     starts, values = _best(objective, starts, num_starts)
     if not values[0].isfinite().all():
         model.eval()
@@ -130,14 +134,21 @@ def fit(
 
 
 def _best(objective: Objective, starts: Tensor, num_starts: int) -> tuple[Tensor, Tensor]:
-    """The best starts of each problem, best first, and their values; in memory-sized chunks."""
-    n = objective.model.train_targets.shape[-1]
-    chunk = max(1, int(4e6 / (objective.num_problems * n * n)))
-    with torch.no_grad():
-        values = torch.cat([objective(part) for part in starts.split(chunk)])
+    """The best starts of each problem, best first, and their values."""
+    values = _in_chunks(objective, objective, starts)
     order = values.argsort(dim=0)[:num_starts]
     index = order.unsqueeze(-1).expand(-1, -1, starts.shape[-1])
     return starts.gather(0, index), values.gather(0, order)
+
+
+def _in_chunks(
+    objective: Objective, function: Callable[[Tensor], Tensor], settings: Tensor
+) -> Tensor:
+    """Evaluate a function of settings without gradients, in chunks that fit in memory."""
+    n = objective.model.train_targets.shape[-1]
+    chunk = max(1, int(4e6 / (objective.num_problems * n * n)))
+    with torch.no_grad():
+        return torch.cat([function(part) for part in settings.split(chunk)])
 
 
 def _converged(info: Any, space: SearchSpace) -> bool:
@@ -161,18 +172,18 @@ def _optimise(
     def function(x: np.ndarray, batch_indices: list[int]) -> tuple[np.ndarray, np.ndarray]:
         # The objective takes whole rows of problems: evaluate those with an active one.
         rows, problems = np.divmod(np.asarray(batch_indices), num_problems)
-        reached[rows, problems] = space.from_unit(torch.from_numpy(x), problems)
+        reached[rows, problems] = space.from_unit(torch.from_numpy(x).to(reached), problems)
         active = np.unique(rows)
         values, gradient = objective.value_and_gradient(reached[active])
         position = np.searchsorted(active, rows)
         f = values[position, problems].nan_to_num(posinf=_INFEASIBLE)
         g = (gradient[position, problems] * space.unit[problems]).nan_to_num()
-        return f.numpy(), g.numpy()
+        return f.cpu().numpy(), g.cpu().numpy()
 
     every = np.tile(np.arange(num_problems), num_starts)
     x, f, info = fmin_l_bfgs_b_batched(
         function,
-        space.to_unit(starts.reshape(-1, num_parameters), every).numpy(),
+        space.to_unit(starts.reshape(-1, num_parameters), every).cpu().numpy(),
         bounds=space.unit_bounds,
         maxiter=max_iterations,
         factr=_TOLERANCE / np.finfo(float).eps,
@@ -181,5 +192,5 @@ def _optimise(
     shape = (num_starts, num_problems)
     converged = torch.tensor([_converged(each, space) for each in info]).reshape(shape)
     values = torch.from_numpy(np.asarray(f, dtype=np.float64)).reshape(shape)
-    settings = space.from_unit(torch.from_numpy(x), every).reshape(*shape, num_parameters)
-    return settings, values, converged
+    settings = space.from_unit(torch.from_numpy(x).to(starts), every)
+    return settings.reshape(*shape, num_parameters), values, converged

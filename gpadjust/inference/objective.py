@@ -13,6 +13,8 @@ from torch import Size, Tensor
 from torch.func import functional_call
 from torch.nn import Module
 
+from gpadjust.physics import PhysicsError
+
 _JITTER = 1e-8  # of the mean diagonal, for a covariance that is not positive definite without
 
 
@@ -92,11 +94,16 @@ class Objective:
         """
         if self.is_batched:
             return self._evaluate(self.unflatten(settings)).reshape(-1, self.num_problems)
-        values = []
-        for setting in settings:
-            each = self._evaluate({n: v[0] for n, v in self.unflatten(setting[None]).items()})
-            values.append(each.sum().reshape(1))
-        return torch.stack(values)
+        return torch.stack([self._evaluate_together(setting) for setting in settings])
+
+    def _evaluate_together(self, setting: Tensor) -> Tensor:
+        """The objective of a model whose outputs share parameters, ``1``."""
+        parameters = {name: v[0] for name, v in self.unflatten(setting.unsqueeze(0)).items()}
+        try:
+            return self._evaluate(parameters).sum().reshape(1)
+        except PhysicsError:
+            # Parameters that the physics cannot run with are a bad setting, not the end of a fit.
+            return setting.new_full((1,), math.inf)
 
     def value_and_gradient(self, settings: Tensor) -> tuple[Tensor, Tensor]:
         """Return the objective and its gradient, ``k x B`` and ``k x B x p``."""
@@ -105,10 +112,24 @@ class Objective:
             values = self(settings)
             finite = values.isfinite()
             total = torch.where(finite, values, torch.zeros_like(values)).sum()
-            (gradient,) = torch.autograd.grad(total, settings)
+            # The second term keeps the graph where no setting is feasible.
+            (gradient,) = torch.autograd.grad(total + 0 * settings.sum(), settings)
         return values.detach(), gradient
 
+    def best_scale(self, settings: Tensor) -> Tensor:
+        r"""The factor of all variances that maximises the likelihood, ``k x B``.
+
+        With :math:`c K` in place of :math:`K` it is :math:`(y - m)^T K^{-1} (y - m) / n`.
+        """
+        if not self.is_batched:
+            return torch.ones_like(settings[..., 0])
+        _, square = self._terms(self.unflatten(settings))
+        return (square / self.model.train_targets.shape[-1]).reshape(-1, self.num_problems)
+
     def _evaluate(self, parameters: dict[str, Tensor]) -> Tensor:
+        return self._terms(parameters)[0]
+
+    def _terms(self, parameters: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         named = {f"model.{name}": value for name, value in parameters.items()}
         with gpytorch.settings.lazily_evaluate_kernels(False):
             mean, covariance, log_prior = functional_call(self._covariance, named, ())
@@ -117,9 +138,10 @@ class Objective:
         white = torch.linalg.solve_triangular(chol, residual, upper=False).squeeze(-1)
         log_det = 2 * chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
         n = residual.shape[-2]
-        nll = 0.5 * (white.square().sum(-1) + log_det + n * math.log(2 * math.pi)) - log_prior
+        square = white.square().sum(-1)
+        nll = 0.5 * (square + log_det + n * math.log(2 * math.pi)) - log_prior
         bad = failed | ~nll.isfinite()
-        return torch.where(bad, torch.full_like(nll, math.inf), nll)
+        return torch.where(bad, torch.full_like(nll, math.inf), nll), square
 
 
 class _NoisyPrior(Module):

@@ -13,7 +13,7 @@ from gpadjust.inference.objective import Objective
 from gpadjust.models.parameter_scales import BOUNDS, constraint_of, kind, parameter_scales
 
 # Ranges of the starts as multiples of a parameter's typical size.
-_STARTS = {"lengthscale": (0.05, 50.0), "outputscale": (1e-2, 1e2), "noise": (1e-6, 1e-1)}
+_STARTS = {"lengthscale": (0.05, 50.0), "outputscale": (1e-2, 1e2), "noise": (1e-6, 1.0)}
 
 
 class SearchSpace:
@@ -21,8 +21,8 @@ class SearchSpace:
 
     Lengthscales, outputscales and noises are searched relative to their typical sizes
     (:func:`~gpadjust.models.parameter_scales.parameter_scales`), so that units do not matter.
-    Parameters of other kinds start at their current values plus standard normal noise, and are
-    bounded by nothing but their constraints.
+    Parameters of other kinds start at normal draws around their current values, one to ten times
+    as wide as these are large, and are bounded by nothing but their constraints.
 
     Args:
         objective: The objective whose settings are to be searched.
@@ -43,10 +43,23 @@ class SearchSpace:
         # The start that the user gives may lie outside.
         self.lower = torch.minimum(objective.flatten(lower)[0], current)
         self.upper = torch.maximum(objective.flatten(upper)[0], current)
+        self._is_log_variance = objective.flatten(
+            {
+                name: torch.full_like(self._parameters[name], self._is_variance(name))[None]
+                for name in objective.names
+            }
+        )[0].detach()
         width = self.upper - self.lower
         bounded = width.isfinite() & (width > 0)
         self._origin = torch.where(bounded, self.lower, torch.zeros_like(width))
-        self.unit = torch.where(bounded, width, torch.ones_like(width))
+        self.unit = torch.where(bounded, width, _magnitude(current))
+
+    def rescaled(self, settings: Tensor, factor: Tensor) -> Tensor:
+        """Multiply all variances of settings (``k x B x p``) by factors (``k x B``)."""
+        usable = factor.isfinite() & (factor > 0)
+        shift = torch.where(usable, factor, torch.ones_like(factor)).log().unsqueeze(-1)
+        moved = settings + self._is_log_variance * shift
+        return torch.minimum(torch.maximum(moved, self.lower), self.upper)
 
     def draw(self, num_starts: int, generator: torch.Generator) -> Tensor:
         """Draw random settings, ``num_starts x B x p``."""
@@ -59,7 +72,9 @@ class SearchSpace:
                 parameter = self._parameters[name].detach()
                 shape = (num_starts, *parameter.shape)
                 noise = torch.randn(shape, generator=generator, dtype=parameter.dtype)
-                values[name] = parameter + noise
+                spread = 10 ** torch.rand(shape, generator=generator, dtype=parameter.dtype)
+                noise = (spread * noise).to(parameter.device)
+                values[name] = parameter + _magnitude(parameter) * noise
         settings = self._objective.flatten(values)
         return torch.minimum(torch.maximum(settings, self.lower), self.upper)
 
@@ -77,14 +92,14 @@ class SearchSpace:
                 low, high = (math.log(limit) for limit in _STARTS[kind(name)])
                 shape = (num_starts, *parameter.shape)
                 share = torch.rand(shape, generator=generator, dtype=parameter.dtype)
-                multiples[name] = (low + share * (high - low)).exp()
+                multiples[name] = (low + share * (high - low)).exp().to(parameter.device)
         for name, multiple in multiples.items():
             if kind(name) == "outputscale":
                 path = name.removesuffix("raw_outputscale") + "base_kernel.raw_lengthscale"
                 if path in multiples:
                     stretch = multiples[path].amin((-1, -2)).clamp_min(1.0)
                     power = torch.rand(multiple.shape, generator=generator, dtype=multiple.dtype)
-                    multiple *= stretch.pow((4 * power - 2).clamp_min(0.0))
+                    multiple *= stretch.pow((4 * power - 2).clamp_min(0.0).to(stretch.device))
         return multiples
 
     @property
@@ -102,6 +117,10 @@ class SearchSpace:
     def from_unit(self, coordinates: Tensor, problems: np.ndarray) -> Tensor:
         """The reverse of :meth:`to_unit`."""
         return self._origin[problems] + coordinates * self.unit[problems]
+
+    def _is_variance(self, name: str) -> bool:
+        constraint = constraint_of(self._objective.model, name)
+        return kind(name) in ("outputscale", "noise") and isinstance(constraint, LogInterval)
 
     def _bound(self, name: str, side: int) -> Tensor:
         parameter = self._parameters[name].detach()
@@ -124,3 +143,8 @@ class SearchSpace:
         value = torch.minimum(torch.maximum(value, lower + margin), upper - margin)
         raw: Tensor = constraint.inverse_transform(value)
         return raw
+
+
+def _magnitude(values: Tensor) -> Tensor:
+    """The absolute values, and 1 for zeros."""
+    return torch.where(values == 0, torch.ones_like(values), values.abs())

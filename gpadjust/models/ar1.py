@@ -8,6 +8,7 @@ from typing import Any, Self
 import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
+from botorch.posteriors import Posterior
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.constraints import Interval
@@ -246,6 +247,15 @@ class AR1(MultiOutputGP):
     def rho(self) -> Tensor:
         r"""The constant :math:`\rho` of each output, ``batch_shape x (m)``."""
         return self.covar_module.rho.squeeze(-1)
+
+    def posterior(self, X: Tensor, *args: Any, **kwargs: Any) -> Posterior:
+        """The posterior of the high level at raw ``X`` (``... x q x d``); see BoTorch."""
+        if X.shape[-1] != self.input_transform.num_inputs:
+            raise ValueError(
+                f"Expected X with {self.input_transform.num_inputs} columns, the inputs that the "
+                f"model was built on, got shape {tuple(X.shape)}."
+            )
+        return super().posterior(X, *args, **kwargs)
 
     def condition_on_observations(self, X: Tensor, Y: Tensor, **kwargs: Any) -> Self:
         """Condition on observations of the high level; see BoTorch."""

@@ -203,7 +203,7 @@ class Physics(torch.nn.Module, ABC):
         return Y.detach()
 
     def _call(self, rows: Tensor) -> Tensor:
-        """Evaluates all rows, and checks the result: ``N x m``, finite, of the dtype of ``rows``."""
+        """Evaluates all rows and checks the result: ``N x m``, finite, of the rows' dtype."""
         try:
             Y = self.evaluate(rows)
         except PhysicsError as error:

@@ -42,7 +42,7 @@ class PhysicsError(RuntimeError):
         self.partial = partial
 
     def relocate(self, origin: Tensor) -> None:
-        """Restates ``rows`` as positions in a longer list, whose entry ``i`` is row ``origin[i]`` here.
+        """Restates ``rows`` as positions in a longer list, whose entry ``i`` is row ``origin[i]``.
 
         Args:
             origin: ``N`` integers; -1 marks an entry that is none of the rows.

@@ -15,9 +15,9 @@ class FunctionPhysics(Physics):
     """Physics given as a torch function, differentiable by autograd.
 
     Args:
-        function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. The parameters of a
-            ``torch.nn.Module`` become parameters of the physics: they are learnt with the GP's
-            hyper-parameters by the marginal likelihood.
+        function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. The parameters
+            of a ``torch.nn.Module`` become parameters of the physics: they are learnt with the
+            GP's hyper-parameters by the marginal likelihood.
         inputs: The columns of X that the function reads. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: the function's.

@@ -26,9 +26,9 @@ class ODEPhysics(Physics):
     or :math:`s(h) - s` with ``difference=True``.
 
     Args:
-        rhs: The time derivative :math:`g`, from the state ``N x state_dim`` and the action ``N x a``
-            (``a`` may be 0) to ``N x state_dim``. The parameters of a ``torch.nn.Module`` become
-            parameters of the physics.
+        rhs: The time derivative :math:`g`, from the state ``N x state_dim`` and the action
+            ``N x a`` (``a`` may be 0) to ``N x state_dim``. The parameters of a
+            ``torch.nn.Module`` become parameters of the physics.
         step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that hold the state; the others hold the action.
         substeps: Integration steps within the step, for the fixed-step methods.
@@ -44,7 +44,8 @@ class ODEPhysics(Physics):
 
     Raises:
         TypeError: If ``rhs`` is not callable.
-        ValueError: If ``step``, ``substeps`` or ``state_dim`` is not positive, or ``method`` is unknown.
+        ValueError: If ``step``, ``substeps`` or ``state_dim`` is not positive, or ``method`` is
+            unknown.
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
@@ -103,8 +104,8 @@ class ODEPhysics(Physics):
             ``N x state_dim``.
 
         Raises:
-            PhysicsError: If X has fewer than ``state_dim`` columns, or ``rhs`` returns something else
-                than one time derivative per state.
+            PhysicsError: If X has fewer than ``state_dim`` columns, or ``rhs`` returns something
+                else than one time derivative per state.
         """
         if X.shape[1] < self.state_dim:
             raise PhysicsError(

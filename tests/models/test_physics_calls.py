@@ -37,7 +37,7 @@ def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs,
         model.posterior(Z.unsqueeze(-2), observation_noise=True)
         conditioned = model.condition_on_observations(new_X, 3 + new_X[:, :num_outputs])
         conditioned.posterior(Z)
-        fantasies = model.fantasize(new_X.unsqueeze(0), SobolQMCNormalSampler(torch.Size([3])))
+        fantasies = model.fantasize(new_X, SobolQMCNormalSampler(torch.Size([3])))
         fantasies.posterior(Z)
     expected = {tuple(row) for row in torch.cat([X, Z, new_X]).tolist()}
     assert set(counting.rows) == expected

@@ -6,33 +6,30 @@ from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize, Standardize
 
 
-def options(transform, normalize, m, batch_shape=()):
-    shape = torch.Size(batch_shape)
-    chosen = {"default": {}, "none": {"outcome_transform": None}}.get(transform)
-    if chosen is None:
-        chosen = {"outcome_transform": Standardize(m, batch_shape=shape)}
-    if normalize:
-        chosen["input_transform"] = Normalize(2, batch_shape=shape)
-    return chosen
+@pytest.fixture(params=["default", "raw units", "standardize and normalize"])
+def options(request, kind, num_outputs):
+    """Options of a model, as a function of its batch shape."""
+    if request.param == "standardize and normalize":
+        outcome = None if kind == "RRA-paper" else Standardize(num_outputs)
+        return lambda batch_shape: {
+            "outcome_transform": outcome and Standardize(num_outputs, batch_shape=batch_shape),
+            "input_transform": Normalize(2),
+        }
+    return lambda batch_shape: {"outcome_transform": None} if request.param == "raw units" else {}
 
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
-@pytest.mark.parametrize("normalize", [False, True], ids=["raw", "normalize"])
-@pytest.mark.parametrize("transform", ["default", "none", "standardize"])
 @pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])
-def test_posterior(
-    data, build, uniform, kind, num_outputs, batch_shape, transform, normalize, known_noise
-):
-    if kind == "RRA-paper" and transform == "standardize":
-        pytest.skip("is refused")
+def test_posterior(data, build, uniform, kind, num_outputs, batch_shape, options, known_noise):
     X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
     Yvar = 0.01 * torch.ones_like(Y) if known_noise else None
-    model = build(kind, X, Y, Yvar, **options(transform, normalize, num_outputs, batch_shape))
+    model = build(kind, X, Y, Yvar, **options(torch.Size(batch_shape)))
     assert model.num_outputs == num_outputs
     assert model.batch_shape == batch_shape
     for leading in ((), (5, *batch_shape), (2, 5, *batch_shape)):
-        posterior = model.posterior(uniform(*leading, 4, 2))
-        noisy = model.posterior(uniform(*leading, 4, 2), observation_noise=True)
+        Z = uniform(*leading, 4, 2)
+        posterior = model.posterior(Z)
+        noisy = model.posterior(Z, observation_noise=True)
         expected = torch.Size([*(leading or batch_shape), 4, num_outputs])
         assert posterior.mean.shape == posterior.variance.shape == expected
         assert posterior.rsample(torch.Size([6])).shape == (6, *expected)
@@ -40,16 +37,36 @@ def test_posterior(
         assert (noisy.variance > posterior.variance).all()
 
 
+def test_a_batched_input_transform(data, build, uniform, kind, request):
+    if kind != "ZeroMeanGP":
+        reason = "the physics is not expanded to the batch that the base transform makes"
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+    X, Y = data(batch_shape=(3,))
+    X = X * torch.tensor([1.0, 10.0, 100.0], dtype=torch.float64).reshape(3, 1, 1)
+    normalize = Normalize(2, batch_shape=torch.Size([3]))
+    physics = {} if kind == "ZeroMeanGP" else {"physics": lambda X: 2 + X[..., 0].sin()}
+    if kind == "AR1":
+        low_X = uniform(3, 12, 2, high=2.0, seed=1)
+        physics = {"low_X": low_X, "low_Y": 2 + low_X[..., :1].sin()}
+    model = build(kind, X, Y, input_transform=normalize, **physics)
+    Z = uniform(4, 2, high=2.0, seed=3)
+    one_by_one = torch.stack([model.posterior(Z.expand(3, 4, 2)).mean[i] for i in range(3)])
+    torch.testing.assert_close(model.posterior(Z).mean, one_by_one)
+
+
 def test_is_a_single_task_gp(data, build, kind):
     assert isinstance(build(kind, *data()), SingleTaskGP)
 
 
-def test_one_posterior_for_some_outputs(data, build, kind, uniform):
+@pytest.mark.xfail(
+    strict=True, reason="BoTorch undoes the outcome transform, and RRA selects, in the old order"
+)
+def test_output_indices(data, build, kind, uniform):
     model = build(kind, *data(num_outputs=2))
     Z = uniform(4, 2)
-    full, second = model.posterior(Z), model.posterior(Z, output_indices=[1])
-    torch.testing.assert_close(second.mean, full.mean[:, 1:])
-    torch.testing.assert_close(second.variance, full.variance[:, 1:])
+    full, swapped = model.posterior(Z), model.posterior(Z, output_indices=[1, 0])
+    torch.testing.assert_close(swapped.mean, full.mean.flip(-1))
+    torch.testing.assert_close(swapped.variance, full.variance.flip(-1))
 
 
 def test_outputs_are_independent(data, build, kind, uniform):

@@ -1,0 +1,110 @@
+"""The models inside BoTorch's acquisition functions."""
+
+import pytest
+import torch
+from botorch.acquisition import (
+    qKnowledgeGradient,
+    qLogNoisyExpectedImprovement,
+    qNegIntegratedPosteriorVariance,
+)
+from botorch.acquisition.objective import ScalarizedPosteriorTransform
+from botorch.models.transforms import Normalize
+from botorch.optim import optimize_acqf
+from botorch.sampling import SobolQMCNormalSampler
+
+from gpadjust import CKA, BlackBoxPhysics
+
+BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
+QUICK = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5, "batch_limit": 2}}
+
+
+@pytest.fixture
+def model(data, build, kind):
+    return build(kind, *data(), input_transform=Normalize(2)).eval()
+
+
+def inside(candidates, q=1):
+    assert candidates.shape == (q, 2)
+    assert (candidates >= BOUNDS[0]).all()
+    assert (candidates <= BOUNDS[1]).all()
+
+
+def best_of(acquisition, value, uniform, q=1):
+    """The optimiser's value is at least that of most random points."""
+    others = acquisition(uniform(16, q, 2, high=2.0, seed=9))
+    assert value >= others.median()
+
+
+# Line searches fail on the wrong gradients that test_gradients_through_fantasies is about.
+@pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
+def test_integrated_posterior_variance(model, uniform):
+    acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=2, **QUICK)
+    inside(candidates, q=2)
+    best_of(acquisition, value, uniform, q=2)
+
+
+@pytest.mark.parametrize("acquisition", ["variance", "knowledge gradient"])
+def test_gradients_through_fantasies(data, build, kind, uniform, acquisition, request):
+    if kind != "RRA-paper" and acquisition == "variance":
+        reason = "GPyTorch detaches the fantasies' training covariance in condition_on_observations"
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+    model = build(kind, *data()).eval()
+    if acquisition == "variance":
+        function = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
+        X = uniform(1, 2, 2, high=2.0, seed=5)
+    else:
+        function = qKnowledgeGradient(model, num_fantasies=4)
+        X = uniform(1, 5, 2, high=2.0, seed=5)
+    leaf = X.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(leaf).sum(), leaf)
+    differences = torch.zeros_like(X)
+    for i in range(X.numel()):
+        step = torch.zeros_like(X)
+        step.view(-1)[i] = 1e-5
+        change = function(X + step) - function(X - step)
+        differences.view(-1)[i] = change.item() / 2e-5
+    size = differences.abs().max().item()
+    torch.testing.assert_close(gradient, differences, rtol=1e-4, atol=1e-4 * size)
+
+
+def test_noisy_expected_improvement(model, data, uniform, kind, request):
+    if kind == "RRA-paper":
+        reason = "its covariance has a root that is not square"
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+    sampler = SobolQMCNormalSampler(torch.Size([16]), seed=0)
+    acquisition = qLogNoisyExpectedImprovement(model, data()[0], sampler=sampler)
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **QUICK)
+    inside(candidates)
+    best_of(acquisition, value, uniform)
+
+
+def test_knowledge_gradient(model):
+    acquisition = qKnowledgeGradient(model, num_fantasies=4)
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **QUICK)
+    inside(candidates)
+    assert value.isfinite()
+
+
+@pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
+def test_several_outputs(data, build, kind, uniform):
+    model = build(kind, *data(num_outputs=2)).eval()
+    weigh = ScalarizedPosteriorTransform(torch.tensor([0.5, 0.5], dtype=torch.float64))
+    acquisition = qNegIntegratedPosteriorVariance(
+        model, mc_points=uniform(30, 2, high=2.0), posterior_transform=weigh
+    )
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **QUICK)
+    inside(candidates)
+    best_of(acquisition, value, uniform)
+
+
+@pytest.mark.filterwarnings("ignore:No gradient flows:UserWarning")
+def test_a_black_box_without_gradient(data, uniform):
+    X, Y = data()
+    physics = BlackBoxPhysics(lambda X: 2 + X.sum(-1), gradient=None)
+    model = CKA(X, Y, physics=physics).eval()
+    acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
+    options = {"num_restarts": 2, "raw_samples": 8, "options": {"with_grad": False, "maxiter": 5}}
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **options)
+    inside(candidates)
+    best_of(acquisition, value, uniform)

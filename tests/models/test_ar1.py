@@ -1,0 +1,154 @@
+"""AR1 as joint co-kriging of two levels."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust import AR1
+
+
+@pytest.fixture
+def levels(uniform, crude_physics):
+    X, low_X = uniform(7, 2, high=2.0, seed=1), uniform(11, 2, high=2.0, seed=2)
+    low_Y = crude_physics(low_X)[:, :1]
+    Y = 1.7 * crude_physics(X)[:, :1] + X.sum(-1, keepdim=True).sin()
+    return X, Y, low_X, low_Y
+
+
+@pytest.fixture
+def ar1(levels, shuffle):
+    X, Y, low_X, low_Y = levels
+    return shuffle(AR1(X, Y, low_X=low_X, low_Y=low_Y))
+
+
+@pytest.fixture
+def users_units(ar1, rbf):
+    """Kernels, rho and noises of the model in the user's units."""
+    scale, shift = ar1.outcome_transform.stdvs.squeeze(), ar1.outcome_transform.means.squeeze()
+    low = ar1.covar_module.low_kernel.base_kernel
+    delta = ar1.covar_module.delta_kernel.base_kernel
+    noise = ar1.likelihood.noise.detach() * scale**2
+
+    def kernel(part):
+        return rbf(part.base_kernel.lengthscale.detach(), part.outputscale.detach() * scale**2)
+
+    return kernel(low), kernel(delta), ar1.rho.item(), noise, shift
+
+
+def test_joint_co_kriging(ar1, users_units, levels, close, uniform):
+    X, Y, low_X, low_Y = levels
+    k_1, k_delta, rho, noise, shift = users_units
+    Z = uniform(5, 2, high=2.0, seed=3)
+    high = rho**2 * k_1(X, X) + k_delta(X, X) + noise[1] * torch.eye(7)
+    low = k_1(low_X, low_X) + noise[0] * torch.eye(11)
+    between = rho * k_1(low_X, X)
+    K = torch.cat([torch.cat([low, between], 1), torch.cat([between.mT, high], 1)])
+    cross = torch.cat([rho * k_1(Z, low_X), rho**2 * k_1(Z, X) + k_delta(Z, X)], dim=1)
+    y = torch.cat([low_Y, Y])[:, 0] - shift
+    prior = rho**2 * k_1(Z, Z) + k_delta(Z, Z)
+    posterior = ar1.posterior(Z)
+    close(posterior.mean.squeeze(-1).detach(), shift + cross @ torch.linalg.solve(K, y))
+    covariance = prior - cross @ torch.linalg.solve(K, cross.mT)
+    close(posterior.distribution.covariance_matrix.detach(), covariance)
+    noisy = ar1.posterior(Z, observation_noise=True).variance.squeeze(-1)
+    close(noisy.detach(), covariance.diagonal() + noise[1])
+
+
+def test_recursive_co_kriging_on_nested_designs(shuffle, rbf, close, uniform, crude_physics):
+    """Le Gratiet and Garnier's recursion equals the joint model when there is no noise."""
+    low_X = uniform(12, 2, high=2.0, seed=2)
+    X = low_X[:6]
+    low_Y = crude_physics(low_X)[:, :1]
+    Y = 1.7 * low_Y[:6] + X.sum(-1, keepdim=True).sin()
+    model = AR1(X, Y, low_X=low_X, low_Y=low_Y, outcome_transform=None)
+    with torch.no_grad():
+        for kernel, length in (
+            (model.covar_module.low_kernel.base_kernel, 0.5),
+            (model.covar_module.delta_kernel.base_kernel, 0.9),
+        ):
+            kernel.base_kernel.raw_lengthscale.fill_(np.log(length))
+            kernel.raw_outputscale.fill_(0.0)
+        model.covar_module.rho.fill_(1.4)
+        model.likelihood.noise_covar.raw_noise.fill_(np.log(1e-12))
+    k_1, k_delta = rbf(0.5, 1.0), rbf(0.9, 1.0)
+    Z = uniform(5, 2, high=2.0, seed=3)
+    first = k_1(Z, low_X) @ torch.linalg.solve(k_1(low_X, low_X), low_Y)
+    bias = k_delta(Z, X) @ torch.linalg.solve(k_delta(X, X), Y - 1.4 * low_Y[:6])
+    variance = 1.4**2 * (
+        k_1(Z, Z) - k_1(Z, low_X) @ torch.linalg.solve(k_1(low_X, low_X), k_1(low_X, Z))
+    ) + (k_delta(Z, Z) - k_delta(Z, X) @ torch.linalg.solve(k_delta(X, X), k_delta(X, Z)))
+    posterior = model.eval().posterior(Z)
+    close(posterior.mean.detach(), 1.4 * first + bias, 1e-6)
+    close(posterior.variance.squeeze(-1).detach(), variance.diagonal(), 1e-6)
+
+
+def test_rho_is_one_number_for_each_output(levels):
+    X, Y, low_X, low_Y = levels
+    assert AR1(X, Y, low_X=low_X, low_Y=low_Y).rho.shape == ()
+    two = AR1(X, torch.cat([Y, 2 * Y], -1), low_X=low_X, low_Y=torch.cat([low_Y, low_Y], -1))
+    assert two.rho.shape == (2,)
+
+
+def test_each_level_has_a_noise_of_its_own(ar1):
+    assert ar1.likelihood.noise.shape == (2,)
+    low, high = ar1.likelihood.noise.tolist()
+    inputs = ar1.train_inputs[0]
+    prior = ar1.forward(inputs)
+    noise = ar1.likelihood(prior, inputs).variance - prior.variance
+    expected = torch.tensor([low] * 11 + [high] * 7, dtype=torch.float64)
+    torch.testing.assert_close(noise.detach(), expected)
+
+
+def test_the_samples_lie_within_the_bounds(data, crude_physics):
+    X, Y = data()
+    seen = []
+
+    def physics(X):
+        seen.append(X)
+        return crude_physics(X)[:, :1]
+
+    bounds = torch.tensor([[-3.0, 1.0], [-2.0, 5.0]], dtype=torch.float64)
+    AR1(X, Y, physics=physics, bounds=bounds, num_low=33)
+    rows = torch.cat(seen)
+    assert len(rows) == 33
+    assert (rows >= bounds[0]).all()
+    assert (rows <= bounds[1]).all()
+    assert (rows.amax(0) - rows.amin(0) > 0.8 * (bounds[1] - bounds[0])).all()
+
+
+def test_the_seed_makes_the_samples(data, build):
+    X, Y = data()
+    first, same, other = (build("AR1", X, Y, seed=s).train_inputs[0] for s in (1, 1, 2))
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
+
+
+def test_low_values_are_computed_where_only_inputs_are_given(levels, crude_physics, uniform):
+    X, Y, low_X, low_Y = levels
+    given = AR1(X, Y, low_X=low_X, low_Y=low_Y)
+    computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude_physics(X)[:, :1])
+    Z = uniform(5, 2)
+    torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
+
+
+def test_without_bias_and_noise_it_follows_the_scaled_low_level(levels, uniform, crude_physics):
+    X, _, low_X, low_Y = levels
+    Y = 2 * crude_physics(X)[:, :1]
+    model = AR1(X, Y, low_X=low_X, low_Y=low_Y, outcome_transform=None)
+    with torch.no_grad():
+        model.covar_module.rho.fill_(2.0)
+        model.covar_module.delta_kernel.base_kernel.raw_outputscale.fill_(np.log(1e-9))
+        model.likelihood.noise_covar.raw_noise.fill_(np.log(1e-9))
+    posterior = model.eval().posterior(low_X)
+    torch.testing.assert_close(posterior.mean, 2 * low_Y, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="the low level's noise is below GPyTorch's floor, which warns about it"
+)
+@pytest.mark.parametrize("num_outputs", [1, 2])
+def test_known_noise_in_raw_units(data, build, num_outputs):
+    X, Y = data(num_outputs=num_outputs)
+    small = 0.1 if num_outputs == 1 else 1.0
+    build("AR1", X, small * Y, 0.01 * torch.ones_like(Y), outcome_transform=None,
+          physics=lambda X: small * (2 + X[..., :1].sin()).expand(*X.shape[:-1], num_outputs))

@@ -1,0 +1,276 @@
+"""RRA as Bayesian linear regression."""
+
+import pyro
+import pytest
+import torch
+from botorch.models.transforms import Normalize, Standardize
+from pyro.infer import MCMC, NUTS, Predictive
+from pyro.infer.autoguide import AutoLaplaceApproximation
+
+from gpadjust import RRA
+
+
+@pytest.fixture(autouse=True)
+def _clear_pyro():
+    pyro.clear_param_store()
+    pyro.set_rng_seed(0)
+
+
+@pytest.fixture(params=["plain", "centred", "transformed", "known-noise"])
+def rra(request, data, build, num_outputs, shuffle):
+    """An RRA with few features."""
+    X, Y = data(num_outputs=num_outputs)
+    options = {"num_features": 4}
+    if request.param == "centred":
+        options["center"] = "mean"
+    if request.param == "transformed":
+        options |= {
+            "input_transform": Normalize(2),
+            "outcome_transform": Standardize(num_outputs),
+        }
+    Yvar = torch.full_like(Y, 0.02) if request.param == "known-noise" else None
+    return shuffle(build("RRA", X, Y, Yvar, **options))
+
+
+def test_weights_are_pyros_laplace_approximation(rra):
+    guide = AutoLaplaceApproximation(rra.pyro_model)
+    optimiser = pyro.optim.PyroLRScheduler(
+        torch.optim.lr_scheduler.ExponentialLR,
+        {"optimizer": torch.optim.Adam, "optim_args": {"lr": 0.5}, "gamma": 0.99},
+    )
+    svi = pyro.infer.SVI(rra.pyro_model, guide, optimiser, pyro.infer.Trace_ELBO())
+    svi.step()
+    weights = rra.weights()
+    # Laplace's mode is where the optimiser ends: polish it, so that only the Hessian is judged.
+    loc = dict(guide.named_parameters())["loc"]
+    mode = torch.optim.LBFGS([loc], max_iter=1000, tolerance_grad=1e-10, line_search_fn="strong_wolfe")
+
+    def closure():
+        mode.zero_grad()
+        loss = pyro.infer.Trace_ELBO().differentiable_loss(rra.pyro_model, guide)
+        loss.backward()
+        return loss
+
+    mode.step(closure)
+    mode.step(closure)
+    laplace = guide.laplace_approximation()
+    m = rra.num_outputs
+    mean = laplace.loc.detach().reshape(weights.mean.shape)
+    covariance = laplace.get_posterior().covariance_matrix.detach()
+    scale = weights.variance.sqrt().mean().item()
+    torch.testing.assert_close(weights.mean.detach(), mean, rtol=1e-3, atol=1e-3 * scale)
+    expected = torch.block_diag(*weights.covariance_matrix.detach().reshape(m, 8, 8))
+    torch.testing.assert_close(covariance, expected, rtol=1e-6, atol=1e-8 * scale**2)
+
+
+@pytest.mark.slow
+def test_weights_are_what_nuts_samples(data, build):
+    X, Y = data()
+    model = build("RRA", X, Y, num_features=4).eval()
+    mcmc = MCMC(
+        NUTS(model.pyro_model, jit_compile=False),
+        num_samples=600,
+        warmup_steps=200,
+        disable_progbar=True,
+    )
+    mcmc.run()
+    samples = mcmc.get_samples()["weights"]
+    weights = model.weights()
+    sd = weights.variance.sqrt()
+    assert ((samples.mean(0) - weights.mean).abs() < 0.25 * sd).all()
+    assert ((samples.std(0) / sd - 1).abs() < 0.25).all()
+    Z = X[:4] + 0.05
+    with torch.no_grad():
+        values = model.functions(samples)(Z)
+        posterior = model.posterior(Z)
+    assert ((values.mean(0) - posterior.mean).abs() < 0.25 * posterior.variance.sqrt()).all()
+
+
+def test_the_pyro_model_is_the_prior_in_the_users_units(rra, close, uniform):
+    Z = uniform(5, 2, high=2.0, seed=3)
+    sites = pyro.poutine.trace(rra.pyro_model).get_trace(Z).nodes
+    weights, prior_sd = sites["weights"]["value"], sites["weights"]["fn"].base_dist.scale
+    m = rra.num_outputs
+    assert weights.shape == (8,) if m == 1 else (m, 8)
+    assert (sites["weights"]["fn"].base_dist.loc == 0).all()
+    values = rra.functions(weights.unsqueeze(0))(Z)[0].mT.reshape(sites["Y"]["value"].shape)
+    close(sites["Y"]["fn"].base_dist.loc.detach(), values.detach())
+    scale = rra.outcome_transform.stdvs.reshape(m, 1)
+    noise = rra.likelihood.noise.reshape(m, -1)[:, :1].sqrt() * scale
+    noise_sd = sites["Y"]["fn"].base_dist.scale.reshape(m, -1)
+    close(noise_sd.detach(), noise.expand_as(noise_sd).detach())
+    # Its marginal variance is that of the Gaussian process.
+    unit = torch.eye(8, dtype=torch.float64)
+    unit = unit if m == 1 else unit.unsqueeze(1).expand(8, m, 8)
+    zero = rra.functions(torch.zeros_like(unit[:1]))(Z)
+    design = (rra.functions(unit)(Z) - zero).permute(2, 1, 0)
+    variance = (design * prior_sd.reshape(m, 1, 8)).square().sum(-1)
+    inputs = rra.transform_inputs(Z).expand(*rra._aug_batch_shape, 5, -1)
+    prior = rra.covar_module(inputs).to_dense().diagonal(dim1=-1, dim2=-2).reshape(m, 5)
+    close(variance.detach(), (prior * scale**2).detach())
+
+
+def test_prior_predictive(data, build, uniform, close):
+    model = build("RRA", *data(), num_features=4)
+    Z = uniform(5, 2, high=2.0, seed=3)
+    samples = Predictive(model.pyro_model, num_samples=400)(Z)["Y"].squeeze()
+    assert samples.shape == (400, 5)
+    mean = model.physics(Z).squeeze(-1)
+    assert ((samples.mean(0) - mean).abs() < 5 * samples.std(0) / 20).all()
+
+
+def test_functions_of_the_weights_have_the_posterior(rra, close, uniform):
+    Z = uniform(6, 2, high=2.0, seed=3)
+    weights = rra.weights()
+    posterior = rra.posterior(Z)
+    mean = rra.functions(weights.mean.unsqueeze(0))(Z)[0]
+    close(mean.detach(), posterior.mean.detach())
+    # The functions are affine in the weights: the images of a basis make the design.
+    m = rra.num_outputs
+    unit = torch.eye(8, dtype=torch.float64)
+    unit = unit if m == 1 else unit.unsqueeze(1).expand(8, m, 8)
+    zero = rra.functions(torch.zeros_like(unit[:1]))(Z)
+    design = (rra.functions(unit)(Z) - zero).permute(2, 1, 0)
+    covariance = weights.covariance_matrix.reshape(m, 8, 8)
+    for j in range(m):
+        expected = design[j] @ covariance[j] @ design[j].mT
+        close(posterior.variance[:, j].detach(), expected.diagonal().detach())
+    close(zero[0].detach(), rra.physics(Z))
+
+
+def test_sampled_functions_have_the_posteriors_moments(rra, uniform):
+    Z = uniform(6, 2, high=2.0, seed=3)
+    values = rra.sample_functions(20_000)(Z).detach()
+    posterior = rra.posterior(Z)
+    sd = posterior.variance.sqrt().detach()
+    assert ((values.mean(0) - posterior.mean).abs() < 5 * sd / 20_000**0.5).all()
+    for j in range(rra.num_outputs):
+        covariance = posterior.distribution.covariance_matrix.detach()
+        if rra.num_outputs > 1:
+            covariance = covariance[j::2, j::2] if posterior._interleaved else covariance[
+                6 * j : 6 * (j + 1), 6 * j : 6 * (j + 1)
+            ]
+        error = values[..., j].mT.cov() - covariance
+        assert (error.abs() < 0.05 * sd[:, j].outer(sd[:, j])).all()
+
+
+def test_functions_are_deterministic_and_take_any_batch(rra, uniform):
+    functions = rra.sample_functions(3)
+    Z = uniform(4, 5, 6, 2, high=2.0)
+    values = functions(Z)
+    assert values.shape == (3, 4, 5, 6, rra.num_outputs)
+    assert torch.equal(values, functions(Z))
+    torch.testing.assert_close(functions(Z[1, 2]), values[:, 1, 2])
+    torch.testing.assert_close(functions(Z[:, :, 2:3]), values[:, :, :, 2:3])
+
+
+def test_functions_outlive_a_change_of_the_model(rra, uniform, shuffle):
+    functions = rra.sample_functions(3)
+    Z = uniform(6, 2)
+    before = functions(Z)
+    shuffle(rra.train(), seed=5)
+    assert torch.equal(functions(Z), before)
+
+
+def test_functions_have_gradients_in_x(rra, uniform):
+    functions = rra.sample_functions(3)
+    Z = uniform(6, 2).requires_grad_()
+    assert torch.autograd.gradcheck(lambda Z: functions(Z), (Z,), atol=1e-4)
+
+
+def test_functions_of_a_batch_of_data_sets(data, build, uniform):
+    model = build("RRA", *data(batch_shape=(3,), num_outputs=2))
+    values = model.sample_functions(4)(uniform(3, 6, 2))
+    assert values.shape == (4, 3, 6, 2)
+
+
+def test_evidence_is_that_of_the_weights_marginalised(data, build, shuffle):
+    X, Y = data()
+    model = shuffle(build("RRA", X, Y, num_features=5))
+    scale = model.outcome_transform.stdvs.item()
+    unit = torch.eye(10, dtype=torch.float64)
+    zero = model.functions(torch.zeros_like(unit[:1]))(X)
+    design = (model.functions(unit)(X) - zero).squeeze(-1).mT
+    s_rho, s_delta = model.rho_covar_module.outputscale, model.delta_covar_module.outputscale
+    prior = torch.cat([s_rho.expand(5), (s_delta * scale**2).expand(5)])
+    noise = model.likelihood.noise * scale**2
+    covariance = design @ prior.diag() @ design.mT + noise * torch.eye(len(X))
+    expected = torch.distributions.MultivariateNormal(zero[0, :, 0], covariance).log_prob(Y[:, 0])
+    model.train()
+    marginal = model.likelihood(model(*model.train_inputs))
+    jacobian = len(X) * model.outcome_transform.stdvs.log().item()
+    actual = marginal.log_prob(model.train_targets).item() - jacobian
+    assert actual == pytest.approx(expected.item(), rel=1e-8)
+
+
+@pytest.mark.parametrize("known_noise", [False, True])
+def test_the_papers_closed_form(data, build, shuffle, close, crude_physics, uniform, known_noise):
+    X, Y = data(num_outputs=2)
+    Yvar = torch.full_like(Y, 0.3) if known_noise else None
+    model = shuffle(build("RRA-paper", X, Y, Yvar, num_features=6))
+    Z = uniform(5, 2, high=2.0, seed=3)
+    posterior, noisy = model.posterior(Z), model.posterior(Z, observation_noise=True)
+    weights = model.weights()
+    for j in range(2):
+        lengthscales = [
+            kernel.base_kernel.lengthscale[j].detach()
+            for kernel in (model.rho_covar_module, model.delta_covar_module)
+        ]
+        maps = [
+            kernel.base_kernel.features
+            for kernel in (model.rho_covar_module, model.delta_covar_module)
+        ]
+
+        def phi(X, j=j, lengthscales=lengthscales, maps=maps):
+            rho, delta = (
+                (2 / 6) ** 0.5 * torch.cos((X / length) @ m.frequencies.mT + m.phases)
+                for length, m in zip(lengthscales, maps, strict=True)
+            )
+            return torch.cat([crude_physics(X)[:, [j]] * rho, delta], dim=-1)
+
+        ridge = 0.3 if known_noise else model.likelihood.noise[j].item()
+        eye = torch.eye(12, dtype=torch.float64)
+        gram = phi(X).mT @ phi(X)
+        beta = torch.linalg.solve(gram + ridge * eye, phi(X).mT @ Y[:, j])
+        covariance = torch.linalg.inv(gram + eye)
+        close(weights.mean[j].detach(), beta)
+        close(weights.covariance_matrix[j].detach(), covariance)
+        variance = (phi(Z) @ covariance @ phi(Z).mT).diagonal()
+        close(posterior.mean[:, j].detach(), phi(Z) @ beta)
+        close(posterior.variance[:, j].detach(), variance)
+        close(noisy.mean[:, j].detach(), phi(Z) @ beta)
+        close(noisy.variance[:, j].detach(), variance + ridge)
+
+
+def test_the_papers_prior_falls_to_zero_without_data(data, build, uniform):
+    X, Y = data()
+    model = build("RRA-paper", X, Y).eval()
+    assert (model.weights().variance <= 1).all()
+    assert not model.rho_covar_module.raw_outputscale.requires_grad
+    functions = model.functions(torch.zeros(1, 48, dtype=torch.float64))
+    assert (functions(uniform(4, 2)) == 0).all()
+
+
+def test_the_papers_prior_rho_times_physics_plus_delta(data, build, shuffle, close, uniform):
+    model = shuffle(build("RRA-paper", *data(), center="mean"))
+    Z = uniform(5, 2, high=2.0, seed=3)
+    parts = model.rho(Z).mean * model.physics(Z) + model.delta(Z).mean
+    close(parts.detach(), model.posterior(Z).mean.detach())
+
+
+def test_the_seed_makes_the_features(data, build, uniform):
+    X, Y = data()
+    Z = uniform(5, 2)
+    first, same, other = (build("RRA", X, Y, seed=s).posterior(Z).mean for s in (1, 1, 2))
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
+
+
+def test_rho_and_delta_have_features_of_their_own(data, build):
+    model = build("RRA", *data())
+    rho, delta = (
+        kernel.base_kernel.features.frequencies
+        for kernel in (model.rho_covar_module, model.delta_covar_module)
+    )
+    assert not torch.equal(rho, delta)
+    assert isinstance(model, RRA)
