@@ -1,6 +1,6 @@
 """The GPyTorch pieces: means, kernels and transforms that read the physics."""
 
-from gpadjust.gp.fixed_standardize import FixedStandardize
+from gpadjust.gp.fixed_standardize import FixedStandardize, RescaledPosterior
 from gpadjust.gp.fourier import FourierFeatures, FourierKernel
 from gpadjust.gp.inputs_kernel import InputsKernel
 from gpadjust.gp.log_interval import LogInterval
@@ -20,4 +20,5 @@ __all__ = [
     "PhysicsMean",
     "PhysicsOutput",
     "PhysicsScaledKernel",
+    "RescaledPosterior",
 ]

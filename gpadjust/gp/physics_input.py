@@ -42,7 +42,7 @@ class PhysicsInput(InputTransform):
     def transform(self, X: Tensor) -> Tensor:
         """Map raw ``X`` (``... x n x d``) to ``... x n x (d' + m)``."""
         self._check(X)
-        return torch.cat([X if self.base is None else self.base(X), self.physics(X)], dim=-1)
+        return self._append(X if self.base is None else self.base(X), self.physics(X))
 
     def without_physics(self, X: Tensor) -> Tensor:
         """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
@@ -56,7 +56,7 @@ class PhysicsInput(InputTransform):
         """As :meth:`transform`, with the base transform's own preprocessing."""
         self._check(X)
         inputs = X if self.base is None else self.base.preprocess_transform(X)
-        return torch.cat([inputs, self.physics(X)], dim=-1)
+        return self._append(inputs, self.physics(X))
 
     def equals(self, other: InputTransform) -> bool:
         """Whether ``other`` appends the same physics after an equal base transform."""
@@ -72,6 +72,11 @@ class PhysicsInput(InputTransform):
                 )
             )
         )
+
+    @staticmethod
+    def _append(inputs: Tensor, values: Tensor) -> Tensor:
+        """Join columns; the base transform may have added a batch."""
+        return torch.cat([inputs, values.expand(*inputs.shape[:-1], values.shape[-1])], dim=-1)
 
     def _check(self, X: Tensor) -> None:
         if X.shape[-1] != self.num_inputs:

@@ -27,6 +27,7 @@ from gpadjust.gp import (
     PhysicsInput,
     PhysicsMean,
     PhysicsScaledKernel,
+    RescaledPosterior,
 )
 from gpadjust.models.defaults import default_likelihood, make_kernel
 from gpadjust.models.multi_output_gp import MultiOutputGP
@@ -155,11 +156,16 @@ class AdjustmentGP(MultiOutputGP):
         X, output_dim = self._with_output_dim(self.input_transform.without_physics(X))
         with gpt_posterior_settings(), self._infer(component):
             mvn = self(X)
-        if component == "delta":
-            scale = self._column.scale  # from the units of the targets to the user's
-            covariance = to_dense(mvn.lazy_covariance_matrix) * scale.unsqueeze(-1).square()
-            mvn = MultivariateNormal(mvn.mean * scale, to_linear_operator(covariance))
-        return self._as_posterior(mvn, output_dim)
+        if component == "rho":
+            return self._as_posterior(mvn, output_dim)
+        scale = self._column.scale  # from the units of the targets to the user's
+        covariance = to_dense(mvn.lazy_covariance_matrix) * scale.unsqueeze(-1).square()
+        rescaled = MultivariateNormal(mvn.mean * scale, to_linear_operator(covariance))
+        return RescaledPosterior(
+            self._as_posterior(rescaled, output_dim).distribution,
+            self._as_posterior(mvn, output_dim),
+            scale.mT.square() if self._num_outputs > 1 else scale.unsqueeze(-1).square(),
+        )
 
     def _with_output_dim(self, X: Tensor) -> tuple[Tensor, int | None]:
         """Insert the dimension of the outputs into ``X``, and tell where it is."""

@@ -9,6 +9,7 @@ import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.posteriors import Posterior
+from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.constraints import Interval
@@ -23,7 +24,7 @@ from torch import Size, Tensor
 from gpadjust.gp import FixedStandardize, InputsKernel
 from gpadjust.models.defaults import make_kernel, scaled_rbf, wide
 from gpadjust.models.multi_output_gp import MultiOutputGP
-from gpadjust.models.parameter_scales import BOUNDS, set_initial_values
+from gpadjust.models.parameter_scales import set_initial_values
 from gpadjust.models.training_data import check_training_data
 from gpadjust.physics import Physics, as_physics
 
@@ -54,7 +55,8 @@ class LevelInput(InputTransform):
         """Map ``... x n x d`` (or ``d + 1``, level included) to ``... x n x (d' + 1)``."""
         X = self.with_level(X)
         inputs, level = X[..., :-1], X[..., -1:]
-        return torch.cat([inputs if self.base is None else self.base(inputs), level], dim=-1)
+        inputs = inputs if self.base is None else self.base(inputs)
+        return torch.cat([inputs, level.expand(*inputs.shape[:-1], 1)], dim=-1)
 
     def with_level(self, X: Tensor) -> Tensor:
         """Append level 1 to ``X`` unless it has a level column."""
@@ -226,9 +228,10 @@ class AR1(MultiOutputGP):
         if train_Yvar is None:
             likelihood = LevelLikelihood(wide(), batch_shape)
         else:
-            # f_p is known without error; GPyTorch raises this to its own minimum.
-            low_Yvar = BOUNDS["noise"][0] * low_Y.var(-2, keepdim=True).expand_as(low_Y)
-            Yvar = torch.cat([low_Yvar, train_Yvar], dim=-2)
+            # f_p is known without error, but GPyTorch wants at least 1e-6 for fixed noise.
+            low_Yvar = 1e-5 * low_Y.var(-2, keepdim=True)
+            low_Yvar = low_Yvar.clamp_min(1e-6) if outcome_transform is None else low_Yvar
+            Yvar = torch.cat([low_Yvar.expand_as(low_Y), train_Yvar], dim=-2)
         super().__init__(
             X,
             Y,
@@ -242,6 +245,17 @@ class AR1(MultiOutputGP):
             input_transform=transform,
         )
         set_initial_values(self, low_covar_module, delta_covar_module)
+
+    @classmethod
+    def construct_inputs(
+        cls,
+        training_data: SupervisedDataset,
+        physics: Physics | Callable[[Tensor], Tensor],
+        bounds: Tensor,
+    ) -> dict[str, Any]:
+        """Construct keyword arguments of the model from a dataset, a physics and bounds."""
+        inputs = super().construct_inputs(training_data)
+        return {**inputs, "physics": physics, "bounds": bounds}
 
     @property
     def rho(self) -> Tensor:

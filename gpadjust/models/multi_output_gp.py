@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import Any, Self
 
 import torch
+from botorch.acquisition.objective import PosteriorTransform
 from botorch.models import SingleTaskGP
+from botorch.posteriors import Posterior
+from gpytorch.settings import detach_test_caches
 from torch import Size, Tensor
 
 from gpadjust.gp import FourierFeatures
@@ -15,8 +18,34 @@ class MultiOutputGP(SingleTaskGP):
     """The base of this library's models: a ``SingleTaskGP`` with independent outputs.
 
     Beyond BoTorch's, a subset of its outputs can be fitted again, whatever its kernels and
-    transforms, and it can be conditioned on observations before any prediction was made.
+    transforms; it can be conditioned on observations before any prediction was made, with
+    gradients to where they are made; and ``output_indices`` may come in any order.
     """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Evaluate the model at *transformed* inputs, as GPyTorch does."""
+        inputs = self.train_inputs[0]
+        if not self.training and args and args[0].shape[-1] != inputs.shape[-1]:
+            raise ValueError(
+                f"In eval mode the model itself takes transformed inputs with {inputs.shape[-1]} "
+                f"columns, got shape {tuple(args[0].shape)}. Call `model.posterior(X)` on raw "
+                "inputs, or `model(model.transform_inputs(X))`."
+            )
+        return super().__call__(*args, **kwargs)
+
+    def posterior(
+        self,
+        X: Tensor,
+        output_indices: list[int] | None = None,
+        observation_noise: bool | Tensor = False,
+        posterior_transform: PosteriorTransform | None = None,
+    ) -> Posterior:
+        """The posterior at raw ``X`` (``... x q x d``); see BoTorch."""
+        if output_indices is not None and list(output_indices) != list(range(self.num_outputs)):
+            # BoTorch would undo the outcome transform of all outputs on these.
+            subset = self.subset_output(list(output_indices))
+            return subset.posterior(X, None, observation_noise, posterior_transform)
+        return super().posterior(X, None, observation_noise, posterior_transform)
 
     @property
     def _subset_batch_dict(self) -> dict[str, int]:
@@ -53,4 +82,6 @@ class MultiOutputGP(SingleTaskGP):
         if self.prediction_strategy is None:
             with torch.no_grad():
                 SingleTaskGP.posterior(self, X)
-        return super().condition_on_observations(X, Y, **kwargs)
+        # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
+        with detach_test_caches(not X.requires_grad):
+            return super().condition_on_observations(X, Y, **kwargs)

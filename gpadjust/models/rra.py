@@ -17,6 +17,7 @@ from gpytorch.distributions import MultivariateNormal
 from gpytorch.kernels import ScaleKernel
 from gpytorch.likelihoods import Likelihood
 from gpytorch.means import ZeroMean
+from linear_operator import to_linear_operator
 from linear_operator.operators import RootLinearOperator
 from torch import Size, Tensor
 
@@ -239,8 +240,8 @@ class RRA(AdjustmentGP):
         """The posterior at raw ``X`` (``... x q x d``); see BoTorch."""
         if self.prior != "paper":
             return super().posterior(X, output_indices, observation_noise, posterior_transform)
-        if output_indices is not None and len(output_indices) < self.num_outputs:
-            subset = self.subset_output(output_indices)
+        if output_indices is not None and list(output_indices) != list(range(self.num_outputs)):
+            subset = self.subset_output(list(output_indices))
             return subset.posterior(X, None, observation_noise, posterior_transform)
         self.eval()
         inputs, output_dim = self._with_output_dim(self.transform_inputs(X))
@@ -269,7 +270,7 @@ class RRA(AdjustmentGP):
         weights = self.weights()
         mean = (features @ weights.mean.unsqueeze(-1)).squeeze(-1)
         root = features @ weights.lazy_covariance_matrix.root.to_dense()
-        return MultivariateNormal(mean, RootLinearOperator(root))
+        return MultivariateNormal(mean, to_linear_operator(root @ root.mT))
 
     def _prior_sd(self) -> Tensor:
         """Prior standard deviations of the weights in the user's units, ``... x 2D``."""

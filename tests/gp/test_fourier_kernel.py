@@ -61,7 +61,7 @@ def test_a_batch_shares_the_draw_but_not_the_lengthscale(uniform):
     X = uniform(5, 2)
     features = FourierFeatures(7, 2)
     kernel = FourierKernel(features, batch_shape=Size([2])).double()
-    kernel.lengthscale = torch.tensor([0.3, 0.9]).reshape(2, 1, 1)
+    kernel.lengthscale = torch.tensor([0.3, 0.9], dtype=torch.float64).reshape(2, 1, 1)
     for j, length in enumerate((0.3, 0.9)):
         torch.testing.assert_close(kernel.feature_map(X)[j], features(X / length))
 

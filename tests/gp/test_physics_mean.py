@@ -27,9 +27,7 @@ def test_values(uniform):
 
 def test_a_batch_reads_its_own_column(uniform):
     X = uniform(6, 4)
-    column = PhysicsColumn(
-        2, 2, Size([2]), scale=torch.tensor([[2.0], [3.0]], dtype=torch.float64)
-    )
+    column = PhysicsColumn(2, 2, Size([2]), scale=torch.tensor([[2.0], [3.0]], dtype=torch.float64))
     torch.testing.assert_close(PhysicsMean(column)(X), torch.stack([X[:, 2] / 2, X[:, 3] / 3]))
 
 

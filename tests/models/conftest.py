@@ -27,7 +27,12 @@ def truth(X):
     return crude(X) * (1.2 + 0.2 * X[..., :1]) + bias
 
 
-@pytest.fixture(params=list(_CLASSES))
+def _name(kind):
+    # BiasGP is a PhysicsMeanGP, and is tested in its place in the quick run.
+    return pytest.param(kind, marks=pytest.mark.slow if kind == "PhysicsMeanGP" else ())
+
+
+@pytest.fixture(params=[_name(kind) for kind in _CLASSES])
 def kind(request):
     """The name of each model, for `build`."""
     return request.param

@@ -18,6 +18,17 @@ BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
 QUICK = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5, "batch_limit": 2}}
 
 
+SLOW = ["ZeroMeanGP", "PhysicsMeanGP", "BiasGP", "ScaleGP"]
+
+
+@pytest.fixture(
+    params=["CKA", "AR1", "RRA", "RRA-paper"]
+    + [pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW]
+)
+def kind(request):
+    return request.param
+
+
 @pytest.fixture
 def model(data, build, kind):
     return build(kind, *data(), input_transform=Normalize(2)).eval()
@@ -37,11 +48,22 @@ def best_of(acquisition, value, uniform, q=1):
 
 # Line searches fail on the wrong gradients that test_gradients_through_fantasies is about.
 @pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
+@pytest.mark.slow
 def test_integrated_posterior_variance(model, uniform):
     acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
     candidates, value = optimize_acqf(acquisition, BOUNDS, q=2, **QUICK)
     inside(candidates, q=2)
     best_of(acquisition, value, uniform, q=2)
+
+
+@pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
+def test_one_point_of_cka(data, build, uniform):
+    model = build("CKA", *data()).eval()
+    acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
+    options = {"num_restarts": 1, "raw_samples": 8, "options": {"maxiter": 3}}
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **options)
+    inside(candidates)
+    best_of(acquisition, value, uniform)
 
 
 @pytest.mark.parametrize("acquisition", ["variance", "knowledge gradient"])
@@ -87,6 +109,7 @@ def test_knowledge_gradient(model):
 
 
 @pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
+@pytest.mark.slow
 def test_several_outputs(data, build, kind, uniform):
     model = build(kind, *data(num_outputs=2)).eval()
     weigh = ScalarizedPosteriorTransform(torch.tensor([0.5, 0.5], dtype=torch.float64))

@@ -150,5 +150,11 @@ def test_without_bias_and_noise_it_follows_the_scaled_low_level(levels, uniform,
 def test_known_noise_in_raw_units(data, build, num_outputs):
     X, Y = data(num_outputs=num_outputs)
     small = 0.1 if num_outputs == 1 else 1.0
-    build("AR1", X, small * Y, 0.01 * torch.ones_like(Y), outcome_transform=None,
-          physics=lambda X: small * (2 + X[..., :1].sin()).expand(*X.shape[:-1], num_outputs))
+    build(
+        "AR1",
+        X,
+        small * Y,
+        0.01 * torch.ones_like(Y),
+        outcome_transform=None,
+        physics=lambda X: small * (2 + X[..., :1].sin()).expand(*X.shape[:-1], num_outputs),
+    )

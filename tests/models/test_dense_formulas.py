@@ -66,23 +66,36 @@ def test_variance(uniform, shuffle, dense, rbf, close, scale, quantity):
     close(getattr(model, quantity)(Z).variance.detach().squeeze(-1), covariance.diagonal())
 
 
-TINY = pytest.param(
-    1e-4,
-    marks=pytest.mark.xfail(
-        strict=True, reason="GPyTorch's floor of 1e-10 acts on variances in the user's units"
-    ),
+FLOOR = pytest.mark.xfail(
+    strict=True, reason="GPyTorch's floor of 1e-10 acts on variances in the user's units"
 )
 
 
-@pytest.mark.parametrize("scale", [TINY, 1.0, 1e4])
-def test_variance_where_the_data_are_dense(uniform, dense, rbf, close, scale):
+@pytest.mark.parametrize(
+    ("scale", "quantity", "transform"),
+    [
+        (1.0, "posterior", "default"),
+        (1e4, "posterior", "default"),
+        (1e-4, "posterior", "default"),
+        (1.0, "delta", "default"),
+        pytest.param(1e-4, "delta", "default", marks=FLOOR),
+        (1.0, "posterior", "standardize"),
+        pytest.param(1e-4, "posterior", "standardize", marks=FLOOR),
+    ],
+)
+def test_variances_that_are_small(dense, rbf, close, scale, quantity, transform):
     X = torch.linspace(0, 1, 30, dtype=torch.float64).unsqueeze(-1)
-    model = CKA(X, scale * (X + 0.1 * (5 * X).sin()), physics=lambda X: scale * X).eval()
-    expected = dense(
-        X, model.train_targets, lambda X: scale * X[:, 0], **in_users_units(model, rbf)
-    )
-    _, covariance = expected.posterior(X)
-    close(model.posterior(X).variance.detach().squeeze(-1), covariance.diagonal(), 1e-6)
+    options = {"outcome_transform": Standardize(1)} if transform == "standardize" else {}
+    Y = scale * (1 + X + 0.1 * (5 * X).sin())
+    model = CKA(X, Y, physics=lambda X: scale * (1 + X), **options).eval()
+    with torch.no_grad():
+        model.rho_covar_module.outputscale = 1e-4
+        model.delta_covar_module.outputscale = 1e-3
+        model.likelihood.noise = 1e-3
+    formula = in_users_units(model, rbf)
+    expected = dense(X, Y[:, 0], lambda X: scale * (1 + X[:, 0]), **formula)
+    _, covariance = getattr(expected, quantity)(X)
+    close(getattr(model, quantity)(X).variance.detach().squeeze(-1), covariance.diagonal(), 1e-6)
 
 
 def test_observation_noise_is_added(uniform, shuffle, dense, rbf, close):

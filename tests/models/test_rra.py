@@ -43,7 +43,9 @@ def test_weights_are_pyros_laplace_approximation(rra):
     weights = rra.weights()
     # Laplace's mode is where the optimiser ends: polish it, so that only the Hessian is judged.
     loc = dict(guide.named_parameters())["loc"]
-    mode = torch.optim.LBFGS([loc], max_iter=1000, tolerance_grad=1e-10, line_search_fn="strong_wolfe")
+    mode = torch.optim.LBFGS(
+        [loc], max_iter=1000, tolerance_grad=1e-10, line_search_fn="strong_wolfe"
+    )
 
     def closure():
         mode.zero_grad()
@@ -147,9 +149,11 @@ def test_sampled_functions_have_the_posteriors_moments(rra, uniform):
     for j in range(rra.num_outputs):
         covariance = posterior.distribution.covariance_matrix.detach()
         if rra.num_outputs > 1:
-            covariance = covariance[j::2, j::2] if posterior._interleaved else covariance[
-                6 * j : 6 * (j + 1), 6 * j : 6 * (j + 1)
-            ]
+            covariance = (
+                covariance[j::2, j::2]
+                if posterior._interleaved
+                else covariance[6 * j : 6 * (j + 1), 6 * j : 6 * (j + 1)]
+            )
         error = values[..., j].mT.cov() - covariance
         assert (error.abs() < 0.05 * sd[:, j].outer(sd[:, j])).all()
 

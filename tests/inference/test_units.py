@@ -1,0 +1,92 @@
+"""Fits on Forrester's pair: accuracy, and invariance to units."""
+
+import statistics
+
+import pytest
+import torch
+
+from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
+
+BOUNDS = torch.tensor([[-0.6], [1.0]], dtype=torch.float64)
+BUILD = {
+    "ZeroMeanGP": lambda X, Y, physics: ZeroMeanGP(X, Y),
+    "PhysicsMeanGP": lambda X, Y, physics: PhysicsMeanGP(X, Y, physics=physics),
+    "BiasGP": lambda X, Y, physics: BiasGP(X, Y, physics=physics),
+    "ScaleGP": lambda X, Y, physics: ScaleGP(X, Y, physics=physics),
+    "CKA": lambda X, Y, physics: CKA(X, Y, physics=physics),
+    "AR1": lambda X, Y, physics: AR1(X, Y, physics=physics, bounds=BOUNDS, num_low=16),
+    "RRA": lambda X, Y, physics: RRA(X, Y, physics=physics, num_features=32),
+}
+EXACT = 1e-3  # an RMSE below this is rounding: the pair's spread is 4
+
+pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero:UserWarning")
+
+
+@pytest.fixture
+def error(forrester):
+    """The RMSE of a model's mean in the units of the pair, for changed units of x and y."""
+
+    def error(build, seed, scale=1.0, offset=0.0, stretch=1.0, shift=0.0):
+        X, Y = forrester.data(seed)
+
+        def physics(X):
+            return scale * forrester.crude((X - shift) / stretch) + offset
+
+        model = build(shift + stretch * X, scale * Y + offset, physics)
+        fit(model)
+        Z = forrester.test_X
+        with torch.no_grad():
+            mean = (model.posterior(shift + stretch * Z).mean - offset) / scale
+        return (mean - forrester.truth(Z)).square().mean().sqrt().item()
+
+    return error
+
+
+CASES = [(kind, seed) for kind in BUILD for seed in range(3)]
+QUICK = [("CKA", 0), ("PhysicsMeanGP", 0)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow) for case in CASES],
+)
+def test_the_scale_of_targets_and_physics(error, kind, seed):
+    expected = error(BUILD[kind], seed)
+    for scale in (1e-4, 1e4):
+        actual = error(BUILD[kind], seed, scale=scale)
+        assert actual == pytest.approx(expected, rel=0.05, abs=EXACT)
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_common_offset_with_center(error, seed):
+    def build(X, Y, physics):
+        return CKA(X, Y, physics=physics, center="mean")
+
+    expected = error(build, seed)
+    actual = error(build, seed, offset=-1000.0)
+    assert actual == pytest.approx(expected, rel=0.05, abs=EXACT)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "shift"), [(1000.0, -70.0), pytest.param(0.01, 5.0, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize(
+    "kind",
+    ["CKA", *(pytest.param(k, marks=pytest.mark.slow) for k in ("ZeroMeanGP", "BiasGP", "RRA"))],
+)
+def test_units_of_the_inputs(error, kind, stretch, shift):
+    if kind == "RRA" and shift:
+        shift = 0.0  # the phases of its features are not invariant to shifts
+    expected = error(BUILD[kind], 0)
+    actual = error(BUILD[kind], 0, stretch=stretch, shift=shift)
+    assert actual == pytest.approx(expected, rel=0.05, abs=EXACT)
+
+
+@pytest.mark.parametrize("num_seeds", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_cka_is_exact_on_a_pair_within_its_class(error, num_seeds):
+    errors = [error(BUILD["CKA"], seed) for seed in range(num_seeds)]
+    assert statistics.median(errors) <= 0.002
+
+
+def test_cka_beats_the_physics_mean(error):
+    assert error(BUILD["CKA"], 0) < 0.3 * error(BUILD["PhysicsMeanGP"], 0)
