@@ -86,6 +86,8 @@ class AdjustmentGP(MultiOutputGP):
         if isinstance(outcome_transform, _DefaultType):
             outcome_transform = residual_scale(train_Y, f_p)
         shift, scale = _affine(outcome_transform, train_Y, X)
+        if outcome_transform is not None:
+            outcome_transform = FixedStandardize.of(shift, scale)
         offset = _center(center, f_p)
         to_outputs = (lambda t: t.mT) if m > 1 else (lambda t: t.squeeze(-1))
         mean = PhysicsColumn(d, m, batch_shape, to_outputs(shift), to_outputs(scale))

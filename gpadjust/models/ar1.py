@@ -250,12 +250,15 @@ class AR1(MultiOutputGP):
     def construct_inputs(
         cls,
         training_data: SupervisedDataset,
-        physics: Physics | Callable[[Tensor], Tensor],
-        bounds: Tensor,
+        **options: Any,
     ) -> dict[str, Any]:
-        """Construct keyword arguments of the model from a dataset, a physics and bounds."""
-        inputs = super().construct_inputs(training_data)
-        return {**inputs, "physics": physics, "bounds": bounds}
+        """Construct keyword arguments of the model from a dataset.
+
+        Args:
+            training_data: The data of the high level.
+            options: The low level: ``physics`` with ``bounds``, or ``low_X`` with ``low_Y``.
+        """
+        return {**super().construct_inputs(training_data), **options}
 
     @property
     def rho(self) -> Tensor:

@@ -46,8 +46,6 @@ def best_of(acquisition, value, uniform, q=1):
     assert value >= others.median()
 
 
-# Line searches fail on the wrong gradients that test_gradients_through_fantasies is about.
-@pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
 @pytest.mark.slow
 def test_integrated_posterior_variance(model, uniform):
     acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
@@ -56,7 +54,6 @@ def test_integrated_posterior_variance(model, uniform):
     best_of(acquisition, value, uniform, q=2)
 
 
-@pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
 def test_one_point_of_cka(data, build, uniform):
     model = build("CKA", *data()).eval()
     acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
@@ -67,10 +64,7 @@ def test_one_point_of_cka(data, build, uniform):
 
 
 @pytest.mark.parametrize("acquisition", ["variance", "knowledge gradient"])
-def test_gradients_through_fantasies(data, build, kind, uniform, acquisition, request):
-    if kind != "RRA-paper" and acquisition == "variance":
-        reason = "GPyTorch detaches the fantasies' training covariance in condition_on_observations"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+def test_gradients_through_fantasies(data, build, kind, uniform, acquisition):
     model = build(kind, *data()).eval()
     if acquisition == "variance":
         function = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
@@ -90,10 +84,7 @@ def test_gradients_through_fantasies(data, build, kind, uniform, acquisition, re
     torch.testing.assert_close(gradient, differences, rtol=1e-4, atol=1e-4 * size)
 
 
-def test_noisy_expected_improvement(model, data, uniform, kind, request):
-    if kind == "RRA-paper":
-        reason = "its covariance has a root that is not square"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+def test_noisy_expected_improvement(model, data, uniform):
     sampler = SobolQMCNormalSampler(torch.Size([16]), seed=0)
     acquisition = qLogNoisyExpectedImprovement(model, data()[0], sampler=sampler)
     candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **QUICK)
@@ -108,7 +99,6 @@ def test_knowledge_gradient(model):
     assert value.isfinite()
 
 
-@pytest.mark.filterwarnings("ignore:Optimization failed:RuntimeWarning")
 @pytest.mark.slow
 def test_several_outputs(data, build, kind, uniform):
     model = build(kind, *data(num_outputs=2)).eval()

@@ -143,9 +143,6 @@ def test_without_bias_and_noise_it_follows_the_scaled_low_level(levels, uniform,
     torch.testing.assert_close(posterior.mean, 2 * low_Y, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the low level's noise is below GPyTorch's floor, which warns about it"
-)
 @pytest.mark.parametrize("num_outputs", [1, 2])
 def test_known_noise_in_raw_units(data, build, num_outputs):
     X, Y = data(num_outputs=num_outputs)

@@ -18,8 +18,6 @@ def rebuild(build, kind, model, X, Y, Yvar=None, **options):
     return new.eval()
 
 
-# The noise of the low level of AR1, which test_ar1.py is about.
-@pytest.mark.filterwarnings("ignore:Very small noise values")
 @pytest.mark.parametrize("normalize", [False, True], ids=["raw", "normalize"])
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 def test_conditioning_is_rebuilding(

@@ -1,14 +1,10 @@
 """Models from BoTorch's datasets."""
 
-import pytest
 import torch
 from botorch.utils.datasets import SupervisedDataset
 
 
-def test_a_model_from_a_dataset(data, build, kind, num_outputs, crude_physics, uniform, request):
-    if kind == "AR1":
-        reason = "AR1 has no construct_inputs of its own, so it takes no physics"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+def test_a_model_from_a_dataset(data, build, kind, num_outputs, crude_physics, uniform):
     X, Y = data(num_outputs=num_outputs)
     direct = build(kind, X, Y).eval()
     dataset = SupervisedDataset(

@@ -66,11 +66,6 @@ def test_variance(uniform, shuffle, dense, rbf, close, scale, quantity):
     close(getattr(model, quantity)(Z).variance.detach().squeeze(-1), covariance.diagonal())
 
 
-FLOOR = pytest.mark.xfail(
-    strict=True, reason="GPyTorch's floor of 1e-10 acts on variances in the user's units"
-)
-
-
 @pytest.mark.parametrize(
     ("scale", "quantity", "transform"),
     [
@@ -78,9 +73,9 @@ FLOOR = pytest.mark.xfail(
         (1e4, "posterior", "default"),
         (1e-4, "posterior", "default"),
         (1.0, "delta", "default"),
-        pytest.param(1e-4, "delta", "default", marks=FLOOR),
+        (1e-4, "delta", "default"),
         (1.0, "posterior", "standardize"),
-        pytest.param(1e-4, "posterior", "standardize", marks=FLOOR),
+        (1e-4, "posterior", "standardize"),
     ],
 )
 def test_variances_that_are_small(dense, rbf, close, scale, quantity, transform):

@@ -37,8 +37,6 @@ def test_the_likelihood_rises(data, build, kind, num_outputs, batch_shape):
     assert log_likelihood(model) > before + 0.01
 
 
-# The noise of the low level of AR1, which test_ar1.py is about.
-@pytest.mark.filterwarnings("ignore:Very small noise values")
 @pytest.mark.parametrize("transform", ["none", "standardize"])
 def test_with_transforms_and_known_noise(data, build, kind, transform):
     if kind == "RRA-paper" and transform == "standardize":

@@ -1,12 +1,9 @@
 """Shapes of posteriors, for every model."""
 
-import warnings
-
 import pytest
 import torch
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize, Standardize
-from linear_operator.utils.warnings import NumericalWarning
 
 
 @pytest.fixture(params=["default", "raw units", "standardize and normalize"])
@@ -24,8 +21,6 @@ def options(request, kind, num_outputs):
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 @pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])
 def test_posterior(data, build, uniform, kind, num_outputs, batch_shape, options, known_noise):
-    if kind == "AR1" and known_noise:
-        warnings.simplefilter("ignore", NumericalWarning)  # test_ar1.py is about it
     X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
     Yvar = 0.01 * torch.ones_like(Y) if known_noise else None
     model = build(kind, X, Y, Yvar, **options(torch.Size(batch_shape)))
@@ -42,10 +37,7 @@ def test_posterior(data, build, uniform, kind, num_outputs, batch_shape, options
         assert (noisy.variance > posterior.variance).all()
 
 
-def test_a_batched_input_transform(data, build, uniform, kind, request):
-    if kind != "ZeroMeanGP":
-        reason = "the physics is not expanded to the batch that the base transform makes"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+def test_a_batched_input_transform(data, build, uniform, kind):
     X, Y = data(batch_shape=(3,))
     X = X * torch.tensor([1.0, 10.0, 100.0], dtype=torch.float64).reshape(3, 1, 1)
     normalize = Normalize(2, batch_shape=torch.Size([3]))
@@ -63,9 +55,6 @@ def test_is_a_single_task_gp(data, build, kind):
     assert isinstance(build(kind, *data()), SingleTaskGP)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="BoTorch undoes the outcome transform, and RRA selects, in the old order"
-)
 def test_output_indices(data, build, kind, uniform):
     model = build(kind, *data(num_outputs=2))
     Z = uniform(4, 2)

@@ -7,8 +7,6 @@ from botorch.models.transforms import Normalize, Standardize
 from pyro.infer import MCMC, NUTS, Predictive
 from pyro.infer.autoguide import AutoLaplaceApproximation
 
-from gpadjust import RRA
-
 
 @pytest.fixture(autouse=True)
 def _clear_pyro():
@@ -277,4 +275,3 @@ def test_rho_and_delta_have_features_of_their_own(data, build):
         for kernel in (model.rho_covar_module, model.delta_covar_module)
     )
     assert not torch.equal(rho, delta)
-    assert isinstance(model, RRA)
