@@ -139,9 +139,11 @@ class SearchSpace:
         if constraint is None:
             return value
         lower, upper = constraint.lower_bound, constraint.upper_bound
-        margin = 1e-6 * torch.where(upper.isfinite(), upper - lower, lower.abs())
-        value = torch.minimum(torch.maximum(value, lower + margin), upper - margin)
-        raw: Tensor = constraint.inverse_transform(value)
+        if not isinstance(constraint, LogInterval):
+            # At its ends the raw parameter of a constraint that squashes is infinite.
+            margin = 1e-6 * torch.where(upper.isfinite(), upper - lower, self._sizes[name])
+            lower, upper = lower + margin, upper - margin
+        raw: Tensor = constraint.inverse_transform(value.clamp(lower, upper))
         return raw
 
 

@@ -39,7 +39,7 @@ def parameter_scales(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor
         ranges = inputs.amax(-2, keepdim=True) - inputs.amin(-2, keepdim=True)
         ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
         sizes: dict[str, Tensor] = {}
-        _visit(model.covar_module, "covar_module", inputs, ranges, unit, unit, sizes)
+        _visit(model.covar_module, "covar_module", inputs, ranges, unit, sizes)
         for name, noise in model.likelihood.named_parameters():
             if name.endswith("raw_noise"):
                 sizes[f"likelihood.{name}"] = unit.unsqueeze(-1).expand(noise.shape)
@@ -96,15 +96,13 @@ def _visit(
     name: str,
     inputs: Tensor,
     ranges: Tensor,
-    unit: Tensor,
-    outer: Tensor,
+    scale: Tensor,
     sizes: dict[str, Tensor],
 ) -> None:
     """Walk down a kernel, following what each level does to its inputs and its scale."""
-    scale = outer
     if isinstance(module, PhysicsScaledKernel):
         power = module.physics(inputs).square().mean(-1)
-        scale = (outer / power).where(power > 0, torch.ones_like(outer))
+        scale = (scale / power).where(power > 0, torch.ones_like(scale))
     if isinstance(module, Kernel) and module.active_dims is not None:
         ranges = ranges.index_select(-1, module.active_dims)
     if isinstance(module, ScaleKernel):
@@ -116,4 +114,4 @@ def _visit(
         size = ranges if shape[-1] == ranges.shape[-1] else ranges.mean(-1, keepdim=True)
         sizes[f"{name}.raw_lengthscale"] = size.expand(shape)
     for child_name, child in module.named_children():
-        _visit(child, f"{name}.{child_name}", inputs, ranges, unit, scale, sizes)
+        _visit(child, f"{name}.{child_name}", inputs, ranges, scale, sizes)
