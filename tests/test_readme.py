@@ -1,0 +1,24 @@
+"""What the README shows runs, and its commands are those of CI."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def test_the_example_runs():
+    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    names = {}
+    exec(example, names)
+    truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
+    assert (names["posterior"].mean - truth).abs().max() < 1e-2
+    assert (names["rho"].mean - 2).abs().max() < 0.5
+
+
+def test_ci_runs_the_test_command():
+    _, tests = re.findall(r"```bash\n(.*?)\n```", README, flags=re.DOTALL)
+    script = (ROOT / ".ci" / "run").read_text()
+    install, run = tests.split(" && ")
+    assert install.replace("pip install", "pip install --quiet") in script
+    assert run in script
