@@ -15,7 +15,6 @@ from paper.forrester.figure import draw
 from paper.forrester.models import Protocol
 from paper.forrester.runs import run_all
 
-HERE = Path(__file__).parent.parent
 FIGURE_SEED = 3  # the data set of the six fits
 
 
@@ -27,7 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--jobs", type=int, default=os.cpu_count(), help="parallel processes [all cores]"
     )
     parser.add_argument(
-        "--out", type=Path, default=HERE / "results" / "forrester", help="folder of the results"
+        "--out",
+        type=Path,
+        default=Path("results", "forrester"),
+        help="folder of the results [results/forrester]",
     )
     parser.set_defaults(run=run)
 
