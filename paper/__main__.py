@@ -19,7 +19,12 @@ def main() -> None:
         "report", help="copy the results that are committed into the READMEs"
     ).set_defaults(run=lambda arguments: report())
     arguments = parser.parse_args()
-    arguments.run(arguments)
+    try:
+        arguments.run(arguments)
+    except KeyboardInterrupt:
+        raise SystemExit(
+            "\nInterrupted. The same command goes on where this one stopped."
+        ) from None
 
 
 if __name__ == "__main__":

@@ -24,13 +24,14 @@ class MultiOutputGP(SingleTaskGP):
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the model at *transformed* inputs, as GPyTorch does."""
-        inputs = self.train_inputs[0]
-        if not self.training and args and args[0].shape[-1] != inputs.shape[-1]:
-            raise ValueError(
-                f"In eval mode the model itself takes transformed inputs with {inputs.shape[-1]} "
-                f"columns, got shape {tuple(args[0].shape)}. Call `model.posterior(X)` on raw "
-                "inputs, or `model(model.transform_inputs(X))`."
-            )
+        if not self.training and self.train_inputs is not None and args:
+            expected, found = self.train_inputs[0].shape[-1], args[0].shape
+            if found[-1] != expected:
+                raise ValueError(
+                    f"In eval mode the model itself takes transformed inputs with {expected} "
+                    f"columns, got shape {tuple(found)}. Call `model.posterior(X)` on raw inputs, "
+                    "or `model(model.transform_inputs(X))`."
+                )
         return super().__call__(*args, **kwargs)
 
     def posterior(

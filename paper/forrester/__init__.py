@@ -38,6 +38,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Run the experiment; write and print its table, verdicts and figures."""
     if arguments.runs < 2:
         raise SystemExit(f"--runs: expected at least 2 (for a spread), got {arguments.runs}")
+    if arguments.jobs < 1:
+        raise SystemExit(f"--jobs: expected at least 1 process, got {arguments.jobs}")
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     runs = run_all(arguments.runs, arguments.seed, arguments.jobs, out)

@@ -49,11 +49,13 @@ def test_command_writes_table_claims_and_figures(tmp_path, monkeypatch, capsys):
     assert "CKA" in capsys.readouterr().out
 
 
-def test_needs_two_runs(tmp_path, monkeypatch):
-    arguments = ["paper", "forrester", "--runs", "1", "--out", str(tmp_path)]
+@pytest.mark.parametrize(("option", "value"), [("--runs", "1"), ("--jobs", "0")])
+def test_options_out_of_range(tmp_path, monkeypatch, option, value):
+    arguments = ["paper", "forrester", option, value, "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", arguments)
-    with pytest.raises(SystemExit, match="at least 2"):
+    with pytest.raises(SystemExit, match=f"{option}: expected at least"):
         command_line.main()
+    assert not list(tmp_path.iterdir())
 
 
 def fake_run(reading, protocol, seed):
