@@ -202,7 +202,7 @@ class AR1(MultiOutputGP):
                 raise ValueError("AR1 needs a low level: pass `physics`, or `low_X` and `low_Y`.")
             with torch.no_grad():
                 low_Y = as_physics(physics)(low_X)
-        check_training_data(low_X, low_Y)
+        check_training_data(low_X, low_Y, prefix="low")
         if low_X.shape[-1] != train_X.shape[-1] or low_Y.shape[-1] != train_Y.shape[-1]:
             raise ValueError(
                 f"Expected the low level with {train_X.shape[-1]} inputs and {train_Y.shape[-1]} "

@@ -54,7 +54,7 @@ class TestData:
     @pytest.mark.parametrize("n", [0, 1])
     def test_too_few_points(self, build, kind, XY, n):
         X, Y = XY
-        with pytest.raises(ValueError, match=f"at least 2 training points, got {n}"):
+        with pytest.raises(ValueError, match=f"at least 2 points in train_X, got {n}"):
             build(kind, X[:n], Y[:n])
 
     @pytest.mark.parametrize("name", ["train_X", "train_Y"])
