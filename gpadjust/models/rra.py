@@ -238,11 +238,9 @@ class RRA(AdjustmentGP):
         posterior_transform: PosteriorTransform | None = None,
     ) -> Posterior:
         """The posterior at raw ``X`` (``... x q x d``); see BoTorch."""
-        if self.prior != "paper":
+        everything = output_indices is None or [*output_indices] == [*range(self.num_outputs)]
+        if self.prior != "paper" or not everything:
             return super().posterior(X, output_indices, observation_noise, posterior_transform)
-        if output_indices is not None and list(output_indices) != list(range(self.num_outputs)):
-            subset = self.subset_output(list(output_indices))
-            return subset.posterior(X, None, observation_noise, posterior_transform)
         self.eval()
         inputs, output_dim = self._with_output_dim(self.transform_inputs(X))
         mvn = self._push_forward(AdjustmentFeatures(self)(inputs))
