@@ -48,7 +48,7 @@ def _rmse(table: pd.DataFrame) -> str:
         [name, *(f"{mean[p][name]:.3g} / {median[p][name]:.3g}" for p in ("paper", "gpadjust"))]
         for name in table["model"].unique()
     ]
-    return _markdown(["mean / median RMSE", "paper", "gpadjust"], rows)
+    return _markdown(["mean / median RMSE", "paper's protocol", "`fit`"], rows)
 
 
 def _scores(table: pd.DataFrame) -> str:
@@ -70,7 +70,7 @@ def _claims(claims: pd.DataFrame) -> str:
             for p in ("paper", "gpadjust")
         ]
         rows.append([str(name), str(claim), *found])
-    return _markdown(["", "claim", "paper's protocol", "gpadjust's protocol"], rows)
+    return _markdown(["", "claim", "protocol paper", "protocol gpadjust"], rows)
 
 
 def _markdown(header: list[str], rows: list[list[str]]) -> str:

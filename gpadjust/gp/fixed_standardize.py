@@ -45,7 +45,9 @@ class FixedStandardize(Standardize):
 class RescaledPosterior(GPyTorchPosterior):
     """A posterior in the user's units whose variance is computed in the model's.
 
-    GPyTorch raises every variance to an absolute minimum, which small units would fall below.
+    GPyTorch raises every variance to an absolute minimum (1e-10), which small units would fall
+    below. ``.variance`` is free of that; what is computed from ``.distribution``, by a posterior
+    transform, say, is not: bring targets far below 1e-4 to larger units.
 
     Args:
         distribution: The distribution in the user's units.

@@ -79,6 +79,9 @@ class PhysicsInput(InputTransform):
         return torch.cat([inputs, values.expand(*inputs.shape[:-1], values.shape[-1])], dim=-1)
 
     def _check(self, X: Tensor) -> None:
+        if not isinstance(X, Tensor) or X.dtype != torch.float64:
+            found = X.dtype if isinstance(X, Tensor) else type(X).__name__
+            raise TypeError(f"Expected X as a float64 tensor, got {found}; use `X.double()`.")
         if X.shape[-1] != self.num_inputs:
             raise ValueError(
                 f"Expected X with {self.num_inputs} columns, the inputs that the model was built "

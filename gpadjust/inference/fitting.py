@@ -55,7 +55,8 @@ def fit(
     honoured (maximum a posteriori); parameters with ``requires_grad=False`` stay.
 
     Args:
-        model: Any model of this library, or a ``ModelListGP`` of them.
+        model: Any model of this library, any BoTorch model with batched outputs such as
+            ``SingleTaskGP``, or a ``ModelListGP`` of them.
         num_starts: Number of starts that L-BFGS is run from, for each output.
         num_screened: Number of random starts that are screened; 0 fits from the current
             parameters alone (a warm start). Default: 128, fewer for more than 100 points.
@@ -95,7 +96,8 @@ def fit(
         return results
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(
-            f"Expected a model of gpadjust (or a ModelListGP of them), got {type(model).__name__}."
+            "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "
+            f"ModelListGP of them, got {type(model).__name__}."
         )
     objective = Objective(model)
     space = SearchSpace(objective)

@@ -273,4 +273,10 @@ def _center(center: float | Tensor | str, f_p: Tensor) -> Tensor:
                 "inputs), a number, or a tensor with one number per output."
             )
         return mean
-    return torch.as_tensor(center, dtype=f_p.dtype).expand(mean.shape).clone()
+    offset = torch.as_tensor(center, dtype=f_p.dtype, device=f_p.device)
+    if offset.dim() > 1 or offset.numel() not in (1, f_p.shape[-1]) or not offset.isfinite().all():
+        raise ValueError(
+            f"Expected center to be 'mean', a finite number, or a tensor of {f_p.shape[-1]}, one "
+            f"for each output, got {center}."
+        )
+    return offset.expand(mean.shape).clone()

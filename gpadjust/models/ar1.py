@@ -13,7 +13,9 @@ from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.constraints import Interval
+from gpytorch.distributions import MultivariateNormal
 from gpytorch.kernels import Kernel
+from gpytorch.likelihoods import FixedNoiseGaussianLikelihood
 from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.likelihoods.noise_models import MultitaskHomoskedasticNoise
 from gpytorch.means import ZeroMean
@@ -195,11 +197,16 @@ class AR1(MultiOutputGP):
         seed: int = 0,
     ) -> None:
         check_training_data(train_X, train_Y, train_Yvar)
+        if low_X is None and low_Y is not None:
+            raise ValueError("Got `low_Y` without `low_X`, the inputs that it belongs to.")
         if low_X is None:
             low_X = _samples(train_X, bounds, num_low, seed)
         if low_Y is None:
             if physics is None:
-                raise ValueError("AR1 needs a low level: pass `physics`, or `low_X` and `low_Y`.")
+                raise ValueError(
+                    "AR1 needs a low level: pass `physics` with `bounds` (or with `low_X`), or "
+                    "`low_X` with `low_Y`."
+                )
             with torch.no_grad():
                 low_Y = as_physics(physics)(low_X)
         check_training_data(low_X, low_Y, prefix="low")
@@ -261,9 +268,22 @@ class AR1(MultiOutputGP):
         return {**super().construct_inputs(training_data), **options}
 
     @property
-    def rho(self) -> Tensor:
+    def rho_constant(self) -> Tensor:
         r"""The constant :math:`\rho` of each output, ``batch_shape x (m)``."""
         return self.covar_module.rho.squeeze(-1)
+
+    def _apply_noise(
+        self, X: Tensor, mvn: MultivariateNormal, observation_noise: bool | Tensor = False
+    ) -> MultivariateNormal:
+        """BoTorch's hook for observation noise; known noise is that of the high level."""
+        if observation_noise is True and isinstance(self.likelihood, FixedNoiseGaussianLikelihood):
+            high = self.train_inputs[0][..., -1]
+            noise = (self.likelihood.noise * high).sum(-1, keepdim=True) / high.sum(
+                -1, keepdim=True
+            )
+            shape = torch.broadcast_shapes(mvn.batch_shape + mvn.event_shape, noise.shape)
+            return self.likelihood(mvn, X, noise=noise.expand(shape))
+        return super()._apply_noise(X, mvn, observation_noise)
 
     def posterior(self, X: Tensor, *args: Any, **kwargs: Any) -> Posterior:
         """The posterior of the high level at raw ``X`` (``... x q x d``); see BoTorch."""
@@ -284,7 +304,7 @@ def _samples(train_X: Tensor, bounds: Tensor | None, num_low: int, seed: int) ->
     d = train_X.shape[-1]
     if bounds is None:
         raise ValueError("AR1 samples f_p in `bounds` (2 x d); pass them, or `low_X` and `low_Y`.")
-    bounds = torch.as_tensor(bounds, dtype=train_X.dtype)
+    bounds = torch.as_tensor(bounds, dtype=train_X.dtype, device=train_X.device)
     if bounds.shape != (2, d):
         raise ValueError(f"Expected bounds of shape (2, {d}), got {tuple(bounds.shape)}.")
     if not bounds.isfinite().all() or (bounds[0] >= bounds[1]).any():

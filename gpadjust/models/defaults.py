@@ -47,7 +47,7 @@ def make_kernel(
         batch_shape: The model's batch shape, the outputs last.
     """
     if not isinstance(kernel, Kernel):
-        if isinstance(kernel, torch.nn.Module) or not callable(kernel):
+        if isinstance(kernel, torch.nn.Module | type) or not callable(kernel):
             raise TypeError(f"Expected {name} to be a GPyTorch kernel, got {kernel!r}.")
         return kernel(num_inputs, batch_shape)
     if kernel.batch_shape != batch_shape:

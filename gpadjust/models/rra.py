@@ -92,8 +92,10 @@ class RRA(AdjustmentGP):
     ) -> None:
         if prior not in ("physics", "paper"):
             raise ValueError(f"Unknown prior {prior!r}; expected 'physics' or 'paper'.")
-        if num_features < 1:
-            raise ValueError(f"Expected num_features >= 1, got {num_features}.")
+        if not isinstance(num_features, int) or num_features < 1:
+            raise ValueError(
+                f"Expected num_features to be a whole number >= 1, got {num_features}."
+            )
         if prior == "paper" and isinstance(outcome_transform, _DefaultType):
             outcome_transform = None
 
@@ -211,10 +213,12 @@ class RRA(AdjustmentGP):
         self.eval()
         features = AdjustmentFeatures(self)
         with torch.no_grad():
+            noise = self.likelihood.noise
             if X is None:
                 inputs = self.train_inputs[0]
                 obs: Tensor | None = features.user_units(self.train_targets)
             else:
+                noise = noise.mean(-1, keepdim=True)  # known noise is that of the training points
                 inputs = self.transform_inputs(X)
                 inputs = inputs.expand(*self._aug_batch_shape, *inputs.shape[-2:])
                 obs = Y
@@ -222,7 +226,7 @@ class RRA(AdjustmentGP):
                     obs = Y.mT if self.num_outputs > 1 else Y.squeeze(-1)
             prior_sd = self._prior_sd()
             design, mean = features(inputs), features.prior_mean(inputs)
-            noise_sd = self.likelihood.noise.mean(-1, keepdim=True).sqrt() * self._column.scale
+            noise_sd = noise.sqrt() * self._column.scale
         weights = pyro.sample(
             "weights", dist.Normal(torch.zeros_like(prior_sd), prior_sd).to_event(prior_sd.dim())
         )

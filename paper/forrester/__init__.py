@@ -68,7 +68,7 @@ def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
         nlpd=("nlpd", "mean"),
         crps=("crps", "mean"),
         coverage=("coverage", "mean"),
-        seconds=("seconds", "mean"),
+        seconds=("seconds", "median"),
     )
 
 

@@ -32,7 +32,7 @@ def users_units(ar1, rbf):
     def kernel(part):
         return rbf(part.base_kernel.lengthscale.detach(), part.outputscale.detach() * scale**2)
 
-    return kernel(low), kernel(delta), ar1.rho.item(), noise, shift
+    return kernel(low), kernel(delta), ar1.rho_constant.item(), noise, shift
 
 
 def test_joint_co_kriging(ar1, users_units, levels, close, uniform):
@@ -84,9 +84,9 @@ def test_recursive_co_kriging_on_nested_designs(shuffle, rbf, close, uniform, cr
 
 def test_rho_is_one_number_for_each_output(levels):
     X, Y, low_X, low_Y = levels
-    assert AR1(X, Y, low_X=low_X, low_Y=low_Y).rho.shape == ()
+    assert AR1(X, Y, low_X=low_X, low_Y=low_Y).rho_constant.shape == ()
     two = AR1(X, torch.cat([Y, 2 * Y], -1), low_X=low_X, low_Y=torch.cat([low_Y, low_Y], -1))
-    assert two.rho.shape == (2,)
+    assert two.rho_constant.shape == (2,)
 
 
 def test_each_level_has_a_noise_of_its_own(ar1):
@@ -155,3 +155,13 @@ def test_known_noise_in_raw_units(data, build, num_outputs):
         outcome_transform=None,
         physics=lambda X: small * (2 + X[..., :1].sin()).expand(*X.shape[:-1], num_outputs),
     )
+
+
+@pytest.mark.parametrize("transform", [{}, {"outcome_transform": None}])
+def test_known_noise_of_a_prediction_is_the_high_levels(data, build, uniform, transform):
+    X, Y = data()
+    Yvar = torch.linspace(0.01, 0.03, len(Y), dtype=torch.float64).unsqueeze(-1)
+    model = build("AR1", X, Y, Yvar, **transform)
+    Z = uniform(4, 2, high=2.0, seed=3)
+    added = model.posterior(Z, observation_noise=True).variance - model.posterior(Z).variance
+    torch.testing.assert_close(added, Yvar.mean().expand_as(added))

@@ -153,10 +153,23 @@ class TestOptions:
         with pytest.raises(ValueError, match="in the user's units: outcome_transform=None"):
             build("RRA-paper", *XY, outcome_transform=Standardize(1))
 
-    @pytest.mark.parametrize("num_features", [0, -3])
+    @pytest.mark.parametrize("num_features", [0, -3, 10.5])
     def test_num_features(self, build, XY, num_features):
-        with pytest.raises(ValueError, match=f"num_features >= 1, got {num_features}"):
+        with pytest.raises(ValueError, match=f"a whole number >= 1, got {num_features}"):
             build("RRA", *XY, num_features=num_features)
+
+    @pytest.mark.parametrize("center", [float("nan"), torch.ones(3)])
+    def test_center_of_another_kind(self, build, XY, center):
+        with pytest.raises(ValueError, match="Expected center to be 'mean', a finite number"):
+            build("CKA", *XY, center=center)
+
+    def test_kernel_class(self, build, XY):
+        with pytest.raises(TypeError, match="the kernel of rho to be a GPyTorch kernel"):
+            build("CKA", *XY, rho_covar_module=RBFKernel)
+
+    def test_values_of_the_low_level_without_inputs(self, XY):
+        with pytest.raises(ValueError, match="`low_Y` without `low_X`"):
+            AR1(*XY, low_Y=XY[1])
 
     @pytest.mark.parametrize("kind", ["CKA", "BiasGP", "ScaleGP", "PhysicsMeanGP", "RRA"])
     def test_outcome_transform_that_is_not_linear(self, build, kind, XY):
@@ -219,6 +232,14 @@ class TestAR1:
 
 
 class TestPredictions:
+    @pytest.mark.parametrize("method", ["posterior", "rho", "delta"])
+    def test_inputs_of_another_type(self, build, XY, uniform, method):
+        model = build("CKA", *XY)
+        with pytest.raises(TypeError, match=r"float64 tensor, got torch\.float32"):
+            getattr(model, method)(uniform(4, 2).float())
+        with pytest.raises(TypeError, match="float64 tensor, got ndarray"):
+            getattr(model, method)(uniform(4, 2).numpy())
+
     @pytest.mark.parametrize("kind", ["CKA", "BiasGP", "ScaleGP", "PhysicsMeanGP", "RRA", "AR1"])
     def test_wrong_number_of_columns(self, build, kind, XY, uniform):
         model = build(kind, *XY)

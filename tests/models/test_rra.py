@@ -110,6 +110,14 @@ def test_the_pyro_model_is_the_prior_in_the_users_units(rra, close, uniform):
     close(variance.detach(), (prior * scale**2).detach())
 
 
+def test_the_pyro_model_has_the_known_noise_of_each_point(data, build):
+    X, Y = data()
+    Yvar = torch.linspace(0.001, 0.5, len(Y), dtype=torch.float64).unsqueeze(-1)
+    model = build("RRA", X, Y, Yvar)
+    site = pyro.poutine.trace(model.pyro_model).get_trace().nodes["Y"]
+    torch.testing.assert_close(site["fn"].base_dist.scale.square(), Yvar.squeeze(-1))
+
+
 def test_prior_predictive(data, build, uniform, close):
     model = build("RRA", *data(), num_features=4)
     Z = uniform(5, 2, high=2.0, seed=3)

@@ -89,6 +89,34 @@ def test_interrupted_runs_go_on_where_they_stopped(tmp_path, monkeypatch):
     assert len(frame) == len(calls) * len(MODELS)
 
 
+def test_a_smaller_call_leaves_the_progress_of_a_larger_one(tmp_path, monkeypatch):
+    def stops(*task):
+        if task[2] == 3:
+            raise KeyboardInterrupt
+        return fake_run(*task)
+
+    monkeypatch.setattr(runs_module, "run_one", stops)
+    with pytest.raises(KeyboardInterrupt):
+        runs_module.run_all(5, 0, 1, tmp_path)
+    runs_module.run_all(2, 0, 1, tmp_path)
+    calls = []
+
+    def counts(*task):
+        calls.append(task)
+        return fake_run(*task)
+
+    monkeypatch.setattr(runs_module, "run_one", counts)
+    runs_module.run_all(3, 0, 1, tmp_path)
+    assert ("B", "paper", 2) not in calls
+
+
+def test_rows_cut_short_are_run_again(tmp_path, monkeypatch):
+    pd.DataFrame(fake_run("B", "paper", 0)[:3]).to_csv(tmp_path / "runs.partial.csv", index=False)
+    monkeypatch.setattr(runs_module, "run_one", fake_run)
+    frame = runs_module.run_all(2, 0, 1, tmp_path)
+    assert len(frame) == 2 * 2 * 2 * len(MODELS)
+
+
 def scores(**rmse):
     """Two runs of every model, with the given mean RMSEs and a standard deviation of 0.1 each."""
     rows = []
