@@ -59,7 +59,8 @@ def fit(
             ``SingleTaskGP``, or a ``ModelListGP`` of them.
         num_starts: Number of starts that L-BFGS is run from, for each output.
         num_screened: Number of random starts that are screened; 0 fits from the current
-            parameters alone (a warm start). Default: 128, fewer for more than 100 points.
+            parameters alone (a warm start). Default: 128, fewer for more than 100 points; 32 if
+            the physics learns, which is evaluated at one setting after the other.
         max_iterations: Limit of L-BFGS iterations from each start.
         seed: Seed of the random starts. The global random state is left alone.
 
@@ -102,7 +103,8 @@ def fit(
     objective = Objective(model)
     space = SearchSpace(objective)
     if num_screened is None:
-        num_screened = max(16, min(128, 12_800 // model.train_targets.shape[-1]))
+        most = 128 if objective.is_batched else 32
+        num_screened = max(16, min(most, 12_800 // model.train_targets.shape[-1]))
     starts = objective.current()
     if num_screened:
         generator = torch.Generator().manual_seed(seed)
@@ -139,6 +141,8 @@ def _best(objective: Objective, starts: Tensor, num_starts: int) -> tuple[Tensor
     """The best starts of each problem, best first, and their values."""
     values = _in_chunks(objective, objective, starts)
     order = values.argsort(dim=0)[:num_starts]
+    if num_starts > 1 and not objective.is_batched and not (order == 0).any():
+        order[-1] = 0  # the user's guess of the physics' parameters is worth a start of its own
     index = order.unsqueeze(-1).expand(-1, -1, starts.shape[-1])
     return starts.gather(0, index), values.gather(0, order)
 

@@ -22,7 +22,8 @@ class SearchSpace:
     Lengthscales, outputscales and noises are searched relative to their typical sizes
     (:func:`~gpadjust.models.parameter_scales.parameter_scales`), so that units do not matter.
     Parameters of other kinds start at normal draws around their current values, one to ten times
-    as wide as these are large, and are bounded by nothing but their constraints.
+    as wide as these are large, and are bounded by nothing but their constraints. Those of the
+    physics start within about a third of the user's guesses, which mean something.
 
     Args:
         objective: The objective whose settings are to be searched.
@@ -73,6 +74,8 @@ class SearchSpace:
                 shape = (num_starts, *parameter.shape)
                 noise = torch.randn(shape, generator=generator, dtype=parameter.dtype)
                 spread = 10 ** torch.rand(shape, generator=generator, dtype=parameter.dtype)
+                if name.startswith("input_transform."):
+                    spread = torch.full_like(spread, 0.3)
                 noise = (spread * noise).to(parameter.device)
                 values[name] = parameter + _magnitude(parameter) * noise
         settings = self._objective.flatten(values)

@@ -227,6 +227,14 @@ class TestLearningPhysics:
         model.train()
         torch.testing.assert_close(model.posterior(far).mean, expected)
 
+    @pytest.mark.slow
+    @pytest.mark.parametrize("seed", [1, 3])
+    def test_the_users_guess_is_not_lost_among_aliases(self, seed):
+        X = torch.linspace(0, 3, 15, dtype=torch.float64).unsqueeze(-1)
+        model = CKA(X, 1.7 * (3 * X).sin() + 0.05 * X, physics=Pendulum(2.5))
+        fit(model, seed=seed)
+        assert model.physics.function.rate.item() == pytest.approx(3.0, abs=0.05)
+
     def test_of_several_outputs(self, uniform):
         class Shared(torch.nn.Module):
             def __init__(self):
