@@ -56,6 +56,7 @@ def _fit_panel(ax: Axes, name: str, protocol: Protocol, reading: Reading, seed: 
         x.squeeze(-1), mean - 2 * sd, mean + 2 * sd, color="navy", alpha=0.15, lw=0, label="2 sd"
     )
     if isinstance(model, RRA):
+        torch.manual_seed(seed)
         functions = model.sample_functions(20)(x).squeeze(-1)
         ax.plot(x.squeeze(-1), functions.mT, color="navy", lw=0.4, alpha=0.6)
     ax.plot(x, truth(x), color="black", lw=1, label="truth")
