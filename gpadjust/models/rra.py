@@ -203,8 +203,11 @@ class RRA(AdjustmentGP):
             The values of the function, ``(m) x n``.
 
         Raises:
-            ValueError: If the model has a batch shape besides its outputs.
+            ValueError: If the model has a batch shape besides its outputs, or ``Y`` comes without
+                ``X``.
         """
+        if X is None and Y is not None:
+            raise ValueError("Got `Y` without `X`, the inputs that it belongs to.")
         if self._input_batch_shape:
             raise ValueError(
                 "The Pyro model is of one data set; this model has batch_shape "

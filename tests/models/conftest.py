@@ -38,6 +38,17 @@ def kind(request):
     return request.param
 
 
+_QUICK = ["CKA", "AR1", "RRA", "RRA-paper"]
+
+
+@pytest.fixture(
+    params=[pytest.param(k, marks=() if k in _QUICK else pytest.mark.slow) for k in _CLASSES]
+)
+def costly_kind(request):
+    """As `kind`, for what takes long: the baselines are left to the slow run."""
+    return request.param
+
+
 @pytest.fixture(params=[1, 2], ids=["1-output", "2-outputs"])
 def num_outputs(request):
     return request.param

@@ -18,20 +18,9 @@ BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
 QUICK = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5, "batch_limit": 2}}
 
 
-SLOW = ["ZeroMeanGP", "PhysicsMeanGP", "BiasGP", "ScaleGP"]
-
-
-@pytest.fixture(
-    params=["CKA", "AR1", "RRA", "RRA-paper"]
-    + [pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW]
-)
-def kind(request):
-    return request.param
-
-
 @pytest.fixture
-def model(data, build, kind):
-    return build(kind, *data(), input_transform=Normalize(2)).eval()
+def model(data, build, costly_kind):
+    return build(costly_kind, *data(), input_transform=Normalize(2)).eval()
 
 
 def inside(candidates, q=1):
@@ -64,8 +53,8 @@ def test_one_point_of_cka(data, build, uniform):
 
 
 @pytest.mark.parametrize("acquisition", ["variance", "knowledge gradient"])
-def test_gradients_through_fantasies(data, build, kind, uniform, acquisition):
-    model = build(kind, *data()).eval()
+def test_gradients_through_fantasies(data, build, costly_kind, uniform, acquisition):
+    model = build(costly_kind, *data()).eval()
     if acquisition == "variance":
         function = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
         X = uniform(1, 2, 2, high=2.0, seed=5)
@@ -100,8 +89,8 @@ def test_knowledge_gradient(model):
 
 
 @pytest.mark.slow
-def test_several_outputs(data, build, kind, uniform):
-    model = build(kind, *data(num_outputs=2)).eval()
+def test_several_outputs(data, build, costly_kind, uniform):
+    model = build(costly_kind, *data(num_outputs=2)).eval()
     weigh = ScalarizedPosteriorTransform(torch.tensor([0.5, 0.5], dtype=torch.float64))
     acquisition = qNegIntegratedPosteriorVariance(
         model, mc_points=uniform(30, 2, high=2.0), posterior_transform=weigh

@@ -264,6 +264,10 @@ class TestRRA:
         with pytest.raises(ValueError, match=r"this model has batch_shape \(2,\)"):
             model.pyro_model()
 
+    def test_pyro_model_of_targets_without_inputs(self, build, XY):
+        with pytest.raises(ValueError, match="`Y` without `X`"):
+            build("RRA", *XY).pyro_model(Y=XY[1])
+
     @pytest.mark.parametrize("shape", [(48,), (3, 47), (3, 1, 48)])
     def test_weights_of_another_shape(self, build, XY, shape):
         model = build("RRA", *XY)

@@ -7,16 +7,6 @@ from botorch.models import ModelListGP
 from botorch.models.transforms import Normalize, Standardize
 from gpytorch.mlls import ExactMarginalLogLikelihood, SumMarginalLogLikelihood
 
-SLOW = ["ZeroMeanGP", "PhysicsMeanGP", "BiasGP", "ScaleGP"]
-
-
-@pytest.fixture(
-    params=["CKA", "AR1", "RRA", "RRA-paper"]
-    + [pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW]
-)
-def kind(request):
-    return request.param
-
 
 def log_likelihood(model):
     model.train()
@@ -28,9 +18,9 @@ def log_likelihood(model):
 
 
 @pytest.mark.parametrize("batch_shape", [(), (2,)], ids=["single", "batch"])
-def test_the_likelihood_rises(data, build, kind, num_outputs, batch_shape):
+def test_the_likelihood_rises(data, build, costly_kind, num_outputs, batch_shape):
     X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
-    model = build(kind, X, Y)
+    model = build(costly_kind, X, Y)
     before = log_likelihood(model)
     fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     assert not model.training
@@ -38,13 +28,13 @@ def test_the_likelihood_rises(data, build, kind, num_outputs, batch_shape):
 
 
 @pytest.mark.parametrize("transform", ["none", "standardize"])
-def test_with_transforms_and_known_noise(data, build, kind, transform):
-    if kind == "RRA-paper" and transform == "standardize":
+def test_with_transforms_and_known_noise(data, build, costly_kind, transform):
+    if costly_kind == "RRA-paper" and transform == "standardize":
         pytest.skip("is refused")
     X, Y = data()
     outcome = Standardize(1) if transform == "standardize" else None
     model = build(
-        kind,
+        costly_kind,
         X,
         Y,
         torch.full_like(Y, 1e-3),
@@ -56,9 +46,9 @@ def test_with_transforms_and_known_noise(data, build, kind, transform):
     assert log_likelihood(model) > before
 
 
-def test_in_a_model_list(data, build, kind, uniform):
+def test_in_a_model_list(data, build, costly_kind, uniform):
     X, Y = data(num_outputs=2)
-    first, second = build(kind, X, Y[:, :1]), build(kind, X[2:], Y[2:, :1])
+    first, second = build(costly_kind, X, Y[:, :1]), build(costly_kind, X[2:], Y[2:, :1])
     model = ModelListGP(first, second)
     fit_gpytorch_mll(SumMarginalLogLikelihood(model.likelihood, model))
     Z = uniform(5, 4, 2)

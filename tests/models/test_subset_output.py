@@ -8,25 +8,15 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gpadjust import fit
 
-SLOW = ["ZeroMeanGP", "PhysicsMeanGP", "BiasGP", "ScaleGP"]
-
-
-@pytest.fixture(
-    params=["CKA", "AR1", "RRA", "RRA-paper"]
-    + [pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW]
-)
-def kind(request):
-    return request.param
-
 
 @pytest.fixture(params=["plain", "transformed", "known-noise", "batch"])
-def three_outputs(request, data, build, kind, crude_physics, shuffle):
+def three_outputs(request, data, build, costly_kind, crude_physics, shuffle):
     """A model of three different outputs."""
     batch = (2,) if request.param == "batch" else ()
     X, Y = data(batch_shape=batch, num_outputs=2)
     Y = torch.cat([Y, Y[..., :1].sin() + 3], dim=-1)
     options = {}
-    if kind != "ZeroMeanGP":
+    if costly_kind != "ZeroMeanGP":
 
         def physics(X):
             f_p = crude_physics(X)
@@ -35,9 +25,9 @@ def three_outputs(request, data, build, kind, crude_physics, shuffle):
         options["physics"] = physics
     if request.param == "transformed":
         options["input_transform"] = Normalize(2)
-        options["outcome_transform"] = None if kind == "RRA-paper" else Standardize(3)
+        options["outcome_transform"] = None if costly_kind == "RRA-paper" else Standardize(3)
     Yvar = 0.01 * torch.ones_like(Y) if request.param == "known-noise" else None
-    return shuffle(build(kind, X, Y, Yvar, **options))
+    return shuffle(build(costly_kind, X, Y, Yvar, **options))
 
 
 @pytest.mark.parametrize("indices", [[1], [2, 0]])
@@ -54,17 +44,17 @@ def test_the_posterior_is_that_of_the_whole(three_outputs, uniform, indices):
 
 
 @pytest.mark.parametrize("indices", [[1], [2, 0]])
-def test_it_can_be_fitted_again(data, build, kind, crude_physics, uniform, indices):
+def test_it_can_be_fitted_again(data, build, costly_kind, crude_physics, uniform, indices):
     X, Y = data(num_outputs=2)
     Y = torch.cat([Y, Y[:, :1].sin() + 3], dim=-1)
     options = {}
-    if kind != "ZeroMeanGP":
+    if costly_kind != "ZeroMeanGP":
         options["physics"] = lambda X: torch.cat(
             [crude_physics(X), crude_physics(X)[..., :1].cos() + 3], dim=-1
         )
-    whole = build(kind, X, Y, **options)
+    whole = build(costly_kind, X, Y, **options)
     part = whole.subset_output(indices)
-    if kind != "ZeroMeanGP":
+    if costly_kind != "ZeroMeanGP":
         # A subset still reads all columns of f_p.
         assert part.posterior(X).mean.shape == (len(X), len(indices))
     refitted = whole.subset_output(indices)
