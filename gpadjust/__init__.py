@@ -1,6 +1,6 @@
 """Gaussian processes that adjust a physics model to data."""
 
-from gpadjust.inference import FitResult, fit
+from gpadjust.inference import Comparison, FitResult, SampleResult, compare, fit
 from gpadjust.models import (
     AR1,
     CKA,
@@ -20,13 +20,16 @@ __all__ = [
     "RRA",
     "BiasGP",
     "BlackBoxPhysics",
+    "Comparison",
     "FitResult",
     "FunctionPhysics",
     "ODEPhysics",
     "Physics",
     "PhysicsError",
     "PhysicsMeanGP",
+    "SampleResult",
     "ScaleGP",
     "ZeroMeanGP",
+    "compare",
     "fit",
 ]

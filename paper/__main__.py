@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from paper import forrester
+from paper import forrester, multifidelity
 from paper.report import report
 
 
@@ -13,7 +13,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m paper", description=__doc__)
     experiments = parser.add_subparsers(dest="experiment", required=True, metavar="experiment")
     forrester.add_arguments(
-        experiments.add_parser("forrester", help="seven models of Forrester's function (figure 1)")
+        experiments.add_parser("forrester", help="eight models of Forrester's function (figure 1)")
+    )
+    multifidelity.add_arguments(
+        experiments.add_parser(
+            "multifidelity", help="eight methods on functions of low and high fidelity"
+        )
     )
     experiments.add_parser(
         "report", help="copy the results that are committed into the READMEs"

@@ -10,6 +10,17 @@ import pandas as pd
 PAPER = Path(__file__).parent
 READMES = (PAPER.parent / "README.md", PAPER / "README.md")
 
+NOT_RUN = "No results yet."
+SCORES = {
+    "nrmse": "nrmse_median",
+    "nlpd": "nlpd_median",
+    "nlpd-mean": "nlpd_mean",
+    "crps": "crps_median",
+    "coverage": "coverage",
+    "seconds": "seconds",
+}
+LOWER_IS_BETTER = ("nrmse_median", "nlpd_median", "nlpd_mean", "crps_median")
+
 
 def report() -> None:
     """Write every result into the READMEs."""
@@ -38,6 +49,11 @@ def results(folder: Path) -> dict[str, str]:
     for (reading, protocol), part in table.groupby(["reading", "protocol"]):
         fragments[f"forrester:{reading}:{protocol}"] = _scores(part)
     fragments["forrester:claims"] = _claims(claims[claims["reading"] == "B"])
+    path = folder / "multifidelity" / "table.csv"
+    pairs = pd.read_csv(path) if path.exists() else None
+    for name, column in SCORES.items():
+        fragments[f"multifidelity:{name}"] = NOT_RUN if pairs is None else _scores_of(pairs, column)
+    fragments["multifidelity:short"] = NOT_RUN if pairs is None else _short(pairs)
     return fragments
 
 
@@ -71,6 +87,40 @@ def _claims(claims: pd.DataFrame) -> str:
         ]
         rows.append([str(name), str(claim), *found])
     return _markdown(["", "claim", "protocol paper", "protocol gpadjust"], rows)
+
+
+def _scores_of(table: pd.DataFrame, column: str) -> str:
+    """One score: a row for each pair and number of observations, a column for each method."""
+    methods = list(table["method"].unique())
+    rows = []
+    for (name, N), part in table.groupby(["pair", "N"], sort=False):
+        by_method = part.set_index("method")[column]
+        rows.append([f"{name}, N = {N}", *_cells(by_method[methods], column in LOWER_IS_BETTER)])
+    return _markdown(["", *methods], rows)
+
+
+def _short(table: pd.DataFrame) -> str:
+    """The median errors with 5 observations per input; coverage and time over all pairs."""
+    table = table[table["per_input"] == 5]
+    methods = list(table["method"].unique())
+    rows = []
+    for (name, N), part in table.groupby(["pair", "N"], sort=False):
+        errors = part.set_index("method")["nrmse_median"]
+        rows.append([f"{name}, N = {N}", *_cells(errors[methods], mark_best=True)])
+    by_method = table.groupby("method")
+    for label, values in (
+        ("mean coverage of 95 %", by_method["coverage"].mean()),
+        ("median seconds", by_method["seconds"].median()),
+    ):
+        rows.append([label, *_cells(values[methods], mark_best=False)])
+    return _markdown(["median RMSE / sd", *methods], rows)
+
+
+def _cells(values: pd.Series[float], mark_best: bool) -> list[str]:
+    """Two digits of each value, the lowest in bold (and what looks the same)."""
+    cells = [f"{value:.2g}" for value in values]
+    best = f"{values.min():.2g}"
+    return [f"**{cell}**" if mark_best and cell == best else cell for cell in cells]
 
 
 def _markdown(header: list[str], rows: list[list[str]]) -> str:

@@ -7,13 +7,17 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 
-def test_the_example_runs():
-    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+def test_the_examples_run(capsys):
+    first, second = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     names = {}
-    exec(example, names)
+    exec(first, names)
     truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
     assert (names["posterior"].mean - truth).abs().max() < 1e-2
     assert (names["rho"].mean - 2).abs().max() < 0.5
+    exec(second, names)
+    assert "physics mean" in capsys.readouterr().out
+    assert (names["mixture"].mixture_mean - truth).abs().max() < 1e-2
+    assert names["loo"].rmse < 1e-2
 
 
 def test_ci_runs_the_test_command():

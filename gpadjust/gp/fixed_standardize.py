@@ -7,6 +7,7 @@ from typing import Self
 import torch
 from botorch.models.transforms.outcome import Standardize
 from botorch.posteriors import GPyTorchPosterior, Posterior, TransformedPosterior
+from gpytorch.settings import min_variance
 from torch import Tensor
 
 
@@ -45,9 +46,9 @@ class FixedStandardize(Standardize):
 class RescaledPosterior(GPyTorchPosterior):
     """A posterior in the user's units whose variance is computed in the model's.
 
-    GPyTorch raises every variance to an absolute minimum (1e-10), which small units would fall
-    below. ``.variance`` is free of that; what is computed from ``.distribution``, by a posterior
-    transform, say, is not: bring targets far below 1e-4 to larger units.
+    GPyTorch raises every variance to an absolute minimum (1e-10), which small units and noise-free
+    data would fall below. ``.variance`` is free of that; what is computed from ``.distribution``,
+    by a posterior transform, say, is not: bring targets far below 1e-4 to larger units.
 
     Args:
         distribution: The distribution in the user's units.
@@ -63,5 +64,6 @@ class RescaledPosterior(GPyTorchPosterior):
     @property
     def variance(self) -> Tensor:
         """The posterior variance, ``batch_shape x q x m``."""
-        variance: Tensor = self._scaled.variance * self._factor
+        with min_variance(double_value=0.0):
+            variance: Tensor = self._scaled.variance * self._factor
         return variance

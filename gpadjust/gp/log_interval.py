@@ -29,3 +29,22 @@ class LogInterval(Interval):
     def inverse_transform(self, transformed_tensor: Tensor) -> Tensor:
         """Map the parameter to the raw parameter."""
         return transformed_tensor.log()
+
+
+class DataInterval(LogInterval):
+    """A :class:`LogInterval` whose bounds are read off the data, as nobody gave any.
+
+    They are for optimisers that know of boxes only; :func:`gpadjust.fit` searches the ratios of
+    variances instead. Any positive value may be set, as Pyro's samplers do that follow a prior.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(1e-12, 1e12)
+
+    def check(self, tensor: Tensor) -> bool:
+        """Whether all elements are valid values of the parameter."""
+        return bool((tensor >= 0).all())
+
+    def check_raw(self, tensor: Tensor) -> bool:
+        """Whether all elements are valid raw parameters."""
+        return self.check(self.transform(tensor))

@@ -94,8 +94,11 @@ class PhysicsColumn(Module):
                 f"got x with shape {tuple(x.shape)}. The model's input transform appends f_p: call "
                 "`model.posterior(X)`, or `model(model.transform_inputs(X))` in eval mode."
             )
-        values = (x[..., self.num_inputs :] * self.select).sum(-1)
-        return (values - self.offset) / self.scale
+        values = (x[..., self.num_inputs :] * self.select).sum(-1) - self.offset
+        # Differences of rounding errors are none: a physics that is constant has no variation.
+        rounding = 8 * torch.finfo(values.dtype).eps * self.offset.abs()
+        values = torch.where(values.abs() <= rounding, values - values.detach(), values)
+        return values / self.scale
 
     def __getitem__(self, index: Any) -> PhysicsColumn:
         """The reader of a part of the batch, as GPyTorch indexes batched kernels."""

@@ -14,13 +14,14 @@ from botorch.posteriors import GPyTorchPosterior
 from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
-from gpytorch.kernels import Kernel
+from gpytorch.kernels import AdditiveKernel, Kernel
 from gpytorch.likelihoods import Likelihood
 from linear_operator import to_dense, to_linear_operator
 from torch import Size, Tensor
 from torch.nn import Module
 
 from gpadjust.gp import (
+    AdjustedMean,
     FixedStandardize,
     InputsKernel,
     PhysicsColumn,
@@ -28,10 +29,13 @@ from gpadjust.gp import (
     PhysicsMean,
     PhysicsScaledKernel,
     RescaledPosterior,
+    UnknownMeanKernel,
 )
 from gpadjust.models.defaults import default_likelihood, make_kernel
+from gpadjust.models.hyperparameter_samples import HyperparameterMixture
 from gpadjust.models.multi_output_gp import MultiOutputGP
 from gpadjust.models.parameter_scales import set_initial_values
+from gpadjust.models.target_units import affine, kernel_center, residual_scale
 from gpadjust.models.training_data import check_training_data
 from gpadjust.physics import Physics, as_physics
 
@@ -67,6 +71,8 @@ class AdjustmentGP(MultiOutputGP):
         rho_covar_module: Kernel | Callable[[int, Size], Kernel] | None,
         delta_covar_module: Kernel | Callable[[int, Size], Kernel] | None,
         center: float | Tensor | Literal["mean"] = 0.0,
+        learn_rho_mean: bool = False,
+        learn_delta_mean: bool = False,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
@@ -85,28 +91,38 @@ class AdjustmentGP(MultiOutputGP):
         batch_shape = self.get_batch_dimensions(train_X, train_Y)[1]
         if isinstance(outcome_transform, _DefaultType):
             outcome_transform = residual_scale(train_Y, f_p)
-        shift, scale = _affine(outcome_transform, train_Y, X)
+        shift, scale = affine(outcome_transform, train_Y, X)
         if outcome_transform is not None:
             outcome_transform = FixedStandardize.of(shift, scale)
-        offset = _center(center, f_p)
+        offset = kernel_center(center, f_p)
         to_outputs = (lambda t: t.mT) if m > 1 else (lambda t: t.squeeze(-1))
         mean = PhysicsColumn(d, m, batch_shape, to_outputs(shift), to_outputs(scale))
         column = PhysicsColumn(d, m, batch_shape, to_outputs(offset), to_outputs(scale))
 
         terms: list[Kernel] = []
-        if rho_covar_module is not None:
-            kernel = make_kernel(rho_covar_module, "the kernel of rho", d, batch_shape)
-            terms.append(PhysicsScaledKernel(InputsKernel(kernel, d), column))
-        if delta_covar_module is not None:
-            kernel = make_kernel(delta_covar_module, "the kernel of delta", d, batch_shape)
-            terms.append(InputsKernel(kernel, d))
+        rho = _prior_kernel(rho_covar_module, "rho", d, batch_shape, learn_rho_mean)
+        if rho is not None:
+            terms.append(PhysicsScaledKernel(InputsKernel(rho, d), column))
+        delta = _prior_kernel(delta_covar_module, "delta", d, batch_shape, learn_delta_mean)
+        if delta is not None:
+            terms.append(InputsKernel(delta, d))
+        learn_means = learn_rho_mean or learn_delta_mean
+        num_unknown = int(learn_rho_mean) + int(learn_delta_mean)
+        if train_X.shape[-2] < 2 + num_unknown and learn_means:
+            raise ValueError(
+                f"Expected at least {2 + num_unknown} points to learn {num_unknown} constant means "
+                f"and a variance, got {train_X.shape[-2]}; leave `learn_rho_mean` and "
+                "`learn_delta_mean` at False."
+            )
         super().__init__(
             train_X,
             train_Y,
             train_Yvar,
             likelihood=likelihood or default_likelihood(train_Yvar, batch_shape),
             covar_module=terms[0] if len(terms) == 1 else terms[0] + terms[1],
-            mean_module=PhysicsMean(mean),
+            mean_module=(
+                AdjustedMean(mean, column, batch_shape) if learn_means else PhysicsMean(mean)
+            ),
             outcome_transform=outcome_transform,
             input_transform=transform,
         )
@@ -123,13 +139,50 @@ class AdjustmentGP(MultiOutputGP):
     def rho_covar_module(self) -> Any:
         r"""The kernel :math:`k_\rho` on the inputs, or None if the model has no rho."""
         kernel = self._kernel("rho")
-        return None if kernel is None else kernel.base_kernel.base_kernel
+        return None if kernel is None else _without_constant(kernel.base_kernel.base_kernel)
 
     @property
     def delta_covar_module(self) -> Any:
         r"""The kernel :math:`k_\delta` on the inputs, or None if the model has no delta."""
         kernel = self._kernel("delta")
-        return None if kernel is None else kernel.base_kernel
+        return None if kernel is None else _without_constant(kernel.base_kernel)
+
+    @property
+    def constant_means(self) -> dict[str, Callable[[Tensor], Tensor]]:
+        """The unknown constant means: the names of their (log) prior variances, and their bases."""
+        rho = self._kernel("rho")
+        bases: dict[str, Callable[[Tensor], Tensor]] = {}
+        for name, module in self.covar_module.named_modules(prefix="covar_module"):
+            if isinstance(module, UnknownMeanKernel):
+                of_rho = rho is not None and module in set(rho.modules())
+                bases[f"{name}.raw_constant"] = self._column if of_rho else _ones
+        return bases
+
+    @property
+    def constant_mean_values(self) -> Tensor:
+        """The prior means of the unknown constants, ``batch_shape x (m) x q``."""
+        return torch.cat([self._constant(basis) for basis in self.constant_means.values()], -1)
+
+    def _constant(self, basis: Callable[[Tensor], Tensor]) -> Tensor:
+        mean = self.mean_module
+        return mean.delta_mean if basis is _ones else mean.rho_mean
+
+    def set_constant_means(self, values: Tensor, variance: Tensor) -> None:
+        r"""Set the prior means and variances of the unknown constants.
+
+        With the generalised least squares estimate as its mean and many of its standard errors as
+        its standard deviation, the prior of a constant is flat for all purposes, and the posterior
+        that of universal kriging.
+
+        Args:
+            values: The prior means, ``batch_shape x (m) x q``.
+            variance: The prior variances, of the same shape.
+        """
+        named = dict(self.named_parameters())
+        with torch.no_grad():
+            for i, (name, basis) in enumerate(self.constant_means.items()):
+                self._constant(basis).copy_(values[..., i : i + 1])
+                named[name].copy_(variance[..., i : i + 1].clamp_min(1e-100).log())
 
     @classmethod
     def construct_inputs(
@@ -155,17 +208,27 @@ class AdjustmentGP(MultiOutputGP):
     def _adjustment(self, X: Tensor, component: Component) -> GPyTorchPosterior:
         """The posterior of rho or delta at ``X``; f_p is not evaluated there."""
         self.eval()
-        X, output_dim = self._with_output_dim(self.input_transform.without_physics(X))
+        X = self.input_transform.without_physics(self._for_samples(X))
+        X, output_dim = self._with_output_dim(X)
         with gpt_posterior_settings(), self._infer(component):
             mvn = self(X)
-        if component == "rho":
-            return self._as_posterior(mvn, output_dim)
-        scale = self._column.scale  # from the units of the targets to the user's
+        posterior = self._as_posterior(mvn, output_dim)
+        if component == "delta":
+            posterior = self._rescaled(mvn, posterior, output_dim)
+        else:
+            posterior = RescaledPosterior(posterior.distribution, posterior, torch.ones(()))
+        return posterior if self.num_samples is None else HyperparameterMixture(posterior)
+
+    def _rescaled(
+        self, mvn: MultivariateNormal, posterior: GPyTorchPosterior, output_dim: int | None
+    ) -> GPyTorchPosterior:
+        """A posterior in the units of the targets, brought to the user's."""
+        scale = self._column.scale
         covariance = to_dense(mvn.lazy_covariance_matrix) * scale.unsqueeze(-1).square()
         rescaled = MultivariateNormal(mvn.mean * scale, to_linear_operator(covariance))
         return RescaledPosterior(
             self._as_posterior(rescaled, output_dim).distribution,
-            self._as_posterior(mvn, output_dim),
+            posterior,
             scale.mT.square() if self._num_outputs > 1 else scale.unsqueeze(-1).square(),
         )
 
@@ -219,9 +282,8 @@ class AdjustmentGP(MultiOutputGP):
         if self._component == "delta" and delta is not None:
             test_test = test_test + to_dense(delta(test, test))
             test_train = test_train + to_dense(delta(test, train))
-        prior_mean = self._rho_mean if self._component == "rho" else 0.0
         return (
-            test.new_full((*batch_shape, test.shape[-2]), prior_mean),
+            self._prior_mean(self._component, test[..., 0]),
             to_linear_operator(test_test),
             to_linear_operator(test_train),
             batch_shape,
@@ -229,54 +291,40 @@ class AdjustmentGP(MultiOutputGP):
             MultivariateNormal,
         )
 
-
-def residual_scale(train_Y: Tensor, mean: Tensor) -> FixedStandardize:
-    """The default outcome transform: divide by the root mean square of ``train_Y - mean``.
-
-    Args:
-        train_Y: Targets, ``batch_shape x n x m``.
-        mean: The prior mean at the training inputs, of the same shape. Where it meets the targets
-            exactly, the scale is a millionth of theirs (or 1 if they are zero).
-    """
-
-    def rms(values: Tensor) -> Tensor:
-        return values.square().mean(-2, keepdim=True).sqrt()
-
-    scale, size = rms(train_Y - mean), rms(train_Y)
-    tiny = 1e-6 * size.where(size > 0, torch.full_like(size, 1e6))
-    return FixedStandardize.of(torch.zeros_like(scale), scale.where(scale > 0, tiny))
+    def _prior_mean(self, component: Component, like: Tensor) -> Tensor:
+        """The prior mean of rho or delta, of the shape ``... x n`` of ``like``."""
+        constants = self.mean_module
+        if not isinstance(constants, AdjustedMean):
+            return torch.full_like(like, self._rho_mean if component == "rho" else 0.0)
+        if component == "rho":
+            return constants.rho_mean.expand_as(like)
+        c = self._column.offset / self._column.scale
+        return (constants.delta_mean - c * (constants.rho_mean - 1)).expand_as(like)
 
 
-def _affine(transform: Standardize | None, train_Y: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Shift and scale (``batch_shape x 1 x m``) that an outcome transform puts on the targets."""
-    if transform is None:
-        return torch.zeros_like(train_Y[..., :1, :]), torch.ones_like(train_Y[..., :1, :])
-    if type(transform) not in (Standardize, FixedStandardize):
-        raise ValueError(
-            f"The outcome transform {type(transform).__name__} is not supported: f_p lives in the "
-            "units of the targets, so the transform must be one shift and scale per output. Use "
-            "Standardize, None, or the default, which divides by the residual's scale; to model "
-            "log(y), say, take the logarithm of both train_Y and the physics."
-        )
-    transform.train()
-    transform(train_Y, X=X)
-    return transform.means, transform.stdvs
+def _prior_kernel(
+    kernel: Kernel | Callable[[int, Size], Kernel] | None,
+    component: Component,
+    num_inputs: int,
+    batch_shape: Size,
+    learn_mean: bool,
+) -> Kernel | None:
+    """The kernel of rho or delta: the user's or the default, and that of an unknown mean."""
+    made = None
+    if kernel is not None:
+        made = make_kernel(kernel, f"the kernel of {component}", num_inputs, batch_shape)
+    if not learn_mean:
+        return made
+    constant = UnknownMeanKernel(batch_shape)
+    return constant if made is None else AdditiveKernel(made, constant)
 
 
-def _center(center: float | Tensor | str, f_p: Tensor) -> Tensor:
-    """The constant c of the kernel on ``f_p - c``, as ``batch_shape x 1 x m``."""
-    mean = f_p.mean(-2, keepdim=True)
-    if isinstance(center, str):
-        if center != "mean":
-            raise ValueError(
-                f"Unknown center {center!r}; expected 'mean' (the mean of f_p at the training "
-                "inputs), a number, or a tensor with one number per output."
-            )
-        return mean
-    offset = torch.as_tensor(center, dtype=f_p.dtype, device=f_p.device)
-    if offset.dim() > 1 or offset.numel() not in (1, f_p.shape[-1]) or not offset.isfinite().all():
-        raise ValueError(
-            f"Expected center to be 'mean', a finite number, or a tensor of {f_p.shape[-1]}, one "
-            f"for each output, got {center}."
-        )
-    return offset.expand(mean.shape).clone()
+def _without_constant(kernel: Kernel) -> Kernel:
+    """The kernel that the user gave, without that of an unknown mean."""
+    parts = getattr(kernel, "kernels", [kernel])
+    return parts[0] if isinstance(parts[-1], UnknownMeanKernel) else kernel
+
+
+def _ones(inputs: Tensor) -> Tensor:
+    """The basis of a constant, ``... x n``."""
+    return torch.ones_like(inputs[..., 0])

@@ -23,10 +23,11 @@ from linear_operator import to_dense
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
-from gpadjust.gp import FixedStandardize, InputsKernel
-from gpadjust.models.defaults import make_kernel, scaled_rbf, wide
+from gpadjust.gp import DataInterval, FixedStandardize, InputsKernel
+from gpadjust.models.defaults import make_kernel, scaled_rbf
 from gpadjust.models.multi_output_gp import MultiOutputGP
 from gpadjust.models.parameter_scales import set_initial_values
+from gpadjust.models.prediction import Prediction
 from gpadjust.models.training_data import check_training_data
 from gpadjust.physics import Physics, as_physics
 
@@ -138,6 +139,8 @@ class LevelLikelihood(_GaussianLikelihoodBase):
     def _shaped_noise_covar(
         self, base_shape: Size, *params: Any, **kwargs: Any
     ) -> DiagLinearOperator:
+        if kwargs.get("noise") is not None:
+            return DiagLinearOperator(kwargs["noise"])
         inputs = params[0] if isinstance(params[0], Tensor) else params[0][0]
         high = inputs[..., -1]
         low_noise, high_noise = self.noise[..., :1], self.noise[..., 1:]
@@ -233,7 +236,7 @@ class AR1(MultiOutputGP):
         )
         Yvar = likelihood = None
         if train_Yvar is None:
-            likelihood = LevelLikelihood(wide(), batch_shape)
+            likelihood = LevelLikelihood(DataInterval(), batch_shape)
         else:
             # f_p is known without error, but GPyTorch wants at least 1e-6 for fixed noise.
             low_Yvar = 1e-5 * low_Y.var(-2, keepdim=True)
@@ -272,6 +275,11 @@ class AR1(MultiOutputGP):
         r"""The constant :math:`\rho` of each output, ``batch_shape x (m)``."""
         return self.covar_module.rho.squeeze(-1)
 
+    def _measured(self, inputs: Tensor) -> tuple[Tensor, slice]:
+        """For leave-one-out: inputs without their level, and the rows of the high level."""
+        num_low = int((inputs[..., -1] == 0).sum(-1).max())
+        return inputs[..., :-1], slice(num_low, None)
+
     def _apply_noise(
         self, X: Tensor, mvn: MultivariateNormal, observation_noise: bool | Tensor = False
     ) -> MultivariateNormal:
@@ -287,12 +295,21 @@ class AR1(MultiOutputGP):
 
     def posterior(self, X: Tensor, *args: Any, **kwargs: Any) -> Posterior:
         """The posterior of the high level at raw ``X`` (``... x q x d``); see BoTorch."""
+        self._check_columns(X)
+        return super().posterior(X, *args, **kwargs)
+
+    def predict(self, X: Tensor, observation_noise: bool | Tensor = False) -> Prediction:
+        """Predict the high level at each point of raw ``X`` (``... x q x d``) by itself."""
+        self._check_columns(X)
+        return super().predict(X, observation_noise)
+
+    def _check_columns(self, X: Tensor) -> None:
+        """Refuse the level, which training inputs may bring."""
         if X.shape[-1] != self.input_transform.num_inputs:
             raise ValueError(
                 f"Expected X with {self.input_transform.num_inputs} columns, the inputs that the "
                 f"model was built on, got shape {tuple(X.shape)}."
             )
-        return super().posterior(X, *args, **kwargs)
 
     def condition_on_observations(self, X: Tensor, Y: Tensor, **kwargs: Any) -> Self:
         """Condition on observations of the high level; see BoTorch."""

@@ -15,7 +15,7 @@ from gpytorch.likelihoods import Likelihood
 from gpytorch.means import ZeroMean
 from torch import Tensor
 
-from gpadjust.models.adjustment_gp import AdjustmentGP, residual_scale
+from gpadjust.models.adjustment_gp import AdjustmentGP
 from gpadjust.models.defaults import (
     default_likelihood,
     make_kernel,
@@ -23,6 +23,7 @@ from gpadjust.models.defaults import (
 )
 from gpadjust.models.multi_output_gp import MultiOutputGP
 from gpadjust.models.parameter_scales import set_initial_values
+from gpadjust.models.target_units import residual_scale
 from gpadjust.models.training_data import check_training_data
 from gpadjust.physics import Physics
 
@@ -84,6 +85,8 @@ class PhysicsMeanGP(AdjustmentGP):
         train_Yvar: Known observation variances, or None to learn one per output.
         physics: The physics f_p, as in :class:`~gpadjust.CKA`.
         covar_module: The kernel. Default: RBF with a lengthscale per input.
+        learn_rho_mean: Scale the physics by an unknown constant, :math:`f \sim GP(\rho f_p, k)`.
+        learn_delta_mean: Add an unknown constant to the mean.
         likelihood: As in :class:`~gpadjust.CKA`.
         outcome_transform: As in :class:`~gpadjust.CKA`.
         input_transform: As in :class:`~gpadjust.CKA`.
@@ -102,6 +105,8 @@ class PhysicsMeanGP(AdjustmentGP):
         *,
         physics: Physics | Callable[[Tensor], Tensor],
         covar_module: Kernel | None = None,
+        learn_rho_mean: bool = False,
+        learn_delta_mean: bool = False,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
@@ -113,6 +118,8 @@ class PhysicsMeanGP(AdjustmentGP):
             physics=physics,
             rho_covar_module=None,
             delta_covar_module=covar_module or scaled_rbf,
+            learn_rho_mean=learn_rho_mean,
+            learn_delta_mean=learn_delta_mean,
             likelihood=likelihood,
             outcome_transform=outcome_transform,
             input_transform=input_transform,

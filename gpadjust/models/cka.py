@@ -43,6 +43,10 @@ class CKA(AdjustmentGP):
         center: With a constant c, the kernel is built on :math:`f_p - c`, in the user's units
             (``"mean"``: its mean at ``train_X``). The literal model has 0. Take ``"mean"`` where
             f_p varies little about a large constant, which rho and delta would dispute otherwise.
+        learn_rho_mean: Take the constant mean of :math:`\rho` as unknown instead of 1, with a vague
+            prior, as in universal kriging: for a physics that is wrong by an unknown factor
+            throughout. Far from the data the model then falls back to the scaled physics.
+        learn_delta_mean: Take the constant mean of :math:`\delta` as unknown instead of 0.
         likelihood: A Gaussian likelihood. Default: learnt noise, at least 1e-6 of the mean square
             of ``train_Y - f_p``.
         outcome_transform: ``Standardize`` or None. Default: division by the root mean square of
@@ -77,6 +81,8 @@ class CKA(AdjustmentGP):
         rho_covar_module: Kernel | None = None,
         delta_covar_module: Kernel | None = None,
         center: float | Tensor | Literal["mean"] = 0.0,
+        learn_rho_mean: bool = False,
+        learn_delta_mean: bool = False,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
@@ -89,6 +95,8 @@ class CKA(AdjustmentGP):
             rho_covar_module=rho_covar_module or scaled_rbf,
             delta_covar_module=delta_covar_module or scaled_rbf,
             center=center,
+            learn_rho_mean=learn_rho_mean,
+            learn_delta_mean=learn_delta_mean,
             likelihood=likelihood,
             outcome_transform=outcome_transform,
             input_transform=input_transform,

@@ -12,27 +12,22 @@ from gpytorch.kernels import Kernel, RBFKernel, ScaleKernel
 from gpytorch.likelihoods import GaussianLikelihood, Likelihood
 from torch import Size, Tensor
 
-from gpadjust.gp import LogInterval
-
-
-def wide() -> LogInterval:
-    """A constraint whose bounds are to be set from the data."""
-    return LogInterval(1e-12, 1e12)
+from gpadjust.gp import DataInterval
 
 
 def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
     """An RBF kernel with one lengthscale per input and an outputscale."""
     base = RBFKernel(
-        ard_num_dims=num_inputs, batch_shape=batch_shape, lengthscale_constraint=wide()
+        ard_num_dims=num_inputs, batch_shape=batch_shape, lengthscale_constraint=DataInterval()
     )
-    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=wide())
+    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=DataInterval())
 
 
 def default_likelihood(train_Yvar: Tensor | None, batch_shape: Size) -> Likelihood | None:
     """Learnt Gaussian noise; or None, BoTorch's fixed noise, where the variances are known."""
     if train_Yvar is not None:
         return None
-    return GaussianLikelihood(batch_shape=batch_shape, noise_constraint=wide())
+    return GaussianLikelihood(batch_shape=batch_shape, noise_constraint=DataInterval())
 
 
 def make_kernel(

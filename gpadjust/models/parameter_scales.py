@@ -14,12 +14,17 @@ from gpytorch.constraints import Interval
 from gpytorch.kernels import Kernel, ScaleKernel
 from torch import Tensor
 
-from gpadjust.gp import InputsKernel, LogInterval, PhysicsScaledKernel
+from gpadjust.gp import DataInterval, InputsKernel, PhysicsScaledKernel, UnknownMeanKernel
 
 # Multiples of the typical sizes. Noise below a millionth of the residual's mean square is not
 # told from none, and a higher floor would cap the accuracy.
-INITIAL = {"lengthscale": 0.5, "outputscale": 0.5, "noise": 1e-2}
-BOUNDS = {"lengthscale": (1e-2, 1e3), "outputscale": (1e-6, 1e6), "noise": (1e-6, 1e1)}
+INITIAL = {"lengthscale": 0.5, "outputscale": 0.5, "noise": 1e-2, "constant": 1e2}
+BOUNDS = {
+    "lengthscale": (1e-2, 1e3),
+    "outputscale": (1e-6, 1e6),
+    "noise": (1e-6, 1e1),
+    "constant": (1e-100, 1e100),
+}
 
 
 def parameter_scales(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor]:
@@ -62,7 +67,7 @@ def set_initial_values(
             continue
         lower, upper = BOUNDS[kind(name)]
         constraint = constraint_of(model, name)
-        if isinstance(constraint, LogInterval):
+        if isinstance(constraint, DataInterval):
             # One bound for all outputs, as BoTorch's optimiser wants it.
             constraint.lower_bound = lower * size.amin()
             constraint.upper_bound = upper * size.amax()
@@ -71,7 +76,7 @@ def set_initial_values(
 
 
 def kind(name: str) -> str:
-    """What a raw parameter is: ``"lengthscale"``, ``"outputscale"``, ``"noise"`` or another."""
+    """What a raw parameter is: ``"lengthscale"``, ``"outputscale"``, ``"noise"`` and so on."""
     return name.rsplit(".", 1)[-1].removeprefix("raw_")
 
 
@@ -107,6 +112,8 @@ def _visit(
         ranges = ranges.index_select(-1, module.active_dims)
     if isinstance(module, ScaleKernel):
         sizes[f"{name}.raw_outputscale"] = scale.expand(module.raw_outputscale.shape)
+    if isinstance(module, UnknownMeanKernel):
+        sizes[f"{name}.raw_constant"] = scale.unsqueeze(-1).expand(module.raw_constant.shape)
     if isinstance(module, InputsKernel):
         ranges = ranges[..., : module.num_inputs]
     if isinstance(module, Kernel) and module.has_lengthscale:

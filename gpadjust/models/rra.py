@@ -21,10 +21,9 @@ from linear_operator import to_linear_operator
 from linear_operator.operators import RootLinearOperator
 from torch import Size, Tensor
 
-from gpadjust.gp import FourierFeatures, FourierKernel
+from gpadjust.gp import DataInterval, FourierFeatures, FourierKernel
 from gpadjust.models.adjusted_functions import AdjustedFunctions, AdjustmentFeatures
 from gpadjust.models.adjustment_gp import AdjustmentGP, Component
-from gpadjust.models.defaults import wide
 from gpadjust.physics import Physics
 
 
@@ -104,9 +103,9 @@ class RRA(AdjustmentGP):
                 FourierFeatures(num_features, num_inputs, seed),
                 ard_num_dims=num_inputs,
                 batch_shape=batch_shape,
-                lengthscale_constraint=wide(),
+                lengthscale_constraint=DataInterval(),
             )
-            return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=wide())
+            return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=DataInterval())
 
         super().__init__(
             train_X,
@@ -129,6 +128,15 @@ class RRA(AdjustmentGP):
             self._rho_mean = 0.0
             for kernel_ in (self.rho_covar_module, self.delta_covar_module):
                 kernel_.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
+
+    def check_can_hold_samples(self) -> None:
+        """As the base class; the paper's closed form has no likelihood to sample from."""
+        if self.prior == "paper":
+            raise ValueError(
+                "RRA(prior='paper') cannot be fully Bayesian: its covariance is not that of a "
+                "posterior. Take prior='physics'."
+            )
+        super().check_can_hold_samples()
 
     def rho(self, X: Tensor) -> GPyTorchPosterior:
         r"""The posterior of :math:`\rho` at raw ``X`` (``... x q x d``), without units."""
@@ -180,12 +188,8 @@ class RRA(AdjustmentGP):
         """
         return AdjustedFunctions(self, weights)
 
-    def sample_functions(self, num_functions: int) -> AdjustedFunctions:
-        """Draw functions from the posterior; see :meth:`functions`.
-
-        Args:
-            num_functions: Number ``k`` of functions.
-        """
+    def _draw_functions(self, num_functions: int) -> AdjustedFunctions:
+        """As the base class, but exactly; see :meth:`functions`."""
         with torch.no_grad():
             return self.functions(self.weights().sample(Size([num_functions])))
 
@@ -270,12 +274,26 @@ class RRA(AdjustmentGP):
             blocks = [-self._column.offset.unsqueeze(-1) * rho, delta]
         return self._as_posterior(self._push_forward(torch.cat(blocks, dim=-1)), output_dim)
 
+    def _marginals(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """As the base class; the posterior of ``prior="paper"`` is that of its weights."""
+        if self.prior != "paper":
+            return super()._marginals(inputs)
+        features, weights = AdjustmentFeatures(self)(inputs), self.weights()
+        mean = (features @ weights.mean.unsqueeze(-1)).squeeze(-1)
+        root = weights.lazy_covariance_matrix.root.to_dense()
+        return mean, (features @ root).square().sum(-1)
+
     def _push_forward(self, features: Tensor) -> MultivariateNormal:
         """The distribution of ``features @ weights``, for features ``... x q x 2D``."""
         weights = self.weights()
         mean = (features @ weights.mean.unsqueeze(-1)).squeeze(-1)
         root = features @ weights.lazy_covariance_matrix.root.to_dense()
         return MultivariateNormal(mean, to_linear_operator(root @ root.mT))
+
+    @property
+    def _covariance_noise(self) -> float | None:
+        """For leave-one-out: the noise variance in the covariance, if not that in the mean."""
+        return 1.0 if self.prior == "paper" else None
 
     def _prior_sd(self) -> Tensor:
         """Prior standard deviations of the weights in the user's units, ``... x 2D``."""

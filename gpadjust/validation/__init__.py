@@ -1,5 +1,16 @@
-"""Judging predictions."""
+"""Judging predictions. Plots are in `gpadjust.validation.plots`, which needs matplotlib."""
 
-from gpadjust.validation.scores import coverage, crps, nlpd, rmse
+from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
+from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
 
-__all__ = ["coverage", "crps", "nlpd", "rmse"]
+__all__ = [
+    "LeaveOneOut",
+    "Scores",
+    "coverage",
+    "crps",
+    "leave_one_out",
+    "nlpd",
+    "pit",
+    "rmse",
+    "score",
+]

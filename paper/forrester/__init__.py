@@ -1,9 +1,8 @@
-"""Forrester's function: seven models, eight observations, a hundred runs (the paper's sec. 3.1)."""
+"""Forrester's function: eight models, eight observations, a hundred runs (the paper's sec. 3.1)."""
 
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import get_args
@@ -14,34 +13,21 @@ from paper.forrester.claims import judge
 from paper.forrester.figure import draw
 from paper.forrester.models import Protocol
 from paper.forrester.runs import run_all
+from paper.options import add_options, check_options
 
 FIGURE_SEED = 3  # the data set of the six fits
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment to its command line."""
-    parser.add_argument("--runs", type=int, default=100, help="number of data sets [100]")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first data set [0]")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count(), help="parallel processes [all cores]"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("results", "forrester"),
-        help="folder of the results [results/forrester]",
-    )
+    add_options(parser, "forrester", num_runs=100)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Run the experiment; write and print its table, verdicts and figures."""
-    if arguments.runs < 2:
-        raise SystemExit(f"--runs: expected at least 2 (for a spread), got {arguments.runs}")
-    if arguments.jobs < 1:
-        raise SystemExit(f"--jobs: expected at least 1 process, got {arguments.jobs}")
+    check_options(arguments)
     out: Path = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
     runs = run_all(arguments.runs, arguments.seed, arguments.jobs, out)
     table, claims = tabulate(runs), verdicts(runs)
     table.to_csv(out / "table.csv", float_format="%.4g")

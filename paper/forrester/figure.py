@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gpadjust import RRA
-from paper.forrester.models import NAMES, Protocol, trained
+from paper.forrester.models import MODELS, Protocol, trained
 from paper.forrester.problem import CRUDE, LOWER, UPPER, Reading, observations, truth
 
 PANELS = ("Zero-mean GP", "Phy-mean GP", "GP-scale", "AR1", "CKA", "RRA")
@@ -68,9 +68,9 @@ def _fit_panel(ax: Axes, name: str, protocol: Protocol, reading: Reading, seed: 
 
 def _error_panel(ax: Axes, runs: pd.DataFrame) -> None:
     by_model = runs.groupby("model")["rmse"]
-    names = ["f_p", *NAMES]
+    names = ["f_p", *MODELS]
     mean, sd = by_model.mean()[names], by_model.std()[names]
-    ax.barh(names, mean, color=["0.6", *["tab:blue"] * len(NAMES)])
+    ax.barh(names, mean, color=["0.6", *["tab:blue"] * len(MODELS)])
     # The lower half of a bar cannot fall below zero.
     ax.errorbar(mean, names, xerr=[sd.clip(upper=mean), sd], fmt="none", color="black", capsize=3)
     for name in names:

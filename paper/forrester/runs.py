@@ -1,4 +1,4 @@
-"""All models on all data sets, in parallel processes, resumable."""
+"""All models on all data sets."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ from typing import Any, get_args
 
 import pandas as pd
 import torch
-from joblib import Parallel, delayed
-from tqdm import tqdm
 
 from gpadjust.validation import coverage, crps, nlpd, rmse
-from paper.forrester.models import NAMES, Protocol, trained
+from paper.forrester.models import MODELS, Protocol, trained
 from paper.forrester.problem import CRUDE, GRID, Reading, observations, truth
-
-KEY = ["reading", "protocol", "seed"]
+from paper.grid import run_grid
 
 
 @cache
@@ -27,7 +24,7 @@ def _prepare() -> None:
 
 
 def run_one(reading: Reading, protocol: Protocol, seed: int) -> list[dict[str, Any]]:
-    """Train the seven models on one data set; return a row of scores for each, and for f_p."""
+    """Train all models on one data set; return a row of scores for each, and for f_p."""
     _prepare()
     X, Y = observations(seed)
     y = truth(GRID)
@@ -35,7 +32,7 @@ def run_one(reading: Reading, protocol: Protocol, seed: int) -> list[dict[str, A
     rows: list[dict[str, Any]] = [
         {**which, "model": "f_p", "rmse": rmse(CRUDE[reading](GRID), y).item()}
     ]
-    for name in NAMES:
+    for name in MODELS:
         start = time.perf_counter()
         model = trained(name, protocol, reading, X, Y)
         seconds = time.perf_counter() - start
@@ -53,44 +50,19 @@ def run_one(reading: Reading, protocol: Protocol, seed: int) -> list[dict[str, A
 
 
 def run_all(num_runs: int, first_seed: int, num_jobs: int, out: Path) -> pd.DataFrame:
-    """Run both readings and protocols on ``num_runs`` data sets.
-
-    Finished runs are appended to ``out/runs.partial.csv`` as they come, so that an interrupted
-    call goes on where it stopped; at the end it becomes ``out/runs.csv``.
-    """
-    partial = out / "runs.partial.csv"
-    done = pd.read_csv(partial) if partial.exists() else pd.DataFrame(columns=KEY)
+    """Run both readings and protocols on ``num_runs`` data sets; see :func:`run_grid`."""
     tasks = [
         (reading, protocol, seed)
         for reading in sorted(CRUDE, reverse=True)
         for protocol in get_args(Protocol)
         for seed in range(first_seed, first_seed + num_runs)
     ]
-    counts = done.groupby(KEY).size()
-    # An interruption may have cut a task's rows short.
-    finished = set(counts[counts == 1 + len(NAMES)].index)
-    missing = [task for task in tasks if task not in finished]
-    results = Parallel(n_jobs=num_jobs, return_as="generator_unordered")(
-        delayed(run_one)(*task) for task in missing
+    return run_grid(
+        run_one,
+        tasks,
+        out,
+        key=("reading", "protocol", "seed"),
+        num_rows=1 + len(MODELS),
+        num_jobs=num_jobs,
+        ranks={"model": ("f_p", *MODELS)},
     )
-    progress = tqdm(results, total=len(tasks), initial=len(tasks) - len(missing), unit="run")
-    for rows in progress:
-        frame = pd.DataFrame(rows)
-        frame.to_csv(partial, mode="a", header=not partial.exists(), index=False)
-    order = [*KEY, "model"]
-    every = pd.read_csv(partial).drop_duplicates(order, keep="last")
-    wanted = every[KEY].apply(tuple, axis=1).isin(tasks)
-    frame = every[wanted].sort_values(order, key=_rank).reset_index(drop=True)
-    frame.to_csv(out / "runs.csv", index=False, float_format="%.6g")
-    if wanted.all():
-        partial.unlink()
-    else:  # the others belong to a larger call, which may go on
-        every[~wanted].to_csv(partial, index=False)
-    return frame
-
-
-def _rank(column: pd.Series[Any]) -> pd.Series[Any]:
-    """Sort models in the paper's order, the rest by value."""
-    if column.name == "model":
-        return column.map(["f_p", *NAMES].index)
-    return column

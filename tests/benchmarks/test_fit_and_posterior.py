@@ -1,7 +1,5 @@
 """Time of CKA beside BoTorch's SingleTaskGP; run with `--benchmark-only`."""
 
-import time
-
 import pytest
 import torch
 from botorch.fit import fit_gpytorch_mll
@@ -60,20 +58,8 @@ def test_posterior(benchmark, data, uniform, name):
     benchmark(predict, model, Z)
 
 
-def interleaved(ours, theirs, rounds):
-    """The ratio of the median times of two actions, timed by turns."""
-    times = ([], [])
-    for _ in range(rounds):
-        for action, record in zip((ours, theirs), times, strict=True):
-            start = time.perf_counter()
-            action()
-            record.append(time.perf_counter() - start)
-    medians = [torch.tensor(record).median().item() for record in times]
-    return medians[0] / medians[1]
-
-
 @pytest.mark.parametrize("name", ["fit", "fit_gpytorch_mll", "posterior"])
-def test_ratio_to_single_task_gp(benchmark, data, uniform, name):
+def test_ratio_to_single_task_gp(benchmark, record_ratio, data, uniform, name):
     benchmark.group = f"ratio of {name}, n = {len(data[0])}"
     if name == "posterior":
         Z = uniform(200, 2, seed=1)
@@ -89,5 +75,4 @@ def test_ratio_to_single_task_gp(benchmark, data, uniform, name):
         rounds = 3
     for action in actions:
         action()
-    ratio = benchmark.pedantic(interleaved, args=(*actions, rounds), rounds=1)
-    benchmark.extra_info["ratio to SingleTaskGP"] = ratio
+    record_ratio("ratio to SingleTaskGP", *actions, rounds)

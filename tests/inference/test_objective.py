@@ -62,7 +62,7 @@ def neighbours(objective, k, spread=0.2):
 
 
 def test_it_is_gpytorchs_likelihood(model):
-    objective = Objective(model)
+    objective = Objective(model, marginal=True)
     settings = neighbours(objective, 3)
     values = objective(settings).detach()
     assert values.shape == (3, objective.num_problems)
@@ -75,7 +75,7 @@ def test_it_is_gpytorchs_likelihood(model):
 
 
 def test_its_gradient_is_that_of_finite_differences(model):
-    objective = Objective(model)
+    objective = Objective(model, marginal=True)
     settings = neighbours(objective, 2)
     values, gradient = objective.value_and_gradient(settings)
     torch.testing.assert_close(values, objective(settings).detach())
@@ -100,7 +100,7 @@ def test_priors_are_added(uniform):
         )
 
     priors = GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5)
-    plain, penalised = Objective(build()), Objective(build(*priors))
+    plain, penalised = Objective(build(), True), Objective(build(*priors), True)
     settings = neighbours(plain, 3)
     with torch.no_grad():
         difference = penalised(settings) - plain(settings)
@@ -115,7 +115,7 @@ def test_priors_are_added(uniform):
 
 
 def test_packing_is_undone(model):
-    objective = Objective(model)
+    objective = Objective(model, marginal=True)
     settings = neighbours(objective, 3)
     assert torch.equal(objective.flatten(objective.unflatten(settings)), settings)
     objective.assign(settings[1])
@@ -126,7 +126,7 @@ def test_a_covariance_that_is_not_positive_definite_is_infinitely_bad(uniform):
     X = torch.zeros(6, 1, dtype=torch.float64)
     X[1:] += uniform(5, 1)
     model = CKA(X, crude(X), torch.full_like(X, 1e-6), physics=crude)
-    objective = Objective(model)
+    objective = Objective(model, marginal=True)
     settings = objective.current().repeat(2, 1, 1)
     settings[1] = 800.0
     values, gradient = objective.value_and_gradient(settings)
@@ -139,4 +139,4 @@ def test_nothing_to_learn(uniform):
     X = uniform(8, 2)
     model = CKA(X, crude(X), physics=crude).requires_grad_(False)
     with pytest.raises(ValueError, match="no learnable parameter"):
-        Objective(model)
+        Objective(model, marginal=True)

@@ -7,10 +7,10 @@ import torch
 from paper import __main__ as command_line
 from paper.forrester import runs as runs_module
 from paper.forrester.claims import judge
-from paper.forrester.models import NAMES
+from paper.forrester.models import MODELS as TRAINED
 from paper.forrester.problem import CRUDE, GRID, observations, truth
 
-MODELS = ["f_p", *NAMES]
+MODELS = ["f_p", *TRAINED]
 
 
 def test_truth_is_linear_in_both_readings_of_the_crude_function():

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import scipy.stats
 import torch
+from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
+from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
 
-from gpadjust.validation import coverage, crps, nlpd, rmse
+from gpadjust.validation import coverage, crps, nlpd, pit, rmse, score
 
 
 @pytest.fixture
@@ -66,8 +68,8 @@ def test_coverage_of_overconfident_predictions_is_too_low(uniform):
 
 
 def test_shapes(prediction):
-    for score in (crps, nlpd, coverage):
-        assert score(*prediction).shape == (2, 3)
+    for one in (crps, nlpd, coverage):
+        assert one(*prediction).shape == (2, 3)
     assert rmse(prediction[0], prediction[2]).shape == (2, 3)
 
 
@@ -75,3 +77,115 @@ def test_shapes(prediction):
 def test_bad_level(prediction, level):
     with pytest.raises(ValueError, match="Expected level between 0 and 1, got"):
         coverage(*prediction, level=level)
+
+
+@pytest.fixture
+def mixture(uniform):
+    """Means and variances of 4 components at 7 points of 3 outputs, in a batch of 2; targets."""
+    shape = (2, 4, 7, 3)
+    return (
+        uniform(*shape, low=-2, high=2, seed=1),
+        uniform(*shape, low=0.1, high=3, seed=2),
+        uniform(2, 7, 3, low=-3, high=3, seed=3),
+    )
+
+
+def test_mixture_against_scipy(mixture):
+    mean, variance, y = (t.numpy() for t in mixture)
+    normal = scipy.stats.norm(mean, np.sqrt(variance))
+    y = y[:, None]
+    expected = torch.from_numpy(-np.log(normal.pdf(y).mean(1)).mean(-2))
+    torch.testing.assert_close(nlpd(*mixture, mixture_dim=-3), expected)
+    values = torch.from_numpy(normal.cdf(y).mean(1))
+    torch.testing.assert_close(pit(*mixture, mixture_dim=-3), values)
+    inside = ((values > 0.1) & (values < 0.9)).double().mean(-2)
+    torch.testing.assert_close(coverage(*mixture, 0.8, mixture_dim=-3), inside)
+    expected = torch.from_numpy(np.sqrt(((mean.mean(1) - y[:, 0]) ** 2).mean(-2)))
+    torch.testing.assert_close(rmse(mixture[0], mixture[2], mixture_dim=-3), expected)
+
+
+def test_crps_of_a_mixture_is_the_integral(mixture):
+    mean, variance, y = mixture
+    grid = torch.linspace(-20, 20, 40_001, dtype=torch.float64)
+    expected = torch.zeros_like(y)
+    for i in np.ndindex(*y.shape):
+        batch, point, output = i
+        sd = variance[batch, :, point, output].sqrt()
+        normal = torch.distributions.Normal(mean[batch, :, point, output], sd)
+        cdf = normal.cdf(grid.unsqueeze(-1)).mean(-1)
+        expected[i] = (cdf - (grid >= y[i]).double()).square().sum() * (grid[1] - grid[0])
+    torch.testing.assert_close(
+        crps(*mixture, mixture_dim=-3), expected.mean(-2), rtol=1e-3, atol=1e-3
+    )
+
+
+def test_crps_of_a_mixture_by_monte_carlo(mixture):
+    mean, variance, y = (t[:1, ..., :1, :1] for t in mixture)
+    mean, variance = mean.reshape(4), variance.reshape(4)
+    n = 400_000
+    pick = torch.randint(4, (2, n))
+    a, b = mean[pick] + variance[pick].sqrt() * torch.randn(2, n, dtype=torch.float64)
+    sampled = (a - y.item()).abs().mean() - (a - b).abs().mean() / 2
+    exact = crps(mean.reshape(4, 1, 1), variance.reshape(4, 1, 1), y.reshape(1, 1), mixture_dim=0)
+    assert exact.item() == pytest.approx(sampled.item(), abs=0.01)
+
+
+def test_a_mixture_of_equal_components_is_the_component(prediction):
+    mean, variance, y = prediction
+    many = [t.unsqueeze(-3).expand(2, 5, 7, 3) for t in (mean, variance)]
+    for one in (nlpd, crps, pit, coverage):
+        torch.testing.assert_close(one(*many, y, mixture_dim=-3), one(*prediction))
+
+
+def test_pit_of_calibrated_predictions_is_uniform(uniform):
+    mean, variance = uniform(5000, 1, seed=1), uniform(5000, 1, low=0.1, high=2, seed=2)
+    y = mean + variance.sqrt() * torch.randn(5000, 1, dtype=torch.float64)
+    values = pit(mean, variance, y)
+    assert scipy.stats.kstest(values.flatten().numpy(), "uniform").pvalue > 1e-3
+
+
+def test_score_of_a_posterior(data, build, uniform):
+    X, Y = data(num_outputs=2)
+    posterior = build("CKA", X, Y).posterior(X, observation_noise=True)
+    scores = score(posterior, Y, level=0.5)
+    three = posterior.mean, posterior.variance, Y
+    torch.testing.assert_close(scores.rmse, rmse(posterior.mean, Y))
+    torch.testing.assert_close(scores.nlpd, nlpd(*three))
+    torch.testing.assert_close(scores.crps, crps(*three))
+    torch.testing.assert_close(scores.pit, pit(*three))
+    torch.testing.assert_close(scores.coverage, coverage(*three, 0.5))
+
+
+@pytest.mark.parametrize("num_outputs", [1, 2])
+def test_score_of_a_fully_bayesian_posterior(uniform, num_outputs):
+    mean = uniform(5, 7, num_outputs, seed=1)
+    variance = uniform(5, 7, num_outputs, low=0.1, high=1, seed=2)
+    y = uniform(7, num_outputs, seed=3)
+    normals = [
+        MultivariateNormal(mean[..., j], torch.diag_embed(variance[..., j]))
+        for j in range(num_outputs)
+    ]
+    joint = normals[0]
+    if num_outputs > 1:
+        joint = MultitaskMultivariateNormal.from_independent_mvns(normals)
+    scores = score(GaussianMixturePosterior(joint), y)
+    torch.testing.assert_close(scores.nlpd, nlpd(mean, variance, y, mixture_dim=-3))
+    torch.testing.assert_close(scores.crps, crps(mean, variance, y, mixture_dim=-3))
+    torch.testing.assert_close(scores.pit, pit(mean, variance, y, mixture_dim=-3))
+    torch.testing.assert_close(scores.rmse, rmse(mean, y, mixture_dim=-3))
+
+
+def test_shapes_that_disagree(prediction):
+    mean, variance, y = prediction
+    with pytest.raises(ValueError, match=r"y's shape \(2, 7, 1\)"):
+        crps(mean, variance, y[..., :1])
+    with pytest.raises(ValueError, match="There is no dimension -4"):
+        crps(mean, variance, y, mixture_dim=-4)
+
+
+def test_predictions_without_variance_have_their_limits():
+    mean, y = torch.tensor([[1.0], [2.0]]).double(), torch.tensor([[1.5], [2.0]]).double()
+    variance = torch.zeros_like(mean)
+    torch.testing.assert_close(crps(mean, variance, y), torch.tensor([0.25]).double())
+    assert nlpd(mean, variance, y) > 1e10
+    assert coverage(mean, variance, y) == 0.5

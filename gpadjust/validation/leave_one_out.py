@@ -1,0 +1,234 @@
+"""Leave-one-out predictions in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from botorch.models import ModelListGP
+from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+from botorch.models.transforms.outcome import Standardize
+from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.utils.transforms import is_fully_bayesian
+from gpytorch.distributions import MultivariateNormal
+from linear_operator import to_dense, to_linear_operator
+from linear_operator.utils.cholesky import psd_safe_cholesky
+from torch import Tensor
+
+from gpadjust.validation import scores
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Predictions of each observation from all the others, in the user's units.
+
+    Attributes:
+        X: Raw inputs, ``batch_shape x n x d``.
+        Y: Observations, ``batch_shape x n x m``.
+        mean: Their predictions, of the same shape.
+        variance: The variances of the predictions, observation noise included.
+    """
+
+    X: Tensor
+    Y: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    @property
+    def residuals(self) -> Tensor:
+        """Standardized residuals, ``(Y - mean) / sd``, ``batch_shape x n x m``."""
+        return (self.Y - self.mean) / self.variance.sqrt()
+
+    @property
+    def rmse(self) -> Tensor:
+        """Root mean square error, ``batch_shape x m``."""
+        return scores.rmse(self.mean, self.Y)
+
+    @property
+    def nlpd(self) -> Tensor:
+        """Mean negative log predictive density, ``batch_shape x m``."""
+        return scores.nlpd(self.mean, self.variance, self.Y)
+
+    @property
+    def crps(self) -> Tensor:
+        """Mean continuous ranked probability score, ``batch_shape x m``."""
+        return scores.crps(self.mean, self.variance, self.Y)
+
+    @property
+    def pit(self) -> Tensor:
+        """Probability integral transform, ``batch_shape x n x m``."""
+        return scores.pit(self.mean, self.variance, self.Y)
+
+    def coverage(self, level: float = 0.95) -> Tensor:
+        """Share of the observations in their central intervals, ``batch_shape x m``."""
+        return scores.coverage(self.mean, self.variance, self.Y, level)
+
+
+def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> LeaveOneOut:
+    r"""Predict each observation from all the others, without fitting again.
+
+    The hyper-parameters (and the scale of the outcomes) stay as they are, so that each left-out
+    observation has had its say in them: with few points the scores are optimistic. With the
+    covariance :math:`K` of the observations, noise included, and
+    :math:`\alpha = K^{-1} (y - m)`,
+
+    .. math:: \mu_{-i} = y_i - \alpha_i / [K^{-1}]_{ii}, \quad
+        \sigma^2_{-i} = 1 / [K^{-1}]_{ii}
+
+    (Rasmussen and Williams 2006, eqs. 5.10-5.12; Sundararajan and Keerthi 2001). Of an
+    :class:`~gpadjust.AR1` only points of the high level are left out. The covariance of an
+    :class:`~gpadjust.RRA` with ``prior="paper"`` is that of the paper.
+
+    Of a model that holds samples of its hyper-parameters, these *are* without the left-out
+    observation: a sample has the weight :math:`1 / p(y_i | y_{-i}, \theta)`, at most
+    :math:`\sqrt S` times the average (Gelfand et al. 1992; Ionides 2008), and mean and variance
+    are those of the weighted mixture, whose shape the scores take as Gaussian.
+
+    Args:
+        model: Any model of this library, a ``SingleTaskGP``, or a ``ModelListGP`` of such with the
+            same training inputs. It stays as it is.
+
+    Raises:
+        TypeError: If the model is of another kind.
+        ValueError: If its outcome transform is not a shift and scale, or the parts of a list have
+            different inputs.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import CKA, fit
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
+        >>> result = fit(model)
+        >>> loo = leave_one_out(model)
+        >>> loo.mean.shape, bool(loo.rmse < 0.1)
+        (torch.Size([8, 1]), True)
+    """
+    if isinstance(model, ModelListGP):
+        return _join([leave_one_out(part) for part in model.models])
+    if not isinstance(model, BatchedMultiOutputGPyTorchModel):
+        raise TypeError(
+            "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such, got "
+            f"{type(model).__name__}."
+        )
+    transform = getattr(model, "outcome_transform", None)
+    if transform is not None and not isinstance(transform, Standardize):
+        raise ValueError(
+            f"The outcome transform {type(transform).__name__} is not a shift and scale, so the "
+            "predictions are not Gaussian in the user's units; use Standardize or None, and "
+            "transform the data beforehand."
+        )
+    with _evaluating(model), torch.no_grad():
+        X, rows = _measurements(model)
+        mean, variance = _targets(model)
+        Y, mean, variance = (
+            _outputs_last(model, t)[..., rows, :] for t in (model.train_targets, mean, variance)
+        )
+        if transform is not None:
+            Y, mean = transform.untransform(Y)[0], transform.untransform(mean)[0]
+            variance = variance * transform.stdvs.square()
+        if is_fully_bayesian(model):
+            X, Y = X.select(MCMC_DIM, 0), Y.select(MCMC_DIM, 0)
+            mean, variance = _mixture(Y, mean, variance)
+    X, Y = X[..., rows, :].expand(*mean.shape[:-1], X.shape[-1]), Y.expand(mean.shape)
+    return LeaveOneOut(X.clone(), Y.clone(), mean, variance)
+
+
+def _mixture(Y: Tensor, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance ``... x n x m`` of mixtures of predictions ``... x S x n x m``."""
+    error = (Y.unsqueeze(MCMC_DIM) - mean).square()
+    weight = (0.5 * (error / variance + variance.log())).softmax(MCMC_DIM)
+    weight = weight.clamp_max(weight.shape[MCMC_DIM] ** -0.5)
+    weight = weight / weight.sum(MCMC_DIM, keepdim=True)
+    centre = (weight * mean).sum(MCMC_DIM, keepdim=True)
+    spread = (mean - centre).square()
+    return centre.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM)
+
+
+def training_data(model: Any) -> tuple[Tensor, Tensor]:
+    """The observations that a model was given, ``n x d`` and ``n x m`` in the user's units.
+
+    Of an :class:`~gpadjust.AR1` those of the high level; of a batch the first.
+    """
+    if isinstance(model, ModelListGP):
+        parts = [training_data(part) for part in model.models]
+        return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
+    with _evaluating(model), torch.no_grad():
+        X, rows = _measurements(model)
+        Y = _outputs_last(model, model.train_targets)
+        transform = getattr(model, "outcome_transform", None)
+        Y = Y if transform is None else transform.untransform(Y)[0]
+    X, Y = X[..., rows, :], Y[..., rows, :]
+    return X.reshape(-1, *X.shape[-2:])[0], Y.reshape(-1, *Y.shape[-2:])[0]
+
+
+def _targets(model: Any) -> tuple[Tensor, Tensor]:
+    """Leave-one-out means and variances of the targets, ``... x (m) x n`` in their units."""
+    inputs, y = model.train_inputs[0], model.train_targets
+    covariance = to_dense(model.covar_module(inputs))
+    mean = model.mean_module(inputs).expand(covariance.shape[:-1])
+    prior = MultivariateNormal(mean, to_linear_operator(covariance))
+    noisy = to_dense(model.likelihood(prior, inputs).lazy_covariance_matrix)
+    chol = psd_safe_cholesky(noisy)
+    alpha = torch.cholesky_solve((y - prior.mean).unsqueeze(-1), chol).squeeze(-1)
+    variance = _left_out_variance(chol)
+    mean = y - alpha * variance
+    ridge = getattr(model, "_covariance_noise", None)
+    if ridge is not None:
+        # The model's covariance is that of another noise than its mean.
+        identity = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
+        noise = (noisy - covariance).diagonal(dim1=-1, dim2=-2)
+        latent = _left_out_variance(psd_safe_cholesky(covariance + ridge * identity)) - ridge
+        variance = latent + noise
+    return mean, variance
+
+
+def _left_out_variance(chol: Tensor) -> Tensor:
+    """The variances of observations given all others, from the factor of their covariance."""
+    return torch.cholesky_inverse(chol).diagonal(dim1=-1, dim2=-2).reciprocal()
+
+
+def _measurements(model: Any) -> tuple[Tensor, slice]:
+    """Raw training inputs, ``... x n x d``, and which rows of them can be left out."""
+    inputs = model.train_inputs[0]
+    raw = getattr(model, "_original_train_inputs", None)
+    inputs = inputs if raw is None else raw
+    if model.num_outputs > 1:
+        inputs = inputs[..., 0, :, :]
+    select = getattr(model, "_measured", None)
+    return (inputs, slice(None)) if select is None else select(inputs)
+
+
+def _outputs_last(model: Any, values: Tensor) -> Tensor:
+    """Bring ``... x (m) x n`` to ``... x n x m``."""
+    return values.mT if model.num_outputs > 1 else values.unsqueeze(-1)
+
+
+@contextmanager
+def _evaluating(model: Any) -> Iterator[None]:
+    """Put the model in eval mode, in which its training inputs are transformed, for a while."""
+    was_training = model.training
+    model.eval()
+    try:
+        yield
+    finally:
+        if was_training:
+            model.train()
+
+
+def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
+    """Put the outputs of several models side by side."""
+    X = parts[0].X
+    for part in parts[1:]:
+        if part.X.shape != X.shape or not torch.equal(part.X, X):
+            raise ValueError(
+                "The models of the list have different training inputs, so their observations do "
+                "not belong to the same points; call `leave_one_out` on each of `model.models`."
+            )
+    Y, mean, variance = (
+        torch.cat([getattr(part, name) for part in parts], dim=-1)
+        for name in ("Y", "mean", "variance")
+    )
+    return LeaveOneOut(X, Y, mean, variance)

@@ -1,0 +1,18 @@
+"""Figures of predictions, of their calibration, and of where the physics is wrong.
+
+Each function draws on the axes that it is given, or on those of a new figure, and returns them;
+show or save the figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``.
+"""
+
+from gpadjust.validation.plots.adjustments import plot_adjustment, plot_adjustment_pair
+from gpadjust.validation.plots.calibration import plot_calibration, plot_pit
+from gpadjust.validation.plots.predictions import plot_leave_one_out, plot_prediction
+
+__all__ = [
+    "plot_adjustment",
+    "plot_adjustment_pair",
+    "plot_calibration",
+    "plot_leave_one_out",
+    "plot_pit",
+    "plot_prediction",
+]

@@ -1,0 +1,102 @@
+"""Figures of calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from scipy.stats import binom
+from torch import Tensor
+
+from gpadjust.validation.leave_one_out import LeaveOneOut
+from gpadjust.validation.plots.drawing import BLUE, GREY, column, legend, new_axes, tidy
+from gpadjust.validation.scores import Scores
+
+
+def plot_calibration(
+    prediction: Tensor | LeaveOneOut | Scores, *, output: int = 0, ax: Axes | None = None
+) -> Axes:
+    """Draw the observed coverage of central intervals against the nominal one.
+
+    Below the diagonal the intervals are too narrow, above it too wide. The band holds 95 % of the
+    observed coverages of a calibrated prediction with as many points, at each level.
+
+    Args:
+        prediction: PIT values, ``n`` or ``n x m``, or what has them.
+        output: Which output to draw.
+        ax: Where to draw. Default: a new figure.
+
+    Raises:
+        ValueError: If PIT values are not between 0 and 1, or there is no such output.
+
+    Example:
+        >>> import torch
+        >>> plot_calibration(torch.rand(50)).get_ylabel()
+        'observed coverage'
+    """
+    pit = _pit(prediction, output)
+    ax = new_axes(1, 1, size=3.6)[0, 0] if ax is None else ax
+    levels = np.linspace(0, 1, 201)
+    n = len(pit)
+    low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
+    ax.fill_between(levels, low, high, color=GREY, alpha=0.2, lw=0, label="95 % if calibrated")
+    ax.plot([0, 1], [0, 1], color=GREY, lw=1, ls="--")
+    reached = np.sort(2 * (pit - 0.5).abs().numpy())
+    steps = np.arange(n + 1) / n
+    ax.step(
+        [0, *reached, 1], [*steps, steps[-1]], where="post", color=BLUE, lw=1.8, label="observed"
+    )
+    ax.set(xlabel="nominal coverage", ylabel="observed coverage", aspect="equal")
+    ax.set(xlim=(0, 1), ylim=(0, 1.01))
+    ax.legend(frameon=False, loc="upper left")
+    tidy(ax)
+    return ax
+
+
+def plot_pit(
+    prediction: Tensor | LeaveOneOut | Scores,
+    *,
+    output: int = 0,
+    bins: int = 10,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the histogram of PIT values: flat if calibrated, U-shaped if too sure.
+
+    The band holds 95 % of the counts of a bin if calibrated.
+
+    Args:
+        prediction: PIT values, ``n`` or ``n x m``, or what has them.
+        output: Which output to draw.
+        bins: Number of bins.
+        ax: Where to draw. Default: a new figure.
+
+    Raises:
+        ValueError: If PIT values are not between 0 and 1, or there is no such output or bin.
+
+    Example:
+        >>> import torch
+        >>> len(plot_pit(torch.rand(50), bins=5).patches)
+        5
+    """
+    if bins < 1:
+        raise ValueError(f"Expected bins >= 1, got {bins}.")
+    pit = _pit(prediction, output)
+    ax = new_axes(1, 1)[0, 0] if ax is None else ax
+    n = len(pit)
+    low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
+    ax.hist(pit.numpy(), bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
+    ax.fill_between(
+        [0, 1], low, high, color=GREY, alpha=0.25, lw=0, zorder=3, label="95 % if calibrated"
+    )
+    ax.axhline(n / bins, color=GREY, lw=1, ls="--", zorder=3)
+    ax.set(xlabel="probability integral transform", ylabel="count", xlim=(0, 1))
+    ax.set_ylim(top=1.25 * max(high, ax.get_ylim()[1]))  # room for the legend
+    legend(ax)
+    return ax
+
+
+def _pit(prediction: Tensor | LeaveOneOut | Scores, output: int) -> Tensor:
+    pit = prediction if isinstance(prediction, Tensor) else prediction.pit
+    pit = column(pit.unsqueeze(-1) if pit.dim() == 1 else pit, output)
+    if len(pit) == 0 or not ((pit >= 0) & (pit <= 1)).all():
+        raise ValueError("Expected PIT values between 0 and 1, as `gpadjust.validation.pit` makes.")
+    return pit

@@ -1,0 +1,88 @@
+"""What the figures share: colours, axes, bands, and one output of a posterior."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
+BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
+DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
+
+
+def quantile(level: float) -> float:
+    """Half the width of the central interval, in standard deviations."""
+    if not 0 < level < 1:
+        raise ValueError(f"Expected level between 0 and 1, got {level}.")
+    return NormalDist().inv_cdf((1 + level) / 2)
+
+
+def mean_and_half_width(posterior: Any, output: int, level: float) -> tuple[Tensor, Tensor]:
+    """Mean and half the width of the interval of one output, ``n`` each."""
+    mean = getattr(posterior, "mixture_mean", None)
+    variance = posterior.variance if mean is None else posterior.mixture_variance
+    mean = posterior.mean if mean is None else mean
+    return column(mean, output), quantile(level) * column(variance.sqrt(), output)
+
+
+def column(values: Tensor, output: int) -> Tensor:
+    """One output of ``n x m`` values."""
+    if values.dim() != 2:
+        raise ValueError(
+            f"Expected n x m values to draw, got shape {tuple(values.shape)}; plot the elements of "
+            "a batch one by one."
+        )
+    if not 0 <= output < values.shape[-1]:
+        raise ValueError(f"There is no output {output}; there are {values.shape[-1]}, from 0.")
+    return values[:, output].detach()
+
+
+def new_axes(rows: int, columns: int, size: float = 3.2) -> Any:
+    """Axes of a new figure that pyplot does not know of, so that nobody has to close it."""
+    width = 1.3 * size if columns == 1 else 1.15 * size
+    figure = Figure(figsize=(width * columns, size * rows), layout="constrained")
+    return figure.subplots(rows, columns, squeeze=False)
+
+
+def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
+    """The axes that the user gave, as an array of the shape needed."""
+    axes = np.asarray(axes)
+    if axes.size != math.prod(shape):
+        raise ValueError(f"Expected {' x '.join(map(str, shape))} axes, got {axes.size}.")
+    return axes.reshape(shape)
+
+
+def band(ax: Axes, x: Tensor, mean: Tensor, half: Tensor, level: float) -> None:
+    """Draw a mean and its interval, ``n`` each."""
+    ax.fill_between(x, mean - half, mean + half, **BAND, label=f"{100 * level:g} %")
+    ax.plot(x, mean, color=BLUE, lw=1.8, label="mean")
+
+
+def against_truth(
+    ax: Axes, truth: Tensor, mean: Tensor, half: Tensor, level: float, xlabel: str, ylabel: str
+) -> None:
+    """Draw predictions with intervals against what is true."""
+    ends = [min(truth.min(), mean.min()), max(truth.max(), mean.max())]
+    ax.plot(ends, ends, color=GREY, lw=1, ls="--")
+    label = f"mean, {100 * level:g} %"
+    ax.errorbar(truth, mean, half, color=BLUE, **DOTS, elinewidth=1, alpha=0.85, label=label)
+    ax.set(xlabel=xlabel, ylabel=ylabel)
+    ax.legend(frameon=False, loc="upper left")
+    tidy(ax)
+
+
+def legend(ax: Axes) -> None:
+    """Add a legend and take away what is not needed."""
+    ax.legend(frameon=False)
+    tidy(ax)
+
+
+def tidy(ax: Axes) -> None:
+    """Take away the frame's upper and right sides."""
+    ax.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,140 @@
+"""Figures of predictions and of what was observed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from matplotlib.axes import Axes
+from torch import Tensor
+
+from gpadjust.validation.leave_one_out import LeaveOneOut, training_data
+from gpadjust.validation.plots.drawing import (
+    BAND,
+    BLUE,
+    DOTS,
+    GREY,
+    RED,
+    against_truth,
+    band,
+    column,
+    given_axes,
+    legend,
+    mean_and_half_width,
+    new_axes,
+    quantile,
+)
+
+
+def plot_prediction(
+    model: Any,
+    X: Tensor,
+    Y: Tensor | None = None,
+    *,
+    output: int = 0,
+    level: float = 0.95,
+    observation_noise: bool = False,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw what a model predicts.
+
+    With one input: the mean, the central interval, the training data, the physics, and the truth
+    if ``Y`` is given. With more: the predictions against ``Y``, with their intervals.
+
+    Args:
+        model: Any BoTorch model.
+        X: Raw inputs, ``n x d``.
+        Y: True values there, ``n x m``; needed if ``d > 1``.
+        output: Which output to draw.
+        level: Nominal coverage of the intervals.
+        observation_noise: Whether the intervals are those of observations.
+        ax: Where to draw. Default: a new figure.
+
+    Raises:
+        ValueError: If shapes or ``level`` are wrong, or ``Y`` is missing.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import CKA
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
+        >>> plot_prediction(model, X).get_xlabel()
+        'x'
+    """
+    _check_inputs(X, Y)
+    if X.shape[-1] > 1 and Y is None:
+        raise ValueError(
+            f"X has {X.shape[-1]} inputs, so predictions are drawn against the truth: pass `Y`; "
+            "for slices through a model use `plot_adjustment`."
+        )
+    with torch.no_grad():
+        posterior = model.posterior(X, observation_noise=observation_noise)
+    mean, half = mean_and_half_width(posterior, output, level)
+    truth = None if Y is None else column(Y, output)
+    ax = new_axes(1, 1)[0, 0] if ax is None else ax
+    if X.shape[-1] > 1:
+        assert truth is not None
+        against_truth(ax, truth, mean, half, level, "true", "predicted")
+        return ax
+    order = X[:, 0].argsort()
+    x = X[order, 0].detach()
+    band(ax, x, mean[order], half[order], level)
+    if hasattr(model, "physics"):
+        with torch.no_grad():
+            f_p = column(model.physics(X[order]), output)
+        ax.plot(x, f_p, color=GREY, ls="--", lw=1.2, label="physics")
+    if truth is not None:
+        ax.plot(x, truth[order], color="black", lw=1, ls=":", label="truth")
+    train_X, train_Y = training_data(model)
+    ax.plot(train_X[:, 0], column(train_Y, output), color=RED, **DOTS, label="data")
+    ax.set(xlabel="x", ylabel="y")
+    legend(ax)
+    return ax
+
+
+def plot_leave_one_out(
+    loo: LeaveOneOut, *, output: int = 0, level: float = 0.95, axes: Any = None
+) -> Any:
+    """Draw left-out predictions against the observations, and standardized residuals.
+
+    Args:
+        loo: What :func:`~gpadjust.validation.leave_one_out` returned, without batch.
+        output: Which output to draw.
+        level: Nominal coverage of the intervals.
+        axes: Two axes to draw on. Default: a new figure.
+
+    Returns:
+        An array of two axes.
+
+    Raises:
+        ValueError: If there is a batch, no such output, or ``level`` is not between 0 and 1.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import CKA
+        >>> from gpadjust.validation import leave_one_out
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
+        >>> plot_leave_one_out(leave_one_out(model)).shape
+        (2,)
+    """
+    z = quantile(level)
+    Y, mean, sd = (column(t, output) for t in (loo.Y, loo.mean, loo.variance.sqrt()))
+    axes = new_axes(1, 2)[0] if axes is None else given_axes(axes, (2,))
+    against_truth(axes[0], Y, mean, z * sd, level, "observed", "predicted without it")
+    axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
+    axes[1].axhline(0, color=GREY, lw=1, ls="--")
+    axes[1].plot(mean, (Y - mean) / sd, color=BLUE, **DOTS)
+    top = 1.35 * max(z, ((Y - mean) / sd).abs().max().item())  # room for the legend
+    axes[1].set(xlabel="predicted without it", ylabel="standardized residual", ylim=(-top, top))
+    legend(axes[1])
+    return axes
+
+
+def _check_inputs(X: Tensor, Y: Tensor | None) -> None:
+    if X.dim() != 2:
+        raise ValueError(f"Expected X of shape n x d, got {tuple(X.shape)}.")
+    if Y is not None and (Y.dim() != 2 or len(Y) != len(X)):
+        raise ValueError(
+            f"Expected Y of shape {len(X)} x m, one row for each of X, got {tuple(Y.shape)}."
+        )

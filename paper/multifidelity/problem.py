@@ -1,0 +1,103 @@
+"""The pairs of functions of low and high fidelity, and the data."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from gpadjust import BlackBoxPhysics
+
+with warnings.catch_warnings():
+    # Importing mf2 makes setuptools warn that a module which mf2 asks for is on its way out.
+    warnings.filterwarnings("ignore", "pkg_resources is deprecated", UserWarning)
+    import mf2
+
+NUM_TEST = 1000
+NUM_LOW = 20  # samples of the low level per input, for the methods that need them
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A function of high fidelity, the truth, and one of low fidelity, the physics.
+
+    Attributes:
+        name: The name in mf2.
+        high: Maps ``N x d`` to ``N``.
+        low: Likewise.
+        bounds: Lower and upper bounds of the inputs, ``2 x d``.
+    """
+
+    name: str
+    high: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    low: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    bounds: Tensor
+
+    @property
+    def d(self) -> int:
+        """Number of inputs."""
+        return self.bounds.shape[1]
+
+    def truth(self, X: Tensor) -> Tensor:
+        """The function of high fidelity at ``n x d`` inputs: ``n x 1``."""
+        return torch.from_numpy(self.high(X.numpy())).unsqueeze(-1)
+
+    def physics(self) -> BlackBoxPhysics:
+        """The function of low fidelity as f_p, with an empty memo."""
+        return BlackBoxPhysics(self.low, gradient=None, name=f"{self.name}, low fidelity")
+
+    def scaled(self, unit: Tensor) -> Tensor:
+        """Map the unit cube to the bounds."""
+        return self.bounds[0] + (self.bounds[1] - self.bounds[0]) * unit
+
+    def sobol(self, n: int, seed: int) -> Tensor:
+        """The first ``n`` points of a scrambled Sobol sequence in the bounds, ``n x d``."""
+        return self.scaled(SobolEngine(self.d, scramble=True, seed=seed).draw(n).double())
+
+
+def names() -> list[str]:
+    """The problems of mf2 that are such pairs."""
+    return sorted(
+        name
+        for name, value in vars(mf2).items()
+        if isinstance(value, mf2.MultiFidelityFunction)
+        and {"high", "low"} <= set(value.fidelity_names)
+    )
+
+
+def pair(name: str) -> Pair:
+    """The pair of mf2 with a given name.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if name not in names():
+        raise ValueError(f"mf2 has no pair {name!r}; it has {', '.join(names())}")
+    problem = getattr(mf2, name)
+    return Pair(name, problem.high, problem.low, torch.from_numpy(problem.bounds))
+
+
+def observations(pair: Pair, n: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Observe the truth without noise on a random Latin hypercube: ``n x d`` and ``n x 1``."""
+    generator = torch.Generator().manual_seed(seed)
+    cells = torch.stack([torch.randperm(n, generator=generator) for _ in range(pair.d)], dim=-1)
+    within = torch.rand(n, pair.d, generator=generator, dtype=torch.float64)
+    X = pair.scaled((cells + within) / n)
+    return X, pair.truth(X)
+
+
+def low_inputs(pair: Pair, X: Tensor, seed: int) -> Tensor:
+    """Where the low level is sampled: at ``X``, and on a Sobol sequence up to ``20 d`` points."""
+    return torch.cat([X, pair.sobol(NUM_LOW * pair.d - len(X), seed)])
+
+
+def test_points(pair: Pair) -> tuple[Tensor, Tensor]:
+    """The points that all runs are scored at, and the truth there."""
+    X = pair.sobol(NUM_TEST, seed=0)
+    return X, pair.truth(X)

@@ -1,0 +1,131 @@
+"""Time of predicting and of conditioning beside the ways around them; `--benchmark-only`."""
+
+import time
+
+import pytest
+import torch
+from botorch.models import SingleTaskGP
+
+from gpadjust import CKA
+
+NUM_INPUTS = 6
+
+
+@pytest.fixture(params=[1, 4], ids=["1-output", "4-outputs"])
+def m(request):
+    return request.param
+
+
+@pytest.fixture
+def data(m, uniform):
+    """500 points, one more, and 200 to predict at."""
+
+    def truth(X):
+        return 1.3 * crude(X)[..., :m] + X[..., :m].square()
+
+    X, Z = uniform(501, NUM_INPUTS), uniform(200, NUM_INPUTS, seed=1)
+    Y = truth(X) + 0.01 * torch.randn(501, m, dtype=torch.float64)
+    return X, Y, Z
+
+
+def crude(X):
+    return (3 * X[..., :4]).sin() + X[..., 1:5]
+
+
+def build(X, Y):
+    return CKA(X, Y, physics=lambda X: crude(X)[..., : Y.shape[-1]]).eval()
+
+
+class PlainCKA(CKA):
+    """CKA with GPyTorch's own prediction strategy, as a BoTorch model comes."""
+
+    def _remember_training_data(self):
+        pass
+
+
+def moments(posterior):
+    return posterior.mean, posterior.variance
+
+
+def ratio(slow, fast, rounds=9):
+    """The ratio of the median times of two actions, timed by turns without gradients."""
+    times = ([], [])
+    with torch.no_grad():
+        for _ in range(rounds):
+            for action, record in zip((slow, fast), times, strict=True):
+                start = time.perf_counter()
+                action()
+                record.append(time.perf_counter() - start)
+    slow_time, fast_time = (torch.tensor(record[1:]).median().item() for record in times)
+    return slow_time / fast_time
+
+
+def record(benchmark, ratio_of, slow, fast):
+    fast()
+    value = benchmark.pedantic(ratio, args=(slow, fast), rounds=1)
+    benchmark.extra_info[ratio_of] = round(value, 2)
+    print(f"{ratio_of}: {value:.1f}")
+
+
+@pytest.mark.parametrize(
+    "other",
+    ["BoTorch's posterior(Z[:, None])", "posterior(Z[:, None])", "posterior(Z)", "SingleTaskGP"],
+)
+def test_predict(benchmark, data, m, other):
+    X, Y, Z = data
+    model, stock = build(X[:500], Y[:500]), SingleTaskGP(X[:500], Y[:500])
+    plain = PlainCKA(X[:500], Y[:500], physics=model.physics).eval()
+    slow = {
+        "BoTorch's posterior(Z[:, None])": lambda: moments(plain.posterior(Z.unsqueeze(-2))),
+        "posterior(Z[:, None])": lambda: moments(model.posterior(Z.unsqueeze(-2))),
+        "posterior(Z)": lambda: moments(model.posterior(Z)),
+        "SingleTaskGP": lambda: moments(stock.posterior(Z.unsqueeze(-2))),
+    }
+    benchmark.group = f"predict at 200 points, n = 500, {m} outputs"
+    record(benchmark, f"time of {other} / predict", slow[other], lambda: model.predict(Z))
+
+
+def test_append(benchmark, data, m):
+    X, Y, Z = data
+    model, whole = build(X[:500], Y[:500]), build(X, Y)
+    model.predict(Z)
+
+    def refactorise():
+        whole.prediction_strategy = None
+        whole._remember_training_data()
+        return whole.prediction_strategy.factors()
+
+    benchmark.group = f"factors with one more point, n = 500, {m} outputs"
+    record(
+        benchmark,
+        "time of refactorising / conditioning",
+        refactorise,
+        lambda: model.condition_on_observations(X[500:], Y[500:]),
+    )
+
+
+@pytest.mark.parametrize("other", ["rebuild", "SingleTaskGP"])
+def test_condition(benchmark, data, m, other):
+    X, Y, Z = data
+    model, stock = build(X[:500], Y[:500]), SingleTaskGP(X[:500], Y[:500])
+    stock.posterior(Z)
+    state, z = model.state_dict(), Z[:1]
+
+    def rebuild():
+        new = build(X, Y)
+        new.load_state_dict(state)
+        return moments(new.posterior(z))
+
+    slow = {
+        "rebuild": rebuild,
+        "SingleTaskGP": lambda: moments(
+            stock.condition_on_observations(X[500:], Y[500:]).posterior(z)
+        ),
+    }
+    benchmark.group = f"condition on one point and predict, n = 500, {m} outputs"
+    record(
+        benchmark,
+        f"time of {other} / conditioning",
+        slow[other],
+        lambda: model.condition_on_observations(X[500:], Y[500:]).predict(z),
+    )

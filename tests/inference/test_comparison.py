@@ -1,0 +1,187 @@
+"""`compare`: its numbers, its ranking, and what it says about the physics."""
+
+import pytest
+import torch
+
+from gpadjust import compare
+from gpadjust.inference.comparison import STRUCTURES
+from gpadjust.validation import leave_one_out
+
+QUICK = {"num_starts": 2, "num_screened": 32}
+THREE = ["zero mean", "physics mean", "CKA"]
+
+
+def crude(X):
+    return 2 + (7 * X[..., :1]).sin()
+
+
+@pytest.fixture
+def noise():
+    return 0.03 * torch.randn(14, 1, dtype=torch.float64)
+
+
+@pytest.fixture
+def X():
+    return torch.linspace(0, 1, 14, dtype=torch.float64).unsqueeze(-1)
+
+
+@pytest.fixture
+def scaled(X, noise):
+    """Data of a scaled physics, on which CKA is clearly best."""
+    return X, (1 + 2 * X) * crude(X) + X + noise
+
+
+def row(comparison, name):
+    return next(row for row in comparison.table if row.structure == name)
+
+
+def says(comparison, words):
+    return any(words in sentence for sentence in comparison.advice)
+
+
+@pytest.mark.parametrize("num_outputs", [1, 2])
+def test_numbers(X, scaled, noise, num_outputs):
+    Y = torch.cat([scaled[1], 100 * crude(X) + 40 * X.square() + 9 * noise], -1)[:, :num_outputs]
+
+    def physics(X):
+        return torch.cat([crude(X), 100 * crude(X)], -1)[..., :num_outputs]
+
+    names = [*THREE, "CKA centred, learnt rho mean"]
+    comparison = compare(X, Y, physics, structures=names, **QUICK)
+    assert set(comparison.models) == {row.structure for row in comparison.table} == set(names)
+    for name, model in comparison.models.items():
+        number = row(comparison, name)
+        loo = leave_one_out(model)
+        n = Y.numel()
+        assert number.log_predictive == pytest.approx(-loo.nlpd.mean().item() * n)
+        relative = (loo.mean - Y).square().mean(0).sqrt() / Y.std(0)
+        assert number.rmse == pytest.approx(relative.mean().item())
+        inside = (loo.mean - Y).abs() <= 1.9599639845 * loo.variance.sqrt()
+        assert number.coverage == pytest.approx(inside.double().mean().item())
+        if "learnt" in name:
+            continue  # its unknown mean is profiled out of the likelihood
+        prior = model.likelihood(model.forward(model.train_inputs[0]))
+        # log p(y) of y = scale * target.
+        log_scale = model.outcome_transform.stdvs.log().sum().item()
+        expected = prior.log_prob(model.train_targets).sum().item() - len(X) * log_scale
+        assert number.evidence == pytest.approx(expected, rel=1e-6, abs=1e-4)
+    assert row(comparison, "zero mean").num_parameters == 3 * num_outputs
+    assert row(comparison, "CKA").num_parameters == 5 * num_outputs
+    assert row(comparison, "CKA centred, learnt rho mean").num_parameters == 6 * num_outputs
+
+
+@pytest.mark.parametrize(
+    ("criterion", "field"), [("leave-one-out", "log_predictive"), ("evidence", "evidence")]
+)
+def test_ranking(scaled, criterion, field):
+    comparison = compare(*scaled, crude, structures=THREE, criterion=criterion, **QUICK)
+    values = [getattr(row, field) for row in comparison.table]
+    assert values == sorted(values, reverse=True)
+    assert comparison.criterion == criterion
+    assert comparison.chosen == comparison.table[0].structure == "CKA"
+    assert comparison.best is comparison.models["CKA"]
+
+
+def test_evidence_is_in_the_users_units(scaled):
+    X, Y = scaled
+    small = compare(X, Y, crude, structures=THREE, **QUICK)
+    large = compare(X, 1000 * Y, lambda X: 1000 * crude(X), structures=THREE, **QUICK)
+    shift = len(X) * torch.tensor(1000.0).log().item()
+    for name in THREE:
+        assert row(large, name).evidence == pytest.approx(
+            row(small, name).evidence - shift, abs=0.1
+        )
+
+
+@pytest.mark.slow
+def test_all_structures_by_default(scaled):
+    comparison = compare(*scaled, crude, **QUICK)
+    assert set(comparison.models) == set(STRUCTURES)
+    assert not says(comparison, "does not help")
+
+
+class TestAdvice:
+    def test_none_where_cka_is_clearly_better(self, scaled):
+        comparison = compare(*scaled, crude, structures=THREE, **QUICK)
+        assert comparison.advice[0] == "Best: CKA."
+        assert not says(comparison, "no better")
+
+    def test_a_physics_of_zero_does_not_help(self, X, noise):
+        comparison = compare(X, X.exp().sin() + noise, lambda X: 0 * X, **QUICK)
+        assert says(comparison, "does not help")
+
+    def test_rra_is_not_chosen_where_cka_is_at_hand(self, scaled):
+        comparison = compare(*scaled, crude, structures=["RRA", "CKA"], **QUICK)
+        assert comparison.chosen == "CKA"
+        assert comparison.best is comparison.models["CKA"]
+        alone = compare(*scaled, crude, structures=["RRA"], **QUICK)
+        assert alone.chosen == "RRA"
+
+    def test_few_observations(self, X):
+        comparison = compare(X[:5], X[:5].exp(), crude, structures=THREE, **QUICK)
+        assert says(comparison, "observations are few")
+
+    def test_too_few_for_unknown_constants(self, X):
+        comparison = compare(X[:2], X[:2].exp(), crude, **QUICK)
+        assert "constant rho" not in comparison.models
+
+    @pytest.mark.parametrize("criterion", ["leave-one-out", "evidence"])
+    def test_unrelated_physics(self, X, noise, criterion):
+        def unrelated(X):
+            return (1e4 * X).sin()
+
+        comparison = compare(
+            X, X.exp() + noise, unrelated, structures=THREE, criterion=criterion, **QUICK
+        )
+        assert says(comparison, "physics does not help")
+
+    def test_a_smooth_bias(self, X, noise):
+        def rough(X):
+            return 5 * (20 * X).sin()
+
+        comparison = compare(X, rough(X) + X.exp() + noise, rough, structures=THREE, **QUICK)
+        assert says(comparison, "no better than the physics mean")
+        assert not says(comparison, "does not help")
+
+    def test_without_rivals(self, scaled):
+        comparison = compare(*scaled, crude, structures=["CKA"], **QUICK)
+        assert comparison.advice[0] == "Best: CKA."
+        assert not says(comparison, "no better")
+
+
+def test_known_noise(scaled):
+    X, Y = scaled
+    comparison = compare(X, Y, crude, torch.full_like(Y, 1e-3), structures=THREE, **QUICK)
+    assert row(comparison, "CKA").num_parameters == 4
+
+
+def test_printing(scaled):
+    comparison = compare(*scaled, crude, structures=THREE, **QUICK)
+    lines = str(comparison).splitlines()
+    assert lines[0].split()[:2] == ["structure", "evidence"]
+    assert [line.split("  ")[0] for line in lines[1:4]] == [
+        f"{row.structure:12}".strip() for row in comparison.table
+    ]
+    assert lines[5] == "Best: CKA."
+    assert len({len(line) for line in lines[:4]}) == 1
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("structures", [[], ["CKA", "kriging"]])
+    def test_structures(self, scaled, structures):
+        with pytest.raises(ValueError, match="structures"):
+            compare(*scaled, crude, structures=structures)
+
+    def test_criterion(self, scaled):
+        with pytest.raises(ValueError, match="leave-one-out"):
+            compare(*scaled, crude, criterion="BIC")
+
+    def test_batches(self, scaled):
+        X, Y = (t.expand(2, -1, -1) for t in scaled)
+        with pytest.raises(ValueError, match="one data set"):
+            compare(X, Y, crude)
+
+    def test_data(self, scaled):
+        X, Y = scaled
+        with pytest.raises(ValueError, match="train_Y"):
+            compare(X, Y[:5], crude)

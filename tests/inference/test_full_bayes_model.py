@@ -1,0 +1,279 @@
+"""A model that holds samples of its hyper-parameters is the mixture of the samples' models."""
+
+import pickle
+from copy import deepcopy
+
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
+from botorch.sampling import SobolQMCNormalSampler
+from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
+from torch import Size
+
+from gpadjust import fit
+from gpadjust.validation import leave_one_out
+
+KINDS = ["ZeroMeanGP", "PhysicsMeanGP", "BiasGP", "ScaleGP", "CKA", "AR1", "RRA"]
+
+
+def matern(m):
+    batch = Size([m]) if m > 1 else Size()
+    return ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=2, batch_shape=batch), batch_shape=batch)
+
+
+def partial_sum(m):
+    batch = Size([m]) if m > 1 else Size()
+    first = ScaleKernel(RBFKernel(active_dims=[0], batch_shape=batch), batch_shape=batch)
+    return first + ScaleKernel(MaternKernel(nu=1.5, batch_shape=batch), batch_shape=batch)
+
+
+VARIANTS = {
+    "Matern": ("CKA", lambda m: {"rho_covar_module": matern(m), "delta_covar_module": matern(m)}),
+    "sum": ("CKA", lambda m: {"delta_covar_module": partial_sum(m)}),
+    "Normalize": ("CKA", lambda m: {"input_transform": Normalize(2)}),
+    "AR1-Normalize": ("AR1", lambda m: {"input_transform": Normalize(2)}),
+    "centred": ("CKA", lambda m: {"center": "mean"}),
+    "learnt means": (
+        "CKA",
+        lambda m: {"center": "mean", "learn_rho_mean": True, "learn_delta_mean": True},
+    ),
+    "no outcome transform": ("CKA", lambda m: {"outcome_transform": None}),
+}
+_NAMES = [*KINDS, *VARIANTS, "CKA-known", "AR1-known"]
+_QUICK = ["CKA", "AR1", "RRA", "learnt means", "Normalize", "CKA-known"]
+CASES = [pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow) for name in _NAMES]
+
+
+def mixture(posteriors):
+    """Component moments ``... x S x q x m`` of the posteriors of single models."""
+    mean = torch.stack([posterior.mean for posterior in posteriors], dim=-3)
+    variance = torch.stack([posterior.variance for posterior in posteriors], dim=-3)
+    return mean, variance
+
+
+@pytest.fixture(params=CASES)
+def case(request, num_outputs, data, held):
+    """The name, a model that holds three samples, and the models of each."""
+    name = request.param
+    X, Y = data(num_outputs=num_outputs)
+    if name.endswith("-known"):
+        Yvar = 1e-3 * (1 + X.sum(-1, keepdim=True)).expand_as(Y)
+        return name, *held(name.removesuffix("-known"), X, Y, Yvar)
+    kind, _ = VARIANTS.get(name, (name, None))
+    if name in VARIANTS:
+        # Modules are built anew for each model.
+        return name, *_held_with_options(request, held, kind, X, Y, VARIANTS[name][1])
+    return name, *held(kind, X, Y)
+
+
+def _held_with_options(request, held, kind, X, Y, options):
+    build = request.getfixturevalue("build")
+    return held(make=lambda: build(kind, X, Y, **options(Y.shape[-1])))
+
+
+@pytest.fixture
+def close():
+    def close(actual, expected, tolerance=1e-8):
+        assert actual.shape == expected.shape
+        scale = tolerance * expected.abs().max().item()
+        torch.testing.assert_close(actual, expected, rtol=tolerance, atol=scale)
+
+    return close
+
+
+def check(actual, posteriors, close):
+    mean, variance = mixture(posteriors)
+    assert isinstance(actual, GaussianMixturePosterior)
+    close(actual.mean, mean)
+    close(actual.variance, variance)
+    close(actual.mixture_mean, mean.mean(-3))
+    spread = (mean - mean.mean(-3, keepdim=True)).square().mean(-3)
+    close(actual.mixture_variance, variance.mean(-3) + spread)
+
+
+@pytest.mark.parametrize("shape", [(4,), (5, 4), (2, 3, 1)])
+class TestPosterior:
+    @pytest.mark.parametrize("noise", [False, True])
+    def test_components(self, case, uniform, close, shape, noise):
+        _, model, singles = case
+        Z = uniform(*shape, 2, high=2.0)
+        expected = [single.posterior(Z, observation_noise=noise) for single in singles]
+        check(model.posterior(Z, observation_noise=noise), expected, close)
+
+    def test_predict(self, case, uniform, close, shape):
+        _, model, _ = case
+        Z = uniform(*shape, 2, high=2.0)
+        own_noise = uniform(*shape, model.num_outputs)
+        for noise in (False, True, own_noise):
+            per_point = noise.unsqueeze(-2) if isinstance(noise, torch.Tensor) else noise
+            expected = model.posterior(Z.unsqueeze(-2), observation_noise=per_point)
+            mean, variance = model.predict(Z, observation_noise=noise)
+            close(mean, expected.mixture_mean.squeeze(-2))
+            close(variance, expected.mixture_variance.squeeze(-2))
+
+    @pytest.mark.parametrize("component", ["rho", "delta"])
+    def test_adjustments(self, case, uniform, close, shape, component):
+        _, model, singles = case
+        if not hasattr(model, component):
+            pytest.skip("the model has no such component")
+        Z = uniform(*shape, 2, high=2.0)
+        expected = [getattr(single, component)(Z) for single in singles]
+        check(getattr(model, component)(Z), expected, close)
+
+
+class TestObservations:
+    def test_conditioning(self, case, data, uniform, close):
+        name, model, singles = case
+        Z, m = uniform(4, 2, high=2.0), model.num_outputs
+        for seed in (1, 2):
+            X, Y = data(n=2, num_outputs=m, seed=seed)
+            noise = {"noise": torch.full_like(Y, 1e-3)} if "known" in name else {}
+            model = model.condition_on_observations(X, Y, **noise)
+            singles = [single.condition_on_observations(X, Y, **noise) for single in singles]
+            check(model.posterior(Z), [single.posterior(Z) for single in singles], close)
+            close(model.predict(Z).mean, model.posterior(Z).mixture_mean)
+
+    def test_conditioning_of_each_sample(self, held, data, uniform, close):
+        model, singles = held("CKA", *data(num_outputs=2))
+        X, Y = data(batch_shape=(3,), n=2, num_outputs=2, seed=1)
+        Z = uniform(4, 2, high=2.0)
+        each = [
+            single.condition_on_observations(x, y)
+            for single, x, y in zip(singles, X, Y, strict=True)
+        ]
+        actual = model.condition_on_observations(X, Y)
+        check(actual.posterior(Z), [single.posterior(Z) for single in each], close)
+
+    @pytest.mark.parametrize("batch", [(), (6,)])
+    def test_fantasies(self, case, uniform, batch):
+        _, model, _ = case
+        X, Z = uniform(*batch, 2, 2, high=2.0), uniform(*batch, 4, 2, high=2.0)
+        m = model.num_outputs
+        fantasies = model.fantasize(X, SobolQMCNormalSampler(Size([5]), seed=0))
+        posterior = fantasies.posterior(Z)
+        assert posterior.mean.shape == (5, *batch, 3, 4, m)
+        assert posterior.mixture_mean.shape == (5, *batch, 4, m)
+        assert (posterior.variance <= model.posterior(Z).variance + 1e-9).all()
+
+    def test_leave_one_out(self, case, close):
+        _, model, singles = case
+        loo = leave_one_out(model)
+        parts = [leave_one_out(single) for single in singles]
+        close(loo.X, parts[0].X)
+        close(loo.Y, parts[0].Y)
+        mean = torch.stack([part.mean for part in parts])
+        variance = torch.stack([part.variance for part in parts])
+        weight = 1 / torch.distributions.Normal(mean, variance.sqrt()).log_prob(loo.Y).exp()
+        weight = (weight / weight.sum(0)).clamp_max(3**-0.5)
+        weight = weight / weight.sum(0)
+        close(loo.mean, (weight * mean).sum(0))
+        second = (weight * (variance + (mean - loo.mean).square())).sum(0)
+        close(loo.variance, second)
+
+
+def test_leave_one_out_is_the_posterior_without_the_observation(held, data):
+    # A prior of weights 1 / p(y | sample) makes equal weights the exact posterior.
+    X, Y = data()
+    make, spread = {"outcome_transform": None}, 0.02
+    model, singles = held("CKA", X, Y, spread=spread, **make)
+
+    def log_likelihood(single, keep):
+        inputs = single.train_inputs[0][keep]
+        prior = single.likelihood(single.forward(inputs))
+        return prior.log_prob(single.train_targets[keep])
+
+    loo = leave_one_out(model)
+    everything = torch.ones(len(X), dtype=torch.bool)
+    for i in range(len(X)):
+        rest = everything.clone()
+        rest[i] = False
+        log_weight = torch.stack(
+            [log_likelihood(s, rest) - log_likelihood(s, everything) for s in singles]
+        )
+        weight = log_weight.softmax(0)
+        mean = torch.stack([leave_one_out(s).mean[i, 0] for s in singles])
+        torch.testing.assert_close(loo.mean[i, 0], weight @ mean, rtol=1e-8, atol=1e-8)
+
+
+class TestFunctions:
+    @pytest.mark.parametrize(
+        "kind", [pytest.param(k, marks=pytest.mark.slow if k == "AR1" else ()) for k in KINDS]
+    )
+    def test_moments(self, kind, held, data, uniform, num_outputs):
+        model, _ = held(kind, *data(num_outputs=num_outputs))
+        Z = uniform(3, 2, high=2.0)
+        values = model.sample_functions(600, seed=0)(Z)
+        assert values.shape == (600, 3, num_outputs)
+        mean, variance = model.predict(Z)
+        sd = variance.sqrt()
+        # Rounding, where the model is all but sure.
+        assert ((values.mean(0) - mean).abs() <= 0.15 * sd + 1e-6 * mean.abs()).all()
+        assert (values.std(0) / sd - 1).abs().max() < 0.15
+
+    def test_shapes_and_seed(self, held, data, uniform):
+        model, _ = held("CKA", *data(num_outputs=2))
+        functions = model.sample_functions(4, seed=1)
+        Z = uniform(5, 6, 2)
+        assert functions(Z).shape == (4, 5, 6, 2)
+        torch.testing.assert_close(functions(Z)[:, 2], functions(Z[2]))
+        torch.testing.assert_close(functions(Z), model.sample_functions(4, seed=1)(Z))
+
+    def test_after_conditioning(self, held, data):
+        X, Y = data(num_outputs=2)
+        model, _ = held("CKA", X, Y, torch.full_like(Y, 1e-4))
+        new_X, new_Y = data(n=2, num_outputs=2, seed=1)
+        model = model.condition_on_observations(new_X, new_Y, noise=torch.full_like(new_Y, 1e-4))
+        values = model.sample_functions(4, seed=0)(new_X)
+        torch.testing.assert_close(values, new_Y.expand_as(values), rtol=0, atol=0.1)
+
+
+class TestCopies:
+    @pytest.mark.parametrize("kind", ["CKA", "AR1", "RRA"])
+    @pytest.mark.parametrize("indices", [[1], [1, 0]])
+    def test_subset_of_outputs(self, held, data, uniform, close, kind, indices):
+        model, _ = held(kind, *data(num_outputs=2))
+        Z = uniform(4, 2, high=2.0)
+        whole, subset = model.posterior(Z), model.subset_output(indices)
+        for part in (subset.posterior(Z), model.posterior(Z, output_indices=indices)):
+            close(part.mean, whole.mean[..., indices])
+            close(part.mixture_variance, whole.mixture_variance[..., indices])
+        close(subset.predict(Z).mean, whole.mixture_mean[..., indices])
+
+    def test_deepcopy_and_state_dict(self, case, uniform, close, build, data):
+        name, model, _ = case
+        Z = uniform(4, 2, high=2.0)
+        expected = model.posterior(Z)
+        copy = deepcopy(model)
+        assert copy.num_samples == 3
+        close(copy.posterior(Z).variance, expected.variance)
+        if name in KINDS:
+            other = build(name, *data(num_outputs=model.num_outputs))
+            other.load_state_dict(model.state_dict())
+            assert other.num_samples == 3
+            close(other.posterior(Z).mean, expected.mean)
+
+    def test_pickle(self, held, data, uniform, close):
+        model, _ = held("ZeroMeanGP", *data(num_outputs=2))
+        again = pickle.loads(pickle.dumps(model))
+        Z = uniform(4, 2, high=2.0)
+        assert again.num_samples == 3
+        close(again.posterior(Z).mean, model.posterior(Z).mean)
+
+
+class TestRefusals:
+    def test_training(self, held, data):
+        model, _ = held("CKA", *data())
+        for attempt in (model.train, lambda: fit(model), lambda: fit(model, "hmc")):
+            with pytest.raises(RuntimeError, match="holds samples"):
+                attempt()
+        with pytest.raises(RuntimeError, match="holds samples"):
+            model.hold_samples({})
+
+    def test_the_papers_closed_form(self, build, data):
+        with pytest.raises(ValueError, match="prior='physics'"):
+            fit(build("RRA-paper", *data()), "hmc")
+
+    def test_a_batch_of_data_sets(self, build, data):
+        with pytest.raises(ValueError, match="one data set"):
+            fit(build("CKA", *data(batch_shape=(2,))), "hmc")

@@ -1,0 +1,89 @@
+"""The sampler on densities whose moments are known."""
+
+import pytest
+import torch
+
+from gpadjust.inference.hmc import hmc
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def gaussian(mean, covariance):
+    """The potential of B Gaussians, for means ``B x p`` and covariances ``B x p x p``."""
+    precision = torch.linalg.inv(covariance)
+
+    def potential(x):
+        pull = (precision @ (x - mean).unsqueeze(-1)).squeeze(-1)
+        return 0.5 * ((x - mean) * pull).sum(-1), pull
+
+    return potential
+
+
+def bimodal(x):
+    """Normals at -3 and 3 of weights 0.3 and 0.7, of sd 0.5, in the first of two coordinates."""
+    leaf = x.detach().requires_grad_()
+    means = torch.tensor([-3.0, 3.0], dtype=x.dtype)
+    weights = torch.tensor([0.3, 0.7], dtype=x.dtype)
+    first = weights.log() - 0.5 * ((leaf[..., :1] - means) / 0.5).square()
+    value = -first.logsumexp(-1) + 0.5 * leaf[..., 1].square()
+    (gradient,) = torch.autograd.grad(value.sum(), leaf)
+    return value.detach(), gradient
+
+
+@pytest.fixture
+def gaussians():
+    """Two problems in three dimensions, of very different scales and correlations."""
+    mean = torch.tensor([[1.0, -2.0, 0.0], [10.0, 0.0, 5.0]], dtype=torch.float64)
+    root = torch.tensor([[1.0, 0, 0], [0.9, 0.3, 0], [-0.5, 0.2, 2.0]], dtype=torch.float64)
+    covariance = torch.stack([root @ root.mT, 0.01 * root.mT @ root])
+    return mean, covariance
+
+
+def test_moments_of_gaussians(gaussians):
+    mean, covariance = gaussians
+    start = mean + torch.randn(16, 2, 3, generator=generator(), dtype=torch.float64)
+    draws = hmc(gaussian(mean, covariance), start, 100, 300, generator())
+    assert draws.positions.shape == (300, 16, 2, 3)
+    assert draws.acceptance.shape == (2,)
+    assert (draws.acceptance > 0.6).all()
+    flat = draws.positions.flatten(0, 1)
+    sd = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((flat.mean(0) - mean) / sd).abs().max() < 0.1
+    for i in range(2):
+        relative = (flat[:, i].mT.cov() - covariance[i]) / (sd[i, :, None] * sd[i])
+        assert relative.abs().max() < 0.12
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_weights_of_two_modes(seed):
+    start = 3 * torch.randn(16, 1, 2, generator=generator(seed), dtype=torch.float64)
+    draws = hmc(bimodal, start, 100, 500, generator(seed))
+    right = draws.positions[..., 0] > 0
+    assert right.double().mean() == pytest.approx(0.7, abs=0.06)
+    assert draws.positions[..., 0][right].mean() == pytest.approx(3, abs=0.1)
+    assert draws.positions[..., 1].std() == pytest.approx(1, abs=0.1)
+
+
+def test_seed_and_global_state(gaussians):
+    potential = gaussian(*gaussians)
+    start = gaussians[0].expand(4, 2, 3)
+    torch.manual_seed(5)
+    expected = torch.rand(1)
+    torch.manual_seed(5)
+    first, again = (hmc(potential, start, 8, 5, generator(3)).positions for _ in range(2))
+    assert torch.equal(torch.rand(1), expected)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, hmc(potential, start, 8, 5, generator(4)).positions)
+
+
+def test_infinite_potentials_are_never_accepted():
+    def half_line(x):
+        value = 0.5 * x.square().sum(-1)
+        return torch.where(x[..., 0] > 0, value, torch.inf), x
+
+    start = torch.rand(8, 1, 2, generator=generator(), dtype=torch.float64)
+    positions = hmc(half_line, start, 40, 200, generator()).positions
+    assert (positions[..., 0] > 0).all()
+    assert positions[..., 0].mean() == pytest.approx((2 / torch.pi) ** 0.5, abs=0.08)

@@ -1,0 +1,105 @@
+"""The default priors, and densities of priors in an objective."""
+
+import math
+
+import pytest
+import torch
+from gpytorch.kernels import RBFKernel, ScaleKernel
+from gpytorch.priors import GammaPrior, LogNormalPrior
+from torch.distributions import LogNormal, Normal
+
+from gpadjust import CKA
+from gpadjust.inference import register_priors
+from gpadjust.inference.objective import Objective
+
+
+def priors(model):
+    return {name: prior for name, _, prior, _, _ in model.named_priors()}
+
+
+def test_densities(build, data, num_outputs):
+    X, Y = data(num_outputs=num_outputs)
+    X = X * torch.tensor([1.0, 100.0])
+    model = build(
+        "CKA", X, Y, physics=lambda X: 3 + X[..., :1].expand_as(Y), outcome_transform=None
+    )
+    register_priors(model)
+    found = priors(model)
+    ranges = X.amax(0) - X.amin(0)
+    f_p = 3 + X[:, :1].expand_as(Y)
+    v = (Y - f_p).square().mean(0)
+    d = 2
+    medians = {
+        "likelihood.noise_covar.noise_prior": (1e-4 * v.unsqueeze(-1), 4),
+        "covar_module.kernels.1.base_kernel.outputscale_prior": (v, 5),
+        "covar_module.kernels.0.base_kernel.base_kernel.outputscale_prior": (v * 0 + 0.25, 1.5),
+    }
+    median = ranges * math.sqrt(d) * math.exp(math.sqrt(2) - 1)
+    for name in (
+        "covar_module.kernels.1.base_kernel.base_kernel.lengthscale_prior",
+        "covar_module.kernels.0.base_kernel.base_kernel.base_kernel.lengthscale_prior",
+    ):
+        medians[name] = (median.expand(num_outputs, 1, 2), math.sqrt(3))
+    assert set(found) == set(medians)
+    for name, (middle, sd) in medians.items():
+        value = torch.full_like(middle, 0.7)
+        actual = found[name].log_prob(value.reshape(found[name].loc.shape))
+        torch.testing.assert_close(
+            actual.flatten(), LogNormal(middle.log(), sd).log_prob(value).flatten()
+        )
+
+
+def test_constant_rho_of_ar1(build, data):
+    model = build("AR1", *data())
+    register_priors(model)
+    rho = torch.tensor([2.5], dtype=torch.float64)
+    expected = Normal(1.0, 1.0).log_prob(rho)
+    torch.testing.assert_close(priors(model)["covar_module.rho_prior"].log_prob(rho), expected)
+
+
+def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics):
+    X, Y = data()
+    own = GammaPrior(3.0, 6.0)
+    kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=own))
+    model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel)
+    model.delta_covar_module.raw_outputscale.requires_grad_(False)
+    register_priors(model)
+    assert kernel.base_kernel.lengthscale_prior is own
+    assert not hasattr(model.delta_covar_module, "outputscale_prior")
+    before = priors(model)
+    register_priors(model)
+    assert priors(model) == before
+
+
+@pytest.mark.parametrize("kind", ["CKA", "AR1", "RRA", "ScaleGP"])
+def test_objective_is_gpytorchs_log_posterior(build, data, shuffle, kind, num_outputs):
+    model = build(kind, *data(num_outputs=num_outputs))
+    register_priors(model)
+    shuffle(model)
+    objective = Objective(model, marginal=True)
+    model.train()
+    inputs = model.train_inputs[0]
+    likelihood = model.likelihood(model(inputs), model.transform_inputs(inputs))
+    expected = likelihood.log_prob(model.train_targets).sum() + sum(
+        prior.log_prob(read(module)).sum() for _, module, prior, read, _ in model.named_priors()
+    )
+    value = objective(objective.current())
+    torch.testing.assert_close(-value.sum(), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("prior", [None, GammaPrior(3.0, 6.0), LogNormalPrior(0.1, 0.7)])
+def test_potential_has_the_jacobian_of_the_logarithm(data, crude_physics, prior):
+    X, Y = data()
+    kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=prior))
+    model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel)
+    register_priors(model)
+    objective = Objective(model, marginal=True)
+    of_settings = Objective(model, marginal=True, of_settings=True)
+    potential = of_settings.value_and_gradient
+    settings = objective.current() + 0.1
+    value, gradient = potential(settings)
+    # All parameters are positive and sampled as logarithms.
+    torch.testing.assert_close(value, objective(settings) - settings.sum(-1))
+    step = 1e-5 * torch.eye(settings.shape[-1], dtype=torch.float64).unsqueeze(-2)
+    numeric = (potential(settings + step)[0] - potential(settings - step)[0]) / 2e-5
+    torch.testing.assert_close(gradient[0, 0], numeric[:, 0], rtol=1e-5, atol=1e-5)

@@ -1,0 +1,166 @@
+"""Gradients by hand against autograd through the model's own modules."""
+
+import pytest
+import torch
+from gpytorch.kernels import MaternKernel, PeriodicKernel, RBFKernel, ScaleKernel
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust.inference.objective import Objective
+from gpadjust.inference.prior_moments import ModuleMoments
+from gpadjust.inference.stationary_moments import StationaryMoments
+
+D = 2
+SEEDS = st.integers(0, 2**31)
+
+
+def crude(X):
+    return torch.stack([2 + (3 * X[..., 0]).sin(), X.sum(-1), (1 + X[..., 1]).exp()], dim=-1)
+
+
+def draw(seed, n=9, m=1, batch=()):
+    """Inputs, and targets that the physics nearly explains."""
+    generator = torch.Generator().manual_seed(seed)
+    X = torch.rand(*batch, n, D, generator=generator, dtype=torch.float64)
+    noise = torch.randn(*batch, n, m, generator=generator, dtype=torch.float64)
+    return X, 1.3 * crude(X)[..., :m] + X[..., :1].square() + 0.1 * noise
+
+
+def physics(m):
+    return lambda X: crude(X)[..., :m]
+
+
+def kernel(smoothness, ard, batch=()):
+    """The user's own, with GPyTorch's default constraints."""
+    shape = torch.Size(batch)
+    options = {"ard_num_dims": D if ard else None, "batch_shape": shape}
+    base = MaternKernel(smoothness, **options) if smoothness else RBFKernel(**options)
+    return ScaleKernel(base, batch_shape=shape).double()
+
+
+def assert_equal_to_autograd(model, seed, spread=0.5, tolerance=1e-6):
+    by_hand, reference = Objective(model), Objective(model, autograd=True)
+    assert isinstance(by_hand._moments, StationaryMoments)
+    assert isinstance(reference._moments, ModuleMoments)
+    generator = torch.Generator().manual_seed(seed)
+    current = by_hand.current()
+    noise = torch.randn(3, *current.shape[1:], generator=generator, dtype=torch.float64)
+    settings = current + spread * noise
+    values, gradient = by_hand.value_and_gradient(settings)
+    expected_values, expected = reference.value_and_gradient(settings)
+    assert values.isfinite().all()
+    torch.testing.assert_close(values, expected_values, rtol=tolerance, atol=tolerance)
+    size = expected.abs().amax(-1, keepdim=True)
+    error = (gradient - expected).abs() / size.clamp_min(1.0)
+    assert error.max() < tolerance
+    torch.testing.assert_close(by_hand(settings), values, rtol=1e-10, atol=1e-10)
+
+
+MODELS = {
+    "CKA": lambda X, Y, m: CKA(X, Y, physics=physics(m)),
+    "PhysicsMeanGP": lambda X, Y, m: PhysicsMeanGP(X, Y, physics=physics(m)),
+    "ScaleGP": lambda X, Y, m: ScaleGP(X, Y, physics=physics(m)),
+    "ZeroMeanGP": lambda X, Y, m: ZeroMeanGP(X, Y),
+    "known noise": lambda X, Y, m: CKA(X, Y, torch.full_like(Y, 0.01), physics=physics(m)),
+    "centred": lambda X, Y, m: CKA(X, Y, physics=physics(m), center="mean"),
+    "rho mean": lambda X, Y, m: CKA(X, Y, physics=physics(m), learn_rho_mean=True),
+    "delta mean": lambda X, Y, m: CKA(X, Y, physics=physics(m), learn_delta_mean=True),
+    "both means": lambda X, Y, m: CKA(
+        X, Y, physics=physics(m), learn_rho_mean=True, learn_delta_mean=True
+    ),
+    "rho mean alone": lambda X, Y, m: PhysicsMeanGP(X, Y, physics=physics(m), learn_rho_mean=True),
+}
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+@settings(max_examples=5, deadline=None, derandomize=True)
+@given(seed=SEEDS, m=st.sampled_from([1, 3]), batch=st.sampled_from([(), (2,)]))
+def test_every_model(name, seed, m, batch):
+    assert_equal_to_autograd(MODELS[name](*draw(seed, m=m, batch=batch), m), seed)
+
+
+@pytest.mark.parametrize("smoothness", [None, 0.5, 1.5, 2.5], ids=["RBF", "1/2", "3/2", "5/2"])
+@pytest.mark.parametrize("ard", [True, False], ids=["ARD", "one lengthscale"])
+@settings(max_examples=5, deadline=None, derandomize=True)
+@given(seed=SEEDS, m=st.sampled_from([1, 3]), learn=st.booleans())
+def test_every_kernel(smoothness, ard, seed, m, learn):
+    batch = (3,) if m > 1 else ()
+    model = CKA(
+        *draw(seed, m=m),
+        physics=physics(m),
+        rho_covar_module=kernel(smoothness, ard, batch),
+        delta_covar_module=kernel(None, not ard, batch),
+        learn_rho_mean=learn,
+    )
+    assert_equal_to_autograd(model, seed)
+
+
+FROZEN = [
+    "likelihood.noise_covar.raw_noise",
+    "rho_covar_module.raw_outputscale",
+    "rho_covar_module.base_kernel.raw_lengthscale",
+    "delta_covar_module.raw_outputscale",
+    "delta_covar_module.base_kernel.raw_lengthscale",
+]
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(seed=SEEDS, m=st.sampled_from([1, 3]), frozen=st.sets(st.sampled_from(FROZEN), max_size=4))
+def test_some_parameters_frozen(seed, m, frozen):
+    model = CKA(*draw(seed, m=m), physics=physics(m))
+    for name in frozen:
+        parameter = model
+        for part in name.split("."):
+            parameter = getattr(parameter, part)
+        parameter.requires_grad_(False)
+    assert_equal_to_autograd(model, seed)
+
+
+@pytest.mark.parametrize("smoothness", [None, 0.5, 1.5, 2.5], ids=["RBF", "1/2", "3/2", "5/2"])
+@pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-8, 1e-4])
+def test_near_duplicate_inputs(smoothness, gap):
+    X, Y = draw(0)
+    X = torch.cat([X, X[:3] + gap])
+    Y = torch.cat([Y, Y[:3] + 1e-3])
+    made = kernel(smoothness, True)
+    model = CKA(X, Y, physics=physics(1), delta_covar_module=made)
+    # A distance of 1e-8 is known to about half of the digits, by either way.
+    assert_equal_to_autograd(model, 0, tolerance=1e-6 if smoothness != 0.5 else 1e-5)
+
+
+@pytest.mark.parametrize("offset", [1e3, 1e6])
+def test_inputs_far_from_zero(offset):
+    X, Y = draw(0)
+    near = Objective(ZeroMeanGP(X, Y))
+    far = Objective(ZeroMeanGP(X + offset, Y))
+    for a, b in zip(
+        near.value_and_gradient(near.current()), far.value_and_gradient(near.current()), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)
+
+
+BOUNDS = torch.tensor([[0.0] * D, [1.0] * D], dtype=torch.float64)
+OTHERS = {
+    "periodic": lambda X, Y: CKA(
+        X, Y, physics=physics(1), delta_covar_module=ScaleKernel(PeriodicKernel()).double()
+    ),
+    "product": lambda X, Y: CKA(
+        X, Y, physics=physics(1), delta_covar_module=(RBFKernel() * RBFKernel()).double()
+    ),
+    "active_dims": lambda X, Y: CKA(
+        X, Y, physics=physics(1), delta_covar_module=RBFKernel(active_dims=[0]).double()
+    ),
+    "RRA": lambda X, Y: RRA(X, Y, physics=physics(1), num_features=8),
+    "AR1": lambda X, Y: AR1(X, Y, physics=physics(1), num_low=8, bounds=BOUNDS),
+}
+
+
+@pytest.mark.parametrize("name", list(OTHERS))
+def test_other_forms_fall_back_to_autograd(name):
+    objective = Objective(OTHERS[name](*draw(0)))
+    assert isinstance(objective._moments, ModuleMoments)
+    value, gradient = objective.value_and_gradient(objective.current())
+    assert value.isfinite().all()
+    assert gradient.isfinite().all()
+    assert gradient.abs().max() > 0

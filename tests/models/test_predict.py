@@ -1,0 +1,147 @@
+"""Marginal predictions at many points, and how long what they are made from is kept."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from botorch.models.transforms import Normalize, Standardize
+from gpytorch.kernels import InducingPointKernel, RBFKernel, ScaleKernel
+from gpytorch.likelihoods import GaussianLikelihood
+
+from gpadjust import ZeroMeanGP, fit
+
+
+def reference(model, Z, **options):
+    posterior = model.posterior(Z.unsqueeze(-2), **options)
+    return posterior.mean.squeeze(-2), posterior.variance.squeeze(-2)
+
+
+def same(model, Z, close, **options):
+    for actual, expected in zip(
+        model.predict(Z, **options), reference(model, Z, **options), strict=True
+    ):
+        close(actual, expected)
+
+
+@pytest.mark.parametrize("noise", [False, True], ids=["function", "observations"])
+@pytest.mark.parametrize("setting", ["plain", "known-noise", "transformed"])
+def test_as_the_posterior(data, build, kind, num_outputs, shuffle, uniform, close, setting, noise):
+    X, Y = data(num_outputs=num_outputs)
+    options = {}
+    if setting == "transformed":
+        options["input_transform"] = Normalize(2)
+        options["outcome_transform"] = None if kind == "RRA-paper" else Standardize(num_outputs)
+    Yvar = uniform(*Y.shape, low=0.01, high=0.1) if setting == "known-noise" else None
+    model = shuffle(build(kind, X, Y, Yvar, **options))
+    same(model, uniform(7, 2, high=2.0, seed=1), close, observation_noise=noise)
+    same(model, uniform(3, 7, 2, high=2.0, seed=1), close, observation_noise=noise)
+
+
+def test_a_batch_of_models(data, build, kind, num_outputs, uniform, close):
+    model = build(kind, *data((3,), num_outputs=num_outputs)).eval()
+    for shape in [(7, 2), (3, 7, 2), (4, 3, 7, 2)]:
+        Z = uniform(*shape, high=2.0, seed=1)
+        prediction, posterior = model.predict(Z), model.posterior(Z)
+        close(prediction.mean, posterior.mean)
+        close(prediction.variance, posterior.variance)
+
+
+def test_given_noise(data, build, kind, num_outputs, uniform):
+    model, Z = build(kind, *data(num_outputs=num_outputs)), uniform(5, 2)
+    noise = uniform(5, num_outputs, seed=2)
+    scale = model.outcome_transform.stdvs.square() if hasattr(model, "outcome_transform") else 1.0
+    actual = model.predict(Z, noise).variance - model.predict(Z).variance
+    torch.testing.assert_close(actual, (noise * scale).expand_as(actual))
+
+
+def test_gradients(data, build, kind, num_outputs, uniform):
+    model = build(kind, *data(num_outputs=num_outputs)).eval().requires_grad_(False)
+    Z = uniform(3, 2, high=2.0, seed=5).requires_grad_()
+    assert torch.autograd.gradcheck(lambda Z: model.predict(Z), Z)
+
+
+def test_gradients_to_the_hyperparameters_twice(data, build, uniform):
+    model, Z = build("CKA", *data()).eval(), uniform(3, 2)
+    first, second = (
+        torch.autograd.grad(model.predict(Z).mean.sum(), model.rho_covar_module.raw_outputscale)
+        for _ in range(2)
+    )
+    torch.testing.assert_close(first, second)
+
+
+def test_no_points(data, build, kind, num_outputs):
+    model = build(kind, *data(num_outputs=num_outputs))
+    mean, variance = model.predict(torch.empty(0, 2, dtype=torch.float64))
+    assert mean.shape == variance.shape == (0, num_outputs)
+
+
+def test_wrong_columns(data, build, kind):
+    with pytest.raises((ValueError, RuntimeError)):
+        build(kind, *data()).predict(torch.zeros(3, 3, dtype=torch.float64))
+
+
+def change_by_training(model, build, data):
+    model.train()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1
+
+
+def change_by_fit(model, build, data):
+    fit(model)
+
+
+def change_by_state(model, build, data):
+    other = build(*data(seed=3))
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter += 0.2
+    model.load_state_dict(other.state_dict())
+
+
+def change_of_data(model, build, data):
+    targets = model.eval().train_targets
+    model.set_train_data(model.train_inputs[0], 2 * targets, strict=False)
+
+
+@pytest.mark.parametrize(
+    "change", [change_by_training, change_by_fit, change_by_state, change_of_data]
+)
+def test_nothing_stale_is_kept(data, build, costly_kind, uniform, close, change):
+    X, Y = data()
+    model = build(costly_kind, X, Y + 0.1 * uniform(*Y.shape, seed=5))
+    Z = uniform(5, 2, high=2.0)
+    before = model.predict(Z)
+    change(model, lambda X, Y: build(costly_kind, X, Y), data)
+    after = model.predict(Z)
+    assert (after.mean - before.mean).abs().max() > 1e-6
+    fresh = copy.deepcopy(model)
+    assert fresh.prediction_strategy is None
+    # A fit may leave variances that are little more than rounding errors.
+    tolerance = 1e-2 if change is change_by_fit else 1e-8
+    for actual, expected in zip(after, reference(fresh, Z), strict=True):
+        close(actual, expected, tolerance)
+
+
+def test_a_copy_of_a_conditioned_model(data, build, kind, num_outputs, uniform, close):
+    model, Z = build(kind, *data(num_outputs=num_outputs)), uniform(5, 2)
+    model = model.condition_on_observations(Z[:2] + 1, torch.ones(2, num_outputs).double())
+    for actual, expected in zip(copy.deepcopy(model).predict(Z), model.predict(Z), strict=True):
+        close(actual, expected, 1e-7)
+
+
+def test_factors_are_left_out_of_a_pickle(data, uniform):
+    model, Z = ZeroMeanGP(*data(n=150)), uniform(5, 2)
+    size = len(pickle.dumps(model))
+    before = model.predict(Z).mean
+    assert len(pickle.dumps(model)) < size + 10_000
+    torch.testing.assert_close(pickle.loads(pickle.dumps(model)).predict(Z).mean, before)
+
+
+def test_a_kernel_with_its_own_way(data, uniform, close):
+    X, Y = data(n=20)
+    likelihood = GaussianLikelihood().double()
+    kernel = InducingPointKernel(ScaleKernel(RBFKernel()).double(), X[:8].clone(), likelihood)
+    model = ZeroMeanGP(X, Y, covar_module=kernel, likelihood=likelihood).eval()
+    same(model, uniform(5, 2), close)
