@@ -79,3 +79,20 @@ def close():
         )
 
     return close
+
+
+@pytest.fixture
+def rebuild(build):
+    """A model on other data with the hyper-parameters and units of the one given."""
+
+    def on(kind, model, X, Y, Yvar=None, **options):
+        low = {}
+        if kind == "AR1":
+            low = {"low_X": options.pop("low_X"), "low_Y": options.pop("low_Y")}
+        new = build(kind, X, Y, Yvar, **options, **low)
+        own = new.state_dict()
+        state = {k: v for k, v in model.state_dict().items() if own[k].shape == v.shape}
+        new.load_state_dict({**own, **state})
+        return new.eval()
+
+    return on

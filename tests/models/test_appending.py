@@ -3,7 +3,6 @@
 import pytest
 import torch
 from botorch.sampling import SobolQMCNormalSampler
-from test_conditioning import rebuild
 
 from gpadjust.models.cholesky_strategy import batched_product
 
@@ -28,14 +27,16 @@ def options(kind, uniform, crude_physics, num_outputs):
 
 
 @pytest.mark.parametrize("sizes", [(3,), (1, 1, 1), (2, 1)], ids=str)
-def test_rebuilding(data, build, kind, num_outputs, shuffle, uniform, close, options, sizes):
+def test_rebuilding(
+    data, build, rebuild, kind, num_outputs, shuffle, uniform, close, options, sizes
+):
     X, Y = data(num_outputs=num_outputs, n=12)
     model = conditioned = shuffle(build(kind, X[:9], Y[:9], **options))
     n = 9
     for size in sizes:
         new = slice(n, n := n + size)
         conditioned = conditioned.condition_on_observations(X[new], Y[new])
-    expected = rebuild(build, kind, model, X, Y, **options)
+    expected = rebuild(kind, model, X, Y, **options)
     agree(conditioned, expected, uniform(5, 2, high=2.0, seed=4), close)
 
 

@@ -6,22 +6,10 @@ from botorch.models.transforms import Normalize
 from botorch.sampling import SobolQMCNormalSampler
 
 
-def rebuild(build, kind, model, X, Y, Yvar=None, **options):
-    """A model on other data with the hyper-parameters and units of the one given."""
-    low = {}
-    if kind == "AR1":
-        low = {"low_X": options.pop("low_X"), "low_Y": options.pop("low_Y")}
-    new = build(kind, X, Y, Yvar, **options, **low)
-    own = new.state_dict()
-    state = {k: v for k, v in model.state_dict().items() if own[k].shape == v.shape}
-    new.load_state_dict({**own, **state})
-    return new.eval()
-
-
 @pytest.mark.parametrize("normalize", [False, True], ids=["raw", "normalize"])
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 def test_conditioning_is_rebuilding(
-    data, build, kind, num_outputs, shuffle, uniform, crude_physics, known_noise, normalize
+    data, build, rebuild, kind, num_outputs, shuffle, uniform, crude_physics, known_noise, normalize
 ):
     X, Y = data(num_outputs=num_outputs, n=12)
     options = {}
@@ -38,7 +26,7 @@ def test_conditioning_is_rebuilding(
     model = shuffle(build(kind, X[:9], Y[:9], first, **options))
     kwargs = {} if Yvar is None else {"noise": Yvar[9:]}
     conditioned = model.condition_on_observations(X[9:], Y[9:], **kwargs)
-    expected = rebuild(build, kind, model, X, Y, Yvar, **options)
+    expected = rebuild(kind, model, X, Y, Yvar, **options)
     Z = uniform(5, 2, high=2.0, seed=4)
     for name in ("posterior", "rho", "delta"):
         if callable(getattr(model, name, None)):
