@@ -1,0 +1,62 @@
+"""The interface of a dynamics model."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+from torch import Tensor
+
+from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.models.prediction import Prediction
+
+TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
+
+
+class Dynamics(ABC):
+    """A distribution of the next state, given a state and an action.
+
+    All tensors are float64 and in the user's units: states ``N x state_dim``, actions
+    ``N x action_dim``, see :class:`StateSpec`. Angles need not be wrapped.
+
+    Args:
+        spec: What the entries of states and actions are.
+    """
+
+    def __init__(self, spec: StateSpec) -> None:
+        self.spec = spec
+
+    @property
+    @abstractmethod
+    def is_fitted(self) -> bool:
+        """Whether it can predict already."""
+
+    @abstractmethod
+    def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
+        """Learn from further transitions, ``N`` rows each."""
+
+    @abstractmethod
+    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
+        """Mean and variance of the next states, ``N x state_dim`` each, entry by entry."""
+
+    @abstractmethod
+    def sample(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Draw next states, ``N x state_dim``, row by row, from PyTorch's generator."""
+
+    @abstractmethod
+    def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
+        """Draw transition *functions*, so that particles stay consistent along a trajectory.
+
+        Returns:
+            A deterministic function of states ``k x N x state_dim`` and actions
+            ``k x N x action_dim`` to next states, each of the ``k`` blocks by its own draw.
+        """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """All that was learnt, in tensors and plain values; without physics and spec."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take back what :meth:`state_dict` gave; predictions and later fits are the same."""
