@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -39,10 +39,10 @@ class StateSpec:
         tensor([[0., 1., 2.]])
     """
 
-    states: tuple[str, ...]
-    actions: tuple[str, ...]
-    angles: tuple[str, ...] = ()
-    exogenous: tuple[str, ...] = ()
+    states: Sequence[str]
+    actions: Sequence[str]
+    angles: Sequence[str] = ()
+    exogenous: Sequence[str] = ()
     integrated: Mapping[str, str] = field(default_factory=dict)
     step: float | None = None
 
