@@ -55,7 +55,7 @@ class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         array([0., 0., 1., 0., 0.], dtype=float32)
         >>> observation, reward, terminated, truncated, info = env.step(env.action_space.high)
         >>> round(reward, 3)
-        -0.01
+        -0.004
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / TIME_STEP)}  # noqa: RUF012

@@ -41,7 +41,7 @@ class CartPoleView:
             import pygame
         except ImportError as error:
             raise DependencyNotInstalled(
-                'Rendering needs pygame-ce; run `pip install "gymnasium[classic-control]"`.'
+                "Rendering needs pygame-ce; run `pip install pygame-ce`."
             ) from error
         self.pole_length = pole_length
         self.max_force = max_force
