@@ -1,0 +1,475 @@
+"""Soft actor-critic that also trains inside a dynamics model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.sac.policies import SACPolicy
+from torch import Tensor
+
+from gpadjust.dynamics import Dynamics
+from gpadjust.rl.mixed_replay_buffer import MixedReplayBuffer
+from gpadjust.rl.model_vec_env import (
+    InitialStates,
+    ModelVecEnv,
+    Particles,
+    Reward,
+    Termination,
+    check_spaces,
+    per_particle,
+)
+
+if TYPE_CHECKING:
+    from gpadjust.rl.callbacks import DynaCallback
+
+_NOT_SAVED = ("dynamics", "reward", "terminated", "initial_states", "_hooks", "_random_state")
+_BOUNDS = 10.0  # half ranges of the real states that a particle may be from their middle
+
+
+class DynaSAC(SAC):
+    r"""Stable-Baselines3's SAC, trained on real trials and on trials inside a dynamics model.
+
+    After each real trial it updates on what it has, as SAC does; teaches the real transitions to
+    ``dynamics``; and runs ``model_trials`` trials of particles in the model, with
+    ``model_updates`` gradient steps for each step of each particle. Real and model experience lie
+    in one :class:`MixedReplayBuffer` (Sutton 1990; Wannawas and Faisal 2023, sec. 2.3). Model
+    steps do not count as time steps. All else is SAC's: callbacks, ``VecNormalize``, schedules,
+    ``predict``, and ``save`` and ``load``, which keep the data and parameters of the dynamics, but
+    not physics, reward and the other functions: pass these to ``load``, or get an agent that can
+    only predict.
+
+    Args:
+        policy: As in SAC.
+        env: The real environment; observations are those of the spec of the dynamics.
+        dynamics: The model of the real system.
+        reward: The known rewards, see :class:`ModelVecEnv`; compared with those of the first real
+            trial before it is used.
+        terminated: Which states end a trial, see :class:`ModelVecEnv`.
+        initial_states: Draws the initial states of model trials, see :class:`ModelVecEnv`.
+            Default: those at which real trials started.
+        model_trials: Model trials after each real one.
+        model_updates: Gradient steps for each model step; may be broken, such as 0.5.
+        model_until: Number of real trials after which the model is neither fitted nor run, and its
+            experience is kept out of the batches, unless ``keep_model_data``. Default: never.
+        keep_model_data: Whether batches hold model experience after ``model_until``.
+        real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`.
+        model_buffer_size: How many model transitions are kept. Default: as ``buffer_size``.
+        trial_length: Steps of a trial. Default: the time limit that ``env`` was registered with.
+        num_particles: Model trials that run side by side. Default: all.
+        particles: How they are sampled, see :class:`ModelVecEnv`.
+        learning_rate: As in SAC.
+        buffer_size: Real transitions that are kept.
+        learning_starts: As in SAC. Default: the untrained policy acts in the first trial.
+        batch_size: As in SAC.
+        tau: As in SAC.
+        gamma: As in SAC.
+        train_freq: As in SAC. Default: after each trial; with several environments give a number
+            of steps. The model is fitted after updates at which a trial has ended.
+        gradient_steps: As in SAC. Default: one for each real step.
+        kwargs: Further arguments of SAC.
+
+    Attributes:
+        num_trials: Real trials that the dynamics have learnt from.
+        wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"sac"``.
+
+    Raises:
+        ValueError: If observations or actions are not boxes of the spec's entries, ``reward`` is
+            missing, n-step returns are asked for, or a number is out of range; on the first trial
+            if rewards or terminations are not those of the environment.
+
+    Example:
+        >>> import gymnasium, torch
+        >>> from gpadjust.dynamics import CKADynamics
+        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.rl import DynaSAC
+        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+        >>> dynamics = CKADynamics(CART_POLE_SPEC, physics=random_cart_pole_physics(0))
+        >>> agent = DynaSAC(
+        ...     "MlpPolicy", env, dynamics=dynamics, reward=cart_pole_reward, model_trials=2, seed=0
+        ... )
+        >>> agent.learn(total_timesteps=2 * 25).num_trials
+        2
+    """
+
+    replay_buffer: MixedReplayBuffer
+    observation_space: spaces.Box
+    action_space: spaces.Box
+
+    # What a fit and a rollout say, for the logger and the hooks.
+    model_metrics: ClassVar[tuple[str, ...]] = ("nlpd", "coverage", "rmse")
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str,
+        dynamics: Dynamics | None = None,
+        reward: Reward | None = None,
+        *,
+        terminated: Termination | None = None,
+        initial_states: InitialStates | None = None,
+        model_trials: int = 20,
+        model_updates: float = 1.0,
+        model_until: int | None = None,
+        keep_model_data: bool = False,
+        real_fraction: float = 1 / 11,
+        model_buffer_size: int | None = None,
+        trial_length: int | None = None,
+        num_particles: int | None = None,
+        particles: Particles = "independent",
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 0,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = (1, "episode"),
+        gradient_steps: int = -1,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        if kwargs.get("n_steps", 1) != 1:
+            raise ValueError(
+                f"DynaSAC has no n-step returns; found n_steps={kwargs['n_steps']}: model "
+                "transitions do not lie in the order of a trajectory."
+            )
+        buffer_class = kwargs.pop("replay_buffer_class", None) or MixedReplayBuffer
+        if not issubclass(buffer_class, MixedReplayBuffer):
+            raise ValueError(
+                "replay_buffer_class must be MixedReplayBuffer or a subclass of it; found "
+                f"{buffer_class.__name__}."
+            )
+        buffer_kwargs = {
+            "real_fraction": real_fraction,
+            "model_buffer_size": model_buffer_size,
+            **(kwargs.pop("replay_buffer_kwargs", None) or {}),
+        }
+        self.dynamics = dynamics
+        self.reward = reward
+        self.terminated = terminated
+        self.initial_states = initial_states
+        self.model_trials = model_trials
+        self.model_updates = model_updates
+        self.model_until = model_until
+        self.keep_model_data = keep_model_data
+        self.trial_length = trial_length
+        self.num_particles = num_particles
+        self.particles = particles
+        self.num_trials = 0
+        self.wall_time = {"fit": 0.0, "rollout": 0.0, "sac": 0.0}
+        self._num_learnt = 0  # steps of the real environments
+        self._owed_updates = 0.0
+        self._hooks: list[DynaCallback] = []
+        self._random_state: Any = None
+        if _init_setup_model:
+            self._check_options()
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            replay_buffer_class=buffer_class,
+            replay_buffer_kwargs=buffer_kwargs,
+            _init_setup_model=_init_setup_model,
+            **kwargs,
+        )
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update on real experience, then learn the model and train in it; SB3 calls this."""
+        with self._timed("sac"):
+            super().train(gradient_steps, batch_size)
+        if self._episode_num == self.num_trials:
+            return
+        self.num_trials = self._episode_num
+        if self.model_until is not None and self.num_trials > self.model_until:
+            self.replay_buffer.mix = self.keep_model_data
+            return
+        self._fit_model()
+        self._train_in_model(batch_size)
+        total = sum(self.wall_time.values())
+        for name, seconds in self.wall_time.items():
+            self.logger.record(f"model/share_{name}", seconds / total)
+
+    def _fit_model(self) -> None:
+        """Score the dynamics on the transitions since the last fit, and teach them these."""
+        states, actions, next_states = self._new_transitions()
+        metrics: dict[str, float] = {}
+        start = self.wall_time["fit"]
+        with self._timed("fit"):
+            if self.dynamics.is_fitted:
+                score = self.dynamics.score(states, actions, next_states)
+                metrics = {"nlpd": score.nlpd, "coverage": score.coverage}
+            self.dynamics.update(states, actions, next_states)
+        metrics["fit_seconds"] = self.wall_time["fit"] - start
+        for name, value in metrics.items():
+            self.logger.record(f"model/{name}", value)
+        for hook in self._hooks:
+            hook.on_model_fit(metrics)
+
+    def _train_in_model(self, batch_size: int) -> None:
+        """Run the model trials, with updates at each step."""
+        left = self.model_trials
+        returns = []
+        num_left_bounds = 0
+        while left > 0:
+            num_envs = min(left, self.num_particles or left)
+            left -= num_envs
+            env = self.model_env(num_envs)
+            returns.append(self._run_model_trials(env, batch_size))
+            num_left_bounds += env.num_left_bounds
+            for hook in self._hooks:
+                hook.on_model_trials(returns[-1])
+        if returns:
+            self.logger.record("model/ep_rew_mean", float(np.concatenate(returns).mean()))
+            self.logger.record("model/left_bounds", num_left_bounds)
+
+    def _run_model_trials(self, env: ModelVecEnv, batch_size: int) -> np.ndarray:
+        """One trial of each particle; its return."""
+        with self._timed("rollout"):
+            obs = env.reset()
+        returns = np.zeros(env.num_envs)
+        running = np.ones(env.num_envs, dtype=bool)
+        while running.any():
+            with self._timed("rollout"):
+                self.policy.set_training_mode(False)
+                normalizer = self._vec_normalize_env
+                seen = obs if normalizer is None else normalizer.normalize_obs(obs)
+                actions, _ = self.predict(seen, deterministic=False)
+                next_obs, rewards, dones, infos = env.step(actions)
+                final = next_obs.copy()
+                for i in dones.nonzero()[0]:
+                    final[i] = infos[i]["terminal_observation"]
+                timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+                lost = np.array([info.get("left_bounds", False) for info in infos])
+                kept = running & ~lost
+                rows = (obs, final, self.policy.scale_action(actions), rewards, dones, timeouts)
+                self.replay_buffer.model.extend(*(values[kept] for values in rows))
+                returns += rewards * running
+                num_steps = int(running.sum())
+                running &= ~dones
+                obs = next_obs
+            with self._timed("sac"):
+                self._owed_updates += self.model_updates * num_steps
+                updates = int(self._owed_updates)
+                self._owed_updates -= updates
+                if updates:
+                    super().train(updates, batch_size)
+        return returns
+
+    def model_env(self, num_envs: int) -> ModelVecEnv:
+        """The dynamics, as they stand, as an environment of ``num_envs`` particles.
+
+        Raises:
+            ValueError: If there are no dynamics, or neither real trials nor ``initial_states``.
+        """
+        self._check_options()
+        assert self.dynamics is not None
+        assert self.reward is not None
+        return ModelVecEnv(
+            self.dynamics,
+            self.reward,
+            self.initial_states or self._recorded_starts,
+            num_envs,
+            self._trial_length(),
+            self.observation_space,
+            self.action_space,
+            terminated=self.terminated,
+            particles=self.particles,
+            bounds=self._bounds(),
+        )
+
+    def real_transitions(self) -> tuple[Tensor, Tensor, Tensor]:
+        """All real states, actions and next states in the buffer, in their order, float64."""
+        return self._transitions(self._real_rows())
+
+    def _new_transitions(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The real transitions since the last call."""
+        buffer = self.replay_buffer
+        num_steps = self.num_timesteps // buffer.n_envs
+        rows = self._real_rows()[-(num_steps - self._num_learnt) :]
+        if self._num_learnt == 0:
+            self._check_known(rows)
+        self._num_learnt = num_steps
+        return self._transitions(rows)
+
+    def _real_rows(self) -> np.ndarray:
+        buffer = self.replay_buffer
+        first = buffer.pos if buffer.full else 0
+        return (first + np.arange(buffer.size())) % buffer.buffer_size
+
+    def _transitions(self, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        buffer, spec = self.replay_buffer, self._spec
+        obs, next_obs, scaled = (
+            np.concatenate(list(values[rows].swapaxes(0, 1)))
+            for values in (buffer.observations, buffer.next_observations, buffer.actions)
+        )
+        actions = self.policy.unscale_action(scaled.astype(np.float64))
+        obs, next_obs, actions = (torch.from_numpy(np.float64(x)) for x in (obs, next_obs, actions))
+        return spec.decode(obs), actions, spec.decode(next_obs)
+
+    @property
+    def _spec(self) -> Any:
+        assert self.dynamics is not None, "checked when learning starts"
+        return self.dynamics.spec
+
+    def _check_known(self, rows: np.ndarray) -> None:
+        """Raise a ValueError if reward or termination differ from what was recorded."""
+        assert self.reward is not None
+        buffer = self.replay_buffer
+        states, actions, next_states = self._transitions(rows)
+        n = len(states)
+        recorded, dones, timeouts = (
+            torch.from_numpy(np.concatenate(list(values[rows].T)).astype(np.float64))
+            for values in (buffer.rewards, buffer.dones, buffer.timeouts)
+        )
+        rewards = per_particle(self.reward(states, actions, next_states), n, "reward")
+        error = (rewards - recorded).abs()
+        # Observations are float32.
+        tolerance = 1e-3 * recorded.abs().max().clamp_min(1e-6)
+        if (error > tolerance).any():
+            i = int(error.argmax())
+            raise ValueError(
+                f"reward(states, actions, next_states) is not the environment's: transition {i} "
+                f"gave {recorded[i]:.6g} but the function says {rewards[i]:.6g}, at state "
+                f"{states[i].tolist()}, action {actions[i].tolist()}, next state "
+                f"{next_states[i].tolist()}. Correct the function or the spec of the state."
+            )
+        ended = torch.zeros(n, dtype=torch.bool)
+        if self.terminated is not None:
+            ended = per_particle(self.terminated(next_states), n, "terminated").bool()
+        wrong = ended != (dones * (1 - timeouts)).bool()
+        if wrong.any():
+            i = int(wrong.nonzero()[0])
+            found = "none was given" if self.terminated is None else f"it says {bool(ended[i])}"
+            raise ValueError(
+                f"terminated(states) is not the environment's: transition {i} was recorded with "
+                f"terminated={not bool(ended[i])} at next state {next_states[i].tolist()}, but "
+                f"{found}. Pass the termination that the environment has."
+            )
+
+    def _recorded_starts(self, n: int) -> Tensor:
+        """States at which real trials started, drawn with replacement."""
+        buffer = self.replay_buffer
+        rows = self._real_rows()
+        starts = []
+        for env in range(buffer.n_envs):
+            follows_end = np.concatenate([[1.0], buffer.dones[rows[:-1], env]]).astype(bool)
+            starts.append(buffer.observations[rows[follows_end], env])
+        states = self._spec.decode(torch.from_numpy(np.concatenate(starts).astype(np.float64)))
+        return states[torch.randint(len(states), (n,))]
+
+    def _bounds(self) -> Tensor:
+        """How far particles may go: well beyond what was seen; angles anywhere."""
+        states, _, next_states = self.real_transitions()
+        seen = torch.cat([states, next_states])
+        low, high = seen.amin(0), seen.amax(0)
+        reach = _BOUNDS * (high - low).clamp_min(1e-6) / 2
+        middle = (low + high) / 2
+        for i, name in enumerate(self._spec.states):
+            if name in self._spec.angles or name in self._spec.exogenous:
+                reach[i] = torch.inf
+        return torch.stack([middle - reach, middle + reach])
+
+    def _trial_length(self) -> int:
+        if self.trial_length is not None:
+            return self.trial_length
+        assert self.env is not None
+        spec = self.env.get_attr("spec")[0]
+        length = None if spec is None else spec.max_episode_steps
+        if length is None:
+            raise ValueError(
+                "The environment has no time limit that could be read; pass trial_length, the "
+                "number of steps of a trial."
+            )
+        return int(length)
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.wall_time[part] += time.perf_counter() - start
+
+    def _check_options(self) -> None:
+        for name in ("dynamics", "reward"):
+            if getattr(self, name) is None:
+                raise ValueError(
+                    f"DynaSAC needs {name} to learn; found None. Pass {name}=... to DynaSAC or, as "
+                    "they are not saved, to DynaSAC.load. Without them an agent can only predict."
+                )
+        for name, value, least in (
+            ("model_trials", self.model_trials, 0),
+            ("model_updates", self.model_updates, 0),
+            ("model_until", self.model_until, 0),
+            ("trial_length", self.trial_length, 1),
+            ("num_particles", self.num_particles, 1),
+        ):
+            if value is not None and not value >= least:
+                raise ValueError(f"{name} must be at least {least}; found {value}.")
+
+    def _setup_model(self) -> None:
+        """Check the spaces before SB3 builds its networks on them."""
+        if self.dynamics is not None:
+            check_spaces(self.dynamics, self.observation_space, self.action_space)
+        super()._setup_model()
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        """Refuse to spend a real trial on an agent that could not learn from it."""
+        self._check_options()
+        self._trial_length()
+        self._hooks = []  # callbacks that have some add themselves
+        result = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if self._random_state is not None:
+            self._random_state.restore()
+            self._random_state = None
+        return result
+
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """As in SB3, with the state of the dynamics."""
+        parameters = super().get_parameters()
+        if self.dynamics is not None:
+            parameters["dynamics"] = self.dynamics.state_dict()
+        return parameters
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | TensorDict,
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """As in SB3; without dynamics, their state is left out."""
+        if isinstance(load_path_or_dict, dict):
+            parameters = dict(load_path_or_dict)
+            state = parameters.pop("dynamics", None)
+            if self.dynamics is not None and state is not None:
+                self.dynamics.load_state_dict(state)
+            super().set_parameters(parameters, exact_match, device)
+        else:
+            raise TypeError("Pass a dictionary of parameters, or use DynaSAC.load(path).")
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *_NOT_SAVED]

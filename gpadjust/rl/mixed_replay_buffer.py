@@ -1,0 +1,158 @@
+"""Real and model experience in one replay buffer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+_ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+class CompactReplayBuffer(ReplayBuffer):
+    """A ``ReplayBuffer`` that takes many rows at once, and pickles only those that are filled."""
+
+    def extend(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        dones: np.ndarray,
+        timeouts: np.ndarray,
+    ) -> None:
+        """Add ``N`` transitions of one environment at once.
+
+        Args:
+            obs: Observations, ``N x d``.
+            next_obs: The observations after them, ``N x d``, also where an episode ended.
+            actions: Actions scaled to [-1, 1], as SB3 stores them, ``N x a``.
+            rewards: ``N`` rewards.
+            dones: Whether the episode ended, ``N``.
+            timeouts: Whether it ended by a time limit alone, ``N``.
+        """
+        if self.n_envs != 1:
+            raise ValueError(f"extend() is for buffers of one environment; found {self.n_envs}.")
+        rows = (obs, next_obs, actions, rewards, dones, timeouts)
+        n = min(len(obs), self.buffer_size)
+        places = (self.pos + np.arange(n)) % self.buffer_size
+        for name, values in zip(_ROWS, rows, strict=True):
+            getattr(self, name)[places, 0] = values[len(values) - n :]
+        self.full = self.full or self.pos + n >= self.buffer_size
+        self.pos = (self.pos + n) % self.buffer_size
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes, of the rows those that are filled."""
+        state = self.__dict__.copy()
+        for name in _ROWS:
+            state[name] = state[name][: self.size()]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the attributes back, with space for the other rows."""
+        self.__dict__.update(state)
+        for name in _ROWS:
+            filled = state[name]
+            rows = np.zeros((self.buffer_size, *filled.shape[1:]), dtype=filled.dtype)
+            rows[: len(filled)] = filled
+            setattr(self, name, rows)
+
+
+class MixedReplayBuffer(CompactReplayBuffer):
+    """The replay buffer of Dyna: real experience D_R, and beside it model experience D_M.
+
+    To Stable-Baselines3 it is the buffer of the real transitions. The attribute ``model`` is a
+    buffer of the others. Every batch is drawn from both: of ``batch_size`` samples,
+    ``batch_size * real_fraction`` are real, a broken number being rounded up or down at random so
+    that the mean is exact. As long as one of the buffers is empty, or ``mix`` is False, batches
+    come from the real one, or from the model's if that is all there is.
+
+    Args:
+        buffer_size: Capacity of the real buffer.
+        observation_space: A one-dimensional ``Box``.
+        action_space: A ``Box``.
+        device: Device of the samples.
+        n_envs: Number of real environments.
+        optimize_memory_usage: Must be False.
+        handle_timeout_termination: See Stable-Baselines3.
+        real_fraction: Share of real samples in a batch, in [0, 1].
+        model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
+
+    Attributes:
+        model: The model's transitions.
+        mix: Whether batches hold model transitions.
+        real_fraction: Share of real samples in a batch.
+
+    Raises:
+        ValueError: If the fraction is out of range or ``optimize_memory_usage`` is asked for.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: torch.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        *,
+        real_fraction: float = 1 / 11,
+        model_buffer_size: int | None = None,
+    ) -> None:
+        if not 0 <= real_fraction <= 1:
+            raise ValueError(f"real_fraction must lie in [0, 1]; found {real_fraction}.")
+        if optimize_memory_usage:
+            raise ValueError(
+                "MixedReplayBuffer does not support optimize_memory_usage=True: model transitions "
+                "do not lie in the order of a trajectory."
+            )
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device,
+            n_envs,
+            handle_timeout_termination=handle_timeout_termination,
+        )
+        self.real_fraction = real_fraction
+        self.mix = True
+        self.model = CompactReplayBuffer(
+            buffer_size if model_buffer_size is None else model_buffer_size,
+            observation_space,
+            action_space,
+            device,
+        )
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """Draw a batch from both buffers; the real samples come first.
+
+        Args:
+            batch_size: Number of samples.
+            env: Normalises observations and rewards, see Stable-Baselines3.
+        """
+        if not self.mix or not self.model.size():
+            return super().sample(batch_size, env)
+        if not self.size():
+            return self.model.sample(batch_size, env)
+        expected = batch_size * self.real_fraction
+        num_real = int(expected) + int(np.random.random() < expected % 1)  # noqa: NPY002
+        parts = []
+        if num_real:
+            parts.append(super().sample(num_real, env))
+        if num_real < batch_size:
+            parts.append(self.model.sample(batch_size - num_real, env))
+        columns = [
+            torch.cat([part[i] for part in parts]) for i in range(len(ReplayBufferSamples._fields) - 1)
+        ]
+        return ReplayBufferSamples(*columns)
+
+    def reset(self) -> None:
+        """Empty both buffers."""
+        super().reset()
+        self.model.reset()

@@ -1,0 +1,223 @@
+"""A dynamics model as a vectorised environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from torch import Tensor
+
+from gpadjust.dynamics import Dynamics
+
+Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
+Termination = Callable[[Tensor], Tensor]
+InitialStates = Callable[[int], Tensor]
+Particles = Literal["independent", "functions"]
+
+
+class ModelVecEnv(VecEnv):
+    r"""Particles that move by a dynamics model, as a Stable-Baselines3 ``VecEnv``.
+
+    A step of all particles is one call of the model. Its randomness is PyTorch's global generator.
+
+    Args:
+        dynamics: The model; it must be fitted.
+        reward: Known rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
+            states ``N x state_dim``, float64 tensors in the units of the spec.
+        initial_states: Draws ``n`` states, ``n x state_dim``, at which trials start.
+        num_envs: Number of particles.
+        trial_length: Steps after which a trial is truncated.
+        observation_space: The policy's, of the spec's observations.
+        action_space: The policy's.
+        terminated: Whether states ``N x state_dim`` end a trial, ``N`` booleans. Default: none.
+        particles: ``"independent"``: each step is a draw of its own from the predictive
+            distribution, as in the paper. ``"functions"``: between two calls of ``reset``, each
+            particle follows a transition function of its own, drawn from the posterior, so that
+            what it meets is consistent along its trajectory.
+        bounds: Lower and upper bounds of the states, ``2 x state_dim``. A particle that would leave
+            them, or the finite numbers, is truncated where it is: the step's next observation is
+            the old one, its reward zero, its ``info["left_bounds"]`` True. Default: infinite.
+
+    Attributes:
+        num_left_bounds: How many particles have left the bounds.
+
+    Raises:
+        ValueError: If spaces do not fit the spec, a number is not positive, or ``bounds`` have
+            another shape.
+    """
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        reward: Reward,
+        initial_states: InitialStates,
+        num_envs: int,
+        trial_length: int,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        *,
+        terminated: Termination | None = None,
+        particles: Particles = "independent",
+        bounds: Tensor | None = None,
+    ) -> None:
+        spec = dynamics.spec
+        check_spaces(dynamics, observation_space, action_space)
+        for name, number in (("num_envs", num_envs), ("trial_length", trial_length)):
+            if number < 1:
+                raise ValueError(f"{name} must be at least 1; found {number}.")
+        if particles not in ("independent", "functions"):
+            raise ValueError(f"Unknown particles {particles!r}; use 'independent' or 'functions'.")
+        if bounds is not None and bounds.shape != (2, spec.state_dim):
+            raise ValueError(
+                f"bounds must be of shape 2 x {spec.state_dim}; found {tuple(bounds.shape)}."
+            )
+        self.render_mode = None
+        super().__init__(num_envs, observation_space, action_space)
+        self.dynamics = dynamics
+        self.reward = reward
+        self.initial_states = initial_states
+        self.trial_length = trial_length
+        self.terminated = terminated
+        self.particles = particles
+        self.bounds = bounds
+        self.num_left_bounds = 0
+        self._states = torch.empty(num_envs, spec.state_dim, dtype=torch.float64)
+        self._steps = torch.zeros(num_envs, dtype=torch.long)
+        self._transition = dynamics.sample
+
+    def reset(self) -> VecEnvObs:
+        """Start all trials; observations ``num_envs x observation_dim``."""
+        self._states = self._draw_initial(self.num_envs)
+        self._steps.zero_()
+        if self.particles == "functions":
+            functions = self.dynamics.sample_functions(self.num_envs)
+
+            def transition(states: Tensor, actions: Tensor) -> Tensor:
+                return functions(states.unsqueeze(1), actions.unsqueeze(1)).squeeze(1)
+
+            self._transition = transition
+        return self._observe(self._states)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions ``num_envs x action_dim`` of the next step, in the action space."""
+        self._actions = torch.as_tensor(actions, dtype=torch.float64)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all particles; those whose trial ended start another."""
+        states, actions = self._states, self._actions
+        following = self._transition(states, actions)
+        left = ~following.isfinite().all(-1)
+        if self.bounds is not None:
+            low, high = self.bounds
+            left |= ((following < low) | (following > high)).any(-1)
+        following = torch.where(left.unsqueeze(-1), states, following)
+        rewards = per_particle(self.reward(states, actions, following), len(states), "reward")
+        rewards = rewards.to(torch.float64).masked_fill(left, 0.0)
+        ended = torch.zeros_like(left)
+        if self.terminated is not None:
+            ended = per_particle(self.terminated(following), len(states), "terminated").bool()
+            ended &= ~left
+        self._steps += 1
+        truncated = ((self._steps >= self.trial_length) | left) & ~ended
+        dones = ended | truncated
+        self.num_left_bounds += int(left.sum())
+        observations = self._observe(following)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in dones.nonzero().flatten().tolist():
+            infos[i] = {
+                "terminal_observation": observations[i].copy(),
+                "TimeLimit.truncated": bool(truncated[i]),
+                "left_bounds": bool(left[i]),
+            }
+        if dones.any():
+            following = following.clone()
+            following[dones] = self._draw_initial(int(dones.sum()))
+            self._steps[dones] = 0
+            observations[dones.numpy()] = self._observe(following[dones])
+        self._states = following
+        return observations, rewards.numpy().astype(np.float32), dones.numpy(), infos
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of this environment, once for each particle."""
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of all particles."""
+        if len(list(self._get_indices(indices))) < self.num_envs:
+            raise ValueError("The particles share their attributes; set them for all at once.")
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Refuse: there are no environments inside."""
+        raise NotImplementedError(
+            f"The particles of a ModelVecEnv have no methods of their own, such as {method_name!r}."
+        )
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
+        """False for each particle."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def seed(self, seed: int | None = None) -> Sequence[None | int]:
+        """Refuse unless ``seed`` is None: the generator is PyTorch's, not this environment's."""
+        if seed is not None:
+            raise NotImplementedError(
+                "ModelVecEnv draws from PyTorch's global generator; use torch.manual_seed(seed)."
+            )
+        return [None] * self.num_envs
+
+    def _draw_initial(self, n: int) -> Tensor:
+        states = torch.as_tensor(self.initial_states(n), dtype=torch.float64)
+        if states.shape != (n, self.dynamics.spec.state_dim):
+            raise ValueError(
+                f"initial_states({n}) must return states of shape {n} x "
+                f"{self.dynamics.spec.state_dim}; found {tuple(states.shape)}."
+            )
+        return states
+
+    def _observe(self, states: Tensor) -> np.ndarray:
+        return self.dynamics.spec.observe(states).numpy().astype(np.float32)
+
+
+def per_particle(values: Tensor, n: int, name: str) -> Tensor:
+    """Check what a function of the user's says of ``n`` rows."""
+    values = torch.as_tensor(values)
+    if values.shape != (n,):
+        raise ValueError(
+            f"{name} must return one value per row, shape ({n},); found {tuple(values.shape)}."
+        )
+    if not values.isfinite().all():
+        row = int((~values.isfinite()).nonzero()[0])
+        raise ValueError(f"{name} returned {values[row]} for row {row}; expected finite numbers.")
+    return values
+
+
+def check_spaces(
+    dynamics: Dynamics, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
+    """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
+    spec = dynamics.spec
+    for name, space, size in (
+        ("observation", observation_space, spec.observation_dim),
+        ("action", action_space, spec.action_dim),
+    ):
+        if not isinstance(space, spaces.Box) or space.shape != (size,):
+            raise ValueError(
+                f"The spec of the dynamics says that the {name} has {size} entries, so a Box of "
+                f"shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, of "
+                f"which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
+                f"{tuple(spec.actions)}."
+            )
