@@ -1,7 +1,29 @@
 """Distributions of the next state of a system, over the models of this library."""
 
+from gpadjust.dynamics.adjusted_dynamics import (
+    BiasDynamics,
+    CKADynamics,
+    GPDynamics,
+    PhysicsMeanDynamics,
+    RRADynamics,
+    ScaleDynamics,
+)
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.learned_dynamics import LearnedDynamics, TransitionScores
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state_spec import StateSpec
 
-__all__ = ["Dynamics", "PhysicsDynamics", "StateSpec", "TransitionFunctions"]
+__all__ = [
+    "BiasDynamics",
+    "CKADynamics",
+    "Dynamics",
+    "GPDynamics",
+    "LearnedDynamics",
+    "PhysicsDynamics",
+    "PhysicsMeanDynamics",
+    "RRADynamics",
+    "ScaleDynamics",
+    "StateSpec",
+    "TransitionFunctions",
+    "TransitionScores",
+]

@@ -1,6 +1,7 @@
 """The GPyTorch pieces: means, kernels and transforms that read the physics."""
 
 from gpadjust.gp.adjusted_mean import AdjustedMean
+from gpadjust.gp.angle_input import AngleInput
 from gpadjust.gp.fixed_standardize import FixedStandardize, RescaledPosterior
 from gpadjust.gp.fourier import FourierFeatures, FourierKernel
 from gpadjust.gp.inputs_kernel import InputsKernel
@@ -13,6 +14,7 @@ from gpadjust.gp.unknown_mean_kernel import UnknownMeanKernel
 
 __all__ = [
     "AdjustedMean",
+    "AngleInput",
     "DataInterval",
     "FixedStandardize",
     "FourierFeatures",

@@ -91,3 +91,18 @@ class AdjustedFunctions(Module):
         weights = self.weights.reshape(k, *[1] * extra, *batch_shape, num_weights, 1)
         values = self.features.prior_mean(inputs) + (features @ weights).squeeze(-1)
         return values.mT if self.has_outputs else values.unsqueeze(-1)
+
+    def each(self, X: Tensor) -> Tensor:
+        """Evaluate each function at points of its own.
+
+        Args:
+            X: Raw inputs, ``k x q x d``; of a model without a batch shape.
+
+        Returns:
+            ``k x q x m``: the i-th function at the i-th block of points.
+        """
+        inputs = self.input_transform(X)
+        inputs = inputs.unsqueeze(-3) if self.has_outputs else inputs
+        deviation = (self.features(inputs) @ self.weights.unsqueeze(-1)).squeeze(-1)
+        values = self.features.prior_mean(inputs) + deviation
+        return values.mT if self.has_outputs else values.unsqueeze(-1)

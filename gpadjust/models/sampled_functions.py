@@ -55,6 +55,18 @@ class SampledFunctions(Module):
         values = values.unflatten(-2, (count, X.shape[-2])).movedim(-3, 1)
         return values.reshape(values.shape[0], *lead[:extra], *values.shape[2:])
 
+    def each(self, X: Tensor) -> Tensor:
+        """Evaluate each function at points of its own.
+
+        Args:
+            X: Raw inputs, ``k x q x d``; of a model without a batch shape.
+
+        Returns:
+            ``k x q x m``: the i-th function at the i-th block of points.
+        """
+        values: Tensor = self.paths(X.unsqueeze(-3) if self.has_outputs else X)
+        return values.mT if self.has_outputs else values.unsqueeze(-1)
+
 
 class FunctionPerBatch(Module):
     """One function of each batch of a model, seen as so many functions of the same inputs.

@@ -1,0 +1,120 @@
+"""The physics of a system, in the form of the targets that a model learns."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics.physics_dynamics import next_values
+from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.physics import Physics
+from gpadjust.physics.memo import RowMemo, row_keys
+
+Target = Literal["difference", "absolute"]
+
+
+class TransitionTargets:
+    r"""Targets of a model that stand for next states.
+
+    They are the change of each predicted state, :math:`y = s' - s`, of an angle the shortest way
+    round; or with ``"absolute"`` its next value :math:`s + (s' - s)`, which is continuous along a
+    trajectory even where angles come wrapped.
+
+    Args:
+        spec: What the entries of states and actions are.
+        target: ``"difference"`` or ``"absolute"``.
+
+    Raises:
+        ValueError: If ``target`` is neither.
+    """
+
+    def __init__(self, spec: StateSpec, target: Target) -> None:
+        if target not in ("difference", "absolute"):
+            raise ValueError(f"Unknown target {target!r}; expected 'difference' or 'absolute'.")
+        self.spec = spec
+        self.target = target
+        moving = spec.moving
+        self.predicted = [moving.index(i) for i in spec.predicted]
+        self.angles = [moving.index(i) for i in spec.angle_columns if i in moving]
+
+    def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The raw inputs of model and physics, ``... x d``: states that move, and actions."""
+        moving = states[..., self.spec.moving]
+        return torch.cat([moving, actions.expand(*moving.shape[:-1], -1)], dim=-1)
+
+    def encode(self, states: Tensor, next_states: Tensor) -> Tensor:
+        """Targets ``... x m`` of transitions."""
+        predicted = self.spec.predicted
+        change = self.spec.change(states, next_states)[..., predicted]
+        return change if self.target == "difference" else states[..., predicted] + change
+
+    def decode(self, states: Tensor, targets: Tensor) -> Tensor:
+        """Next values of the predicted states, ``... x m``."""
+        return targets if self.target == "absolute" else states[..., self.spec.predicted] + targets
+
+
+class TransitionPhysics(Physics):
+    r"""Turns f_p, which returns next states, into a physics of the targets.
+
+    Memo, batching and gradients are those of the physics itself. The values at the training
+    inputs can be given, so that a simulator need not run again when a model is loaded.
+
+    Args:
+        physics: Next values of the states that move, from these and the actions.
+        targets: What the models learn.
+    """
+
+    def __init__(self, physics: Physics, targets: TransitionTargets) -> None:
+        super().__init__(memo=0, name=physics.name)
+        self.physics = physics
+        self.targets = targets
+        self.num_outputs = len(targets.predicted)
+        self._known = RowMemo(2**62)
+
+    def evaluate(self, X: Tensor) -> Tensor:
+        """The targets that the physics stands for, ``N x m``."""
+        targets = self.targets
+        num_states = len(targets.spec.moving)
+        states = X[:, :num_states]
+        change = next_values(self.physics, X, num_states) - states
+        columns = []
+        for i in targets.predicted:
+            column = change[:, i]
+            if i in targets.angles:
+                column = torch.atan2(column.sin(), column.cos())
+            columns.append(column if targets.target == "difference" else states[:, i] + column)
+        return torch.stack(columns, dim=-1)
+
+    def know(self, X: Tensor, values: Tensor) -> None:
+        """Take the values at inputs ``N x d`` as given; they replace those known so far."""
+        self._known.clear()
+        keys = dict(zip(row_keys(X), range(len(X)), strict=True))
+        self._known.store([*keys], values[list(keys.values())])
+
+    def forget(self) -> None:
+        """Empties the memo of the physics, too."""
+        super().forget()
+        self._known.clear()
+        self.physics.forget()
+
+    def _recall(self, rows: Tensor) -> Tensor:
+        if not len(self._known) or self._state():
+            return super()._recall(rows)
+        slots = self._known.lookup(row_keys(rows))
+        new = slots < 0
+        if new.all():
+            return super()._recall(rows)
+        values = self._known.gather(slots.clamp_min(0)).to(rows)
+        if new.any():
+            values[new] = super()._recall(rows[new])
+        return values
+
+    def extra_repr(self) -> str:
+        """The settings that ``repr`` shows."""
+        return f"target={self.targets.target!r}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is known, which belongs to the data."""
+        return {**self.__dict__, "_known": RowMemo(self._known.capacity)}

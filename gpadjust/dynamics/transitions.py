@@ -1,0 +1,59 @@
+"""Observed transitions of a system."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics.state_spec import StateSpec, check_columns
+from gpadjust.models.training_data import check_finite
+
+
+class Transitions(NamedTuple):
+    """Transitions of a system, row by row.
+
+    Args:
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+        next_states: ``N x state_dim``.
+    """
+
+    states: Tensor
+    actions: Tensor
+    next_states: Tensor
+
+    @classmethod
+    def checked(
+        cls, spec: StateSpec, states: Tensor, actions: Tensor, next_states: Tensor
+    ) -> Transitions:
+        """Take the user's tensors, copied.
+
+        Raises:
+            TypeError: If they are not float64 tensors.
+            ValueError: If shapes disagree, there are no rows, or values are not finite.
+        """
+        named = {"states": states, "actions": actions, "next_states": next_states}
+        for name, tensor in named.items():
+            columns = spec.action_dim if name == "actions" else spec.state_dim
+            check_columns(tensor, columns, name)
+            if tensor.dtype != torch.float64:
+                raise TypeError(
+                    f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`."
+                )
+            if tensor.dim() != 2 or len(tensor) != len(states) or not len(tensor):
+                raise ValueError(
+                    "Expected states, actions and next_states with as many rows each, and at least "
+                    f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
+                )
+            check_finite(tensor, name)
+        return cls(*(tensor.detach().clone() for tensor in named.values()))
+
+    def append(self, other: Transitions) -> Transitions:
+        """These transitions, then others."""
+        return Transitions(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
+
+    def rows(self, start: int, end: int) -> Transitions:
+        """Some of the rows."""
+        return Transitions(*(tensor[start:end] for tensor in self))
