@@ -40,7 +40,7 @@ class CartPoleEquation:
             + 6 (a - b \dot{x}) \cos\theta}{l (4 M - 3 m_p \cos^2\theta)}.
 
     This is the system of Deisenroth, "Efficient Reinforcement Learning using Gaussian Processes",
-    2010, Appendix C.2, with the angle taken from upright. Its tip is at
+    2010, Appendix C, with the angle taken from upright. Its tip is at
     :math:`(x - l \sin\theta, l \cos\theta)`.
 
     Args:
