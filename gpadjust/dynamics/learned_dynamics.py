@@ -29,8 +29,8 @@ from gpadjust.models.prediction import Prediction
 from gpadjust.physics import Physics
 from gpadjust.validation import coverage, nlpd, rmse
 
-_SEARCHED = 200  # points that a search is made on; more would tell the same, and take longer
-_SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=50)
+_SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
+_SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
 _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=8)
 
 
