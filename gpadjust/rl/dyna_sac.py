@@ -262,7 +262,7 @@ class DynaSAC(SAC):
                 obs = step.observations
             with self._timed("sac"):
                 self._owed_updates += self.model_updates * num_steps
-                updates = int(self._owed_updates)
+                updates = int(self._owed_updates + 1e-9)  # ten times 0.3 are three
                 self._owed_updates -= updates
                 if updates:
                     super().train(updates, batch_size)
