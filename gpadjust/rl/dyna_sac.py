@@ -185,13 +185,14 @@ class DynaSAC(SAC):
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update on real experience, then learn the model and train in it; SB3 calls this."""
+        over = self.model_until is not None and self.num_trials >= self.model_until
+        self.replay_buffer.mix = self.keep_model_data or not over
         with self._timed("sac"):
             super().train(gradient_steps, batch_size)
         if self._episode_num == self.num_trials:
             return
         self.num_trials = self._episode_num
-        if self.model_until is not None and self.num_trials > self.model_until:
-            self.replay_buffer.mix = self.keep_model_data
+        if over:
             return
         self._fit_model()
         self._train_in_model(batch_size)
