@@ -160,7 +160,8 @@ class DynaSAC(SAC):
         self.particles = particles
         self.num_trials = 0
         self.wall_time = {"fit": 0.0, "rollout": 0.0, "sac": 0.0}
-        self._num_learnt = 0  # steps of the real environments
+        self._num_learnt = 0  # steps of the real environments, on the clock of num_timesteps
+        self._num_episodes_learnt = 0  # on the clock of _episode_num
         self._owed_updates = 0.0
         self._hooks: list[DynaCallback] = []
         self._random_state: Any = None
@@ -189,9 +190,11 @@ class DynaSAC(SAC):
         self.replay_buffer.mix = self.keep_model_data or not over
         with self._timed("sac"):
             super().train(gradient_steps, batch_size)
-        if self._episode_num == self.num_trials:
+        ended = self._episode_num - self._num_episodes_learnt
+        if not ended:
             return
-        self.num_trials = self._episode_num
+        self._num_episodes_learnt = self._episode_num
+        self.num_trials += ended
         if over:
             return
         self._fit_model()
@@ -206,7 +209,7 @@ class DynaSAC(SAC):
         assert self.reward is not None
         num_steps = self.num_timesteps // self.n_envs
         new = self.recorded_trials(newest=num_steps - self._num_learnt)
-        if self._num_learnt == 0:
+        if self.num_trials == 1:
             new.check(self.reward, self.terminated)
         transitions = (new.states, new.actions, new.next_states)
         metrics: dict[str, float] = {}
@@ -353,6 +356,9 @@ class DynaSAC(SAC):
         self._check_options()
         self._trial_length()
         self._hooks = []  # callbacks that have some add themselves
+        if reset_num_timesteps:
+            self._num_learnt -= self.num_timesteps // self.n_envs
+            self._num_episodes_learnt -= self._episode_num
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
