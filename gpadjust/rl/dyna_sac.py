@@ -30,7 +30,7 @@ from gpadjust.rl.recorded_trials import RecordedTrials
 if TYPE_CHECKING:
     from gpadjust.rl.callbacks import DynaCallback
 
-_NOT_SAVED = ("dynamics", "reward", "terminated", "initial_states", "_hooks", "_random_state")
+_NOT_SAVED = ("dynamics", "reward", "terminated", "initial_states", "_hooks", "_random_state", "_checked")
 
 
 class DynaSAC(SAC):
@@ -165,6 +165,7 @@ class DynaSAC(SAC):
         self._owed_updates = 0.0
         self._hooks: list[DynaCallback] = []
         self._random_state: Any = None
+        self._checked = False  # the functions, by real trials
         if _init_setup_model:
             self._check_options()
         super().__init__(
@@ -209,8 +210,9 @@ class DynaSAC(SAC):
         assert self.reward is not None
         num_steps = self.num_timesteps // self.n_envs
         new = self.recorded_trials(newest=num_steps - self._num_learnt)
-        if self.num_trials == 1:
+        if not self._checked or (self.terminated is None and new.terminated.any()):
             new.check(self.reward, self.terminated)
+            self._checked = True
         transitions = (new.states, new.actions, new.next_states)
         metrics: dict[str, float] = {}
         before = self.wall_time["fit"]
