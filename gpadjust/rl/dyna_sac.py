@@ -284,6 +284,11 @@ class DynaSAC(SAC):
         assert self.dynamics is not None
         assert self.reward is not None
         trials = self.recorded_trials()
+        if self.initial_states is None and not trials.num_transitions:
+            raise ValueError(
+                "There are no real trials yet that particles could start from; pass initial_states "
+                "to DynaSAC, or call learn() first."
+            )
         return ModelVecEnv(
             self.dynamics,
             self.reward,
