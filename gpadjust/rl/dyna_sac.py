@@ -236,18 +236,23 @@ class DynaSAC(SAC):
         while left > 0:
             num_envs = min(left, self.num_particles or left)
             left -= num_envs
-            env = self.model_env(num_envs)
-            returns.append(self._run_model_trials(env, batch_size))
-            num_left_bounds += env.num_left_bounds
+            trial_returns, num_left = self._run_model_trials(self.model_env(num_envs), batch_size)
+            returns.append(trial_returns)
+            num_left_bounds += num_left
             for hook in self._hooks:
                 hook.on_model_trials(returns[-1])
         if returns:
             self.logger.record("model/ep_rew_mean", float(np.concatenate(returns).mean()))
             self.logger.record("model/left_bounds", num_left_bounds)
 
-    def _run_model_trials(self, env: ModelVecEnv, batch_size: int) -> np.ndarray:
-        """One trial of each particle, with updates at each step; the returns."""
+    def _run_model_trials(self, env: ModelVecEnv, batch_size: int) -> tuple[np.ndarray, int]:
+        """One trial of each particle, with updates at each step.
+
+        Returns:
+            The returns, and the number of particles that left the bounds.
+        """
         returns = np.zeros(env.num_envs)
+        num_left_bounds = 0
         running = np.ones(env.num_envs, dtype=bool)
         with self._timed("rollout"):
             obs = env.reset()
@@ -263,6 +268,7 @@ class DynaSAC(SAC):
                 ends = (step.terminated | step.truncated, step.truncated)
                 self.replay_buffer.model.extend(*(values[kept] for values in (*rows, *ends)))
                 returns += step.rewards * running
+                num_left_bounds += int((step.left_bounds & running).sum())
                 num_steps = int(running.sum())
                 running &= ~ends[0]
                 obs = step.observations
@@ -272,7 +278,7 @@ class DynaSAC(SAC):
                 self._owed_updates -= updates
                 if updates:
                     super().train(updates, batch_size)
-        return returns
+        return returns, num_left_bounds
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
         """The dynamics, as they stand, as an environment of ``num_envs`` particles.
