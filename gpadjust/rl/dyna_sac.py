@@ -136,6 +136,11 @@ class DynaSAC(SAC):
                 f"DynaSAC has no n-step returns; found n_steps={kwargs['n_steps']}: model "
                 "transitions do not lie in the order of a trajectory."
             )
+        if gradient_steps == 0:
+            raise ValueError(
+                "gradient_steps must not be 0: without updates on real trials Stable-Baselines3 "
+                "does not call train(), and the model would never learn. Pass 1 or more, or -1."
+            )
         buffer_class = kwargs.pop("replay_buffer_class", None) or MixedReplayBuffer
         if not issubclass(buffer_class, MixedReplayBuffer):
             raise ValueError(
