@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
@@ -346,6 +346,10 @@ class DynaSAC(SAC):
                     f"DynaSAC needs {name} to learn; found None. Pass {name}=... to DynaSAC or, as "
                     "they are not saved, to DynaSAC.load. Without them an agent can only predict."
                 )
+        if self.particles not in get_args(Particles):
+            raise ValueError(
+                f"Unknown particles {self.particles!r}; use 'independent' or 'functions'."
+            )
         for name, value, least in (
             ("model_trials", self.model_trials, 0),
             ("model_updates", self.model_updates, 0),
