@@ -376,6 +376,10 @@ class DynaSAC(SAC):
     ) -> tuple[int, BaseCallback]:
         """Refuse to spend a real trial on an agent that could not learn from it."""
         self._check_options()
+        if self.env is None:
+            raise ValueError(
+                "There is no environment to learn in; pass env to DynaSAC.load, or use set_env()."
+            )
         self._trial_length()
         self._hooks = []  # callbacks that have some add themselves
         if reset_num_timesteps:
