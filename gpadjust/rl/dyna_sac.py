@@ -12,6 +12,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.sac.policies import SACPolicy
 
@@ -408,13 +409,13 @@ class DynaSAC(SAC):
     ) -> None:
         """As in SB3; without dynamics, their state is left out."""
         if isinstance(load_path_or_dict, dict):
-            parameters = dict(load_path_or_dict)
-            state: Any = parameters.pop("dynamics", None)
-            if self.dynamics is not None and state is not None:
-                self.dynamics.load_state_dict(state)
-            super().set_parameters(parameters, exact_match, device)
+            parameters: dict[str, Any] = dict(load_path_or_dict)
         else:
-            raise TypeError("Pass a dictionary of parameters, or use DynaSAC.load(path).")
+            parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+        state = parameters.pop("dynamics", None)
+        super().set_parameters(parameters, exact_match, device)
+        if self.dynamics is not None and state is not None:
+            self.dynamics.load_state_dict(state)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *_NOT_SAVED]
