@@ -34,6 +34,13 @@ if TYPE_CHECKING:
 _NOT_SAVED = ("dynamics", "reward", "terminated", "initial_states", "_hooks", "_random_state", "_checked")
 
 
+def _on_cpu(state: Any) -> Any:
+    """A state of dynamics, which SB3 loads to the device of the networks, where they compute."""
+    if isinstance(state, dict):
+        return {name: _on_cpu(part) for name, part in state.items()}
+    return state.cpu() if torch.is_tensor(state) else state
+
+
 class DynaSAC(SAC):
     r"""Stable-Baselines3's SAC, trained on real trials and on trials inside a dynamics model.
 
@@ -415,7 +422,7 @@ class DynaSAC(SAC):
         state = parameters.pop("dynamics", None)
         super().set_parameters(parameters, exact_match, device)
         if self.dynamics is not None and state is not None:
-            self.dynamics.load_state_dict(state)
+            self.dynamics.load_state_dict(_on_cpu(state))
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *_NOT_SAVED]
