@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -423,6 +425,13 @@ class DynaSAC(SAC):
         super().set_parameters(parameters, exact_match, device)
         if self.dynamics is not None and state is not None:
             self.dynamics.load_state_dict(_on_cpu(state))
+
+    def load_replay_buffer(
+        self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
+    ) -> None:
+        """As in SB3, for both buffers."""
+        super().load_replay_buffer(path, truncate_last_traj)
+        self.replay_buffer.model.device = self.device
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *_NOT_SAVED]
