@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import pickle
-import tempfile
 import warnings
 import zipfile
 from pathlib import Path
@@ -97,9 +96,9 @@ def save_checkpoint(agent: DynaSAC, path: str | Path) -> None:
         "random.pkl": pickle.dumps(random_state),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.part")  # one of a killed process is overwritten
     try:
-        with os.fdopen(handle, "wb") as file:
+        with open(temporary, "wb") as file:
             with zipfile.ZipFile(file, "w") as archive:
                 for name, content in parts.items():
                     archive.writestr(name, content)
@@ -107,7 +106,7 @@ def save_checkpoint(agent: DynaSAC, path: str | Path) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink(missing_ok=True)
         raise
 
 
