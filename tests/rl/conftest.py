@@ -13,7 +13,7 @@ POINT_SPEC = StateSpec(["x"], ["v"])
 
 
 class Point(gymnasium.Env):
-    """A point on a line that moves by half the action; near 0 is good; beyond `end` it is over."""
+    """A point on a line, moved by half the action and some noise; beyond `end` it is over."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
 
@@ -27,9 +27,10 @@ class Point(gymnasium.Env):
         return self.x, {}
 
     def step(self, action):
-        self.x = (self.x + 0.5 * action).astype(np.float32)
+        noise = 0.02 * self.np_random.normal(size=1)
+        self.x = (self.x + 0.5 * action + noise).astype(np.float32)
         over = self.end is not None and bool(self.x[0] > self.end)
-        return self.x, -float(self.x[0]) ** 2, over, False, {}
+        return self.x, -(float(self.x[0]) ** 2), over, False, {}
 
 
 @pytest.fixture
