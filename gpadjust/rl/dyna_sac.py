@@ -33,7 +33,15 @@ from gpadjust.rl.recorded_trials import RecordedTrials
 if TYPE_CHECKING:
     from gpadjust.rl.callbacks import DynaCallback
 
-_NOT_SAVED = ("dynamics", "reward", "terminated", "initial_states", "_hooks", "_random_state", "_checked")
+_NOT_SAVED = (
+    "dynamics",
+    "reward",
+    "terminated",
+    "initial_states",
+    "_hooks",
+    "_random_state",
+    "_checked",
+)
 
 
 def _on_cpu(state: Any) -> Any:
