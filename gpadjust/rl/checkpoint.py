@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import pickle
-import tempfile
 import warnings
 import zipfile
 from pathlib import Path
@@ -97,9 +96,9 @@ def save_checkpoint(agent: DynaSAC, path: str | Path) -> None:
         "random.pkl": pickle.dumps(random_state),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.part")  # one of a killed process is overwritten
     try:
-        with os.fdopen(handle, "wb") as file:
+        with open(temporary, "wb") as file:
             with zipfile.ZipFile(file, "w") as archive:
                 for name, content in parts.items():
                     archive.writestr(name, content)
@@ -107,7 +106,7 @@ def save_checkpoint(agent: DynaSAC, path: str | Path) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -173,6 +172,10 @@ def _layers(env: VecEnv) -> list[VecEnv]:
     return layers
 
 
+def _names(layers: list[VecEnv]) -> str:
+    return " of ".join(type(layer).__name__ for layer in layers)
+
+
 def _environment_state(agent: DynaSAC) -> bytes:
     """The pickled state of the environment; empty if it has none that can be pickled."""
     vec_env = agent.get_env()
@@ -188,7 +191,7 @@ def _environment_state(agent: DynaSAC) -> bytes:
         for state in kept:
             state.pop("metadata", None)
         try:
-            return bytes(cloudpickle.dumps((kept, inner.envs)))
+            return bytes(cloudpickle.dumps((_names(layers), kept, inner.envs)))
         except Exception as error:  # pickling runs the user's code
             problem = f"{type(error).__name__}: {error}"
     warnings.warn(
@@ -200,15 +203,20 @@ def _environment_state(agent: DynaSAC) -> bytes:
     return b""
 
 
-def _restore_environment(vec_env: VecEnv, state: tuple[list[dict[str, Any]], list[Any]]) -> None:
+def _restore_environment(
+    vec_env: VecEnv, state: tuple[str, list[dict[str, Any]], list[Any]]
+) -> None:
     layers = _layers(vec_env)
-    kept, envs = state
-    if len(layers) != len(kept) or not isinstance(layers[-1], DummyVecEnv):
+    names, kept, envs = state
+    if _names(layers) != names:
         raise ValueError(
-            "env is not wrapped as the one of the checkpoint, which had "
-            f"{len(kept)} layer(s) of vectorised environments; found {len(layers)}: "
-            f"{', '.join(type(layer).__name__ for layer in layers)}."
+            f"env is not wrapped as the one of the checkpoint, a {names}; found a {_names(layers)}."
         )
+    if vec_env.num_envs != len(envs):
+        raise ValueError(
+            f"The checkpoint had {len(envs)} environments; found {vec_env.num_envs} in env."
+        )
+    assert isinstance(layers[-1], DummyVecEnv), "as saved"
     for layer, attributes in zip(layers, kept, strict=True):
         vars(layer).update(attributes)
     layers[-1].envs = envs

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.sac.policies import SACPolicy
 
@@ -30,7 +33,22 @@ from gpadjust.rl.recorded_trials import RecordedTrials
 if TYPE_CHECKING:
     from gpadjust.rl.callbacks import DynaCallback
 
-_NOT_SAVED = ("dynamics", "reward", "terminated", "initial_states", "_hooks", "_random_state")
+_NOT_SAVED = (
+    "dynamics",
+    "reward",
+    "terminated",
+    "initial_states",
+    "_hooks",
+    "_random_state",
+    "_checked",
+)
+
+
+def _on_cpu(state: Any) -> Any:
+    """A state of dynamics, which SB3 loads to the device of the networks, where they compute."""
+    if isinstance(state, dict):
+        return {name: _on_cpu(part) for name, part in state.items()}
+    return state.cpu() if torch.is_tensor(state) else state
 
 
 class DynaSAC(SAC):
@@ -140,6 +158,11 @@ class DynaSAC(SAC):
                 f"DynaSAC has no n-step returns; found n_steps={kwargs['n_steps']}: model "
                 "transitions do not lie in the order of a trajectory."
             )
+        if gradient_steps == 0:
+            raise ValueError(
+                "gradient_steps must not be 0: without updates on real trials Stable-Baselines3 "
+                "does not call train(), and the model would never learn. Pass 1 or more, or -1."
+            )
         buffer_class = kwargs.pop("replay_buffer_class", None) or MixedReplayBuffer
         if not issubclass(buffer_class, MixedReplayBuffer):
             raise ValueError(
@@ -165,10 +188,12 @@ class DynaSAC(SAC):
         self.particles = particles
         self.num_trials = 0
         self.wall_time = {"fit": 0.0, "rollout": 0.0, "sac": 0.0}
-        self._num_learnt = 0  # steps of the real environments
+        self._num_learnt = 0  # steps of the real environments, on the clock of num_timesteps
+        self._num_episodes_learnt = 0  # on the clock of _episode_num
         self._owed_updates = 0.0
         self._hooks: list[DynaCallback] = []
         self._random_state: Any = None
+        self._checked = False  # the functions, by real trials
         if _init_setup_model:
             self._check_options()
         super().__init__(
@@ -190,13 +215,16 @@ class DynaSAC(SAC):
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update on real experience, then learn the model and train in it; SB3 calls this."""
+        over = self.model_until is not None and self.num_trials >= self.model_until
+        self.replay_buffer.mix = self.keep_model_data or not over
         with self._timed("sac"):
             super().train(gradient_steps, batch_size)
-        if self._episode_num == self.num_trials:
+        ended = self._episode_num - self._num_episodes_learnt
+        if not ended:
             return
-        self.num_trials = self._episode_num
-        if self.model_until is not None and self.num_trials > self.model_until:
-            self.replay_buffer.mix = self.keep_model_data
+        self._num_episodes_learnt = self._episode_num
+        self.num_trials += ended
+        if over:
             return
         self._fit_model()
         self._train_in_model(batch_size)
@@ -210,8 +238,9 @@ class DynaSAC(SAC):
         assert self.reward is not None
         num_steps = self.num_timesteps // self.n_envs
         new = self.recorded_trials(newest=num_steps - self._num_learnt)
-        if self._num_learnt == 0:
+        if not self._checked or (self.terminated is None and new.terminated.any()):
             new.check(self.reward, self.terminated)
+            self._checked = True
         transitions = (new.states, new.actions, new.next_states)
         metrics: dict[str, float] = {}
         before = self.wall_time["fit"]
@@ -238,18 +267,23 @@ class DynaSAC(SAC):
         while left > 0:
             num_envs = min(left, self.num_particles or left)
             left -= num_envs
-            env = self.model_env(num_envs)
-            returns.append(self._run_model_trials(env, batch_size))
-            num_left_bounds += env.num_left_bounds
+            trial_returns, num_left = self._run_model_trials(self.model_env(num_envs), batch_size)
+            returns.append(trial_returns)
+            num_left_bounds += num_left
             for hook in self._hooks:
                 hook.on_model_trials(returns[-1])
         if returns:
             self.logger.record("model/ep_rew_mean", float(np.concatenate(returns).mean()))
             self.logger.record("model/left_bounds", num_left_bounds)
 
-    def _run_model_trials(self, env: ModelVecEnv, batch_size: int) -> np.ndarray:
-        """One trial of each particle, with updates at each step; the returns."""
+    def _run_model_trials(self, env: ModelVecEnv, batch_size: int) -> tuple[np.ndarray, int]:
+        """One trial of each particle, with updates at each step.
+
+        Returns:
+            The returns, and the number of particles that left the bounds.
+        """
         returns = np.zeros(env.num_envs)
+        num_left_bounds = 0
         running = np.ones(env.num_envs, dtype=bool)
         with self._timed("rollout"):
             obs = env.reset()
@@ -265,16 +299,17 @@ class DynaSAC(SAC):
                 ends = (step.terminated | step.truncated, step.truncated)
                 self.replay_buffer.model.extend(*(values[kept] for values in (*rows, *ends)))
                 returns += step.rewards * running
+                num_left_bounds += int((step.left_bounds & running).sum())
                 num_steps = int(running.sum())
                 running &= ~ends[0]
                 obs = step.observations
             with self._timed("sac"):
                 self._owed_updates += self.model_updates * num_steps
-                updates = int(self._owed_updates)
+                updates = int(self._owed_updates + 1e-9)  # ten times 0.3 are three
                 self._owed_updates -= updates
                 if updates:
                     super().train(updates, batch_size)
-        return returns
+        return returns, num_left_bounds
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
         """The dynamics, as they stand, as an environment of ``num_envs`` particles.
@@ -286,6 +321,11 @@ class DynaSAC(SAC):
         assert self.dynamics is not None
         assert self.reward is not None
         trials = self.recorded_trials()
+        if self.initial_states is None and not trials.num_transitions:
+            raise ValueError(
+                "There are no real trials yet that particles could start from; pass initial_states "
+                "to DynaSAC, or call learn() first."
+            )
         return ModelVecEnv(
             self.dynamics,
             self.reward,
@@ -332,6 +372,10 @@ class DynaSAC(SAC):
                     f"DynaSAC needs {name} to learn; found None. Pass {name}=... to DynaSAC or, as "
                     "they are not saved, to DynaSAC.load. Without them an agent can only predict."
                 )
+        if self.particles not in get_args(Particles):
+            raise ValueError(
+                f"Unknown particles {self.particles!r}; use 'independent' or 'functions'."
+            )
         for name, value, least in (
             ("model_trials", self.model_trials, 0),
             ("model_updates", self.model_updates, 0),
@@ -358,8 +402,15 @@ class DynaSAC(SAC):
     ) -> tuple[int, BaseCallback]:
         """Refuse to spend a real trial on an agent that could not learn from it."""
         self._check_options()
+        if self.env is None:
+            raise ValueError(
+                "There is no environment to learn in; pass env to DynaSAC.load, or use set_env()."
+            )
         self._trial_length()
         self._hooks = []  # callbacks that have some add themselves
+        if reset_num_timesteps:
+            self._num_learnt -= self.num_timesteps // self.n_envs
+            self._num_episodes_learnt -= self._episode_num
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -383,13 +434,20 @@ class DynaSAC(SAC):
     ) -> None:
         """As in SB3; without dynamics, their state is left out."""
         if isinstance(load_path_or_dict, dict):
-            parameters = dict(load_path_or_dict)
-            state: Any = parameters.pop("dynamics", None)
-            if self.dynamics is not None and state is not None:
-                self.dynamics.load_state_dict(state)
-            super().set_parameters(parameters, exact_match, device)
+            parameters: dict[str, Any] = dict(load_path_or_dict)
         else:
-            raise TypeError("Pass a dictionary of parameters, or use DynaSAC.load(path).")
+            parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+        state = parameters.pop("dynamics", None)
+        super().set_parameters(parameters, exact_match, device)
+        if self.dynamics is not None and state is not None:
+            self.dynamics.load_state_dict(_on_cpu(state))
+
+    def load_replay_buffer(
+        self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
+    ) -> None:
+        """As in SB3, for both buffers."""
+        super().load_replay_buffer(path, truncate_last_traj)
+        self.replay_buffer.model.device = self.device
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *_NOT_SAVED]

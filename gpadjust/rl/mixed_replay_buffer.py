@@ -89,7 +89,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
         real_fraction: Share of real samples in a batch.
 
     Raises:
-        ValueError: If the fraction is out of range or ``optimize_memory_usage`` is asked for.
+        ValueError: If the fraction or the size is out of range, or ``optimize_memory_usage`` is
+            asked for.
     """
 
     def __init__(
@@ -107,6 +108,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
     ) -> None:
         if not 0 <= real_fraction <= 1:
             raise ValueError(f"real_fraction must lie in [0, 1]; found {real_fraction}.")
+        if model_buffer_size is not None and model_buffer_size < 1:
+            raise ValueError(f"model_buffer_size must be at least 1; found {model_buffer_size}.")
         if optimize_memory_usage:
             raise ValueError(
                 "MixedReplayBuffer does not support optimize_memory_usage=True: model transitions "

@@ -237,11 +237,9 @@ class ModelVecEnv(VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Refuse unless ``seed`` is None: the generator is PyTorch's, not this environment's."""
+        """Seed PyTorch's global generator, from which all particles draw."""
         if seed is not None:
-            raise NotImplementedError(
-                "ModelVecEnv draws from PyTorch's global generator; use torch.manual_seed(seed)."
-            )
+            torch.manual_seed(seed)
         return [None] * self.num_envs
 
     def _draw_initial(self, n: int) -> Tensor:

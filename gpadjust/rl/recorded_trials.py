@@ -51,6 +51,8 @@ class RecordedTrials:
         self.terminated = (dones * (1 - torch.from_numpy(column("timeouts")))).bool()
         starts = torch.ones(buffer.n_envs, len(rows), dtype=torch.bool)
         starts[:, 1:] = dones.reshape(starts.shape)[:, :-1].bool()
+        if buffer.full and starts[:, 1:].any():
+            starts[:, 0] = False  # what came before the oldest row is lost
         self._starts = starts.flatten()
 
     @property

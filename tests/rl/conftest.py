@@ -1,0 +1,139 @@
+"""Small systems, and agents that learn them in moments."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import gpadjust.envs
+from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.rl import DynaSAC
+
+POINT_SPEC = StateSpec(["x"], ["v"])
+
+
+class Point(gymnasium.Env):
+    """A point on a line, moved by half the action and some noise; beyond `end` it is over."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+
+    def __init__(self, end=None, max_action=2.0):
+        self.end = end
+        self.action_space = gymnasium.spaces.Box(-max_action, max_action, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(0.5, 1.5, 1).astype(np.float32)
+        return self.x, {}
+
+    def step(self, action):
+        noise = 0.02 * self.np_random.normal(size=1)
+        self.x = (self.x + 0.5 * action + noise).astype(np.float32)
+        over = self.end is not None and bool(self.x[0] > self.end)
+        return self.x, -(float(self.x[0]) ** 2), over, False, {}
+
+
+@pytest.fixture
+def point_env():
+    """Makes the point's environment, of 5 steps: `point_env(end=None)`."""
+
+    def make(trial_length=5, **options):
+        return gymnasium.wrappers.TimeLimit(Point(**options), trial_length)
+
+    return make
+
+
+@pytest.fixture
+def point_dynamics():
+    """The point, as it is."""
+    return PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+
+
+@pytest.fixture
+def point_reward():
+    return lambda states, actions, next_states: -next_states[:, 0].square()
+
+
+@pytest.fixture
+def point_agent(point_env, point_dynamics, point_reward):
+    """Makes an agent for the point; every argument can be given."""
+
+    def make(env=None, **options):
+        defaults = {
+            "dynamics": point_dynamics,
+            "reward": point_reward,
+            "trial_length": 5,
+            "model_trials": 2,
+            "batch_size": 8,
+            "buffer_size": 500,
+            "policy_kwargs": {"net_arch": [8]},
+            "device": "cpu",
+            "seed": 0,
+        }
+        policy = options.pop("policy", "MlpPolicy")
+        return DynaSAC(policy, point_env() if env is None else env, **{**defaults, **options})
+
+    return make
+
+
+@pytest.fixture
+def cart_pole():
+    """Makes the cart-pole's environment."""
+    return lambda **options: gymnasium.make("gpadjust/CartPoleSwingUp-v0", **options)
+
+
+@pytest.fixture
+def cart_pole_dynamics():
+    """The real cart-pole."""
+    return PhysicsDynamics(
+        gpadjust.envs.CART_POLE_SPEC, gpadjust.envs.cart_pole_physics(0.5, 0.5, 0.6, 0.1)
+    )
+
+
+@pytest.fixture
+def tensors_of():
+    """All that an agent has learnt, by name: parameters, optimisers, both buffers, dynamics."""
+
+    def flatten(name, value, found):
+        if isinstance(value, dict):
+            for key, part in value.items():
+                flatten(f"{name}/{key}", part, found)
+        elif isinstance(value, (list, tuple)):
+            for key, part in enumerate(value):
+                flatten(f"{name}/{key}", part, found)
+        elif isinstance(value, (torch.Tensor, np.ndarray)):
+            found[name] = torch.as_tensor(value).detach().clone()
+        else:
+            found[name] = value
+
+    def tensors(agent):
+        found = {}
+        flatten("parameters", agent.get_parameters(), found)
+        flatten("log_ent_coef", agent.log_ent_coef, found)
+        for name in ("observations", "next_observations", "actions", "rewards", "dones"):
+            for buffer in (agent.replay_buffer, agent.replay_buffer.model):
+                flatten(f"{name}{buffer is agent.replay_buffer}", getattr(buffer, name), found)
+        flatten("counts", [agent.num_timesteps, agent.num_trials, agent._n_updates], found)
+        normalizer = agent.get_vec_normalize_env()
+        if normalizer is not None:
+            flatten("obs_rms", vars(normalizer.obs_rms), found)
+            flatten("ret_rms", vars(normalizer.ret_rms), found)
+        return found
+
+    return tensors
+
+
+@pytest.fixture
+def assert_same(tensors_of):
+    """Asserts that two agents, or what `tensors_of` them, are the same, bit by bit."""
+
+    def check(one, other):
+        one, other = (part if isinstance(part, dict) else tensors_of(part) for part in (one, other))
+        assert one.keys() == other.keys()
+        for name, value in one.items():
+            if torch.is_tensor(value):
+                assert torch.equal(value, other[name]), name
+            else:
+                assert value == other[name], name
+
+    return check

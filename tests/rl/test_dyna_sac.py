@@ -1,0 +1,581 @@
+"""Soft actor-critic that also trains in a model."""
+
+import csv
+import threading
+import zipfile
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import (
+    CheckpointCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from gpadjust.dynamics import CKADynamics, PhysicsDynamics, StateSpec
+from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+from gpadjust.rl import DynaCallback, DynaSAC
+
+
+@pytest.fixture
+def normalised(point_env):
+    """Makes normalised environments of the point."""
+    return lambda n=1: VecNormalize(DummyVecEnv([point_env] * n))
+
+
+@pytest.fixture
+def learnt_dynamics(point_dynamics):
+    """Makes dynamics that learn the point from a physics that errs."""
+    return lambda: CKADynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
+
+
+def model_rows(agent):
+    return agent.replay_buffer.model.size()
+
+
+# What a run does
+
+
+@pytest.mark.parametrize(
+    ("options", "updates"),
+    [
+        ({}, 3 * (5 + 10)),
+        ({"model_updates": 2}, 3 * (5 + 20)),
+        ({"model_updates": 0}, 3 * 5),
+        ({"model_updates": 0.3}, 3 * (5 + 3)),
+        ({"model_updates": 0.25}, 3 * 5 + 7),  # of 7.5
+        ({"model_trials": 0}, 3 * 5),
+        ({"model_trials": 5, "num_particles": 2}, 3 * (5 + 25)),
+        ({"gradient_steps": 2}, 3 * (2 + 10)),
+        ({"model_until": 2}, 3 * 5 + 2 * 10),
+        ({"model_until": 0}, 3 * 5),
+        ({"trial_length": 3}, 3 * (5 + 6)),
+        ({"learning_starts": 5}, 2 * (5 + 10)),
+        ({"train_freq": (2, "episode")}, 2 * (10 + 10)),
+    ],
+)
+def test_updates_are_as_many_as_promised(point_agent, options, updates):
+    agent = point_agent(**options).learn(15)
+    assert agent._n_updates == updates
+
+
+def test_model_steps_are_no_time_steps(point_agent):
+    agent = point_agent().learn(15)
+    assert agent.num_timesteps == 15
+    assert agent.replay_buffer.size() == 15
+    assert model_rows(agent) == 3 * 2 * 5
+    assert agent.num_trials == 3
+
+
+def test_model_rows_are_transitions_of_the_model(point_agent):
+    agent = point_agent(terminated=lambda states: states[:, 0] > 9).learn(10)
+    rows = agent.replay_buffer.model
+    n = rows.size()
+    obs, following, actions, rewards, dones, timeouts = (
+        getattr(rows, name)[:n, 0]
+        for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+    )
+    np.testing.assert_allclose(following, obs + 0.5 * 2.0 * actions, atol=1e-5)
+    np.testing.assert_allclose(rewards, -(following[:, 0] ** 2), atol=1e-5)
+    starts = agent.replay_buffer.observations[[0, 5], 0, 0]
+    assert set(obs[:2, 0]) == {starts[0]}
+    assert set(obs[10:12, 0]) <= set(starts)
+    assert dones.reshape(-1, 2).sum(1).tolist() == [0, 0, 0, 0, 2] * 2
+    np.testing.assert_array_equal(dones, timeouts)
+
+
+def test_initial_states_may_be_given(point_agent):
+    agent = point_agent(initial_states=lambda n: torch.full((n, 1), 0.25)).learn(5)
+    assert (agent.replay_buffer.model.observations[:2] == 0.25).all()
+
+
+def test_trials_that_terminate_in_the_model_end_there(point_agent, point_env):
+    agent = point_agent(
+        point_env(end=1.2),
+        terminated=lambda states: states[:, 0] > 1.2,
+        initial_states=lambda n: torch.full((n, 1), 1.19),
+        model_trials=8,
+    ).learn(10)
+    rows = agent.replay_buffer.model
+    n = rows.size()
+    assert n < 8 * 5 * agent.num_trials
+    over = rows.next_observations[:n, 0, 0] > 1.2
+    assert over.any()
+    np.testing.assert_array_equal(over, (rows.dones * (1 - rows.timeouts))[:n, 0].astype(bool))
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_after_model_until_batches_hold_model_rows_only_if_kept(point_agent, keep):
+    agent = point_agent(model_until=2, keep_model_data=keep, real_fraction=0.0)
+    mixed = []
+    sample = agent.replay_buffer.sample
+
+    def watch(*args, **options):
+        mixed.append(agent.replay_buffer.mix)
+        return sample(*args, **options)
+
+    agent.replay_buffer.sample = watch
+    agent.learn(20)
+    assert mixed == [True] * 2 * (5 + 10) + [keep] * 2 * 5
+    assert model_rows(agent) == 2 * 2 * 5
+
+
+def test_a_long_run_in_pieces_goes_on(point_agent, learnt_dynamics):
+    dynamics = learnt_dynamics()
+    agent = point_agent(dynamics=dynamics)
+    for total in (10, 20):  # the second call counts time steps from zero again
+        agent.learn(10)
+        assert dynamics.num_transitions == total
+        assert agent.num_trials == total // 5
+        assert model_rows(agent) == 2 * total
+    agent.learn(5, reset_num_timesteps=False)
+    assert dynamics.num_transitions == 25
+    assert agent.num_trials == 5
+
+
+def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
+    seen = []
+    dynamics = learnt_dynamics()
+    update = dynamics.update
+
+    def watch(states, actions, next_states):
+        seen.append(states)
+        update(states, actions, next_states)
+
+    dynamics.update = watch
+    agent = point_agent(dynamics=dynamics, learning_starts=5).learn(20)
+    assert torch.equal(torch.cat(seen), agent.recorded_trials().states)
+    assert [len(states) for states in seen] == [10, 5, 5]
+
+
+def test_a_trivial_task_is_improved(point_agent):
+    def cost(agent):
+        x = np.linspace(0.5, 1.5, 11, dtype=np.float32)[:, None]
+        action, _ = agent.predict(x, deterministic=True)
+        return float(((x + 0.5 * action) ** 2).mean())
+
+    agent = point_agent(
+        learning_rate=1e-2,
+        model_trials=10,
+        batch_size=32,
+        gamma=0.5,
+        tau=0.05,
+        policy_kwargs={"net_arch": [16]},
+    )
+    before = cost(agent)
+    agent.learn(30)
+    assert cost(agent) < 0.2 * before
+
+
+def test_cart_pole(cart_pole):
+    dynamics = CKADynamics(
+        CART_POLE_SPEC,
+        random_cart_pole_physics(0),
+        fit_options={"num_screened": 8, "num_starts": 1},
+    )
+    agent = DynaSAC(
+        "MlpPolicy",
+        cart_pole(),
+        dynamics,
+        cart_pole_reward,
+        model_trials=1,
+        particles="functions",
+        batch_size=8,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+        device="cpu",
+    ).learn(50)
+    assert dynamics.num_transitions == 50
+    assert 2 <= model_rows(agent) <= 50
+    assert all(seconds > 0 for seconds in agent.wall_time.values())
+
+
+def pendulum_step(X):
+    """Gymnasium's Pendulum-v1."""
+    theta, speed, torque = X.unbind(-1)
+    speed = (speed + (15 * theta.sin() + 3 * torque) * 0.05).clamp(-8, 8)
+    return torch.stack([theta + speed * 0.05, speed], dim=-1)
+
+
+def test_a_system_with_an_angle_of_another_order(point_agent):
+    class SineFirst(gymnasium.ObservationWrapper):
+        def observation(self, observation):
+            return observation[[1, 0, 2]]
+
+    def reward(states, actions, next_states):
+        theta, speed = states.unbind(-1)
+        theta = torch.atan2(theta.sin(), theta.cos())
+        return -(theta.square() + 0.1 * speed.square() + 0.001 * actions[:, 0].square())
+
+    env = SineFirst(gymnasium.make("Pendulum-v1", max_episode_steps=8))
+    env.observation_space = spaces.Box(-8, 8, (3,))
+    spec = StateSpec(["theta", "speed"], ["torque"], angles=["theta"])
+    agent = point_agent(
+        env, dynamics=PhysicsDynamics(spec, pendulum_step), reward=reward, trial_length=None
+    ).learn(16)
+    assert model_rows(agent) == 2 * 2 * 8
+
+
+def test_several_environments(point_agent, point_env, learnt_dynamics):
+    dynamics = learnt_dynamics()
+    env = make_vec_env(point_env, n_envs=2, seed=0)
+    agent = point_agent(env, dynamics=dynamics, train_freq=(4, "step"), gradient_steps=1)
+    agent.learn(40)
+    assert agent.num_timesteps == 40
+    assert agent.num_trials == 8
+    assert dynamics.num_transitions == 40
+    assert torch.equal(
+        dynamics._data.states.sort(0).values, agent.recorded_trials().states.sort(0).values
+    )
+
+
+def test_normalised_environments(point_agent, normalised, learnt_dynamics):
+    env = normalised()
+    dynamics = learnt_dynamics()
+    agent = point_agent(env, dynamics=dynamics).learn(15)
+    assert env.obs_rms.count > 15
+    raw = agent.recorded_trials()
+    assert torch.allclose(raw.next_states, raw.states + 0.5 * raw.actions, atol=0.1)
+    rows = agent.replay_buffer.model
+    start = torch.from_numpy(rows.observations[:2, 0]).double()
+    assert torch.isin(start, raw.states).all()
+
+
+def test_normalised_observations_are_what_the_policy_sees_in_the_model(
+    point_agent, normalised, monkeypatch
+):
+    env = normalised()
+    agent = point_agent(env)
+    seen = []
+    predict = agent.predict
+    monkeypatch.setattr(agent, "predict", lambda obs, **rest: seen.append(obs) or predict(obs))
+    agent.learn(5)
+    in_model = seen[5:]
+    assert len(in_model) == 5
+    start = agent.replay_buffer.model.observations[:2, 0]
+    np.testing.assert_allclose(in_model[0], env.normalize_obs(start), rtol=1e-6)
+
+
+def test_two_runs_are_the_same(point_agent, learnt_dynamics, assert_same):
+    agents = [point_agent(dynamics=learnt_dynamics(), seed=3).learn(10) for _ in range(2)]
+    assert_same(*agents)
+
+
+def test_another_seed_is_another_run(point_agent):
+    one, other = (point_agent(seed=seed).learn(5) for seed in (0, 1))
+    assert (one.replay_buffer.rewards[:5] != other.replay_buffer.rewards[:5]).any()
+
+
+# Callbacks and the logger
+
+
+class Watch(DynaCallback):
+    def __init__(self):
+        super().__init__()
+        self.fits, self.returns = [], []
+
+    def on_model_fit(self, metrics):
+        self.fits.append(metrics)
+
+    def on_model_trials(self, returns):
+        self.returns.append(returns)
+
+
+def test_hooks_of_the_model(point_agent, learnt_dynamics):
+    watch = Watch()
+    agent = point_agent(dynamics=learnt_dynamics(), model_trials=3, num_particles=2)
+    agent.learn(10, [watch])
+    assert [*watch.fits[0]] == ["fit_seconds"]
+    assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
+    assert all(np.isfinite([*metrics.values()]).all() for metrics in watch.fits)
+    assert [len(returns) for returns in watch.returns] == [2, 1, 2, 1]
+    rewards = agent.replay_buffer.model.rewards[: 5 * 6, 0]
+    assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
+    agent.learn(5, reset_num_timesteps=False)
+    assert len(watch.fits) == 2
+
+
+def test_hooks_are_for_dyna_only(point_env):
+    agent = SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]})
+    with pytest.raises(TypeError, match="Watch is for DynaSAC; found SAC"):
+        agent.learn(5, Watch())
+
+
+def test_metrics_of_the_model_are_logged(point_agent, learnt_dynamics, tmp_path):
+    agent = point_agent(dynamics=learnt_dynamics())
+    agent.set_logger(configure(str(tmp_path), ["csv"]))
+    agent.learn(20, log_interval=1)
+    agent.logger.close()
+    with open(tmp_path / "progress.csv") as file:
+        last = [*csv.DictReader(file)][-1]
+    shares = [float(last[f"model/share_{part}"]) for part in ("fit", "rollout", "sac")]
+    assert sum(shares) == pytest.approx(1, abs=1e-3)
+    for name in ("nlpd", "coverage", "rmse", "fit_seconds", "ep_rew_mean"):
+        assert np.isfinite(float(last[f"model/{name}"]))
+    assert float(last["model/left_bounds"]) == 0
+
+
+def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynamics):
+    runaway = PhysicsDynamics(
+        point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
+    )
+    starts = torch.tensor([[0.6], [1.4], [0.8]])
+    agent = point_agent(dynamics=runaway, model_trials=3, initial_states=lambda n: starts)
+    agent.learn(5)
+    assert agent.logger.name_to_value["model/left_bounds"] == 1
+    assert model_rows(agent) == 2 * 5
+    assert agent._n_updates == 5 + 1 + 2 * 5
+
+
+def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_path):
+    evaluated = VecNormalize(make_vec_env(point_env), training=False)
+    evaluation = EvalCallback(
+        evaluated, n_eval_episodes=1, eval_freq=10, log_path=str(tmp_path), verbose=0
+    )
+    saving = CheckpointCallback(
+        10, str(tmp_path), "agent", save_replay_buffer=True, save_vecnormalize=True
+    )
+    agent = point_agent(normalised())
+    agent.learn(100, [evaluation, saving, StopTrainingOnMaxEpisodes(4)])
+    assert agent.num_timesteps == 20
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [10, 20]
+    names = {file.name for file in tmp_path.iterdir()}
+    assert {
+        "agent_10_steps.zip",
+        "agent_replay_buffer_20_steps.pkl",
+        "agent_vecnormalize_20_steps.pkl",
+    } <= names
+
+
+def test_progress_bar(point_agent, capsys):
+    with pytest.warns(match="rich is experimental"):
+        point_agent().learn(10, progress_bar=True)
+    assert "10/10" in capsys.readouterr().out
+
+
+# Saving and loading
+
+
+@pytest.fixture
+def saved(point_agent, learnt_dynamics, tmp_path):
+    """An agent after two trials, and its file."""
+    agent = point_agent(dynamics=learnt_dynamics()).learn(10)
+    agent.save(tmp_path / "agent")
+    return agent, tmp_path / "agent.zip"
+
+
+def test_a_loaded_agent_predicts_the_same(saved):
+    agent, path = saved
+    obs = np.linspace(-1, 1, 7, dtype=np.float32)[:, None]
+    loaded = DynaSAC.load(path)
+    np.testing.assert_array_equal(
+        loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
+    )
+
+
+def test_without_dynamics_a_loaded_agent_only_predicts(saved, point_env, point_reward):
+    _, path = saved
+    with pytest.raises(ValueError, match=r"needs dynamics to learn.*DynaSAC.load"):
+        DynaSAC.load(path, env=point_env()).learn(5)
+    with pytest.raises(ValueError, match=r"needs dynamics to learn"):
+        DynaSAC.load(path).learn(5)
+
+
+def test_with_dynamics_but_no_environment_it_says_so(saved, learnt_dynamics, point_reward):
+    _, path = saved
+    loaded = DynaSAC.load(path, dynamics=learnt_dynamics(), reward=point_reward)
+    with pytest.raises(ValueError, match="env"):
+        loaded.learn(5)
+
+
+def test_with_dynamics_a_loaded_agent_goes_on(saved, point_env, learnt_dynamics, point_reward):
+    agent, path = saved
+    dynamics = learnt_dynamics()
+    loaded = DynaSAC.load(path, env=point_env(), dynamics=dynamics, reward=point_reward)
+    x = torch.linspace(0, 1, 5).double()[:, None]
+    for one, other in zip(dynamics.predict(x, x), agent.dynamics.predict(x, x), strict=True):
+        assert torch.equal(one, other)
+    assert loaded.num_trials == 2
+    loaded.learn(5, reset_num_timesteps=False)
+    assert dynamics.num_transitions == 15
+    assert loaded.num_timesteps == 15
+    assert loaded.num_trials == 3
+
+
+def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics):
+    _, path = saved
+    loaded = DynaSAC.load(
+        path, env=point_env(), dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0]
+    )
+    with pytest.raises(ValueError, match="is not the environment's"):
+        loaded.learn(5)
+
+
+def test_the_file_holds_neither_physics_nor_functions_nor_environment(
+    point_agent, point_env, tmp_path
+):
+    class Unpicklable:
+        """A physics, reward and so on that no pickler can take."""
+
+        def __init__(self, function):
+            self.function, self.lock = function, threading.Lock()
+
+        def __call__(self, *args):
+            return self.function(*args)
+
+        def __reduce__(self):
+            raise AssertionError("pickled")
+
+    env = point_env()
+    env.unwrapped.robot = threading.Lock()
+    spec = StateSpec(["x"], ["v"])
+    agent = point_agent(
+        env,
+        dynamics=PhysicsDynamics(spec, Unpicklable(lambda X: X[:, :1] + 0.5 * X[:, 1:])),
+        reward=Unpicklable(lambda states, actions, next_states: -next_states[:, 0].square()),
+        terminated=Unpicklable(lambda states: states[:, 0] > 99),
+        initial_states=Unpicklable(lambda n: torch.ones(n, 1)),
+    )
+    agent.learn(5, Watch())
+    agent.save(tmp_path / "agent.zip")
+    with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
+        data = archive.read("data").decode()
+    for name in ("dynamics", "reward", "terminated", "initial_states", "env", "_hooks"):
+        assert f'"{name}"' not in data
+
+
+def test_both_buffers_are_saved_together(point_agent, tmp_path):
+    agent = point_agent().learn(10)
+    agent.replay_buffer.model.device = torch.device("meta")  # as if saved on another machine
+    agent.save_replay_buffer(tmp_path / "buffer.pkl")
+    other = point_agent(seed=1)
+    other.load_replay_buffer(tmp_path / "buffer.pkl")
+    for one, again in [
+        (agent.replay_buffer, other.replay_buffer),
+        (agent.replay_buffer.model, other.replay_buffer.model),
+    ]:
+        np.testing.assert_array_equal(one.observations, again.observations)
+        assert again.size() == one.size() > 0
+        assert again.device == other.device
+
+
+def test_parameters_can_be_moved(saved, point_agent, learnt_dynamics):
+    agent, path = saved
+    for source in (agent.get_parameters(), str(path)):
+        other = point_agent(dynamics=learnt_dynamics(), seed=9)
+        other.set_parameters(source)
+        assert other.dynamics.num_transitions == 10
+        obs = np.zeros((1, 1), dtype=np.float32)
+        np.testing.assert_array_equal(
+            other.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
+        )
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dynamics": None}, "needs dynamics to learn; found None"),
+        ({"reward": None}, "needs reward to learn; found None"),
+        ({"n_steps": 3}, "no n-step returns; found n_steps=3"),
+        ({"replay_buffer_class": dict}, "must be MixedReplayBuffer .*found dict"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage"),
+        ({"real_fraction": 2}, r"real_fraction must lie in \[0, 1\]; found 2"),
+        ({"model_buffer_size": -1}, "model_buffer_size must be at least 1; found -1"),
+        ({"model_trials": -1}, "model_trials must be at least 0; found -1"),
+        ({"model_updates": -0.5}, "model_updates must be at least 0; found -0.5"),
+        ({"model_updates": float("nan")}, "model_updates must be at least 0; found nan"),
+        ({"model_until": -1}, "model_until must be at least 0; found -1"),
+        ({"trial_length": 0}, "trial_length must be at least 1; found 0"),
+        ({"num_particles": 0}, "num_particles must be at least 1; found 0"),
+        ({"particles": "swarm"}, "Unknown particles 'swarm'"),
+        ({"gradient_steps": 0}, "gradient_steps"),
+    ],
+)
+def test_bad_arguments_are_refused(point_agent, options, message):
+    with pytest.raises(ValueError, match=message):
+        point_agent(**options)
+
+
+class Shaped(gymnasium.Env):
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+LINE = spaces.Box(-1, 1, (1,))
+
+
+@pytest.mark.parametrize(
+    ("policy", "observations", "actions", "message"),
+    [
+        ("MultiInputPolicy", spaces.Dict({"x": LINE}), LINE, "observation has 1 entries"),
+        ("MlpPolicy", spaces.Box(-1, 1, (2,)), LINE, "observation has 1 entries"),
+        ("MlpPolicy", LINE, spaces.Box(-1, 1, (2,)), "action has 1 entries"),
+    ],
+)
+def test_other_spaces_are_refused(point_agent, policy, observations, actions, message):
+    with pytest.raises(ValueError, match=message):
+        point_agent(Shaped(observations, actions), policy=policy)
+
+
+def test_discrete_actions_are_refused_by_stable_baselines(point_agent):
+    with pytest.raises(AssertionError, match=r"only supports.*Box.*Discrete"):
+        point_agent(Shaped(LINE, spaces.Discrete(2)))
+
+
+def test_a_wrong_reward_is_refused_before_it_is_used(point_agent):
+    agent = point_agent(reward=lambda states, actions, next_states: -states[:, 0].square())
+    with pytest.raises(ValueError, match=r"transition \d+ gave .* but the function says"):
+        agent.learn(5)
+    assert model_rows(agent) == 0
+
+
+def test_terminations_that_were_not_told_are_refused(point_agent, point_env):
+    with pytest.raises(ValueError, match="terminated=True, but none was given"):
+        point_agent(point_env(end=-9)).learn(5)
+
+
+def test_terminations_that_come_late_are_refused(point_agent, point_env):
+    env = point_env()
+    agent = point_agent(env).learn(5)
+    env.unwrapped.end = -9
+    with pytest.raises(ValueError, match="terminated=True, but none was given"):
+        agent.learn(5, reset_num_timesteps=False)
+
+
+def test_an_unknown_time_limit_is_refused(point_agent, point_env):
+    with pytest.raises(ValueError, match="no time limit .*pass trial_length"):
+        point_agent(point_env().unwrapped, trial_length=None).learn(5)
+
+
+def test_a_model_without_starts_is_refused(point_agent):
+    with pytest.raises(ValueError, match="initial_states"):
+        point_agent().model_env(3)
+    assert point_agent(initial_states=lambda n: torch.ones(n, 1)).model_env(3).reset().shape == (
+        3,
+        1,
+    )
+
+
+def test_states_that_are_no_numbers_never_reach_the_buffer(point_agent, point_dynamics):
+    step = point_dynamics.sample
+
+    def broken(states, actions):
+        following = step(states, actions)
+        following[0] = torch.nan
+        return following
+
+    point_dynamics.sample = broken
+    agent = point_agent(model_trials=3).learn(10)
+    assert np.isfinite(agent.replay_buffer.model.next_observations).all()
+    assert model_rows(agent) == 2 * 2 * 5
+    assert all(p.isfinite().all() for p in agent.policy.parameters())

@@ -1,0 +1,263 @@
+"""The model as a vectorised environment."""
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import VecMonitor
+
+from gpadjust.dynamics import CKADynamics
+from gpadjust.envs import cart_pole_reward, cart_pole_start
+from gpadjust.rl import ModelVecEnv
+
+
+@pytest.fixture
+def point_particles(point_env, point_dynamics, point_reward):
+    """Makes particles that are points, from x = 1; every argument can be given."""
+
+    def make(num_envs=3, trial_length=5, start=1.0, **options):
+        env = point_env()
+        arguments = {
+            "dynamics": point_dynamics,
+            "reward": point_reward,
+            "initial_states": lambda n: torch.full((n, 1), start),
+            "observation_space": env.observation_space,
+            "action_space": env.action_space,
+            **options,
+        }
+        return ModelVecEnv(num_envs=num_envs, trial_length=trial_length, **arguments)
+
+    return make
+
+
+@pytest.fixture
+def rise():
+    """An action of 1 for each particle."""
+    return lambda n: np.ones((n, 1), dtype=np.float32)
+
+
+def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics):
+    env = cart_pole()
+    starts = cart_pole_start(3)
+    particles = ModelVecEnv(
+        cart_pole_dynamics,
+        cart_pole_reward,
+        lambda n: starts[:n],
+        3,
+        25,
+        env.observation_space,
+        env.action_space,
+    )
+    actions = np.random.default_rng(0).uniform(-10, 10, (25, 3, 1)).astype(np.float32)
+    seen = [particles.reset()]
+    steps = [particles.step(action) for action in actions]
+    seen += [step[0] for step in steps]
+    for i, start in enumerate(starts):
+        obs, _ = env.reset(options={"state": start})
+        np.testing.assert_allclose(seen[0][i], obs, rtol=1e-6)
+        for t, (_, rewards, dones, infos) in enumerate(steps):
+            obs, reward, terminated, truncated, _ = env.step(actions[t, i])
+            found = infos[i]["terminal_observation"] if dones[i] else seen[t + 1][i]
+            np.testing.assert_allclose(found, obs, rtol=1e-5, atol=1e-6)
+            assert rewards[i] == pytest.approx(reward, rel=1e-5, abs=1e-7)
+            assert bool(dones[i]) == (terminated or truncated)
+            assert infos[i].get("TimeLimit.truncated", False) == truncated
+        np.testing.assert_array_equal(seen[-1][i], seen[0][i])
+
+
+def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynamics, rise):
+    calls = []
+    step = point_dynamics.sample
+    point_dynamics.sample = lambda *args: calls.append(len(args[0])) or step(*args)
+    particles = point_particles(num_envs=7)
+    particles.reset()
+    particles.step(rise(7))
+    assert calls == [7]
+
+
+def test_observations_have_the_type_of_the_space(point_particles, rise):
+    particles = point_particles()
+    assert particles.reset().dtype == np.float32
+    obs, rewards, dones, _ = particles.step(rise(3))
+    assert (obs.dtype, rewards.dtype, dones.dtype) == (np.float32, np.float32, bool)
+
+
+def test_soft_actor_critic_learns_in_it(point_particles):
+    env = VecMonitor(point_particles())
+    agent = SAC(
+        "MlpPolicy", env, learning_starts=6, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0
+    )
+    agent.learn(30)
+    assert agent._n_updates > 0
+    assert [info["l"] for info in agent.ep_info_buffer] == [5] * 6
+    assert np.isfinite([info["r"] for info in agent.ep_info_buffer]).all()
+
+
+def test_seed_repeats_what_particles_meet(point_particles, rise):
+    def rewards():
+        particles = point_particles(initial_states=lambda n: torch.rand(n, 1))
+        particles.seed(7)
+        particles.reset()
+        return particles.step(rise(3))[1]
+
+    np.testing.assert_array_equal(rewards(), rewards())
+
+
+@pytest.fixture
+def unsure_dynamics(point_dynamics):
+    """Of the point, learnt from few transitions."""
+    dynamics = CKADynamics(point_dynamics.spec, point_dynamics.physics)
+    states, actions = torch.rand(4, 1).double(), torch.rand(4, 1).double()
+    dynamics.update(states, actions, states + 0.4 * actions + 0.3 * (3 * states).sin())
+    return dynamics
+
+
+def test_particles_of_functions_meet_the_same_twice(point_particles, unsure_dynamics, rise):
+    particles = point_particles(
+        num_envs=2, trial_length=1, dynamics=unsure_dynamics, particles="functions"
+    )
+    np.random.default_rng(0)
+    particles.reset()
+    first, second = (particles.step(2 * rise(2))[1] for _ in range(2))
+    np.testing.assert_allclose(first, second, rtol=1e-6)
+    assert first[0] != first[1]
+    particles.reset()
+    assert (particles.step(2 * rise(2))[1] != first).all()
+
+
+def test_independent_particles_do_not(point_particles, unsure_dynamics, rise):
+    particles = point_particles(num_envs=2, trial_length=1, dynamics=unsure_dynamics)
+    particles.reset()
+    first, second = (particles.step(2 * rise(2))[1] for _ in range(2))
+    assert (first != second).all()
+
+
+def test_termination_ends_a_trial(point_particles, rise):
+    particles = point_particles(num_envs=2, terminated=lambda states: states[:, 0] > 1.7)
+    particles.reset()
+    _, _, dones, _ = particles.step(rise(2))
+    assert not dones.any()
+    obs, rewards, dones, infos = particles.step(np.array([[1.0], [0.0]], dtype=np.float32))
+    assert dones.tolist() == [True, False]
+    assert not infos[0]["TimeLimit.truncated"]
+    assert infos[0]["terminal_observation"].tolist() == [2.0]
+    assert obs[:, 0].tolist() == [1.0, 1.5]
+    assert rewards.tolist() == [-4.0, -2.25]
+
+
+def test_a_termination_at_the_time_limit_is_no_truncation(point_particles, rise):
+    particles = point_particles(trial_length=1, terminated=lambda states: states[:, 0] > 0)
+    particles.reset()
+    *_, dones, infos = particles.step(rise(3))
+    assert dones.all()
+    assert not any(info["TimeLimit.truncated"] for info in infos)
+
+
+def test_each_particle_has_its_own_clock(point_particles, rise):
+    particles = point_particles(
+        num_envs=2, trial_length=3, terminated=lambda states: states[:, 0] > 1.9
+    )
+    particles.reset()
+    particles.step(np.array([[2.0], [0.0]], dtype=np.float32))  # ends the first
+    ended = [particles.step(0 * rise(2))[2].tolist() for _ in range(3)]
+    assert ended == [[False, False], [False, True], [True, False]]
+
+
+def test_particles_that_leave_the_bounds_are_truncated_and_counted(point_particles, rise):
+    particles = point_particles(num_envs=2, bounds=torch.tensor([[-5.0], [1.3]]))
+    particles.reset()
+    obs, rewards, dones, infos = particles.step(np.array([[1.0], [0.1]], dtype=np.float32))
+    assert dones.tolist() == [True, False]
+    assert infos[0]["left_bounds"]
+    assert infos[0]["TimeLimit.truncated"]
+    assert infos[0]["terminal_observation"].tolist() == [1.0]
+    assert rewards[0] == 0
+    assert obs[:, 0].tolist() == pytest.approx([1.0, 1.05])
+    assert particles.num_left_bounds == 1
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_particles_that_leave_the_numbers_are_truncated(
+    point_particles, point_dynamics, value, rise
+):
+    def broken(states, actions):
+        following = states + actions
+        following[1] = value
+        return following
+
+    point_dynamics.sample = broken
+    particles = point_particles(terminated=lambda states: states[:, 0] > 10)
+    particles.reset()
+    obs, rewards, dones, infos = particles.step(rise(3))
+    assert dones.tolist() == [False, True, False]
+    assert particles.num_left_bounds == 1
+    assert np.isfinite(obs).all()
+    assert np.isfinite(rewards).all()
+    assert np.isfinite(infos[1]["terminal_observation"]).all()
+
+
+def test_whole_numbers_are_rewards(point_particles, rise):
+    particles = point_particles(reward=lambda s, a, n: (n[:, 0] > 0).long())
+    particles.reset()
+    assert particles.step(rise(3))[1].tolist() == [1, 1, 1]
+
+
+def test_attributes_are_those_of_all_particles(point_particles):
+    particles = point_particles()
+    assert particles.get_attr("trial_length", indices=[0, 2]) == [5, 5]
+    particles.set_attr("trial_length", 7)
+    assert particles.get_attr("trial_length") == [7, 7, 7]
+    assert particles.env_is_wrapped(VecMonitor) == [False] * 3
+    with pytest.raises(ValueError, match="all at once"):
+        particles.set_attr("trial_length", 7, indices=0)
+    with pytest.raises(NotImplementedError, match="fly"):
+        particles.env_method("fly")
+
+
+def column(states, actions, next_states):
+    return next_states
+
+
+def not_finite(states, actions, next_states):
+    return next_states[:, 0] / 0
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [(column, r"reward must return one value per row, shape \(3,\)"), (not_finite, "reward.*inf")],
+)
+def test_bad_rewards_are_refused(point_particles, reward, message, rise):
+    particles = point_particles(reward=reward)
+    particles.reset()
+    with pytest.raises(ValueError, match=message):
+        particles.step(rise(3))
+
+
+def test_bad_terminations_are_refused(point_particles, rise):
+    particles = point_particles(terminated=lambda states: states > 0)
+    particles.reset()
+    with pytest.raises(ValueError, match=r"terminated must return one value per row"):
+        particles.step(rise(3))
+
+
+def test_bad_starts_are_refused(point_particles):
+    with pytest.raises(ValueError, match=r"initial_states\(3\) must return .* 3 x 1; found \(3,\)"):
+        point_particles(initial_states=torch.zeros).reset()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"observation_space": spaces.Box(-1, 1, (2,))}, "observation has 1 entries"),
+        ({"observation_space": spaces.Discrete(2)}, "observation has 1 entries"),
+        ({"action_space": spaces.Box(-1, 1, (3,))}, "action has 1 entries"),
+        ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
+        ({"trial_length": 0}, "trial_length must be at least 1; found 0"),
+        ({"particles": "swarm"}, "Unknown particles 'swarm'"),
+        ({"bounds": torch.zeros(2, 4)}, r"bounds must be of shape 2 x 1; found \(2, 4\)"),
+    ],
+)
+def test_bad_arguments_are_refused(point_particles, options, message):
+    with pytest.raises(ValueError, match=message):
+        point_particles(**options)
