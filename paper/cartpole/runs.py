@@ -117,12 +117,17 @@ def run_all(
     missing = [task for task in tasks if not result_path(out, *task).exists()]
     for name, seed in (task for task in tasks if task not in missing):
         run_one(name, seed, out, settings)  # checks its settings
-    with _backend(backend), tqdm(total=len(tasks), initial=len(tasks) - len(missing)) as progress:
+    calls = (joblib.delayed(run_one)(*task, out.absolute(), settings) for task in missing)
+    with _backend(backend):
+        if backend == "ray":  # which cannot return results one by one
+            joblib.Parallel(n_jobs=num_jobs, batch_size=1, verbose=10)(calls)
+            return
         parallel = joblib.Parallel(n_jobs=num_jobs, return_as="generator_unordered", batch_size=1)
-        calls = (joblib.delayed(run_one)(*task, out.absolute(), settings) for task in missing)
-        for path in parallel(calls):
+        progress = tqdm(
+            parallel(calls), total=len(tasks), initial=len(tasks) - len(missing), unit="run"
+        )
+        for path in progress:
             progress.set_postfix_str(path.stem)
-            progress.update()
 
 
 def make_tasks(names: Sequence[str], num_runs: int, first_seed: int) -> list[tuple[str, int]]:
