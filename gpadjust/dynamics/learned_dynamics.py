@@ -29,8 +29,8 @@ from gpadjust.models.prediction import Prediction
 from gpadjust.physics import Physics
 from gpadjust.validation import coverage, nlpd, rmse
 
-_SEARCHED = 200  # points that a search is made on; more would tell the same, and take longer
-_SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=50)
+_SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
+_SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
 _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=8)
 
 
@@ -287,7 +287,7 @@ class LearnedDynamics(Dynamics):
         self._chunks, self._searched_at = [*state["chunks"]], state["searched_at"]
         start = self._chunks[0]
         self._tell_physics(data, self._known)
-        model = self._build(data.rows(0, start))
+        model = self._build(data.rows(0, start), quiet=True)
         model.load_state_dict(state["model"])
         self._fitted = self._model = model.eval()
         for size in self._chunks[1:]:
@@ -304,10 +304,7 @@ class LearnedDynamics(Dynamics):
                 "fewer. Collect more before the first update."
             )
         self._tell_physics(data, known)
-        with warnings.catch_warnings():
-            if previous is not None:
-                warnings.simplefilter("ignore")  # the first fit has said it
-            model = self._build(data)
+        model = self._build(data, quiet=previous is not None)
         searches = previous is None or n >= 2 * self._searched_at
         if previous is None:
             result = fit(model, **self.fit_options)
@@ -332,7 +329,7 @@ class LearnedDynamics(Dynamics):
             return
         generator = torch.Generator().manual_seed(n)
         rows = torch.randperm(n, generator=generator)[:_SEARCHED]
-        part = self._build(Transitions(*(tensor[rows] for tensor in data)))
+        part = self._build(Transitions(*(tensor[rows] for tensor in data)), quiet=True)
         warm_start(part, model)
         fit(part, "map", **_SEARCH)
         objective = Objective(model)
@@ -342,7 +339,8 @@ class LearnedDynamics(Dynamics):
         better = objective(after) < objective(before)
         objective.assign(torch.where(better.unsqueeze(-1), after, before)[0])
 
-    def _build(self, data: Transitions) -> MultiOutputGP:
+    def _build(self, data: Transitions, quiet: bool) -> MultiOutputGP:
+        """The model of some transitions; quiet where the first one has given its warnings."""
         options = {
             name: deepcopy(value) if isinstance(value, Module) else value
             for name, value in self.model_options.items()
@@ -350,13 +348,16 @@ class LearnedDynamics(Dynamics):
         transform: InputTransform | None = None
         if self.encode_angles and self.targets.angles:
             transform = AngleInput(self.targets.angles)
-        return self._make_model(
-            self.targets.inputs(data.states, data.actions),
-            self.targets.encode(data.states, data.next_states),
-            self._physics,
-            input_transform=transform,
-            **options,
-        )
+        with warnings.catch_warnings():
+            if quiet:
+                warnings.simplefilter("ignore")
+            return self._make_model(
+                self.targets.inputs(data.states, data.actions),
+                self.targets.encode(data.states, data.next_states),
+                self._physics,
+                input_transform=transform,
+                **options,
+            )
 
     def _condition(self, model: MultiOutputGP, data: Transitions) -> MultiOutputGP:
         with torch.no_grad():

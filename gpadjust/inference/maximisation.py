@@ -142,7 +142,7 @@ def _optimise(
         g = gradient[position, problems].nan_to_num()
         return f.cpu().numpy(), g.cpu().numpy()
 
-    def run(start: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def run(start: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, ...]:
         x, f, info = fmin_l_bfgs_b_batched(
             lambda x, batch_indices: function(x, which[batch_indices]),
             start,
@@ -151,17 +151,18 @@ def _optimise(
             factr=_TOLERANCE / np.finfo(float).eps,
             pass_batch_indices=True,
         )
-        return x, np.asarray(f, dtype=np.float64), np.array([each["success"] for each in info])
+        flags = np.array([each["status"] for each in info])
+        return x, np.asarray(f, dtype=np.float64), flags == 0, flags == 1
 
     flat = reached.reshape(-1, num_parameters).cpu().numpy()
-    x, f, converged = run(flat, np.arange(len(flat)))
+    x, f, converged, spent = run(flat, np.arange(len(flat)))
     best = f.reshape(num_starts, num_problems).argmin(0) * num_problems + np.arange(num_problems)
     for _ in range(_RESTARTS):
-        stuck = best[~converged[best]]
+        stuck = best[~converged[best] & ~spent[best]]
         if not stuck.size:
             break
         # The line search may have failed in rounding errors at the optimum: another run tells.
-        again, value, success = run(x[stuck], stuck)
+        again, value, success, spent[stuck] = run(x[stuck], stuck)
         converged[stuck] = success | (f[stuck] - value < _STUCK * np.maximum(1, np.abs(value)))
         better = value < f[stuck]
         x[stuck[better]], f[stuck[better]] = again[better], value[better]

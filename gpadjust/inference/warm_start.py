@@ -37,7 +37,7 @@ def warm_start(
             continue
         value = source.current(name)
         if kind(name) in ("outputscale", "noise") and name not in unitless and target.covers(name):
-            value = value + ratio.reshape(*ratio.shape, *[1] * (value.dim() - ratio.dim()))
+            value = value + ratio[(..., *[None] * (value.dim() - ratio.dim()))]
         values[name] = value
     target.assign(values)
 

@@ -24,6 +24,7 @@ from gpytorch.models.exact_prediction_strategies import (
 from gpytorch.settings import (
     detach_test_caches,
     lazily_evaluate_kernels,
+    min_variance,
     prior_mode,
 )
 from linear_operator import to_dense
@@ -154,7 +155,8 @@ class MultiOutputGP(HyperparameterSamples):
             mean, variance = self._marginals(inputs)
             if observation_noise is not False:
                 mvn = MultivariateNormal(mean, DiagLinearOperator(variance))
-                variance = self._apply_noise(inputs, mvn, observation_noise).variance
+                with min_variance(double_value=0.0):
+                    variance = self._apply_noise(inputs, mvn, observation_noise).variance
         mean, variance = (
             t.mT if self._num_outputs > 1 else t.unsqueeze(-1) for t in (mean, variance)
         )

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from copy import deepcopy
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from botorch.sampling.pathwise import draw_kernel_feature_paths, draw_matheron_paths
+from botorch.sampling.pathwise.features import FeatureMap, gen_kernel_features
 from torch import Size, Tensor
 from torch.nn import Module
 
@@ -34,7 +35,10 @@ class SampledFunctions(Module):
         super().__init__()
         model = deepcopy(model).requires_grad_(False).eval()
         draw = partial(
-            draw_kernel_feature_paths, num_features=num_features, weight_generator=_normal
+            draw_kernel_feature_paths,
+            num_features=num_features,
+            weight_generator=_normal,
+            map_generator=partial(_features, model.train_inputs[0].shape[-1]),
         )
         with torch.no_grad():
             self.paths = draw_matheron_paths(model, Size([num_functions]), prior_sampler=draw)
@@ -83,6 +87,11 @@ class FunctionPerBatch(Module):
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
         values: Tensor = self.functions(X.unsqueeze(-3))
         return values.squeeze(0).movedim(-3, 0)
+
+
+def _features(num_transformed: int, *, num_inputs: int, **options: Any) -> FeatureMap:
+    """A kernel's features; BoTorch counts the inputs before their transform."""
+    return gen_kernel_features(num_inputs=num_transformed, **options)
 
 
 def _normal(shape: Size) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,9 +14,8 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.sac.policies import SACPolicy
-from torch import Tensor
 
-from gpadjust.dynamics import Dynamics
+from gpadjust.dynamics import Dynamics, LearnedDynamics
 from gpadjust.rl.mixed_replay_buffer import MixedReplayBuffer
 from gpadjust.rl.model_vec_env import (
     InitialStates,
@@ -25,14 +24,13 @@ from gpadjust.rl.model_vec_env import (
     Reward,
     Termination,
     check_spaces,
-    per_particle,
 )
+from gpadjust.rl.recorded_trials import RecordedTrials
 
 if TYPE_CHECKING:
     from gpadjust.rl.callbacks import DynaCallback
 
 _NOT_SAVED = ("dynamics", "reward", "terminated", "initial_states", "_hooks", "_random_state")
-_BOUNDS = 10.0  # half ranges of the real states that a particle may be from their middle
 
 
 class DynaSAC(SAC):
@@ -103,9 +101,6 @@ class DynaSAC(SAC):
     replay_buffer: MixedReplayBuffer
     observation_space: spaces.Box
     action_space: spaces.Box
-
-    # What a fit and a rollout say, for the logger and the hooks.
-    model_metrics: ClassVar[tuple[str, ...]] = ("nlpd", "coverage", "rmse")
 
     def __init__(
         self,
@@ -206,15 +201,22 @@ class DynaSAC(SAC):
 
     def _fit_model(self) -> None:
         """Score the dynamics on the transitions since the last fit, and teach them these."""
-        states, actions, next_states = self._new_transitions()
+        assert self.dynamics is not None
+        assert self.reward is not None
+        num_steps = self.num_timesteps // self.n_envs
+        new = self.recorded_trials(newest=num_steps - self._num_learnt)
+        if self._num_learnt == 0:
+            new.check(self.reward, self.terminated)
+        transitions = (new.states, new.actions, new.next_states)
         metrics: dict[str, float] = {}
-        start = self.wall_time["fit"]
+        before = self.wall_time["fit"]
         with self._timed("fit"):
-            if self.dynamics.is_fitted:
-                score = self.dynamics.score(states, actions, next_states)
-                metrics = {"nlpd": score.nlpd, "coverage": score.coverage}
-            self.dynamics.update(states, actions, next_states)
-        metrics["fit_seconds"] = self.wall_time["fit"] - start
+            if isinstance(self.dynamics, LearnedDynamics) and self.dynamics.is_fitted:
+                score = self.dynamics.score(*transitions)
+                metrics = {name: float(t.mean()) for name, t in score._asdict().items()}
+            self.dynamics.update(*transitions)
+        self._num_learnt = num_steps
+        metrics["fit_seconds"] = self.wall_time["fit"] - before
         for name, value in metrics.items():
             self.logger.record(f"model/{name}", value)
         for hook in self._hooks:
@@ -238,30 +240,26 @@ class DynaSAC(SAC):
             self.logger.record("model/left_bounds", num_left_bounds)
 
     def _run_model_trials(self, env: ModelVecEnv, batch_size: int) -> np.ndarray:
-        """One trial of each particle; its return."""
-        with self._timed("rollout"):
-            obs = env.reset()
+        """One trial of each particle, with updates at each step; the returns."""
         returns = np.zeros(env.num_envs)
         running = np.ones(env.num_envs, dtype=bool)
+        with self._timed("rollout"):
+            obs = env.reset()
         while running.any():
             with self._timed("rollout"):
                 self.policy.set_training_mode(False)
                 normalizer = self._vec_normalize_env
                 seen = obs if normalizer is None else normalizer.normalize_obs(obs)
                 actions, _ = self.predict(seen, deterministic=False)
-                next_obs, rewards, dones, infos = env.step(actions)
-                final = next_obs.copy()
-                for i in dones.nonzero()[0]:
-                    final[i] = infos[i]["terminal_observation"]
-                timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
-                lost = np.array([info.get("left_bounds", False) for info in infos])
-                kept = running & ~lost
-                rows = (obs, final, self.policy.scale_action(actions), rewards, dones, timeouts)
-                self.replay_buffer.model.extend(*(values[kept] for values in rows))
-                returns += rewards * running
+                step = env.transition(actions)
+                kept = running & ~step.left_bounds
+                rows = (obs, step.observations, self.policy.scale_action(actions), step.rewards)
+                ends = (step.terminated | step.truncated, step.truncated)
+                self.replay_buffer.model.extend(*(values[kept] for values in (*rows, *ends)))
+                returns += step.rewards * running
                 num_steps = int(running.sum())
-                running &= ~dones
-                obs = next_obs
+                running &= ~ends[0]
+                obs = step.observations
             with self._timed("sac"):
                 self._owed_updates += self.model_updates * num_steps
                 updates = int(self._owed_updates)
@@ -279,110 +277,24 @@ class DynaSAC(SAC):
         self._check_options()
         assert self.dynamics is not None
         assert self.reward is not None
+        trials = self.recorded_trials()
         return ModelVecEnv(
             self.dynamics,
             self.reward,
-            self.initial_states or self._recorded_starts,
+            self.initial_states or trials.draw_starts,
             num_envs,
             self._trial_length(),
             self.observation_space,
             self.action_space,
             terminated=self.terminated,
             particles=self.particles,
-            bounds=self._bounds(),
+            bounds=trials.bounds() if trials.num_transitions else None,
         )
 
-    def real_transitions(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All real states, actions and next states in the buffer, in their order, float64."""
-        return self._transitions(self._real_rows())
-
-    def _new_transitions(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The real transitions since the last call."""
-        buffer = self.replay_buffer
-        num_steps = self.num_timesteps // buffer.n_envs
-        rows = self._real_rows()[-(num_steps - self._num_learnt) :]
-        if self._num_learnt == 0:
-            self._check_known(rows)
-        self._num_learnt = num_steps
-        return self._transitions(rows)
-
-    def _real_rows(self) -> np.ndarray:
-        buffer = self.replay_buffer
-        first = buffer.pos if buffer.full else 0
-        return (first + np.arange(buffer.size())) % buffer.buffer_size
-
-    def _transitions(self, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        buffer, spec = self.replay_buffer, self._spec
-        obs, next_obs, scaled = (
-            np.concatenate(list(values[rows].swapaxes(0, 1)))
-            for values in (buffer.observations, buffer.next_observations, buffer.actions)
-        )
-        actions = self.policy.unscale_action(scaled.astype(np.float64))
-        obs, next_obs, actions = (torch.from_numpy(np.float64(x)) for x in (obs, next_obs, actions))
-        return spec.decode(obs), actions, spec.decode(next_obs)
-
-    @property
-    def _spec(self) -> Any:
+    def recorded_trials(self, newest: int | None = None) -> RecordedTrials:
+        """The real transitions in the buffer; or the newest steps of each environment only."""
         assert self.dynamics is not None, "checked when learning starts"
-        return self.dynamics.spec
-
-    def _check_known(self, rows: np.ndarray) -> None:
-        """Raise a ValueError if reward or termination differ from what was recorded."""
-        assert self.reward is not None
-        buffer = self.replay_buffer
-        states, actions, next_states = self._transitions(rows)
-        n = len(states)
-        recorded, dones, timeouts = (
-            torch.from_numpy(np.concatenate(list(values[rows].T)).astype(np.float64))
-            for values in (buffer.rewards, buffer.dones, buffer.timeouts)
-        )
-        rewards = per_particle(self.reward(states, actions, next_states), n, "reward")
-        error = (rewards - recorded).abs()
-        # Observations are float32.
-        tolerance = 1e-3 * recorded.abs().max().clamp_min(1e-6)
-        if (error > tolerance).any():
-            i = int(error.argmax())
-            raise ValueError(
-                f"reward(states, actions, next_states) is not the environment's: transition {i} "
-                f"gave {recorded[i]:.6g} but the function says {rewards[i]:.6g}, at state "
-                f"{states[i].tolist()}, action {actions[i].tolist()}, next state "
-                f"{next_states[i].tolist()}. Correct the function or the spec of the state."
-            )
-        ended = torch.zeros(n, dtype=torch.bool)
-        if self.terminated is not None:
-            ended = per_particle(self.terminated(next_states), n, "terminated").bool()
-        wrong = ended != (dones * (1 - timeouts)).bool()
-        if wrong.any():
-            i = int(wrong.nonzero()[0])
-            found = "none was given" if self.terminated is None else f"it says {bool(ended[i])}"
-            raise ValueError(
-                f"terminated(states) is not the environment's: transition {i} was recorded with "
-                f"terminated={not bool(ended[i])} at next state {next_states[i].tolist()}, but "
-                f"{found}. Pass the termination that the environment has."
-            )
-
-    def _recorded_starts(self, n: int) -> Tensor:
-        """States at which real trials started, drawn with replacement."""
-        buffer = self.replay_buffer
-        rows = self._real_rows()
-        starts = []
-        for env in range(buffer.n_envs):
-            follows_end = np.concatenate([[1.0], buffer.dones[rows[:-1], env]]).astype(bool)
-            starts.append(buffer.observations[rows[follows_end], env])
-        states = self._spec.decode(torch.from_numpy(np.concatenate(starts).astype(np.float64)))
-        return states[torch.randint(len(states), (n,))]
-
-    def _bounds(self) -> Tensor:
-        """How far particles may go: well beyond what was seen; angles anywhere."""
-        states, _, next_states = self.real_transitions()
-        seen = torch.cat([states, next_states])
-        low, high = seen.amin(0), seen.amax(0)
-        reach = _BOUNDS * (high - low).clamp_min(1e-6) / 2
-        middle = (low + high) / 2
-        for i, name in enumerate(self._spec.states):
-            if name in self._spec.angles or name in self._spec.exogenous:
-                reach[i] = torch.inf
-        return torch.stack([middle - reach, middle + reach])
+        return RecordedTrials(self.replay_buffer, self.policy, self.dynamics.spec, newest)
 
     def _trial_length(self) -> int:
         if self.trial_length is not None:
@@ -464,7 +376,7 @@ class DynaSAC(SAC):
         """As in SB3; without dynamics, their state is left out."""
         if isinstance(load_path_or_dict, dict):
             parameters = dict(load_path_or_dict)
-            state = parameters.pop("dynamics", None)
+            state: Any = parameters.pop("dynamics", None)
             if self.dynamics is not None and state is not None:
                 self.dynamics.load_state_dict(state)
             super().set_parameters(parameters, exact_match, device)

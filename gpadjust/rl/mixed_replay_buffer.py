@@ -147,9 +147,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
             parts.append(super().sample(num_real, env))
         if num_real < batch_size:
             parts.append(self.model.sample(batch_size - num_real, env))
-        columns = [
-            torch.cat([part[i] for part in parts]) for i in range(len(ReplayBufferSamples._fields) - 1)
-        ]
+        names = ReplayBufferSamples._fields[:-1]  # the last is for n-step returns
+        columns = [torch.cat([getattr(part, name) for part in parts]) for name in names]
         return ReplayBufferSamples(*columns)
 
     def reset(self) -> None:

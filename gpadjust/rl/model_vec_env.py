@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics
@@ -18,6 +18,24 @@ Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 Termination = Callable[[Tensor], Tensor]
 InitialStates = Callable[[int], Tensor]
 Particles = Literal["independent", "functions"]
+
+
+class ModelStep(NamedTuple):
+    """What a step of all particles gave.
+
+    Args:
+        observations: ``num_envs x observation_dim``.
+        rewards: ``num_envs``, as all that follows.
+        terminated: Whether the state ended the trial.
+        truncated: Whether the time limit or the bounds did.
+        left_bounds: Whether the particle would have left the bounds.
+    """
+
+    observations: np.ndarray
+    rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    left_bounds: np.ndarray
 
 
 class ModelVecEnv(VecEnv):
@@ -88,59 +106,69 @@ class ModelVecEnv(VecEnv):
         self.num_left_bounds = 0
         self._states = torch.empty(num_envs, spec.state_dim, dtype=torch.float64)
         self._steps = torch.zeros(num_envs, dtype=torch.long)
-        self._transition = dynamics.sample
+        self._move: Callable[[Tensor, Tensor], Tensor] = dynamics.sample
 
-    def reset(self) -> VecEnvObs:
+    def reset(self) -> np.ndarray:
         """Start all trials; observations ``num_envs x observation_dim``."""
         self._states = self._draw_initial(self.num_envs)
         self._steps.zero_()
         if self.particles == "functions":
             functions = self.dynamics.sample_functions(self.num_envs)
 
-            def transition(states: Tensor, actions: Tensor) -> Tensor:
+            def move(states: Tensor, actions: Tensor) -> Tensor:
                 return functions(states.unsqueeze(1), actions.unsqueeze(1)).squeeze(1)
 
-            self._transition = transition
+            self._move = move
         return self._observe(self._states)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions ``num_envs x action_dim`` of the next step, in the action space."""
-        self._actions = torch.as_tensor(actions, dtype=torch.float64)
+        self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all particles; those whose trial ended start another."""
-        states, actions = self._states, self._actions
-        following = self._transition(states, actions)
+        step = self.transition(self._actions)
+        dones = step.terminated | step.truncated
+        observations = step.observations.copy()
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in dones.nonzero()[0]:
+            infos[i] = {
+                "terminal_observation": step.observations[i],
+                "TimeLimit.truncated": bool(step.truncated[i]),
+                "left_bounds": bool(step.left_bounds[i]),
+            }
+        if dones.any():
+            ended = torch.from_numpy(dones)
+            self._states[ended] = self._draw_initial(int(dones.sum()))
+            self._steps[ended] = 0
+            observations[dones] = self._observe(self._states[ended])
+        return observations, step.rewards, dones, infos
+
+    def transition(self, actions: np.ndarray) -> ModelStep:
+        """Step all particles, without a new start for those whose trial ended."""
+        states = self._states
+        moves = torch.as_tensor(actions, dtype=torch.float64)
+        following = self._move(states, moves)
         left = ~following.isfinite().all(-1)
         if self.bounds is not None:
             low, high = self.bounds
             left |= ((following < low) | (following > high)).any(-1)
         following = torch.where(left.unsqueeze(-1), states, following)
-        rewards = per_particle(self.reward(states, actions, following), len(states), "reward")
-        rewards = rewards.to(torch.float64).masked_fill(left, 0.0)
-        ended = torch.zeros_like(left)
+        rewards = per_particle(self.reward(states, moves, following), len(states), "reward")
+        terminated = torch.zeros_like(left)
         if self.terminated is not None:
-            ended = per_particle(self.terminated(following), len(states), "terminated").bool()
-            ended &= ~left
-        self._steps += 1
-        truncated = ((self._steps >= self.trial_length) | left) & ~ended
-        dones = ended | truncated
-        self.num_left_bounds += int(left.sum())
-        observations = self._observe(following)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for i in dones.nonzero().flatten().tolist():
-            infos[i] = {
-                "terminal_observation": observations[i].copy(),
-                "TimeLimit.truncated": bool(truncated[i]),
-                "left_bounds": bool(left[i]),
-            }
-        if dones.any():
-            following = following.clone()
-            following[dones] = self._draw_initial(int(dones.sum()))
-            self._steps[dones] = 0
-            observations[dones.numpy()] = self._observe(following[dones])
+            terminated = per_particle(self.terminated(following), len(states), "terminated").bool()
+            terminated &= ~left
         self._states = following
-        return observations, rewards.numpy().astype(np.float32), dones.numpy(), infos
+        self._steps += 1
+        self.num_left_bounds += int(left.sum())
+        return ModelStep(
+            self._observe(following),
+            rewards.masked_fill(left, 0.0).numpy().astype(np.float32),
+            terminated.numpy(),
+            (((self._steps >= self.trial_length) | left) & ~terminated).numpy(),
+            left.numpy(),
+        )
 
     def close(self) -> None:
         """Nothing to close."""
@@ -171,7 +199,7 @@ class ModelVecEnv(VecEnv):
         """False for each particle."""
         return [False] * len(list(self._get_indices(indices)))
 
-    def seed(self, seed: int | None = None) -> Sequence[None | int]:
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Refuse unless ``seed`` is None: the generator is PyTorch's, not this environment's."""
         if seed is not None:
             raise NotImplementedError(

@@ -1,0 +1,109 @@
+"""What a replay buffer tells of the real trials."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor
+
+from gpadjust.dynamics import StateSpec
+from gpadjust.rl.model_vec_env import Reward, Termination, per_particle
+
+_REACH = 10.0  # how many half ranges of the recorded states particles may be from their middle
+_TOLERANCE = 1e-3  # relative; observations are recorded in float32
+
+
+class RecordedTrials:
+    """The transitions in a replay buffer, as states and actions in the user's units.
+
+    Rows are in the order of time, one environment after the other.
+
+    Args:
+        buffer: The buffer.
+        policy: Knows the scale of the actions in the buffer.
+        spec: Decodes the observations.
+        newest: How many steps of each environment to take. Default: all.
+    """
+
+    def __init__(
+        self,
+        buffer: ReplayBuffer,
+        policy: BasePolicy,
+        spec: StateSpec,
+        newest: int | None = None,
+    ) -> None:
+        first = buffer.pos if buffer.full else 0
+        rows = (first + np.arange(buffer.size())) % buffer.buffer_size
+        rows = rows if newest is None else rows[len(rows) - min(newest, len(rows)) :]
+
+        def column(name: str) -> np.ndarray:
+            values = getattr(buffer, name)[rows].swapaxes(0, 1)
+            return values.reshape(-1, *values.shape[2:]).astype(np.float64)
+
+        self.spec = spec
+        self.states = spec.decode(torch.from_numpy(column("observations")))
+        self.next_states = spec.decode(torch.from_numpy(column("next_observations")))
+        self.actions = torch.from_numpy(policy.unscale_action(column("actions")))
+        self.rewards = torch.from_numpy(column("rewards"))
+        dones = torch.from_numpy(column("dones"))
+        self.terminated = (dones * (1 - torch.from_numpy(column("timeouts")))).bool()
+        starts = torch.ones(buffer.n_envs, len(rows), dtype=torch.bool)
+        starts[:, 1:] = dones.reshape(starts.shape)[:, :-1].bool()
+        self._starts = starts.flatten()
+
+    @property
+    def num_transitions(self) -> int:
+        """Number of rows."""
+        return len(self.states)
+
+    def draw_starts(self, n: int) -> Tensor:
+        """Draw states at which trials started, ``n x state_dim``, from PyTorch's generator."""
+        starts = self.states[self._starts]
+        return starts[torch.randint(len(starts), (n,))]
+
+    def bounds(self) -> Tensor:
+        """Bounds ``2 x state_dim`` far beyond all that was seen; angles and targets have none."""
+        seen = torch.cat([self.states, self.next_states])
+        low, high = seen.amin(0), seen.amax(0)
+        reach = _REACH * (high - low).clamp_min(1e-6) / 2
+        for i, name in enumerate(self.spec.states):
+            if name in self.spec.angles or name in self.spec.exogenous:
+                reach[i] = torch.inf
+        return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
+
+    def check(self, reward: Reward, terminated: Termination | None) -> None:
+        """Compare the functions that the user gave with what was recorded.
+
+        Raises:
+            ValueError: If they differ; it shows the worst transition.
+        """
+        n = len(self.states)
+        rewards = per_particle(
+            reward(self.states, self.actions, self.next_states), n, "reward"
+        ).double()
+        error = (rewards - self.rewards).abs()
+        if (error > _TOLERANCE * self.rewards.abs().max().clamp_min(1e-6)).any():
+            i = int(error.argmax())
+            raise ValueError(
+                "reward(states, actions, next_states) is not the environment's: transition "
+                f"{i} gave {self.rewards[i]:.6g}, but the function says {rewards[i]:.6g}; "
+                f"{self._row(i)}. Correct the function, or the spec of the state."
+            )
+        says = torch.zeros(n, dtype=torch.bool)
+        if terminated is not None:
+            says = per_particle(terminated(self.next_states), n, "terminated").bool()
+        wrong = says != self.terminated
+        if wrong.any():
+            i = int(wrong.nonzero()[0])
+            given = "the function says" if terminated is not None else "none was given, that is"
+            raise ValueError(
+                f"terminated(states) is not the environment's: transition {i} was recorded with "
+                f"terminated={bool(self.terminated[i])}, but {given} {bool(says[i])}; "
+                f"{self._row(i)}. Pass the termination that the environment has."
+            )
+
+    def _row(self, i: int) -> str:
+        parts = ("states", "actions", "next_states")
+        return ", ".join(f"{part}[{i}] = {getattr(self, part)[i].tolist()}" for part in parts)

@@ -1,0 +1,91 @@
+"""A cart-pole, its crude physics, and dynamics of every class."""
+
+import math
+
+import pytest
+import torch
+
+from gpadjust.dynamics import (
+    BiasDynamics,
+    CKADynamics,
+    GPDynamics,
+    PhysicsMeanDynamics,
+    RRADynamics,
+    ScaleDynamics,
+    StateSpec,
+)
+from gpadjust.physics import ODEPhysics
+
+
+def cart_pole(cart, pole, length, friction, step=0.1):
+    """Steps of a cart with a uniform rod, its angle from upright."""
+
+    def rhs(state, action):
+        _, theta, v, omega = state.unbind(-1)
+        force, total = action[:, 0] - friction * v, cart + pole
+        sin, cos = theta.sin(), theta.cos()
+        swing = pole * length * omega.square() * sin
+        divisor = 4 * total - 3 * pole * cos.square()
+        cart_rate = (-2 * swing + 3 * pole * 9.81 * sin * cos + 4 * force) / divisor
+        pole_rate = (-3 * swing * cos + 6 * total * 9.81 * sin + 6 * force * cos) / divisor
+        return torch.stack([v, omega, cart_rate, pole_rate / length], dim=-1)
+
+    return ODEPhysics(rhs, step, 4, substeps=5)
+
+
+class CartPole:
+    spec = StateSpec(["x", "theta", "v", "omega"], ["force"], angles=["theta"])
+
+    def __init__(self):
+        self.truth = cart_pole(0.5, 0.5, 0.6, 0.1)
+        self.crude = cart_pole(0.45, 0.6, 0.65, 0.0)
+
+    def trial(self, seed, num_steps=25):
+        """A trial of random actions from hanging: states, actions, next states."""
+        generator = torch.Generator().manual_seed(seed)
+        start = 0.2 * torch.randn(1, 4, generator=generator, dtype=torch.float64)
+        states = [start + torch.tensor([0, math.pi, 0, 0])]
+        actions = 20 * torch.rand(num_steps, 1, generator=generator, dtype=torch.float64) - 10
+        for action in actions.split(1):
+            states.append(self.truth(torch.cat([states[-1], action], -1)))
+        path = torch.cat(states)
+        return path[:-1], actions, path[1:]
+
+
+@pytest.fixture
+def cart_pole_system():
+    return CartPole()
+
+
+_CLASSES = {
+    "GP": GPDynamics,
+    "PhysicsMean": PhysicsMeanDynamics,
+    "Bias": BiasDynamics,
+    "Scale": ScaleDynamics,
+    "CKA": CKADynamics,
+    "RRA": RRADynamics,
+    "RRA-paper": RRADynamics,
+}
+
+
+@pytest.fixture(params=_CLASSES)
+def kind(request):
+    """The name of each class, for `make`."""
+    return request.param
+
+
+@pytest.fixture
+def make():
+    """Makes dynamics by the name of their class, with a quick search."""
+
+    def make(kind, spec, physics, **options):
+        options.setdefault("fit_options", {"num_starts": 4, "num_screened": 32})
+        if kind == "GP":
+            return GPDynamics(spec, **options)
+        if kind.startswith("RRA"):
+            options.setdefault("num_features", 32)
+        if kind == "RRA-paper":
+            options.setdefault("prior", "paper")
+        return _CLASSES[kind](spec, physics, **options)
+
+    return make

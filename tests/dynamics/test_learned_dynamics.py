@@ -1,0 +1,263 @@
+"""What dynamics predict, in limiting cases."""
+
+import math
+
+import pytest
+import torch
+
+from gpadjust import CKA
+from gpadjust.dynamics import CKADynamics, GPDynamics, RRADynamics, ScaleDynamics, StateSpec
+from gpadjust.physics import ODEPhysics
+
+pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+
+
+def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
+    system = cart_pole_system
+    for target in ("difference", "absolute"):
+        dynamics = make("CKA", system.spec, system.truth, target=target)
+        dynamics.update(*system.trial(0))
+        states, actions, next_states = system.trial(1)
+        mean, _ = dynamics.predict(states, actions)
+        torch.testing.assert_close(mean, next_states, rtol=0, atol=1e-6)
+
+
+def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
+    system = cart_pole_system
+    dynamics = make(kind, system.spec, system.crude)
+    assert not dynamics.is_fitted
+    for seed in range(2):
+        dynamics.update(*system.trial(seed))
+    assert dynamics.is_fitted
+    assert dynamics.num_transitions == 50
+    states, actions, next_states = system.trial(7)
+    scores = dynamics.score(states, actions, next_states)
+    for value in scores:
+        assert value.shape == (4,)
+        assert value.isfinite().all()
+    assert ((scores.coverage >= 0) & (scores.coverage <= 1)).all()
+    physics_error = system.crude(torch.cat([states, actions], -1)) - next_states
+    if kind not in ("GP", "Scale", "RRA-paper"):
+        assert (scores.rmse < physics_error.square().mean(0).sqrt())[2:].all()
+
+
+def test_scores_are_those_of_the_predictions(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    dynamics.update(*system.trial(0))
+    states, actions, next_states = system.trial(1)
+    mean, variance = dynamics.predict(states, actions)
+    scores = dynamics.score(states, actions, next_states)
+    density = torch.distributions.Normal(mean, variance.sqrt()).log_prob(next_states)
+    torch.testing.assert_close(scores.nlpd, -density.mean(0))
+    torch.testing.assert_close(scores.rmse, (mean - next_states).square().mean(0).sqrt())
+    turned = next_states + torch.tensor([0, 2 * math.pi, 0, 0])
+    for turn, score in zip(dynamics.score(states, actions, turned), scores, strict=True):
+        torch.testing.assert_close(turn, score, rtol=1e-3, atol=1e-6)
+
+
+def test_whole_turns_of_an_angle_change_nothing(cart_pole_system, make):
+    system = cart_pole_system
+    turn = torch.tensor([0, 2 * math.pi, 0, 0], dtype=torch.float64)
+    states, actions, next_states = system.trial(0)
+    first, second = (make("CKA", system.spec, system.crude) for _ in range(2))
+    first.update(states, actions, next_states)
+    second.update(states + turn, actions, next_states - turn)  # a step across -pi and pi
+    states, actions, _ = system.trial(1)
+    mean, variance = first.predict(states, actions)
+    turned_mean, turned_variance = second.predict(states - 3 * turn, actions)
+    torch.testing.assert_close(turned_mean + 3 * turn, mean, rtol=0, atol=1e-4)
+    torch.testing.assert_close(turned_variance, variance, rtol=0.05, atol=1e-8)
+
+
+def test_absolute_targets_of_an_angle_go_on_across_the_seam(uniform):
+    spec = StateSpec(["theta"], ["rate"], angles=["theta"])
+    states, actions = uniform(20, 1, low=2.8, high=3.4), uniform(20, 1, high=0.3, seed=1)
+    wrapped = torch.atan2((states + actions).sin(), (states + actions).cos())
+    dynamics = CKADynamics(
+        spec,
+        lambda X: torch.atan2((X[:, :1] + 0.9 * X[:, 1:]).sin(), (X[:, :1]).cos()),
+        target="absolute",
+    )
+    dynamics.update(states, actions, wrapped)
+    mean, _ = dynamics.predict(states, actions)
+    torch.testing.assert_close(mean, states + actions, rtol=0, atol=1e-2)
+
+
+def test_exogenous_and_integrated_states(uniform):
+    spec = StateSpec(["goal", "x", "v"], ["a"], exogenous=["goal"], integrated={"x": "v"}, step=0.1)
+    states, actions = uniform(30, 3, low=-1), uniform(30, 1, low=-1, seed=1)
+
+    def follow(states, actions):
+        goal, x, v = states.split(1, -1)
+        faster = v + 0.1 * (actions - 0.5 * v)
+        return torch.cat([goal, x + 0.05 * (v + faster), faster], -1)
+
+    seen = []
+
+    def physics(X):
+        seen.append(X.shape[-1])
+        return torch.cat([X[:, :1] + 0.1 * X[:, 1:2], X[:, 1:2] + 0.08 * X[:, 2:]], -1)
+
+    dynamics = CKADynamics(spec, physics)
+    dynamics.update(states, actions, follow(states, actions))
+    assert dynamics.model.num_outputs == 1
+    assert set(seen) == {3}
+    new, pushes = uniform(10, 3, low=-1, seed=2), uniform(10, 1, low=-1, seed=3)
+    mean, variance = dynamics.predict(new, pushes)
+    torch.testing.assert_close(mean, follow(new, pushes), rtol=0, atol=1e-3)
+    assert (variance[:, 0] == 0).all()
+    torch.testing.assert_close(variance[:, 1], 0.05**2 * variance[:, 2])
+    for drawn in (
+        dynamics.sample(new, pushes),
+        dynamics.sample_functions(1)(new[None], pushes[None])[0],
+    ):
+        torch.testing.assert_close(drawn[:, 1], new[:, 1] + 0.05 * (new[:, 2] + drawn[:, 2]))
+        torch.testing.assert_close(drawn[:, 0], new[:, 0])
+
+
+def test_model_sees_the_physics_of_the_user(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    dynamics.update(*system.trial(0))
+    assert isinstance(dynamics.model, CKA)
+    assert dynamics.physics is system.crude
+    assert dynamics.model.physics.physics is system.crude
+
+
+def test_each_transition_costs_one_row_of_the_physics(uniform):
+    rows = []
+
+    def physics(X):
+        rows.append(len(X))
+        return X[:, :1] + 0.1 * X[:, 1:]
+
+    dynamics = CKADynamics(StateSpec(["x"], ["v"]), physics)
+    for seed in range(3):
+        x, v = uniform(6, 1, seed=seed), uniform(6, 1, seed=seed + 10)
+        dynamics.update(x, v, x + 0.12 * v)
+    dynamics.predict(x, v)
+    assert sum(rows) == 18
+
+
+def test_samples_scatter_as_predicted(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    states, actions, next_states = system.trial(0)
+    dynamics.update(states, actions, next_states + 0.05 * torch.randn_like(next_states))
+    state, action = (t[:1].expand(4000, -1) for t in system.trial(1)[:2])
+    mean, variance = dynamics.predict(state, action)
+    torch.manual_seed(3)
+    drawn = dynamics.sample(state, action)
+    torch.manual_seed(3)
+    assert torch.equal(drawn, dynamics.sample(state, action))
+    torch.testing.assert_close(drawn.var(0), variance[0], rtol=0.1, atol=0)
+    error = (drawn.mean(0) - mean[0]) / variance[0].sqrt()
+    assert (error.abs() < 4 / math.sqrt(4000)).all()
+    noise_free = dynamics.predict(state, action, observation_noise=False).variance
+    assert (noise_free < variance).all()
+
+
+@pytest.mark.parametrize("kind", ["GP", "CKA", "RRA"])
+def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
+    system = cart_pole_system
+    dynamics = make(kind, system.spec, system.crude)
+    states, actions, next_states = system.trial(0, 12)
+    dynamics.update(states, actions, next_states + 0.02 * torch.randn_like(next_states))
+    k = 600
+    state, action = (t[:3] for t in system.trial(1)[:2])
+    mean, variance = dynamics.predict(state, action, observation_noise=False)
+    functions = dynamics.sample_functions(k, seed=0)
+    blocks = state.expand(k, -1, -1), action.expand(k, -1, -1)
+    drawn = functions(*blocks)
+    assert torch.equal(drawn, functions(*blocks))
+    assert torch.equal(drawn, dynamics.sample_functions(k, seed=0)(*blocks))
+    one = functions(state[:1].expand(k, -1, -1), action[:1].expand(k, -1, -1))
+    torch.testing.assert_close(one, drawn[:, :1])
+    error = (drawn.mean(0) - mean) / variance.sqrt()
+    assert error.abs().max() < 5 / math.sqrt(k)
+    torch.testing.assert_close(drawn.var(0) / variance, torch.ones_like(mean), rtol=0, atol=0.3)
+
+
+def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, kind):
+    system = cart_pole_system
+    dynamics = make(kind, system.spec, system.crude)
+    dynamics.update(*system.trial(0, 12))
+    functions = dynamics.model.sample_functions(3, seed=0)
+    states, actions = (t[:6].reshape(3, 2, -1) for t in system.trial(1)[:2])
+    drawn = dynamics.sample_functions(3, seed=0)(states, actions)
+    for i in range(3):
+        change = functions(torch.cat([states[i], actions[i]], -1))[i]
+        torch.testing.assert_close(drawn[i], states[i] + change, rtol=0, atol=1e-8)
+
+
+def test_raw_angles_on_request(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude, encode_angles=False)
+    dynamics.update(*system.trial(0))
+    assert dynamics.model.rho_covar_module.base_kernel.ard_num_dims == 5
+
+
+def test_predictions_take_leading_dimensions(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    dynamics.update(*system.trial(0))
+    states, actions, _ = system.trial(1)
+    whole = dynamics.predict(states, actions)
+    for block, flat in zip(
+        dynamics.predict(states.reshape(5, 5, 4), actions.reshape(5, 5, 1)), whole, strict=True
+    ):
+        torch.testing.assert_close(block, flat.reshape(5, 5, 4))
+
+
+def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make):
+    system = cart_pole_system
+    states, actions, next_states = system.trial(0, 6)
+    dynamics = make("CKA", system.spec, system.crude)
+    with pytest.raises(ValueError, match="at least 2 transitions to learn from, got 1"):
+        dynamics.update(states[:1], actions[:1], next_states[:1])
+    for call in (dynamics.predict, dynamics.sample):
+        with pytest.raises(RuntimeError, match="call `update`"):
+            call(states, actions)
+    with pytest.raises(RuntimeError, match="call `update`"):
+        dynamics.condition(states, actions, next_states)
+    dynamics.update(states, actions, next_states)
+    before = dynamics.predict(states, actions).mean
+    broken = next_states.clone()
+    broken[4, 2] = math.nan
+    with pytest.raises(ValueError, match=r"next_states to be finite.*row 4"):
+        dynamics.update(states, actions, broken)
+    with pytest.raises(TypeError, match=r"actions in float64, got torch\.float32"):
+        dynamics.update(states, actions.float(), next_states)
+    with pytest.raises(ValueError, match="as many rows each"):
+        dynamics.update(states, actions[:3], next_states)
+    with pytest.raises(ValueError, match="states of shape"):
+        dynamics.predict(states[:, :3], actions)
+    with pytest.raises(ValueError, match="a block for each function"):
+        dynamics.sample_functions(2)(states, actions)
+    assert dynamics.num_transitions == 6
+    assert torch.equal(dynamics.predict(states, actions).mean, before)
+
+
+def test_bad_arguments(cart_pole_system):
+    system = cart_pole_system
+    with pytest.raises(ValueError, match="Unknown target 'change'"):
+        GPDynamics(system.spec, target="change")
+    with pytest.raises(ValueError, match="may not hold 'input_transform'"):
+        GPDynamics(system.spec, model_options={"input_transform": None})
+    with pytest.raises(ValueError, match="difference=False"):
+        CKADynamics(system.spec, ODEPhysics(lambda s, a: s, 0.1, 4, difference=True))
+    with pytest.raises(ValueError, match="Unknown prior"):
+        RRADynamics(system.spec, system.crude, prior="none").update(*system.trial(0))
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_of_the_model_is_given_once(recwarn):
+    still = StateSpec(["x"], ["v"])
+    dynamics = ScaleDynamics(still, lambda X: X[:, :1] + 0.1 * X[:, 1:])
+    x = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    with pytest.warns(UserWarning, match="nearly zero"):
+        dynamics.update(x, x, x + 0.12 * x)
+    recwarn.clear()
+    dynamics.update(x + 0.01, x, x + 0.01 + 0.12 * x)
+    assert not recwarn.list

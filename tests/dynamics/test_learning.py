@@ -1,0 +1,166 @@
+"""How dynamics go on learning, and are stored."""
+
+import io
+import warnings
+
+import pytest
+import torch
+from gpytorch.kernels import MaternKernel, ScaleKernel
+
+from gpadjust import fit
+from gpadjust.gp import FixedStandardize
+from gpadjust.inference.warm_start import warm_start
+
+pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+
+
+def stored(dynamics):
+    file = io.BytesIO()
+    torch.save(dynamics.state_dict(), file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def agree(first, second, states, actions):
+    pairs = zip(first.predict(states, actions), second.predict(states, actions), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_loaded_dynamics_go_on_bit_by_bit(cart_pole_system, make, kind):
+    system = cart_pole_system
+    dynamics, other = (make(kind, system.spec, system.crude) for _ in range(2))
+    for seed in (0, 1):
+        dynamics.update(*system.trial(seed))
+    other.load_state_dict(stored(dynamics))
+    test = system.trial(9)[:2]
+    assert agree(dynamics, other, *test)
+    for each in (dynamics, other):
+        each.condition(*(t[:1] for t in system.trial(2)))
+    assert agree(dynamics, other, *test)
+    other = make(kind, system.spec, system.crude)
+    other.load_state_dict(stored(dynamics))
+    assert agree(dynamics, other, *test)
+    for each in (dynamics, other):
+        each.update(*system.trial(3))
+    assert agree(dynamics, other, *test)
+    assert other.num_transitions == 76
+
+
+def test_state_of_dynamics_that_learnt_nothing(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    dynamics.update(*system.trial(0))
+    dynamics.load_state_dict(stored(make("CKA", system.spec, system.crude)))
+    assert not dynamics.is_fitted
+    assert dynamics.num_transitions == 0
+
+
+def test_loading_does_not_run_the_physics_at_the_data(cart_pole_system, make):
+    system, calls = cart_pole_system, []
+
+    def counted(X):
+        calls.append(len(X))
+        return system.crude(X)
+
+    dynamics = make("CKA", system.spec, system.crude)
+    dynamics.update(*system.trial(0))
+    other = make("CKA", system.spec, counted)
+    other.load_state_dict(stored(dynamics))
+    assert not calls
+
+
+def test_conditioning_is_the_exact_posterior(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    first, second = system.trial(0), system.trial(1)
+    dynamics.update(*first)
+    before = [p.clone() for p in dynamics.model.parameters()]
+    dynamics.update(*second, refit=False)
+    assert all(map(torch.equal, dynamics.model.parameters(), before))
+    assert dynamics.num_transitions == 50
+    whole = make("CKA", system.spec, system.crude)
+    whole.fit(*(torch.cat(pair) for pair in zip(first, second, strict=True)))
+    state = {**whole.state_dict(), "model": dynamics.state_dict()["model"]}
+    whole.load_state_dict(state)
+    test = system.trial(9)[:2]
+    for one, other in zip(dynamics.predict(*test), whole.predict(*test), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
+
+
+def test_fit_replaces_the_data(cart_pole_system, make):
+    system = cart_pole_system
+    once, twice = (make("CKA", system.spec, system.crude) for _ in range(2))
+    twice.update(*system.trial(0))
+    for dynamics in (once, twice):
+        dynamics.fit(*system.trial(1))
+    assert twice.num_transitions == 25
+    assert agree(once, twice, *system.trial(9)[:2])
+
+
+def test_refits_are_quiet_and_leave_the_generator_alone(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    state = torch.get_rng_state()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(3):
+            dynamics.update(*system.trial(seed))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_a_warm_start_is_the_same_in_the_users_units(cart_pole_system, make):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    states, actions, next_states = system.trial(0)
+    next_states = next_states + 0.01 * torch.randn_like(next_states)
+    dynamics.update(states, actions, next_states)
+    before = dynamics.predict(states, actions)
+    model = dynamics._build(dynamics._data, quiet=True)
+    scale = model.outcome_transform.stdvs.clone()
+    again = type(model)(
+        dynamics.targets.inputs(states, actions),
+        dynamics.targets.encode(states, next_states),
+        physics=dynamics._physics,
+        outcome_transform=FixedStandardize.of(torch.zeros_like(scale), 3 * scale),
+        input_transform=model.input_transform.base,
+    )
+    warm_start(again, dynamics.model)
+    mean, variance = again.eval().predict(
+        dynamics.targets.inputs(states, actions), observation_noise=True
+    )
+    torch.testing.assert_close(states + mean, before.mean, rtol=0, atol=1e-7)
+    torch.testing.assert_close(variance, before.variance, rtol=1e-2, atol=0)
+
+
+def test_kernels_of_the_users(cart_pole_system, make):
+    system = cart_pole_system
+
+    def matern(num_inputs, batch_shape):
+        base = MaternKernel(ard_num_dims=num_inputs, batch_shape=batch_shape)
+        return ScaleKernel(base, batch_shape=batch_shape)
+
+    module = matern(6, torch.Size([4]))
+    initial = {name: p.clone() for name, p in module.named_parameters()}
+    options = {"rho_covar_module": matern, "delta_covar_module": module}
+    dynamics = make("CKA", system.spec, system.crude, model_options=options)
+    for seed in range(2):
+        dynamics.update(*system.trial(seed))
+    assert isinstance(dynamics.model.rho_covar_module.base_kernel, MaternKernel)
+    assert isinstance(dynamics.model.delta_covar_module.base_kernel, MaternKernel)
+    assert all(torch.equal(p, initial[name]) for name, p in module.named_parameters())
+    assert dynamics.score(*system.trial(9)).rmse.isfinite().all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, 100])
+def test_refits_reach_what_a_search_reaches(cart_pole_system, make, first):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude, fit_options={})
+    for seed in range(first, first + 8):
+        dynamics.update(*system.trial(seed))
+    reached = dynamics.fit_result.log_likelihood.sum()
+    cold = dynamics._build(dynamics._data, quiet=True)
+    best = fit(cold).log_likelihood.sum()
+    units = (dynamics.model.outcome_transform.stdvs - cold.outcome_transform.stdvs).abs().max()
+    assert units < 1e-12
+    assert reached > best - 1e-3 * best.abs()
