@@ -84,8 +84,8 @@ class Recorder(BaseCallback):
             self.model.replay_buffer.mix = self.model.keep_model_data
 
     def _on_rollout_end(self) -> None:
-        steps = self.settings.trial_length
-        transitions = tuple(t[-steps:] for t in self.model.real_transitions())
+        trial = self.model.recorded_trials(newest=self.settings.trial_length)
+        transitions = (trial.states, trial.actions, trial.next_states)
         rewards = cart_pole_reward(*transitions)
         self._record = {"cost": -rewards.mean().item(), **self._scores(transitions)}
 
