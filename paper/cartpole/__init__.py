@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
+import pandas as pd
+
+from paper.cartpole.claims import Judge
+from paper.cartpole.figure import draw_curves, draw_iqm, draw_time
+from paper.cartpole.results import MEASURES, WINDOWS, load, tabulate, tabulate_time
 from paper.cartpole.runs import make_tasks, run_all
-from paper.cartpole.scenarios import SCENARIOS
+from paper.cartpole.scenarios import SCENARIOS, SETTINGS
 from paper.options import add_options, check_options
+
+FIGURES = ("curves", "iqm", "time")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,11 +34,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="loky",
         help="processes on this machine, or on a Ray cluster [loky]",
     )
+    parser.add_argument(
+        "--only-tables",
+        action="store_true",
+        help="run nothing; make tables and figures of the runs that are there",
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the experiment."""
+    """Run the experiment; write and print its tables, verdicts and figures."""
     unknown = [name for name in arguments.scenarios if name not in SCENARIOS]
     if unknown:
         raise SystemExit(
@@ -40,4 +53,36 @@ def run(arguments: argparse.Namespace) -> None:
     check_options(arguments)
     out: Path = arguments.out
     tasks = make_tasks(arguments.scenarios, arguments.runs, arguments.seed)
-    run_all(tasks, out, num_jobs=arguments.jobs, backend=arguments.backend)
+    if not arguments.only_tables:
+        run_all(tasks, out, num_jobs=arguments.jobs, backend=arguments.backend)
+    summarise(out)
+
+
+def summarise(out: Path) -> None:
+    """Write and print tables, verdicts and figures of all the runs in a folder."""
+    trials = load(out)
+    table, times, claims = tabulate(trials), tabulate_time(trials), verdicts(trials)
+    table.to_csv(out / "table.csv", index=False, float_format="%.4g")
+    times.to_csv(out / "time.csv", index=False, float_format="%.4g")
+    claims.to_csv(out / "claims.csv", index=False)
+    for actions, part in table.groupby("actions", sort=False):
+        print(f"\nMean cost, {actions} actions:")
+        print(part.drop(columns="actions").to_string(index=False, float_format="%.3f", na_rep="-"))
+        for claim in claims[claims["actions"] == actions].itertuples():
+            print(f"  {claim.id} {claim.verdict}: {claim.claim} ({claim.measured})")
+    print("\nMean of a run:")
+    print(times.to_string(index=False, float_format="%.4g", na_rep="-"))
+    draw_curves(trials, SETTINGS.model_until, out / "curves.png")
+    draw_iqm(trials, WINDOWS[1:], out / "iqm.png")
+    draw_time(trials, out / "time.png")
+    print(f"\nFigures: {', '.join(str(out / f'{name}.png') for name in FIGURES)}")
+
+
+def verdicts(trials: pd.DataFrame) -> pd.DataFrame:
+    """Judge the paper's claims, by sampled and by deterministic actions."""
+    rows = [
+        {"actions": label, **asdict(claim)}
+        for measure, label in MEASURES.items()
+        for claim in Judge(trials, measure).judge()
+    ]
+    return pd.DataFrame(rows)
