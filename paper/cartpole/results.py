@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -65,12 +66,15 @@ def first_below(curve: pd.Series[float], threshold: float) -> int | None:
 def iqm(scores: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Interquartile means of runs, with the 95 % bootstrap intervals of rliable."""
     runs = {name: values.reshape(-1, 1) for name, values in scores.items()}
-    points, intervals = get_interval_estimates(
-        runs,
-        lambda x: np.array([metrics.aggregate_iqm(x)]),
-        reps=_BOOTSTRAPS,
-        random_state=np.random.RandomState(0),  # noqa: NPY002 - as rliable wants it
-    )
+    with warnings.catch_warnings():
+        # arch, below rliable, renames the seed's argument, which rliable does not know yet.
+        warnings.filterwarnings("ignore", message="random_state is deprecated")
+        points, intervals = get_interval_estimates(
+            runs,
+            lambda x: np.array([metrics.aggregate_iqm(x)]),
+            reps=_BOOTSTRAPS,
+            random_state=np.random.RandomState(0),
+        )
     return (
         {name: float(value[0]) for name, value in points.items()},
         {name: value[:, 0] for name, value in intervals.items()},
