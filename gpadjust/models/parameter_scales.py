@@ -51,16 +51,15 @@ def parameter_scales(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor
     return sizes
 
 
-def set_initial_values(
-    model: BatchedMultiOutputGPyTorchModel, *given: torch.nn.Module | None
-) -> None:
+def set_initial_values(model: BatchedMultiOutputGPyTorchModel, *given: object) -> None:
     """Set initial values, and bounds of the search, to multiples of the typical sizes.
 
     Args:
         model: The model to initialise.
         given: Modules that the user brought, whose parameters stay as they are.
     """
-    keep = {id(p) for module in given if module is not None for p in module.parameters()}
+    modules = [module for module in given if isinstance(module, torch.nn.Module)]
+    keep = {id(p) for module in modules for p in module.parameters()}
     named = dict(model.named_parameters())
     for name, size in parameter_scales(model).items():
         if id(named[name]) in keep:

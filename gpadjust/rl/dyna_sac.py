@@ -59,6 +59,9 @@ class DynaSAC(SAC):
         model_until: Number of real trials after which the model is neither fitted nor run, and its
             experience is kept out of the batches, unless ``keep_model_data``. Default: never.
         keep_model_data: Whether batches hold model experience after ``model_until``.
+        refresh_model_data: Whether the transitions that earlier models made are made again by the
+            newest one, from the same states and actions, as soon as it is fitted. What the first
+            models got wrong would mislead the agent for long.
         real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`.
         model_buffer_size: How many model transitions are kept. Default: as ``buffer_size``.
         trial_length: Steps of a trial. Default: the time limit that ``env`` was registered with.
@@ -115,6 +118,7 @@ class DynaSAC(SAC):
         model_updates: float = 1.0,
         model_until: int | None = None,
         keep_model_data: bool = False,
+        refresh_model_data: bool = True,
         real_fraction: float = 1 / 11,
         model_buffer_size: int | None = None,
         trial_length: int | None = None,
@@ -155,6 +159,7 @@ class DynaSAC(SAC):
         self.model_updates = model_updates
         self.model_until = model_until
         self.keep_model_data = keep_model_data
+        self.refresh_model_data = refresh_model_data
         self.trial_length = trial_length
         self.num_particles = num_particles
         self.particles = particles
@@ -226,6 +231,9 @@ class DynaSAC(SAC):
         """Run the model trials, with updates at each step."""
         left = self.model_trials
         returns = []
+        if self.refresh_model_data and self.replay_buffer.model.size():
+            with self._timed("rollout"):
+                self.model_env(1).refresh(self.replay_buffer.model)
         num_left_bounds = 0
         while left > 0:
             num_envs = min(left, self.num_particles or left)

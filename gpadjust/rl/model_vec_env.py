@@ -13,6 +13,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics
+from gpadjust.rl.mixed_replay_buffer import CompactReplayBuffer
+
+_CHUNK = 2000  # transitions at once, for the sake of memory
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 Termination = Callable[[Tensor], Tensor]
@@ -146,29 +149,63 @@ class ModelVecEnv(VecEnv):
 
     def transition(self, actions: np.ndarray) -> ModelStep:
         """Step all particles, without a new start for those whose trial ended."""
-        states = self._states
         moves = torch.as_tensor(actions, dtype=torch.float64)
-        following = self._move(states, moves)
+        self._states, rewards, terminated, left = self._outcome(self._states, moves, self._move)
+        self._steps += 1
+        self.num_left_bounds += int(left.sum())
+        truncated = ((self._steps >= self.trial_length) | left) & ~terminated
+        return ModelStep(
+            self._observe(self._states),
+            rewards.numpy().astype(np.float32),
+            terminated.numpy(),
+            truncated.numpy(),
+            left.numpy(),
+        )
+
+    def refresh(self, buffer: CompactReplayBuffer) -> None:
+        """Let the transitions in a buffer end anew, as the model now has it.
+
+        The states and actions stay, and with them the time limits; where the model would leave the
+        bounds, a transition stays as it was.
+
+        Args:
+            buffer: Transitions of an earlier model.
+        """
+        for rows in np.array_split(np.arange(buffer.size()), -(-buffer.size() // _CHUNK) or 1):
+            obs = torch.from_numpy(buffer.observations[rows, 0].astype(np.float64))
+            assert isinstance(self.action_space, spaces.Box), "checked at the start"
+            low, high = self.action_space.low, self.action_space.high
+            scaled = buffer.actions[rows, 0].astype(np.float64)
+            actions = torch.from_numpy(low + (scaled + 1) / 2 * (high - low))
+            states = self.dynamics.spec.decode(obs)
+            following, rewards, terminated, left = self._outcome(
+                states, actions, self.dynamics.sample
+            )
+            kept = ~left.numpy()
+            timeouts = buffer.timeouts[rows, 0].astype(bool) & ~terminated.numpy()
+            for name, values in (
+                ("next_observations", self._observe(following)),
+                ("rewards", rewards.numpy()),
+                ("dones", terminated.numpy() | timeouts),
+                ("timeouts", timeouts),
+            ):
+                getattr(buffer, name)[rows[kept], 0] = values[kept]
+
+    def _outcome(
+        self, states: Tensor, actions: Tensor, move: Callable[[Tensor, Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Next states, rewards, termination, and who would have left the bounds."""
+        following = move(states, actions)
         left = ~following.isfinite().all(-1)
         if self.bounds is not None:
             low, high = self.bounds
             left |= ((following < low) | (following > high)).any(-1)
         following = torch.where(left.unsqueeze(-1), states, following)
-        rewards = per_particle(self.reward(states, moves, following), len(states), "reward")
+        rewards = per_particle(self.reward(states, actions, following), len(states), "reward")
         terminated = torch.zeros_like(left)
         if self.terminated is not None:
             terminated = per_particle(self.terminated(following), len(states), "terminated").bool()
-            terminated &= ~left
-        self._states = following
-        self._steps += 1
-        self.num_left_bounds += int(left.sum())
-        return ModelStep(
-            self._observe(following),
-            rewards.masked_fill(left, 0.0).numpy().astype(np.float32),
-            terminated.numpy(),
-            (((self._steps >= self.trial_length) | left) & ~terminated).numpy(),
-            left.numpy(),
-        )
+        return following, rewards.masked_fill(left, 0.0), terminated & ~left, left
 
     def close(self) -> None:
         """Nothing to close."""
