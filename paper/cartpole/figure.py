@@ -37,6 +37,8 @@ def draw_curves(trials: pd.DataFrame, model_until: int, path: Path) -> None:
         ax.axvline(model_until + 0.5, color="0.7", lw=0.8, ls=":", label="the model's last trial")
     for ax in axes.flat[len(names) :]:
         ax.set_visible(False)
+    for ax in axes.flat[max(0, len(names) - columns) : len(names)]:
+        ax.tick_params(labelbottom=True)
     axes[0, 0].set_ylim(0.2, 1.02)
     figure.supxlabel("trial")
     figure.supylabel("mean cost of a trial")

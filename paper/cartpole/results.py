@@ -17,7 +17,7 @@ MEASURES = {"cost": "sampled", "evaluation": "deterministic"}
 WINDOWS = ((1, 6), (13, 25), (41, 50))
 THRESHOLDS = (0.5, 0.4)
 PARTS = ("fit", "rollout", "sac")
-_BOOTSTRAPS = 2000
+_BOOTSTRAPS = 1000
 
 
 def load(out: Path) -> pd.DataFrame:
