@@ -62,10 +62,16 @@ def results(folder: Path) -> dict[str, str]:
 def _cartpole(folder: Path) -> dict[str, str]:
     """The settings of the cart-pole as they stand, and its results if there are any."""
     fragments = {"cartpole:settings": _settings(), "cartpole:updates": _updates()}
-    names = ("sampled", "deterministic", "claims", "time", "model")
+    names = ("curves", "iqm", "seconds", "sampled", "deterministic", "claims", "time", "model")
     if not (folder / "table.csv").exists():
         return fragments | {f"cartpole:{name}": NOT_RUN for name in names}
     table, times, claims = (pd.read_csv(folder / f"{n}.csv") for n in ("table", "time", "claims"))
+    for name, figure, caption in (
+        ("curves", "curves", "Cost over the trials; the number of runs is in brackets"),
+        ("iqm", "iqm", "Interquartile means of the cost; the number of runs is in brackets"),
+        ("seconds", "time", "Seconds of a run"),
+    ):
+        fragments[f"cartpole:{name}"] = f"![{caption}](results/cartpole/{figure}.png)"
     for actions, part in table.groupby("actions"):
         fragments[f"cartpole:{actions}"] = _costs(part)
     fragments["cartpole:claims"] = _cartpole_claims(claims)
