@@ -8,6 +8,7 @@ import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
+from gpadjust.rl.random_state import RandomState
 from paper import __main__ as command_line
 from paper import report
 from paper.cartpole import summarise
@@ -92,10 +93,11 @@ def test_every_scenario_runs(tmp_path, name):
 
 def test_an_evaluation_draws_no_random_number():
     agent = make_agent(SCENARIOS["gp-paper"], 0, TINY)
-    before = torch.get_rng_state(), np.random.get_state()[1].copy()
+    before = RandomState.capture()
     first = evaluate(agent, False, 25)
-    assert torch.equal(torch.get_rng_state(), before[0])
-    assert (np.random.get_state()[1] == before[1]).all()
+    after = RandomState.capture()
+    assert torch.equal(after.torch, before.torch)
+    assert (after.numpy[1] == before.numpy[1]).all()
     assert evaluate(agent, False, 25) == first
     assert 0.8 < first <= 1
     assert torch.equal(fixed_starts(3), fixed_starts(20)[:3])
@@ -128,9 +130,8 @@ def test_tasks_that_are_done_are_left_out(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Ray
-def test_runs_on_ray(tmp_path, monkeypatch):
+def test_runs_on_ray(tmp_path):
     ray = pytest.importorskip("ray")
-    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     settings = replace(TINY, num_trials=2)
     tasks = [("mf", 0), ("phy", 0)]
     try:
