@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from paper import forrester, multifidelity
+from paper import cartpole, forrester, multifidelity
 from paper.report import report
 
 
@@ -19,6 +19,9 @@ def main() -> None:
         experiments.add_parser(
             "multifidelity", help="eight methods on functions of low and high fidelity"
         )
+    )
+    cartpole.add_arguments(
+        experiments.add_parser("cartpole", help="learners that swing up a cart-pole")
     )
     experiments.add_parser(
         "report", help="copy the results that are committed into the READMEs"

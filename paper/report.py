@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from paper.cartpole.scenarios import SCENARIOS, SETTINGS, Scenario, updates_on_trial
+
 PAPER = Path(__file__).parent
 READMES = (PAPER.parent / "README.md", PAPER / "README.md")
 
@@ -54,7 +56,106 @@ def results(folder: Path) -> dict[str, str]:
     for name, column in SCORES.items():
         fragments[f"multifidelity:{name}"] = NOT_RUN if pairs is None else _scores_of(pairs, column)
     fragments["multifidelity:short"] = NOT_RUN if pairs is None else _short(pairs)
+    return fragments | _cartpole(folder / "cartpole")
+
+
+def _cartpole(folder: Path) -> dict[str, str]:
+    """The settings of the cart-pole as they stand, and its results if there are any."""
+    fragments = {"cartpole:settings": _settings(), "cartpole:updates": _updates()}
+    names = ("curves", "iqm", "seconds", "sampled", "deterministic", "claims", "time", "model")
+    if not (folder / "table.csv").exists():
+        return fragments | {f"cartpole:{name}": NOT_RUN for name in names}
+    table, times, claims = (pd.read_csv(folder / f"{n}.csv") for n in ("table", "time", "claims"))
+    for name, figure, caption in (
+        ("curves", "curves", "Cost over the trials; the number of runs is in brackets"),
+        ("iqm", "iqm", "Interquartile means of the cost; the number of runs is in brackets"),
+        ("seconds", "time", "Seconds of a run"),
+    ):
+        fragments[f"cartpole:{name}"] = f"![{caption}](results/cartpole/{figure}.png)"
+    for actions, part in table.groupby("actions"):
+        fragments[f"cartpole:{actions}"] = _costs(part)
+    fragments["cartpole:claims"] = _cartpole_claims(claims)
+    times = times.set_index(times["scenario"].map(lambda name: SCENARIOS[name].label))
+    columns = ["fit_seconds", "rollout_seconds", "sac_seconds", "total_seconds", "updates"]
+    header = ["mean of a run", "fits, s", "model steps, s", "updates, s", "all, s", "updates"]
+    fragments["cartpole:time"] = _numbers(times[columns], header, "{:.0f}")
+    scores = times[["nlpd_median", "coverage", "rmse_median", "left_bounds"]]
+    scores = scores[scores["rmse_median"].notna()]
+    header = ["", "NLPD, median", "coverage of 95 %", "RMSE, median", "particles lost"]
+    fragments["cartpole:model"] = _numbers(scores, header, "{:.3g}")
     return fragments
+
+
+def _settings() -> str:
+    rows = [[f"`{name}`", f"{value}"] for name, value in vars(SETTINGS).items()]
+    return _markdown(["setting", "value"], rows)
+
+
+def _updates() -> str:
+    """How many gradient steps each scenario makes after a trial."""
+
+    def steps(scenario: Scenario, trial: int) -> str:
+        real = updates_on_trial(scenario, SETTINGS, trial)
+        if scenario.dynamics is None or trial > SETTINGS.model_until:
+            return f"{real}"
+        per_step = scenario.model_updates or SETTINGS.model_updates
+        in_model = per_step * SETTINGS.model_trials * SETTINGS.trial_length
+        return f"{real} + {in_model:.0f}"
+
+    until = SETTINGS.model_until
+    header = ["`--scenarios`", "", f"updates, trials 1-{until}", f"{until + 1}-", "seeds"]
+    rows = [
+        [
+            f"`{name}`",
+            scenario.label,
+            steps(scenario, 1),
+            steps(scenario, until + 1),
+            f"{scenario.max_runs or 'all'}",
+        ]
+        for name, scenario in SCENARIOS.items()
+    ]
+    return _markdown(header, rows)
+
+
+def _costs(table: pd.DataFrame) -> str:
+    header = ["", "runs", "trials 1-6", "at 6", "13-25", "41-50", "IQM of 41-50 (95 %)"]
+    rows = []
+    for row in table.to_dict("records"):
+        costs = [row[f"cost_{name}"] for name in ("1_6", "6", "13_25", "41_50")]
+        firsts = [row["first_0.5"], row["first_0.4"]]
+        rows.append(
+            [
+                SCENARIOS[row["scenario"]].label,
+                f"{row['runs']}",
+                *("" if pd.isna(cost) else f"{cost:.2f}" for cost in costs),
+                ""
+                if pd.isna(row["iqm"])
+                else f"{row['iqm']:.2f} ({row['iqm_low']:.2f}, {row['iqm_high']:.2f})",
+                *("never" if pd.isna(first) else f"{first:.0f}" for first in firsts),
+            ]
+        )
+    return _markdown([*header, "first at 0.5", "first at 0.4"], rows)
+
+
+def _cartpole_claims(claims: pd.DataFrame) -> str:
+    rows = []
+    for (name, claim), part in claims.groupby(["id", "claim"]):
+        by_actions = part.set_index("actions")
+        found = [
+            f"**{by_actions['verdict'][a]}**: {by_actions['measured'][a]}"
+            for a in ("sampled", "deterministic")
+        ]
+        rows.append([str(name), str(claim), *found])
+    return _markdown(["", "claim", "sampled actions", "deterministic actions"], rows)
+
+
+def _numbers(table: pd.DataFrame, header: list[str], form: str) -> str:
+    """A table of numbers, its index first."""
+    rows = [
+        [str(label), *("" if pd.isna(value) else form.format(value) for value in values)]
+        for label, values in zip(table.index, table.to_numpy(), strict=True)
+    ]
+    return _markdown(header, rows)
 
 
 def _rmse(table: pd.DataFrame) -> str:
