@@ -220,7 +220,7 @@ class ModelVecEnv(VecEnv):
 
 def per_particle(values: Tensor, n: int, name: str) -> Tensor:
     """Check what a function of the user's says of ``n`` rows."""
-    values = torch.as_tensor(values)
+    values = torch.as_tensor(values).detach()
     if values.shape != (n,):
         raise ValueError(
             f"{name} must return one value per row, shape ({n},); found {tuple(values.shape)}."
