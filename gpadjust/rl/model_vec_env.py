@@ -215,7 +215,7 @@ class ModelVecEnv(VecEnv):
         return states
 
     def _observe(self, states: Tensor) -> np.ndarray:
-        return self.dynamics.spec.observe(states).numpy().astype(np.float32)
+        return self.dynamics.spec.observe(states).numpy().astype(self.observation_space.dtype)
 
 
 def per_particle(values: Tensor, n: int, name: str) -> Tensor:
