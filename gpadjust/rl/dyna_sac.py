@@ -68,7 +68,7 @@ class DynaSAC(SAC):
         env: The real environment; observations are those of the spec of the dynamics.
         dynamics: The model of the real system.
         reward: The known rewards, see :class:`ModelVecEnv`; compared with those of the first real
-            trial before it is used.
+            trial before it is used, also after loading.
         terminated: Which states end a trial, see :class:`ModelVecEnv`.
         initial_states: Draws the initial states of model trials, see :class:`ModelVecEnv`.
             Default: those at which real trials started.
@@ -101,6 +101,7 @@ class DynaSAC(SAC):
         ValueError: If observations or actions are not boxes of the spec's entries, ``reward`` is
             missing, n-step returns are asked for, or a number is out of range; on the first trial
             if rewards or terminations are not those of the environment.
+        AssertionError: By Stable-Baselines3, if the actions are no box.
 
     Example:
         >>> import gymnasium, torch
