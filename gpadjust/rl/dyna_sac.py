@@ -216,7 +216,7 @@ class DynaSAC(SAC):
         with self._timed("sac"):
             super().train(gradient_steps, batch_size)
         ended = self._episode_num - self._num_episodes_learnt
-        if not ended:
+        if not ended or not self._can_fit():
             return
         self._num_episodes_learnt = self._episode_num
         self.num_trials += ended
@@ -227,6 +227,11 @@ class DynaSAC(SAC):
         total = sum(self.wall_time.values())
         for name, seconds in self.wall_time.items():
             self.logger.record(f"model/share_{name}", seconds / total)
+
+    def _can_fit(self) -> bool:
+        """Whether there are the two transitions that a first fit needs."""
+        assert self.dynamics is not None
+        return self.dynamics.is_fitted or self.replay_buffer.size() * self.n_envs > 1
 
     def _fit_model(self) -> None:
         """Score the dynamics on the transitions since the last fit, and teach them these."""

@@ -148,6 +148,19 @@ def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
     assert [len(states) for states in seen] == [10, 5, 5]
 
 
+def test_a_first_trial_of_a_single_step_waits_for_the_second(
+    point_agent, point_env, learnt_dynamics
+):
+    dynamics = learnt_dynamics()
+    agent = point_agent(
+        point_env(end=-9), terminated=lambda states: states[:, 0] > -9, dynamics=dynamics
+    )
+    assert agent.learn(1).num_trials == 0
+    agent.learn(2, reset_num_timesteps=False)
+    assert agent.num_trials == dynamics.num_transitions == 3
+    assert agent._n_updates == 3 + 2 * 2
+
+
 def test_a_trivial_task_is_improved(point_agent):
     def cost(agent):
         x = np.linspace(0.5, 1.5, 11, dtype=np.float32)[:, None]
