@@ -4,7 +4,10 @@ To import this package registers the environments with Gymnasium; ``gym.make`` i
 where the id names it, as in ``gym.make("gpadjust.envs:gpadjust/CartPoleSwingUp-v0")``.
 """
 
-import gymnasium as _gymnasium
+try:
+    import gymnasium as _gymnasium
+except ImportError as error:
+    raise ImportError('gpadjust.envs needs Gymnasium; run `pip install "gpadjust[rl]"`.') from error
 
 from gpadjust.envs.cart_pole import (
     CART_POLE_RAW_SPEC,

@@ -1,5 +1,12 @@
 """Reinforcement learning inside adjusted physics, on Stable-Baselines3 (the extra ``rl``)."""
 
+try:
+    import stable_baselines3 as _  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        'gpadjust.rl needs Stable-Baselines3 and Gymnasium; run `pip install "gpadjust[rl]"`.'
+    ) from error
+
 from gpadjust.rl.callbacks import DynaCallback
 from gpadjust.rl.checkpoint import TrialCheckpoint, resume, save_checkpoint
 from gpadjust.rl.dyna_sac import DynaSAC

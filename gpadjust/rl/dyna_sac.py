@@ -68,7 +68,7 @@ class DynaSAC(SAC):
         env: The real environment; observations are those of the spec of the dynamics.
         dynamics: The model of the real system.
         reward: The known rewards, see :class:`ModelVecEnv`; compared with those of the first real
-            trial before it is used.
+            trial before it is used, also after loading.
         terminated: Which states end a trial, see :class:`ModelVecEnv`.
         initial_states: Draws the initial states of model trials, see :class:`ModelVecEnv`.
             Default: those at which real trials started.
@@ -104,6 +104,7 @@ class DynaSAC(SAC):
         ValueError: If observations or actions are not boxes of the spec's entries, ``reward`` is
             missing, n-step returns are asked for, or a number is out of range; on the first trial
             if rewards or terminations are not those of the environment.
+        AssertionError: By Stable-Baselines3, if the actions are no box.
 
     Example:
         >>> import gymnasium, torch
@@ -220,7 +221,7 @@ class DynaSAC(SAC):
         with self._timed("sac"):
             super().train(gradient_steps, batch_size)
         ended = self._episode_num - self._num_episodes_learnt
-        if not ended:
+        if not ended or not self._can_fit():
             return
         self._num_episodes_learnt = self._episode_num
         self.num_trials += ended
@@ -231,6 +232,11 @@ class DynaSAC(SAC):
         total = sum(self.wall_time.values())
         for name, seconds in self.wall_time.items():
             self.logger.record(f"model/share_{name}", seconds / total)
+
+    def _can_fit(self) -> bool:
+        """Whether there are the two transitions that a first fit needs."""
+        assert self.dynamics is not None
+        return self.dynamics.is_fitted or self.replay_buffer.size() * self.n_envs > 1
 
     def _fit_model(self) -> None:
         """Score the dynamics on the transitions since the last fit, and teach them these."""

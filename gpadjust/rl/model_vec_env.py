@@ -252,12 +252,12 @@ class ModelVecEnv(VecEnv):
         return states
 
     def _observe(self, states: Tensor) -> np.ndarray:
-        return self.dynamics.spec.observe(states).numpy().astype(np.float32)
+        return self.dynamics.spec.observe(states).numpy().astype(self.observation_space.dtype)
 
 
 def per_particle(values: Tensor, n: int, name: str) -> Tensor:
     """Check what a function of the user's says of ``n`` rows."""
-    values = torch.as_tensor(values)
+    values = torch.as_tensor(values).detach()
     if values.shape != (n,):
         raise ValueError(
             f"{name} must return one value per row, shape ({n},); found {tuple(values.shape)}."

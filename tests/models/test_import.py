@@ -14,7 +14,7 @@ def loaded():
 
 
 @pytest.mark.parametrize(
-    "name", ["gymnasium", "stable_baselines3", "opensim", "matplotlib", "pandas"]
+    "name", ["gymnasium", "stable_baselines3", "pygame", "opensim", "matplotlib", "pandas"]
 )
 def test_optional_dependencies_are_not_imported(loaded, name):
     assert "gpadjust" in loaded

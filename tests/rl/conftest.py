@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import gpadjust.envs
-from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.dynamics import CKADynamics, PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaSAC
 
 POINT_SPEC = StateSpec(["x"], ["v"])
@@ -47,6 +47,12 @@ def point_env():
 def point_dynamics():
     """The point, as it is."""
     return PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+
+
+@pytest.fixture
+def learnt_dynamics(point_dynamics):
+    """Makes dynamics that learn the point from a physics that errs."""
+    return lambda: CKADynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
 
 
 @pytest.fixture

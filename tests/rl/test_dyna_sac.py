@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     EvalCallback,
@@ -28,12 +27,6 @@ from gpadjust.rl import DynaCallback, DynaSAC
 def normalised(point_env):
     """Makes normalised environments of the point."""
     return lambda n=1: VecNormalize(DummyVecEnv([point_env] * n))
-
-
-@pytest.fixture
-def learnt_dynamics(point_dynamics):
-    """Makes dynamics that learn the point from a physics that errs."""
-    return lambda: CKADynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
 
 
 def model_rows(agent):
@@ -155,6 +148,19 @@ def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
     assert [len(states) for states in seen] == [10, 5, 5]
 
 
+def test_a_first_trial_of_a_single_step_waits_for_the_second(
+    point_agent, point_env, learnt_dynamics
+):
+    dynamics = learnt_dynamics()
+    agent = point_agent(
+        point_env(end=-9), terminated=lambda states: states[:, 0] > -9, dynamics=dynamics
+    )
+    assert agent.learn(1).num_trials == 0
+    agent.learn(2, reset_num_timesteps=False)
+    assert agent.num_trials == dynamics.num_transitions == 3
+    assert agent._n_updates == 3 + 2 * 2
+
+
 def test_a_trivial_task_is_improved(point_agent):
     def cost(agent):
         x = np.linspace(0.5, 1.5, 11, dtype=np.float32)[:, None]
@@ -274,38 +280,6 @@ def test_another_seed_is_another_run(point_agent):
 
 
 # Callbacks and the logger
-
-
-class Watch(DynaCallback):
-    def __init__(self):
-        super().__init__()
-        self.fits, self.returns = [], []
-
-    def on_model_fit(self, metrics):
-        self.fits.append(metrics)
-
-    def on_model_trials(self, returns):
-        self.returns.append(returns)
-
-
-def test_hooks_of_the_model(point_agent, learnt_dynamics):
-    watch = Watch()
-    agent = point_agent(dynamics=learnt_dynamics(), model_trials=3, num_particles=2)
-    agent.learn(10, [watch])
-    assert [*watch.fits[0]] == ["fit_seconds"]
-    assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
-    assert all(np.isfinite([*metrics.values()]).all() for metrics in watch.fits)
-    assert [len(returns) for returns in watch.returns] == [2, 1, 2, 1]
-    rewards = agent.replay_buffer.model.rewards[: 5 * 6, 0]
-    assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
-    agent.learn(5, reset_num_timesteps=False)
-    assert len(watch.fits) == 2
-
-
-def test_hooks_are_for_dyna_only(point_env):
-    agent = SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]})
-    with pytest.raises(TypeError, match="Watch is for DynaSAC; found SAC"):
-        agent.learn(5, Watch())
 
 
 def test_metrics_of_the_model_are_logged(point_agent, learnt_dynamics, tmp_path):
@@ -443,7 +417,7 @@ def test_the_file_holds_neither_physics_nor_functions_nor_environment(
         terminated=Unpicklable(lambda states: states[:, 0] > 99),
         initial_states=Unpicklable(lambda n: torch.ones(n, 1)),
     )
-    agent.learn(5, Watch())
+    agent.learn(5, DynaCallback())
     agent.save(tmp_path / "agent.zip")
     with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
         data = archive.read("data").decode()
@@ -553,7 +527,7 @@ def test_terminations_that_come_late_are_refused(point_agent, point_env):
 
 
 def test_an_unknown_time_limit_is_refused(point_agent, point_env):
-    with pytest.raises(ValueError, match="no time limit .*pass trial_length"):
+    with pytest.raises(ValueError, match=r"no time limit .*pass trial_length"):
         point_agent(point_env().unwrapped, trial_length=None).learn(5)
 
 

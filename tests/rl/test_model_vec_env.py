@@ -76,11 +76,13 @@ def test_one_call_of_the_model_moves_all_particles(point_particles, point_dynami
     assert calls == [7]
 
 
-def test_observations_have_the_type_of_the_space(point_particles, rise):
-    particles = point_particles()
-    assert particles.reset().dtype == np.float32
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_observations_have_the_type_of_the_space(point_particles, dtype, rise):
+    space = spaces.Box(-np.inf, np.inf, (1,), dtype)
+    particles = point_particles(observation_space=space)
+    assert particles.reset().dtype == dtype
     obs, rewards, dones, _ = particles.step(rise(3))
-    assert (obs.dtype, rewards.dtype, dones.dtype) == (np.float32, np.float32, bool)
+    assert (obs.dtype, rewards.dtype, dones.dtype) == (dtype, np.float32, bool)
 
 
 def test_soft_actor_critic_learns_in_it(point_particles):
@@ -117,7 +119,6 @@ def test_particles_of_functions_meet_the_same_twice(point_particles, unsure_dyna
     particles = point_particles(
         num_envs=2, trial_length=1, dynamics=unsure_dynamics, particles="functions"
     )
-    np.random.default_rng(0)
     particles.reset()
     first, second = (particles.step(2 * rise(2))[1] for _ in range(2))
     np.testing.assert_allclose(first, second, rtol=1e-6)
@@ -201,6 +202,13 @@ def test_whole_numbers_are_rewards(point_particles, rise):
     particles = point_particles(reward=lambda s, a, n: (n[:, 0] > 0).long())
     particles.reset()
     assert particles.step(rise(3))[1].tolist() == [1, 1, 1]
+
+
+def test_rewards_may_carry_gradients(point_particles, rise):
+    weight = torch.ones(1, requires_grad=True)
+    particles = point_particles(reward=lambda s, a, n: weight * n[:, 0])
+    particles.reset()
+    assert particles.step(rise(3))[1].tolist() == [1.5, 1.5, 1.5]
 
 
 def test_attributes_are_those_of_all_particles(point_particles):
