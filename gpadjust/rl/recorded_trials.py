@@ -66,10 +66,11 @@ class RecordedTrials:
         return starts[torch.randint(len(starts), (n,))]
 
     def bounds(self) -> Tensor:
-        """Bounds ``2 x state_dim`` far beyond all that was seen; angles and targets have none."""
+        """Bounds ``2 x state_dim`` far beyond all that was seen; angles and constants have none."""
         seen = torch.cat([self.states, self.next_states])
         low, high = seen.amin(0), seen.amax(0)
-        reach = _REACH * (high - low).clamp_min(1e-6) / 2
+        reach = _REACH * (high - low) / 2
+        reach[high == low] = torch.inf  # that it has not moved yet tells nothing
         for i, name in enumerate(self.spec.states):
             if name in self.spec.angles or name in self.spec.exogenous:
                 reach[i] = torch.inf

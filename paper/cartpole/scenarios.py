@@ -43,12 +43,12 @@ class Settings:
     model_until: int = 25
     model_updates: float = 2  # gradient steps for each step in the model
     num_particles: int = 5
-    later_updates: int = 200  # gradient steps after each trial after model_until
+    later_updates: int = 100  # gradient steps after each trial after model_until
     learning_rate: float = 3e-3
-    gamma: float = 0.97
-    tau: float = 0.01
+    gamma: float = 0.95
+    tau: float = 0.02
     batch_size: int = 256
-    net_arch: tuple[int, ...] = (64, 64)
+    net_arch: tuple[int, ...] = (128, 128)
     ent_coef: str = "auto_0.3"
     target_entropy: str | float = "auto"
 
