@@ -22,7 +22,9 @@ class Watch(DynaCallback):
 
 def test_hooks_of_the_model(point_agent, learnt_dynamics):
     watch = Watch()
-    agent = point_agent(dynamics=learnt_dynamics(), model_trials=3, num_particles=2)
+    agent = point_agent(
+        dynamics=learnt_dynamics(), model_trials=3, num_particles=2, refresh_model_data=False
+    )
     agent.learn(10, [watch])
     assert [*watch.fits[0]] == ["fit_seconds"]
     assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
