@@ -8,7 +8,7 @@ README = (ROOT / "README.md").read_text()
 
 
 def test_the_examples_run(capsys):
-    first, second = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    first, second, _ = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     names = {}
     exec(first, names)
     truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
@@ -18,6 +18,18 @@ def test_the_examples_run(capsys):
     assert "physics mean" in capsys.readouterr().out
     assert (names["mixture"].mixture_mean - truth).abs().max() < 1e-2
     assert names["loo"].rmse < 1e-2
+
+
+def test_the_agent_learns(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[2]
+    for long, short in (("=10 * 25", "=2 * 25"), ("model_trials=20", "model_trials=2")):
+        assert long in code
+        code = code.replace(long, short)
+    names = {}
+    exec(code, names)
+    assert names["agent"].num_trials == 2
+    assert {path.name for path in tmp_path.iterdir()} == {"cart_pole.ckpt", "cart_pole.zip"}
 
 
 def test_ci_runs_the_test_command():
