@@ -78,9 +78,6 @@ class Recorder(BaseCallback):
         self._finish()
         trial = len(trial_log(self.model)) + 1
         self.model.gradient_steps = updates_on_trial(self.scenario, self.settings, trial)
-        if trial > self.settings.model_until:
-            # Before this trial's updates, which come before DynaSAC looks at model_until.
-            self.model.replay_buffer.mix = self.model.keep_model_data
 
     def _on_rollout_end(self) -> None:
         trial = self.model.recorded_trials(newest=self.settings.trial_length)
