@@ -21,7 +21,7 @@ class DynaCallback(BaseCallback):
             raise TypeError(
                 f"{type(self).__name__} is for DynaSAC; found {type(self.model).__name__}."
             )
-        self.model._hooks.append(self)
+        self.model.model_hooks.append(self)
 
     def _on_step(self) -> bool:
         return True
@@ -30,8 +30,9 @@ class DynaCallback(BaseCallback):
         """Called after the dynamics were fitted.
 
         Args:
-            metrics: ``"fit_seconds"``; and ``"nlpd"`` and ``"coverage"`` of the newest real
-                transitions, predicted before they were learnt, from the second trial on.
+            metrics: ``"fit_seconds"``; and of the newest real transitions, predicted before they
+                were learnt, from the second trial on: ``"nlpd"`` and ``"coverage"``, averaged over
+                the states, and ``"rmse/<state>"`` of each.
         """
 
     def on_model_trials(self, returns: np.ndarray) -> None:

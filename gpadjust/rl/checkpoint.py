@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from gpadjust.dynamics import Dynamics
 from gpadjust.rl.dyna_sac import DynaSAC
-from gpadjust.rl.model_vec_env import Reward
+from gpadjust.rl.model_vec_env import InitialStates, Reward, Termination
 from gpadjust.rl.random_state import RandomState
 
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space")
@@ -30,6 +30,10 @@ class TrialCheckpoint(BaseCallback):
     environment, and all random generators, so that an interrupted run ends with the same weights,
     bit for bit, as one that was not (on the same machine and versions). It is replaced atomically:
     whenever the process dies, a whole checkpoint is on the disk.
+
+    Callbacks keep their own state: it is not in the file. One that draws random numbers (an
+    ``EvalCallback`` with ``deterministic=False``) or counts steps begins anew, and may so change
+    what follows.
 
     The environment must be picklable for this; one that is not (a real robot) is reset when the
     run goes on, which is then another run, and a warning says so. Files are pickles: open only
@@ -111,7 +115,13 @@ def save_checkpoint(agent: DynaSAC, path: str | Path) -> None:
 
 
 def resume(
-    path: str | Path, env: GymEnv, *, dynamics: Dynamics, reward: Reward, **functions: Any
+    path: str | Path,
+    env: GymEnv,
+    *,
+    dynamics: Dynamics,
+    reward: Reward,
+    terminated: Termination | None = None,
+    initial_states: InitialStates | None = None,
 ) -> DynaSAC:
     """Read the agent of a run that :class:`TrialCheckpoint` wrote, ready to go on.
 
@@ -122,7 +132,8 @@ def resume(
         env: The environment, made and wrapped as for the first part of the run.
         dynamics: Dynamics of the same class, spec, physics and options, fitted or not.
         reward: The reward of the run.
-        functions: ``terminated`` and ``initial_states``, if the run had them.
+        terminated: The termination of the run, if it had one.
+        initial_states: The initial states of its model trials, if they were given.
 
     Returns:
         The agent. ``learn`` restores the random generators; until then you may use them.
@@ -148,7 +159,8 @@ def resume(
         dynamics=dynamics,
         reward=reward,
         force_reset=False,
-        **functions,
+        terminated=terminated,
+        initial_states=initial_states,
     )
     agent.replay_buffer = pickle.loads(buffer)
     agent.replay_buffer.device = agent.replay_buffer.model.device = agent.device

@@ -5,27 +5,36 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    Schedule,
+    TensorDict,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.sac.policies import SACPolicy
+from torch import Tensor
 
-from gpadjust.dynamics import Dynamics, LearnedDynamics
+from gpadjust.dynamics import Dynamics
 from gpadjust.rl.mixed_replay_buffer import MixedReplayBuffer
+from gpadjust.rl.model_phase import ModelPhase
 from gpadjust.rl.model_vec_env import (
     InitialStates,
     ModelVecEnv,
     Particles,
     Reward,
     Termination,
+    check_function,
     check_spaces,
 )
 from gpadjust.rl.recorded_trials import RecordedTrials
@@ -33,15 +42,8 @@ from gpadjust.rl.recorded_trials import RecordedTrials
 if TYPE_CHECKING:
     from gpadjust.rl.callbacks import DynaCallback
 
-_NOT_SAVED = (
-    "dynamics",
-    "reward",
-    "terminated",
-    "initial_states",
-    "_hooks",
-    "_random_state",
-    "_checked",
-)
+_FUNCTIONS = ("reward", "terminated", "initial_states")
+_NOT_SAVED = ("dynamics", *_FUNCTIONS, "model_hooks", "_random_state", "_unread_dynamics")
 
 
 def _on_cpu(state: Any) -> Any:
@@ -67,12 +69,12 @@ class DynaSAC(SAC):
         policy: As in SAC.
         env: The real environment; observations are those of the spec of the dynamics.
         dynamics: The model of the real system.
-        reward: The known rewards, see :class:`ModelVecEnv`; compared with those of the first real
-            trial before it is used, also after loading.
+        reward: The known rewards, see :class:`ModelVecEnv`; compared with those of each real trial
+            before the agent learns from it.
         terminated: Which states end a trial, see :class:`ModelVecEnv`.
         initial_states: Draws the initial states of model trials, see :class:`ModelVecEnv`.
             Default: those at which real trials started.
-        model_trials: Model trials after each real one.
+        model_trials: Model trials for each real one.
         model_updates: Gradient steps for each model step; may be broken, such as 0.5.
         model_until: Number of real trials after which the model is neither fitted nor run, and its
             experience is kept out of the batches, unless ``keep_model_data``. Default: never.
@@ -82,7 +84,12 @@ class DynaSAC(SAC):
             models got wrong would mislead the agent for long.
         real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`.
         model_buffer_size: How many model transitions are kept. Default: as ``buffer_size``.
-        trial_length: Steps of a trial. Default: the time limit that ``env`` was registered with.
+        reward_tolerance: How far the known rewards may be from the recorded ones, relative to the
+            largest of a trial; None to check neither rewards nor terminations, as noisy sensors
+            may need.
+        state_bounds: Bounds beyond which particles are not followed, ``2 x state_dim``, see
+            :class:`ModelVecEnv`. Default: far beyond all real states so far.
+        trial_length: Steps of a trial. Default: the time limit of ``env``.
         num_particles: Model trials that run side by side. Default: all.
         particles: How they are sampled, see :class:`ModelVecEnv`.
         learning_rate: As in SAC.
@@ -97,13 +104,14 @@ class DynaSAC(SAC):
         kwargs: Further arguments of SAC.
 
     Attributes:
-        num_trials: Real trials that the dynamics have learnt from.
+        num_trials: Real trials that have ended and were learnt from.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"sac"``.
 
     Raises:
         ValueError: If observations or actions are not boxes of the spec's entries, ``reward`` is
-            missing, n-step returns are asked for, or a number is out of range; on the first trial
-            if rewards or terminations are not those of the environment.
+            missing, n-step returns are asked for, or a number is out of range; after a real trial
+            if its rewards or terminations are not those of the functions given.
+        TypeError: If dynamics or functions are of another kind.
         AssertionError: By Stable-Baselines3, if the actions are no box.
 
     Example:
@@ -140,6 +148,8 @@ class DynaSAC(SAC):
         refresh_model_data: bool = True,
         real_fraction: float = 1 / 11,
         model_buffer_size: int | None = None,
+        reward_tolerance: float | None = 1e-3,
+        state_bounds: Tensor | None = None,
         trial_length: int | None = None,
         num_particles: int | None = None,
         particles: Particles = "independent",
@@ -170,11 +180,6 @@ class DynaSAC(SAC):
                 "replay_buffer_class must be MixedReplayBuffer or a subclass of it; found "
                 f"{buffer_class.__name__}."
             )
-        buffer_kwargs = {
-            "real_fraction": real_fraction,
-            "model_buffer_size": model_buffer_size,
-            **(kwargs.pop("replay_buffer_kwargs", None) or {}),
-        }
         self.dynamics = dynamics
         self.reward = reward
         self.terminated = terminated
@@ -184,17 +189,21 @@ class DynaSAC(SAC):
         self.model_until = model_until
         self.keep_model_data = keep_model_data
         self.refresh_model_data = refresh_model_data
+        self.real_fraction = real_fraction
+        self.model_buffer_size = model_buffer_size
+        self.reward_tolerance = reward_tolerance
+        self.state_bounds = state_bounds
         self.trial_length = trial_length
         self.num_particles = num_particles
         self.particles = particles
         self.num_trials = 0
         self.wall_time = {"fit": 0.0, "rollout": 0.0, "sac": 0.0}
-        self._num_learnt = 0  # steps of the real environments, on the clock of num_timesteps
-        self._num_episodes_learnt = 0  # on the clock of _episode_num
-        self._owed_updates = 0.0
-        self._hooks: list[DynaCallback] = []
+        self._num_stored = 0  # of the time steps, how many came into the buffer
+        self.owed_updates = 0.0
+        self.model_hooks: list[DynaCallback] = []
         self._random_state: Any = None
-        self._checked = False  # the functions, by real trials
+        self._unread_dynamics: dict[str, Any] = {}  # of an agent that was loaded without dynamics
+        self._had = [name for name in _FUNCTIONS if getattr(self, name) is not None]
         if _init_setup_model:
             self._check_options()
         super().__init__(
@@ -209,7 +218,6 @@ class DynaSAC(SAC):
             train_freq,
             gradient_steps,
             replay_buffer_class=buffer_class,
-            replay_buffer_kwargs=buffer_kwargs,
             _init_setup_model=_init_setup_model,
             **kwargs,
         )
@@ -218,104 +226,24 @@ class DynaSAC(SAC):
         """Update on real experience, then learn the model and train in it; SB3 calls this."""
         over = self.model_until is not None and self.num_trials >= self.model_until
         self.replay_buffer.mix = self.keep_model_data or not over
-        with self._timed("sac"):
+        with self.timed("sac"):
             super().train(gradient_steps, batch_size)
-        ended = self._episode_num - self._num_episodes_learnt
-        if not ended or not self._can_fit():
+        if not self.replay_buffer.num_new:
             return
-        self._num_episodes_learnt = self._episode_num
-        self.num_trials += ended
+        new = self.recorded_trials(newest=self.replay_buffer.num_new)
+        assert self.dynamics is not None
+        if not new.num_ended or (new.num_transitions < 2 and not self.dynamics.is_fitted):
+            return  # a first fit needs two
+        self.replay_buffer.num_new = 0
+        self.num_trials += new.num_ended
         if over:
             return
-        self._fit_model()
-        self._train_in_model(batch_size)
+        phase = ModelPhase(self, lambda updates: super(DynaSAC, self).train(updates, batch_size))
+        phase.learn(new)
+        phase.train(self.model_trials * new.num_ended)
         total = sum(self.wall_time.values())
         for name, seconds in self.wall_time.items():
             self.logger.record(f"model/share_{name}", seconds / total)
-
-    def _can_fit(self) -> bool:
-        """Whether there are the two transitions that a first fit needs."""
-        assert self.dynamics is not None
-        return self.dynamics.is_fitted or self.replay_buffer.size() * self.n_envs > 1
-
-    def _fit_model(self) -> None:
-        """Score the dynamics on the transitions since the last fit, and teach them these."""
-        assert self.dynamics is not None
-        assert self.reward is not None
-        num_steps = self.num_timesteps // self.n_envs
-        new = self.recorded_trials(newest=num_steps - self._num_learnt)
-        if not self._checked or (self.terminated is None and new.terminated.any()):
-            new.check(self.reward, self.terminated)
-            self._checked = True
-        transitions = (new.states, new.actions, new.next_states)
-        metrics: dict[str, float] = {}
-        before = self.wall_time["fit"]
-        with self._timed("fit"):
-            if isinstance(self.dynamics, LearnedDynamics) and self.dynamics.is_fitted:
-                score = self.dynamics.score(*transitions)
-                metrics = {name: float(t.mean()) for name, t in score._asdict().items()}
-            self.dynamics.update(*transitions)
-        self._num_learnt = num_steps
-        metrics["fit_seconds"] = self.wall_time["fit"] - before
-        for name, value in metrics.items():
-            self.logger.record(f"model/{name}", value)
-        for hook in self._hooks:
-            hook.on_model_fit(metrics)
-
-    def _train_in_model(self, batch_size: int) -> None:
-        """Run the model trials, with updates at each step."""
-        left = self.model_trials
-        returns = []
-        if self.refresh_model_data and self.replay_buffer.model.size():
-            with self._timed("rollout"):
-                self.model_env(1).refresh(self.replay_buffer.model)
-        num_left_bounds = 0
-        while left > 0:
-            num_envs = min(left, self.num_particles or left)
-            left -= num_envs
-            trial_returns, num_left = self._run_model_trials(self.model_env(num_envs), batch_size)
-            returns.append(trial_returns)
-            num_left_bounds += num_left
-            for hook in self._hooks:
-                hook.on_model_trials(returns[-1])
-        if returns:
-            self.logger.record("model/ep_rew_mean", float(np.concatenate(returns).mean()))
-            self.logger.record("model/left_bounds", num_left_bounds)
-
-    def _run_model_trials(self, env: ModelVecEnv, batch_size: int) -> tuple[np.ndarray, int]:
-        """One trial of each particle, with updates at each step.
-
-        Returns:
-            The returns, and the number of particles that left the bounds.
-        """
-        returns = np.zeros(env.num_envs)
-        num_left_bounds = 0
-        running = np.ones(env.num_envs, dtype=bool)
-        with self._timed("rollout"):
-            obs = env.reset()
-        while running.any():
-            with self._timed("rollout"):
-                self.policy.set_training_mode(False)
-                normalizer = self._vec_normalize_env
-                seen = obs if normalizer is None else normalizer.normalize_obs(obs)
-                actions, _ = self.predict(seen, deterministic=False)
-                step = env.transition(actions)
-                kept = running & ~step.left_bounds
-                rows = (obs, step.observations, self.policy.scale_action(actions), step.rewards)
-                ends = (step.terminated | step.truncated, step.truncated)
-                self.replay_buffer.model.extend(*(values[kept] for values in (*rows, *ends)))
-                returns += step.rewards * running
-                num_left_bounds += int((step.left_bounds & running).sum())
-                num_steps = int(running.sum())
-                running &= ~ends[0]
-                obs = step.observations
-            with self._timed("sac"):
-                self._owed_updates += self.model_updates * num_steps
-                updates = int(self._owed_updates + 1e-9)  # ten times 0.3 are three
-                self._owed_updates -= updates
-                if updates:
-                    super().train(updates, batch_size)
-        return returns, num_left_bounds
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
         """The dynamics, as they stand, as an environment of ``num_envs`` particles.
@@ -332,6 +260,9 @@ class DynaSAC(SAC):
                 "There are no real trials yet that particles could start from; pass initial_states "
                 "to DynaSAC, or call learn() first."
             )
+        bounds = self.state_bounds
+        if bounds is None and trials.num_transitions:
+            bounds = trials.bounds()
         return ModelVecEnv(
             self.dynamics,
             self.reward,
@@ -342,7 +273,7 @@ class DynaSAC(SAC):
             self.action_space,
             terminated=self.terminated,
             particles=self.particles,
-            bounds=trials.bounds() if trials.num_transitions else None,
+            bounds=bounds,
         )
 
     def recorded_trials(self, newest: int | None = None) -> RecordedTrials:
@@ -357,6 +288,10 @@ class DynaSAC(SAC):
         spec = self.env.get_attr("spec")[0]
         length = None if spec is None else spec.max_episode_steps
         if length is None:
+            # A TimeLimit that was put around an environment by hand.
+            with suppress(AttributeError):
+                length = self.env.get_attr("_max_episode_steps")[0]
+        if length is None:
             raise ValueError(
                 "The environment has no time limit that could be read; pass trial_length, the "
                 "number of steps of a trial."
@@ -364,7 +299,8 @@ class DynaSAC(SAC):
         return int(length)
 
     @contextmanager
-    def _timed(self, part: str) -> Iterator[None]:
+    def timed(self, part: str) -> Iterator[None]:
+        """Add what is done inside to a part of ``wall_time``."""
         start = time.perf_counter()
         try:
             yield
@@ -372,31 +308,51 @@ class DynaSAC(SAC):
             self.wall_time[part] += time.perf_counter() - start
 
     def _check_options(self) -> None:
-        for name in ("dynamics", "reward"):
+        for name in ("dynamics", *self._had, "reward"):
             if getattr(self, name) is None:
                 raise ValueError(
                     f"DynaSAC needs {name} to learn; found None. Pass {name}=... to DynaSAC or, as "
-                    "they are not saved, to DynaSAC.load. Without them an agent can only predict."
+                    "it is not saved, to DynaSAC.load. Without it the agent can only predict."
                 )
+        if not isinstance(self.dynamics, Dynamics):
+            raise TypeError(f"dynamics must be an object of a Dynamics; found {self.dynamics!r}.")
+        for name, arguments in (("reward", 3), ("terminated", 1), ("initial_states", 1)):
+            check_function(getattr(self, name), name, arguments)
         if self.particles not in get_args(Particles):
             raise ValueError(
                 f"Unknown particles {self.particles!r}; use 'independent' or 'functions'."
             )
-        for name, value, least in (
-            ("model_trials", self.model_trials, 0),
-            ("model_updates", self.model_updates, 0),
-            ("model_until", self.model_until, 0),
-            ("trial_length", self.trial_length, 1),
-            ("num_particles", self.num_particles, 1),
+        for name, kind, least in (
+            ("model_trials", int, 0),
+            ("model_updates", (int, float), 0),
+            ("model_until", int, 0),
+            ("trial_length", int, 1),
+            ("num_particles", int, 1),
+            ("reward_tolerance", (int, float), 0),
         ):
-            if value is not None and not value >= least:
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if not isinstance(value, kind):
+                whole = "whole " if kind is int else ""
+                raise TypeError(f"{name} must be a {whole}number; found {value!r}.")
+            if not value >= least:
                 raise ValueError(f"{name} must be at least {least}; found {value}.")
 
     def _setup_model(self) -> None:
         """Check the spaces before SB3 builds its networks on them."""
         if self.dynamics is not None:
             check_spaces(self.dynamics, self.observation_space, self.action_space)
+        self.replay_buffer_kwargs |= {
+            "real_fraction": self.real_fraction,
+            "model_buffer_size": self.model_buffer_size,
+        }
         super()._setup_model()
+
+    def _on_step(self) -> None:
+        """Remember that the step was stored; SB3 calls this."""
+        super()._on_step()
+        self._num_stored = self.num_timesteps
 
     def _setup_learn(
         self,
@@ -412,14 +368,21 @@ class DynaSAC(SAC):
             raise ValueError(
                 "There is no environment to learn in; pass env to DynaSAC.load, or use set_env()."
             )
+        assert isinstance(self.train_freq, TrainFreq), "converted when the agent was made"
+        if self.n_envs > 1 and self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+            raise ValueError(
+                f"With {self.n_envs} environments Stable-Baselines3 cannot train by episodes; pass "
+                f"a number of steps as train_freq, such as ({self._trial_length()}, 'step')."
+            )
         self._trial_length()
-        self._hooks = []  # callbacks that have some add themselves
-        if reset_num_timesteps:
-            self._num_learnt -= self.num_timesteps // self.n_envs
-            self._num_episodes_learnt -= self._episode_num
+        self.model_hooks = []  # callbacks that have some add themselves
+        if self._num_stored != self.num_timesteps:
+            # A callback stopped the last call at a step that SB3 made, but did not store.
+            self._last_obs = None
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self._num_stored = self.num_timesteps
         if self._random_state is not None:
             self._random_state.restore()
             self._random_state = None
@@ -428,9 +391,8 @@ class DynaSAC(SAC):
     def get_parameters(self) -> dict[str, dict[str, Any]]:
         """As in SB3, with the state of the dynamics."""
         parameters = super().get_parameters()
-        if self.dynamics is not None:
-            parameters["dynamics"] = self.dynamics.state_dict()
-        return parameters
+        learnt = self._unread_dynamics if self.dynamics is None else self.dynamics.state_dict()
+        return {**parameters, "dynamics": learnt}
 
     def set_parameters(
         self,
@@ -438,15 +400,17 @@ class DynaSAC(SAC):
         exact_match: bool = True,
         device: torch.device | str = "auto",
     ) -> None:
-        """As in SB3; without dynamics, their state is left out."""
+        """As in SB3; without dynamics, their state is kept for the next ``save``."""
         if isinstance(load_path_or_dict, dict):
             parameters: dict[str, Any] = dict(load_path_or_dict)
         else:
             parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
-        state = parameters.pop("dynamics", None)
+        state = _on_cpu(parameters.pop("dynamics", None))
         super().set_parameters(parameters, exact_match, device)
-        if self.dynamics is not None and state is not None:
-            self.dynamics.load_state_dict(_on_cpu(state))
+        if state is not None and self.dynamics is None:
+            self._unread_dynamics = state
+        elif state is not None and self.dynamics is not None:
+            self.dynamics.load_state_dict(state)
 
     def load_replay_buffer(
         self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True

@@ -86,6 +86,7 @@ class MixedReplayBuffer(CompactReplayBuffer):
     Attributes:
         model: The model's transitions.
         mix: Whether batches hold model transitions.
+        num_new: Steps that were added since this was last set to zero, by whom reads them.
         real_fraction: Share of real samples in a batch.
 
     Raises:
@@ -125,12 +126,18 @@ class MixedReplayBuffer(CompactReplayBuffer):
         )
         self.real_fraction = real_fraction
         self.mix = True
+        self.num_new = 0
         self.model = CompactReplayBuffer(
             buffer_size if model_buffer_size is None else model_buffer_size,
             observation_space,
             action_space,
             device,
         )
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """Add a real step of each environment, see Stable-Baselines3."""
+        super().add(*args, **kwargs)
+        self.num_new += 1
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw a batch from both buffers; the real samples come first.
@@ -158,3 +165,4 @@ class MixedReplayBuffer(CompactReplayBuffer):
         """Empty both buffers."""
         super().reset()
         self.model.reset()
+        self.num_new = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -12,7 +13,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 
-from gpadjust.dynamics import Dynamics
+from gpadjust.dynamics import Dynamics, TransitionFunctions
+from gpadjust.physics import PhysicsError
 from gpadjust.rl.mixed_replay_buffer import CompactReplayBuffer
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
@@ -61,8 +63,10 @@ class ModelVecEnv(VecEnv):
             particle follows a transition function of its own, drawn from the posterior, so that
             what it meets is consistent along its trajectory.
         bounds: Lower and upper bounds of the states, ``2 x state_dim``. A particle that would leave
-            them, or the finite numbers, is truncated where it is: the step's next observation is
-            the old one, its reward zero, its ``info["left_bounds"]`` True. Default: infinite.
+            them or the finite numbers, or meets a failure of the physics, is truncated where it
+            is: the step's next observation is the old one, its reward zero, its
+            ``info["left_bounds"]`` True. Bounds give way to the states at which trials start.
+            Default: infinite.
 
     Attributes:
         num_left_bounds: How many particles have left the bounds.
@@ -109,19 +113,14 @@ class ModelVecEnv(VecEnv):
         self.num_left_bounds = 0
         self._states = torch.empty(num_envs, spec.state_dim, dtype=torch.float64)
         self._steps = torch.zeros(num_envs, dtype=torch.long)
-        self._move: Callable[[Tensor, Tensor], Tensor] = dynamics.sample
+        self._functions: TransitionFunctions | None = None
 
     def reset(self) -> np.ndarray:
         """Start all trials; observations ``num_envs x observation_dim``."""
         self._states = self._draw_initial(self.num_envs)
         self._steps.zero_()
         if self.particles == "functions":
-            functions = self.dynamics.sample_functions(self.num_envs)
-
-            def move(states: Tensor, actions: Tensor) -> Tensor:
-                return functions(states.unsqueeze(1), actions.unsqueeze(1)).squeeze(1)
-
-            self._move = move
+            self._functions = self.dynamics.sample_functions(self.num_envs)
         return self._observe(self._states)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -150,7 +149,7 @@ class ModelVecEnv(VecEnv):
     def transition(self, actions: np.ndarray) -> ModelStep:
         """Step all particles, without a new start for those whose trial ended."""
         moves = torch.as_tensor(actions, dtype=torch.float64)
-        self._states, rewards, terminated, left = self._outcome(self._states, moves, self._move)
+        self._states, rewards, terminated, left = self._outcome(self._states, moves)
         self._steps += 1
         self.num_left_bounds += int(left.sum())
         truncated = ((self._steps >= self.trial_length) | left) & ~terminated
@@ -171,16 +170,18 @@ class ModelVecEnv(VecEnv):
         Args:
             buffer: Transitions of an earlier model.
         """
-        for rows in np.array_split(np.arange(buffer.size()), -(-buffer.size() // _CHUNK) or 1):
+        if not buffer.size():
+            return
+        if self.particles == "functions":
+            self._functions = self.dynamics.sample_functions(self.num_envs)
+        for rows in np.array_split(np.arange(buffer.size()), -(-buffer.size() // _CHUNK)):
             obs = torch.from_numpy(buffer.observations[rows, 0].astype(np.float64))
             assert isinstance(self.action_space, spaces.Box), "checked at the start"
             low, high = self.action_space.low, self.action_space.high
             scaled = buffer.actions[rows, 0].astype(np.float64)
             actions = torch.from_numpy(low + (scaled + 1) / 2 * (high - low))
             states = self.dynamics.spec.decode(obs)
-            following, rewards, terminated, left = self._outcome(
-                states, actions, self.dynamics.sample
-            )
+            following, rewards, terminated, left = self._outcome(states, actions)
             kept = ~left.numpy()
             timeouts = buffer.timeouts[rows, 0].astype(bool) & ~terminated.numpy()
             for name, values in (
@@ -191,11 +192,9 @@ class ModelVecEnv(VecEnv):
             ):
                 getattr(buffer, name)[rows[kept], 0] = values[kept]
 
-    def _outcome(
-        self, states: Tensor, actions: Tensor, move: Callable[[Tensor, Tensor], Tensor]
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _outcome(self, states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Next states, rewards, termination, and who would have left the bounds."""
-        following = move(states, actions)
+        following = self._following(states, actions)
         left = ~following.isfinite().all(-1)
         if self.bounds is not None:
             low, high = self.bounds
@@ -206,6 +205,33 @@ class ModelVecEnv(VecEnv):
         if self.terminated is not None:
             terminated = per_particle(self.terminated(following), len(states), "terminated").bool()
         return following, rewards.masked_fill(left, 0.0), terminated & ~left, left
+
+    def _following(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The next states; not finite where the physics fails."""
+        states, actions = states.clone(), actions.clone()
+        failed = torch.zeros(len(states), dtype=torch.bool)
+        while True:
+            try:
+                following = self._move(states, actions)
+            except PhysicsError as error:
+                failed[list(error.rows)] = True
+                if not error.rows or failed.all():
+                    raise
+                # They are evaluated with the others, at a place where the physics does not fail.
+                sound = int((~failed).nonzero()[0])
+                states[failed], actions[failed] = states[sound], actions[sound]
+            else:
+                return following.masked_fill(failed.unsqueeze(-1), torch.nan)
+
+    def _move(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The next states of ``N`` rows, which follow the functions in blocks, if there are any."""
+        functions = self._functions
+        if functions is None:
+            return self.dynamics.sample(states, actions)
+        n, k = len(states), self.num_envs
+        filled = torch.arange(-(-n // k) * k).clamp_max(n - 1)
+        blocks = (rows[filled].reshape(k, -1, rows.shape[-1]) for rows in (states, actions))
+        return functions(*blocks).flatten(0, 1)[:n]
 
     def close(self) -> None:
         """Nothing to close."""
@@ -249,6 +275,13 @@ class ModelVecEnv(VecEnv):
                 f"initial_states({n}) must return states of shape {n} x "
                 f"{self.dynamics.spec.state_dim}; found {tuple(states.shape)}."
             )
+        if self.bounds is not None:
+            low, high = self.bounds
+            room = torch.where((high - low).isfinite(), (high - low) / 2, 0.0)
+            wider = (states < low) | (states > high)
+            low = torch.where(wider.any(0), torch.minimum(low, states.amin(0) - room), low)
+            high = torch.where(wider.any(0), torch.maximum(high, states.amax(0) + room), high)
+            self.bounds = torch.stack([low, high])
         return states
 
     def _observe(self, states: Tensor) -> np.ndarray:
@@ -266,6 +299,24 @@ def per_particle(values: Tensor, n: int, name: str) -> Tensor:
         row = int((~values.isfinite()).nonzero()[0])
         raise ValueError(f"{name} returned {values[row]} for row {row}; expected finite numbers.")
     return values
+
+
+def check_function(function: Any, name: str, num_arguments: int) -> None:
+    """Raise a TypeError unless a function of the user's takes what it will be given, or is None."""
+    if function is None:
+        return
+    if not callable(function):
+        raise TypeError(f"{name} must be a function; found {function!r}.")
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # some compiled functions have none
+        return
+    try:
+        signature.bind(*range(num_arguments))
+    except TypeError as error:
+        raise TypeError(
+            f"{name} is called with {num_arguments} argument(s); found {name}{signature}."
+        ) from error
 
 
 def check_spaces(

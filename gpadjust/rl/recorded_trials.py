@@ -12,7 +12,6 @@ from gpadjust.dynamics import StateSpec
 from gpadjust.rl.model_vec_env import Reward, Termination, per_particle
 
 _REACH = 10.0  # how many half ranges of the recorded states particles may be from their middle
-_TOLERANCE = 1e-3  # relative; observations are recorded in float32
 
 
 class RecordedTrials:
@@ -49,6 +48,7 @@ class RecordedTrials:
         self.rewards = torch.from_numpy(column("rewards"))
         dones = torch.from_numpy(column("dones"))
         self.terminated = (dones * (1 - torch.from_numpy(column("timeouts")))).bool()
+        self._num_ended = int(dones.sum())
         starts = torch.ones(buffer.n_envs, len(rows), dtype=torch.bool)
         starts[:, 1:] = dones.reshape(starts.shape)[:, :-1].bool()
         if buffer.full and starts[:, 1:].any():
@@ -76,8 +76,20 @@ class RecordedTrials:
                 reach[i] = torch.inf
         return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
 
-    def check(self, reward: Reward, terminated: Termination | None) -> None:
+    @property
+    def num_ended(self) -> int:
+        """How many trials ended."""
+        return self._num_ended
+
+    def check(
+        self, reward: Reward, terminated: Termination | None, tolerance: float = 1e-3
+    ) -> None:
         """Compare the functions that the user gave with what was recorded.
+
+        Args:
+            reward: The user's.
+            terminated: The user's, or None for no termination.
+            tolerance: Greatest error of the reward, relative to the largest that was recorded.
 
         Raises:
             ValueError: If they differ; it shows the worst transition.
@@ -87,12 +99,14 @@ class RecordedTrials:
             reward(self.states, self.actions, self.next_states), n, "reward"
         ).double()
         error = (rewards - self.rewards).abs()
-        if (error > _TOLERANCE * self.rewards.abs().max().clamp_min(1e-6)).any():
+        if (error > tolerance * self.rewards.abs().max().clamp_min(1e-6)).any():
             i = int(error.argmax())
             raise ValueError(
                 "reward(states, actions, next_states) is not the environment's: transition "
                 f"{i} gave {self.rewards[i]:.6g}, but the function says {rewards[i]:.6g}; "
-                f"{self._row(i)}. Correct the function, or the spec of the state."
+                f"{self._row(i)}. Correct the function, or the spec of the state (its order, and "
+                "which entries are angles, seen as sine and then cosine). If rewards or "
+                "observations are noisy, raise reward_tolerance; None checks nothing."
             )
         says = torch.zeros(n, dtype=torch.bool)
         if terminated is not None:
