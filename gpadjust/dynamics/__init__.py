@@ -9,9 +9,10 @@ from gpadjust.dynamics.adjusted_dynamics import (
     ScaleDynamics,
 )
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.learned_dynamics import LearnedDynamics, TransitionScores
+from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.transition_scores import TransitionScores
 
 __all__ = [
     "BiasDynamics",

@@ -22,9 +22,17 @@ class Dynamics(ABC):
 
     Args:
         spec: What the entries of states and actions are.
+
+    Raises:
+        TypeError: If ``spec`` is not a :class:`StateSpec`.
     """
 
     def __init__(self, spec: StateSpec) -> None:
+        if not isinstance(spec, StateSpec):
+            raise TypeError(
+                f"Expected spec as a StateSpec, such as StateSpec(['x', 'v'], ['force']); found "
+                f"{spec!r}."
+            )
         self.spec = spec
 
     @property

@@ -6,49 +6,28 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
 from copy import deepcopy
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from botorch.exceptions.warnings import OptimizationWarning
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 from torch.nn import Module
 
-from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.physics_dynamics import check_physics
-from gpadjust.dynamics.state_spec import StateSpec, check_columns
-from gpadjust.dynamics.transition_physics import Target, TransitionPhysics, TransitionTargets
+from gpadjust.dynamics.identity import check_identity, identity
+from gpadjust.dynamics.model_dynamics import ModelDynamics
+from gpadjust.dynamics.next_state_physics import check_physics, warn_of_differences
+from gpadjust.dynamics.refitting import refit, search_rows
+from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.transition_physics import Target, TransitionPhysics
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.gp import AngleInput
 from gpadjust.inference import FitResult, fit
 from gpadjust.inference.fitting import FitOptions
-from gpadjust.inference.objective import Objective
-from gpadjust.inference.warm_start import warm_start
 from gpadjust.models.multi_output_gp import MultiOutputGP
-from gpadjust.models.prediction import Prediction
 from gpadjust.physics import Physics
-from gpadjust.validation import coverage, nlpd, rmse
-
-_SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
-_SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
-_REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=8)
 
 
-class TransitionScores(NamedTuple):
-    """How well transitions were predicted, for each predicted state: ``len(spec.predicted)``.
-
-    Args:
-        nlpd: Mean negative log predictive density, in nats.
-        coverage: Share of the next states in the central 95 % interval.
-        rmse: Root mean square error, in the state's units.
-    """
-
-    nlpd: Tensor
-    coverage: Tensor
-    rmse: Tensor
-
-
-class LearnedDynamics(Dynamics):
+class LearnedDynamics(ModelDynamics):
     """The base of dynamics that a Gaussian process of this library learns.
 
     The states' targets are independent outputs of one model; users build
@@ -66,8 +45,7 @@ class LearnedDynamics(Dynamics):
         model_options: Mapping[str, Any] | None = None,
         fit_options: FitOptions | None = None,
     ) -> None:
-        super().__init__(spec)
-        self.targets = TransitionTargets(spec, target)
+        super().__init__(spec, target)
         self.physics = None if physics is None else check_physics(physics)
         self.encode_angles = encode_angles
         self.model_options = dict(model_options or {})
@@ -76,6 +54,7 @@ class LearnedDynamics(Dynamics):
         if own:
             raise ValueError(f"model_options may not hold {own.pop()!r}, which dynamics set.")
         self.fit_result: FitResult | None = None
+        self._compared = False  # the physics with transitions
         self._forget_data()
         self._physics = (
             None if self.physics is None else TransitionPhysics(self.physics, self.targets)
@@ -127,10 +106,11 @@ class LearnedDynamics(Dynamics):
 
         Raises:
             TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, values are not finite, or there are fewer than 2 rows.
+            ValueError: If shapes disagree, values are not finite, there are fewer than 2 rows, or
+                states are not what the spec says (:meth:`StateSpec.check_transitions`).
             PhysicsError: If the physics fails.
         """
-        data = Transitions.checked(self.spec, states, actions, next_states)
+        data = self._checked(states, actions, next_states)
         self._learn(data, self._physics_at(data), None)
 
     def update(
@@ -157,7 +137,7 @@ class LearnedDynamics(Dynamics):
         if not refit and self.is_fitted:
             self.condition(states, actions, next_states)
             return
-        data = Transitions.checked(self.spec, states, actions, next_states)
+        data = self._checked(states, actions, next_states)
         known = self._physics_at(data)
         if self._data is not None:
             data = self._data.append(data)
@@ -176,7 +156,7 @@ class LearnedDynamics(Dynamics):
         """
         model = self.model
         assert self._data is not None, "there is a model"
-        data = Transitions.checked(self.spec, states, actions, next_states)
+        data = self._checked(states, actions, next_states)
         known = self._physics_at(data)
         self._model = self._condition(model, data)
         self._data = self._data.append(data)
@@ -184,87 +164,12 @@ class LearnedDynamics(Dynamics):
             self._known = torch.cat([self._known, known])
         self._chunks = [*self._chunks, len(data.states)]
 
-    def predict(
-        self, states: Tensor, actions: Tensor, *, observation_noise: bool = True
-    ) -> Prediction:
-        """Mean and variance of the next states, entry by entry.
-
-        Args:
-            states: ``... x state_dim``.
-            actions: ``... x action_dim``.
-            observation_noise: Whether the variance includes the noise that was learnt, by which
-                next states scatter about the mean.
-
-        Returns:
-            ``... x state_dim`` each; of an angle, not wrapped.
-
-        Raises:
-            RuntimeError: If nothing was learnt yet.
-            PhysicsError: If the physics fails.
-        """
-        following, variance = self._predict(states, actions, observation_noise)
-        return Prediction(
-            self.spec.complete(states, following), self.spec.complete_variance(variance)
-        )
-
-    def sample(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Draw next states, noise included, row by row, from PyTorch's generator."""
-        mean, variance = self._predict(states, actions, True)
-        return self.spec.complete(states, mean + variance.sqrt() * torch.randn_like(mean))
-
-    def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Draw transition functions from the posterior; without noise.
-
-        Args:
-            num_functions: Number ``k`` of functions.
-            seed: Seed of the draw. Default: go on with PyTorch's generator.
-
-        Returns:
-            A function of states ``k x N x state_dim`` and actions ``k x N x action_dim`` to next
-            states. Later updates leave it as it is.
-
-        Raises:
-            RuntimeError: If nothing was learnt yet.
-        """
-        functions: Any = self.model.sample_functions(num_functions, seed)
-
-        @torch.no_grad()
-        def step(states: Tensor, actions: Tensor) -> Tensor:
-            self._check_pair(states, actions)
-            if states.dim() != 3 or len(states) != num_functions:
-                raise ValueError(
-                    f"Expected states of shape {num_functions} x N x {self.spec.state_dim}, a "
-                    f"block for each function, got {tuple(states.shape)}."
-                )
-            values = functions.each(self.targets.inputs(states, actions))
-            return self.spec.complete(states, self.targets.decode(states, values))
-
-        return step
-
-    def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> TransitionScores:
-        """Judge the predictions by transitions that were not learnt from.
-
-        Raises:
-            RuntimeError: If nothing was learnt yet.
-            TypeError: As :meth:`fit`.
-            ValueError: As :meth:`fit`; one row will do.
-        """
-        data = Transitions.checked(self.spec, states, actions, next_states)
-        mean, variance = self._predict(data.states, data.actions, True)
-        following = data.states.clone()
-        following[..., self.spec.predicted] = mean
-        found = mean + self.spec.change(following, data.next_states)[..., self.spec.predicted]
-        return TransitionScores(
-            nlpd=nlpd(mean, variance, found),
-            coverage=coverage(mean, variance, found),
-            rmse=rmse(mean, found),
-        )
-
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt, in tensors and plain values: data, f_p there, hyper-parameters."""
         if self._model is None or self._data is None:
             return {}
         return {
+            "identity": self._identity(),
             "transitions": {name: t.clone() for name, t in self._data._asdict().items()},
             "physics": None if self._known is None else self._known.clone(),
             "chunks": [*self._chunks],
@@ -277,7 +182,11 @@ class LearnedDynamics(Dynamics):
 
         Args:
             state: Of dynamics of the same class, options, spec and physics.
+
+        Raises:
+            ValueError: If it is of dynamics of another class, spec, target or model options.
         """
+        check_identity(state, self._identity())
         self._forget_data()
         self.fit_result = None
         if not state:
@@ -303,41 +212,41 @@ class LearnedDynamics(Dynamics):
                 f"Expected at least 2 transitions to learn from, got {n}: there is no scale in "
                 "fewer. Collect more before the first update."
             )
+        if previous is None and known is not None and not self._compared:
+            self._compare(data, known)
         self._tell_physics(data, known)
         model = self._build(data, quiet=previous is not None)
         searches = previous is None or n >= 2 * self._searched_at
         if previous is None:
             result = fit(model, **self.fit_options)
         else:
-            warm_start(model, previous)
-            with warnings.catch_warnings():
-                # The next update goes on from where this one stops.
-                warnings.simplefilter("ignore", OptimizationWarning)
-                if searches:
-                    self._search(model, data)
-                result = fit(model, "map", **_REFIT)
+            rows = search_rows(n) if searches else None
+            part = None if rows is None else self._build(data.some(rows), quiet=True)
+            result = refit(model, previous, searches, part)
         self.fit_result = result
         self._searched_at = n if searches else self._searched_at
         self._data, self._known, self._chunks = data, known, [n]
         self._model = self._fitted = model
 
-    def _search(self, model: MultiOutputGP, data: Transitions) -> None:
-        """Give a model the best hyper-parameters of its own and those of a new search."""
-        n = len(data.states)
-        if n <= _SEARCHED:
-            fit(model, "map", **_SEARCH)
-            return
-        generator = torch.Generator().manual_seed(n)
-        rows = torch.randperm(n, generator=generator)[:_SEARCHED]
-        part = self._build(Transitions(*(tensor[rows] for tensor in data)), quiet=True)
-        warm_start(part, model)
-        fit(part, "map", **_SEARCH)
-        objective = Objective(model)
-        before = objective.current()
-        warm_start(model, part)
-        after = objective.current()
-        better = objective(after) < objective(before)
-        objective.assign(torch.where(better.unsqueeze(-1), after, before)[0])
+    def _compare(self, data: Transitions, known: Tensor) -> None:
+        """Warn of a physics that returns differences."""
+        assert self.physics is not None, "f_p is known"
+        change = self.targets.decode(data.states, known) - data.states[:, self.spec.predicted]
+        warn_of_differences(self.physics.name, self.spec, data, self.spec.predicted, change)
+        self._compared = True
+
+    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
+        data = Transitions.checked(self.spec, states, actions, next_states)
+        self.spec.check_transitions(data.states, data.next_states)
+        return data
+
+    def _identity(self) -> dict[str, str]:
+        return identity(
+            self,
+            target=self.targets.target,
+            encode_angles=self.encode_angles,
+            model_options=self.model_options,
+        )
 
     def _build(self, data: Transitions, quiet: bool) -> MultiOutputGP:
         """The model of some transitions; quiet where the first one has given its warnings."""
@@ -375,19 +284,3 @@ class LearnedDynamics(Dynamics):
     def _tell_physics(self, data: Transitions, known: Tensor | None) -> None:
         if self._physics is not None and known is not None:
             self._physics.know(self.targets.inputs(data.states, data.actions), known)
-
-    def _predict(
-        self, states: Tensor, actions: Tensor, observation_noise: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the predicted states, ``... x len(spec.predicted)``."""
-        self._check_pair(states, actions)
-        X = self.targets.inputs(states, actions)
-        with torch.no_grad():
-            flat = X.reshape(-1, X.shape[-1])
-            mean, variance = self.model.predict(flat, observation_noise=observation_noise)
-        mean, variance = (t.reshape(*X.shape[:-1], -1) for t in (mean, variance))
-        return self.targets.decode(states, mean), variance
-
-    def _check_pair(self, states: Tensor, actions: Tensor) -> None:
-        check_columns(states, self.spec.state_dim, "states")
-        check_columns(actions, self.spec.action_dim, "actions")

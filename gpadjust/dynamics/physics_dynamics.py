@@ -9,9 +9,12 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.identity import check_identity, identity
+from gpadjust.dynamics.next_state_physics import check_physics, next_values, warn_of_differences
 from gpadjust.dynamics.state_spec import StateSpec, check_columns
+from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.prediction import Prediction
-from gpadjust.physics import ODEPhysics, Physics, as_physics
+from gpadjust.physics import Physics
 
 
 class PhysicsDynamics(Dynamics):
@@ -37,6 +40,7 @@ class PhysicsDynamics(Dynamics):
     def __init__(self, spec: StateSpec, physics: Physics | Callable[[Tensor], Tensor]) -> None:
         super().__init__(spec)
         self.physics = check_physics(physics)
+        self._compared = False  # with transitions
 
     @property
     def is_fitted(self) -> bool:
@@ -44,7 +48,20 @@ class PhysicsDynamics(Dynamics):
         return True
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Do nothing."""
+        """Learn nothing; the first transitions show whether the physics returns next states.
+
+        Raises:
+            TypeError: If they are not float64 tensors.
+            ValueError: If shapes disagree, there are no rows, or values are not finite.
+        """
+        data = Transitions.checked(self.spec, states, actions, next_states)
+        if self._compared:
+            return
+        columns = self.spec.moving
+        following = self._step(data.states, data.actions)
+        change = self.spec.change(data.states, following)[:, columns]
+        warn_of_differences(self.physics.name, self.spec, data, columns, change)
+        self._compared = True
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
         """The next states, and zero variance."""
@@ -60,11 +77,16 @@ class PhysicsDynamics(Dynamics):
         return self._step
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
+        """What these dynamics are; there is nothing learnt."""
+        return {"identity": identity(self)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Do nothing."""
+        """Check that the state is of such dynamics.
+
+        Raises:
+            ValueError: If it is of dynamics of another class or spec.
+        """
+        check_identity(state, identity(self))
 
     def _step(self, states: Tensor, actions: Tensor) -> Tensor:
         moving = self.spec.moving
@@ -76,25 +98,3 @@ class PhysicsDynamics(Dynamics):
                 self.physics, torch.cat([states[..., moving], actions], dim=-1), len(moving)
             )
         return following
-
-
-def check_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
-    """A physics of next states, from what the user gave."""
-    physics = as_physics(physics)
-    if isinstance(physics, ODEPhysics) and physics.difference:
-        raise ValueError(
-            f"Physics {physics.name!r} returns the change of the state (difference=True), but "
-            "dynamics take the next state from it; build it with difference=False."
-        )
-    return physics
-
-
-def next_values(physics: Physics, inputs: Tensor, num_states: int) -> Tensor:
-    """What the physics says, ``... x num_states``, from ``... x (num_states + a)``."""
-    Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0))
-    if Y.shape[-1] != num_states:
-        raise ValueError(
-            f"Expected physics {physics.name!r} to return the next values of the {num_states} "
-            f"states that are not exogenous, got {Y.shape[-1]} columns."
-        )
-    return Y

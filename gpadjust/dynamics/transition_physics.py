@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.physics_dynamics import next_values
+from gpadjust.dynamics.next_state_physics import next_values
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.physics import Physics
 from gpadjust.physics.memo import RowMemo, row_keys

@@ -55,5 +55,9 @@ class Transitions(NamedTuple):
         return Transitions(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
 
     def rows(self, start: int, end: int) -> Transitions:
-        """Some of the rows."""
+        """Rows that follow each other."""
         return Transitions(*(tensor[start:end] for tensor in self))
+
+    def some(self, rows: Tensor) -> Transitions:
+        """The rows of these numbers."""
+        return Transitions(*(tensor[rows] for tensor in self))

@@ -1,0 +1,56 @@
+"""Whether states are what a spec declares them to be; the rules are said by `StateSpec`."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def check_exogenous(name: str, change: Tensor, rounding: Tensor) -> None:
+    """Raise an error if an exogenous state changes by more than rounding does."""
+    moved = (change.abs() > rounding).nonzero()
+    if len(moved):
+        row = int(moved[0])
+        raise ValueError(
+            f"State {name!r} is said to be exogenous, which stays as it is during a trial, but it "
+            f"changes by {float(change[row]):.3g} in row {row}. Take it out of `exogenous`, so "
+            "that the model predicts it, or leave out transitions from one trial into the next."
+        )
+
+
+def check_integrated(
+    name: str,
+    velocity: str,
+    step: float,
+    velocities: tuple[Tensor, Tensor],
+    discrepancy: Tensor,
+    rounding: Tensor,
+) -> None:
+    """Raise an error if an integrated state does not follow its velocity.
+
+    Args:
+        name: The state's name.
+        velocity: The name of its velocity.
+        step: The time step.
+        velocities: At the start and at the end of each step, ``N`` each.
+        discrepancy: ``N`` differences between the change of the state and the trapezoid's.
+        rounding: Bounds of the error that single precision makes in ``discrepancy``.
+    """
+    before, after = velocities
+    trapezoid = step * (before + after) / 2
+    way = float((step * (before.abs() + after.abs()) / 2).sum())
+    way = max(way, float((trapezoid + discrepancy).abs().sum()))
+    square, length = trapezoid.square().sum(), trapezoid.abs().sum()
+    excess = (trapezoid * discrepancy).sum() / square
+    scatter = (discrepancy - excess * trapezoid).square().sum() / (len(discrepancy) - 1)
+    # Both are nan, and the comparison false, of one row or without any movement.
+    systematic = float((excess.abs() - 3 * (scatter / square).sqrt()) * length)
+    unavoidable = float(rounding.sum())
+    total = float(discrepancy.abs().sum())
+    if systematic > 0.1 * way + unavoidable or total > 0.5 * way + unavoidable:
+        times = f"moves {1 + float(excess):.3g} times as far as that, and " if square > 0 else ""
+        raise ValueError(
+            f"State {name!r} is said to be integrated, but it does not follow {name}' = {name} + "
+            f"step ({velocity} + {velocity}') / 2 with step={step:g}: it {times}differs by "
+            f"{total:.3g} in all, on a way of {way:.3g}. Mend `step` or `integrated`, or take "
+            f"{name!r} out of `integrated`, so that the model predicts it."
+        )

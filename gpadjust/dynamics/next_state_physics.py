@@ -1,0 +1,68 @@
+"""What dynamics expect of a physics: the next states."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.transitions import Transitions
+from gpadjust.physics import ODEPhysics, Physics, as_physics
+
+
+def check_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
+    """A physics of next states, from what the user gave."""
+    physics = as_physics(physics)
+    if isinstance(physics, ODEPhysics) and physics.difference:
+        raise ValueError(
+            f"Physics {physics.name!r} returns the change of the state (difference=True), but "
+            "dynamics take the next state from it; build it with difference=False."
+        )
+    return physics
+
+
+def next_values(physics: Physics, inputs: Tensor, num_states: int) -> Tensor:
+    """What the physics says, ``... x num_states``, from ``... x (num_states + a)``."""
+    Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0))
+    if Y.shape[-1] != num_states:
+        raise ValueError(
+            f"Expected physics {physics.name!r} to return the next values of the {num_states} "
+            f"states that are not exogenous, got {Y.shape[-1]} columns."
+        )
+    return Y
+
+
+def warn_of_differences(
+    name: str, spec: StateSpec, data: Transitions, columns: list[int], change: Tensor
+) -> None:
+    """Warn if the physics seems to return the change of the state instead of the next state.
+
+    It does if the state plus what it returned errs by less than a third, in units of the root mean
+    square of each state's true change.
+
+    Args:
+        name: The name of the physics.
+        spec: What the entries of the state are.
+        data: Transitions of the system.
+        columns: The states that were compared.
+        change: Their change in the transitions, if the physics returns next states: ``N x m``.
+    """
+    truth = spec.change(data.states, data.next_states)
+    scale = truth.square().mean(0).sqrt()[columns]
+    errors = []
+    for added in (torch.zeros_like(data.states), data.states):
+        predicted = data.states.clone()
+        predicted[:, columns] += change + added[:, columns]
+        error = spec.change(data.next_states, predicted)[:, columns]
+        errors.append(float((error[:, scale > 0] / scale[scale > 0]).square().sum().sqrt()))
+    if errors[1] < errors[0] / 3:
+        warnings.warn(
+            f"Physics {name!r} seems to return the change of the state, but dynamics take the next "
+            f"state from it. As a change, its error is {errors[1] / errors[0]:.2g} times that of "
+            "the next state. Let it return `next state = state + change`.",
+            UserWarning,
+            stacklevel=4,
+        )

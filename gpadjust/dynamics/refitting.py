@@ -1,0 +1,62 @@
+"""Hyper-parameters of a model that has more data than the one before it."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from botorch.exceptions.warnings import OptimizationWarning
+from torch import Tensor
+
+from gpadjust.inference import FitResult, fit
+from gpadjust.inference.fitting import FitOptions
+from gpadjust.inference.objective import Objective
+from gpadjust.inference.warm_start import warm_start
+from gpadjust.models.multi_output_gp import MultiOutputGP
+
+_SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
+_SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
+_REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=8)
+
+
+def search_rows(num_points: int) -> Tensor | None:
+    """The points of the model that a search is made on; None for all."""
+    if num_points <= _SEARCHED:
+        return None
+    generator = torch.Generator().manual_seed(num_points)
+    return torch.randperm(num_points, generator=generator)[:_SEARCHED]
+
+
+def refit(
+    model: MultiOutputGP, previous: MultiOutputGP, searches: bool, part: MultiOutputGP | None
+) -> FitResult:
+    """Fit a model from where an earlier one was, and from a new search if there is one.
+
+    Args:
+        model: The model to fit, in place.
+        previous: The model with the hyper-parameters to start from.
+        searches: Whether to search for better ones first.
+        part: The model of the points at :func:`search_rows`, or None if these are all.
+    """
+    warm_start(model, previous)
+    with warnings.catch_warnings():
+        # The next update goes on from where this one stops.
+        warnings.simplefilter("ignore", OptimizationWarning)
+        if searches:
+            _search(model, part)
+        return fit(model, "map", **_REFIT)
+
+
+def _search(model: MultiOutputGP, part: MultiOutputGP | None) -> None:
+    """Give a model the best hyper-parameters of its own and those of a new search."""
+    if part is None:
+        fit(model, "map", **_SEARCH)
+        return
+    warm_start(part, model)
+    fit(part, "map", **_SEARCH)
+    objective = Objective(model)
+    before = objective.current()
+    warm_start(model, part)
+    after = objective.current()
+    better = objective(after) < objective(before)
+    objective.assign(torch.where(better.unsqueeze(-1), after, before)[0])

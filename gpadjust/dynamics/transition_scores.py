@@ -1,0 +1,45 @@
+"""How well transitions are predicted."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.transitions import Transitions
+from gpadjust.models.prediction import Prediction
+from gpadjust.validation import coverage, nlpd, rmse
+
+
+class TransitionScores(NamedTuple):
+    r"""How well transitions were predicted, for each state that moves: ``len(spec.moving)``.
+
+    These are the states that a model predicts and those integrated from them, in the spec's order;
+    exogenous ones are left out. The variance of an integrated state is what the dynamics say,
+    :math:`(h / 2)^2` times that of its velocity: the more certain the velocity, the more the
+    trapezoid's own error counts in its ``nlpd`` and ``coverage``.
+
+    Args:
+        nlpd: Mean negative log predictive density, in nats.
+        coverage: Share of the next states in the central 95 % interval.
+        rmse: Root mean square error, in the state's units.
+    """
+
+    nlpd: Tensor
+    coverage: Tensor
+    rmse: Tensor
+
+
+def score_transitions(
+    spec: StateSpec, prediction: Prediction, data: Transitions
+) -> TransitionScores:
+    """Compare predictions ``N x state_dim`` with what followed, angles the shortest way round."""
+    moving = spec.moving
+    mean, variance = prediction.mean[:, moving], prediction.variance[:, moving]
+    found = mean + spec.change(prediction.mean, data.next_states)[:, moving]
+    return TransitionScores(
+        nlpd=nlpd(mean, variance, found),
+        coverage=coverage(mean, variance, found),
+        rmse=rmse(mean, found),
+    )
