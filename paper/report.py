@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from paper.cartpole.results import RMSES
 from paper.cartpole.scenarios import SCENARIOS, SETTINGS, Scenario, updates_on_trial
 
 PAPER = Path(__file__).parent
@@ -62,7 +63,7 @@ def results(folder: Path) -> dict[str, str]:
 def _cartpole(folder: Path) -> dict[str, str]:
     """The settings of the cart-pole as they stand, and its results if there are any."""
     fragments = {"cartpole:settings": _settings(), "cartpole:updates": _updates()}
-    names = ("curves", "iqm", "seconds", "sampled", "deterministic", "claims", "time", "model")
+    names = ("curves", "iqm", "seconds", "sampled", "deterministic", "claims", "targets", "time", "model")
     if not (folder / "table.csv").exists():
         return fragments | {f"cartpole:{name}": NOT_RUN for name in names}
     table, times, claims = (pd.read_csv(folder / f"{n}.csv") for n in ("table", "time", "claims"))
@@ -74,15 +75,18 @@ def _cartpole(folder: Path) -> dict[str, str]:
         fragments[f"cartpole:{name}"] = f"![{caption}](results/cartpole/{figure}.png)"
     for actions, part in table.groupby("actions"):
         fragments[f"cartpole:{actions}"] = _costs(part)
-    fragments["cartpole:claims"] = _cartpole_claims(claims)
+    ours = claims["id"].str.startswith("T")
+    fragments["cartpole:claims"] = _cartpole_claims(claims[~ours], "claim")
+    fragments["cartpole:targets"] = _cartpole_claims(claims[ours], "target")
     times = times.set_index(times["scenario"].map(lambda name: SCENARIOS[name].label))
     columns = ["fit_seconds", "rollout_seconds", "sac_seconds", "total_seconds", "updates"]
     header = ["mean of a run", "fits, s", "model steps, s", "updates, s", "all, s", "updates"]
     fragments["cartpole:time"] = _numbers(times[columns], header, "{:.0f}")
-    scores = times[["nlpd_median", "coverage", "rmse_median", "left_bounds"]]
-    scores = scores[scores["rmse_median"].notna()]
-    header = ["", "NLPD, median", "coverage of 95 %", "RMSE, median", "particles lost"]
-    fragments["cartpole:model"] = _numbers(scores, header, "{:.3g}")
+    scores = times[["nlpd_median", "coverage", *RMSES, "left_bounds"]]
+    scores = scores[scores[RMSES[0]].notna()]
+    errors = ("x, m", "theta, rad", "x', m/s", "theta', rad/s")
+    header = ["", "NLPD", "coverage of 95 %", *(f"RMSE of {e}" for e in errors), "particles lost"]
+    fragments["cartpole:model"] = _numbers(scores, header, "{:.2g}")
     return fragments
 
 
@@ -119,25 +123,41 @@ def _updates() -> str:
 
 def _costs(table: pd.DataFrame) -> str:
     header = ["", "runs", "trials 1-6", "at 6", "13-25", "41-50", "IQM of 41-50 (95 %)"]
+    header += ["1-25, less Dyna-CKA's", "41-50, less Dyna-CKA's"]
+    header += ["first at 0.5", "first at 0.4", "holds 0.5 from"]
     rows = []
     for row in table.to_dict("records"):
         costs = [row[f"cost_{name}"] for name in ("1_6", "6", "13_25", "41_50")]
-        firsts = [row["first_0.5"], row["first_0.4"]]
+        firsts = [row["first_0.5"], row["first_0.4"], row["holds_0.5"]]
         rows.append(
             [
                 SCENARIOS[row["scenario"]].label,
                 f"{row['runs']}",
                 *("" if pd.isna(cost) else f"{cost:.2f}" for cost in costs),
-                ""
-                if pd.isna(row["iqm"])
-                else f"{row['iqm']:.2f} ({row['iqm_low']:.2f}, {row['iqm_high']:.2f})",
+                "" if pd.isna(row["iqm"]) else _interval(row),
+                *(_paired(row, f"behind_{trials}") for trials in ("1_25", "41_50")),
                 *("never" if pd.isna(first) else f"{first:.0f}" for first in firsts),
             ]
         )
-    return _markdown([*header, "first at 0.5", "first at 0.4"], rows)
+    return _markdown(header, rows)
 
 
-def _cartpole_claims(claims: pd.DataFrame) -> str:
+def _interval(row: dict[Hashable, Any]) -> str:
+    """An interquartile mean, with its interval if there are runs enough."""
+    if pd.isna(row["iqm_low"]):
+        return f"{row['iqm']:.2f}"
+    return f"{row['iqm']:.2f} ({row['iqm_low']:.2f}, {row['iqm_high']:.2f})"
+
+
+def _paired(row: dict[Hashable, Any], column: str) -> str:
+    """A mean difference over shared seeds, with its standard error if there are two."""
+    mean, error = row[column], row[f"{column}_se"]
+    if pd.isna(mean):
+        return ""
+    return f"{mean:+.2f}" if pd.isna(error) else f"{mean:+.2f} ± {error:.2f}"
+
+
+def _cartpole_claims(claims: pd.DataFrame, kind: str) -> str:
     rows = []
     for (name, claim), part in claims.groupby(["id", "claim"]):
         by_actions = part.set_index("actions")
@@ -145,8 +165,10 @@ def _cartpole_claims(claims: pd.DataFrame) -> str:
             f"**{by_actions['verdict'][a]}**: {by_actions['measured'][a]}"
             for a in ("sampled", "deterministic")
         ]
+        if found[0] == found[1]:
+            found[1] = "the same"
         rows.append([str(name), str(claim), *found])
-    return _markdown(["", "claim", "sampled actions", "deterministic actions"], rows)
+    return _markdown(["", kind, "sampled actions", "deterministic actions"], rows)
 
 
 def _numbers(table: pd.DataFrame, header: list[str], form: str) -> str:

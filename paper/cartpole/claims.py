@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import pandas as pd
 
-from paper.cartpole.results import curve, first_below, window
+from paper.cartpole.results import behind, curve, first_below
 
-Verdict = Literal["reproduced", "not reproduced", "beaten", "not run"]
+Verdict = Literal["reproduced", "not reproduced", "beaten", "met", "missed", "not run"]
 
 CLAIMS = {
     "P1": ("model-free reaches 0.5 at trial 30 and touches 0.4 by 50", ("mf",)),
@@ -22,12 +23,23 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, our verdict, and the measured number behind it."""
+    """A claim of the paper, or a target of our own, the verdict, and the measured number behind it."""
 
     id: str
     claim: str
     verdict: Verdict
     measured: str
+
+
+def num_runs(trials: pd.DataFrame, name: str) -> str:
+    """How many runs of a scenario there are, in words."""
+    runs = trials[trials["scenario"] == name]["seed"].nunique()
+    return f"{runs} run{'' if runs == 1 else 's'}"
+
+
+def signed(value: float, error: float) -> str:
+    """A difference, with its standard error unless that is nan, as it is of a single run."""
+    return f"{value:+.3f}" if math.isnan(error) else f"{value:+.3f} ± {error:.3f}"
 
 
 @dataclass(frozen=True)
@@ -92,14 +104,11 @@ class Judge:
 
     def _p5(self) -> tuple[Verdict, str]:
         first = self._first("rra-paper", 0.5)
-        rra, cka = (window(self.trials, n, self.measure, 41, 50) for n in ("rra-paper", "cka"))
-        behind = (rra - cka).dropna()
-        error = 2 * behind.sem() if len(behind) > 1 else 0.0
-        caught = len(behind) > 0 and behind.mean() <= error
+        more, error = behind(self.trials, "rra-paper", self.measure, 41, 50)
+        caught = more <= 2 * (0 if math.isnan(error) else error)
         failed = first is None or first > 25
         measured = (
-            f"{self._described('rra-paper')}, {behind.mean():+.3f} ± {error / 2:.3f} of CKA's"
-            + self._beside("rra")
+            f"{self._described('rra-paper')}, {signed(more, error)} of CKA's{self._beside('rra')}"
         )
         return ("reproduced" if failed and caught else "not reproduced"), measured
 
@@ -114,8 +123,8 @@ class Judge:
         for threshold in (0.5, 0.4):
             first = self._first(name, threshold)
             parts.append(f"{threshold} {'never' if first is None else f'at trial {first}'}")
-        runs = self.trials[self.trials["scenario"] == name]["seed"].nunique()
-        return f"{', '.join(parts)}, mean of 41-50 {self._mean(name, 41, 50):.3f} ({runs} runs)"
+        late = f"mean of 41-50 {self._mean(name, 41, 50):.3f}"
+        return f"{', '.join(parts)}, {late} ({num_runs(self.trials, name)})"
 
     def _beside(self, name: str) -> str:
         if not (self.trials["scenario"] == name).any():

@@ -120,8 +120,9 @@ SCENARIOS = {
         lambda f_p: CKADynamics(CART_POLE_SPEC, f_p, target="absolute"),
         max_runs=SUBSET,
     ),
-    "cka-x4": Scenario("Dyna-CKA, 4 updates", _cka, model_updates=4, max_runs=SUBSET),
-    "oracle-x4": Scenario("oracle, 4 updates", _oracle, model_updates=4, max_runs=SUBSET),
+    "cka-1": Scenario("Dyna-CKA, 1 update a step", _cka, model_updates=1, max_runs=SUBSET),
+    "cka-4": Scenario("Dyna-CKA, 4 updates a step", _cka, model_updates=4, max_runs=SUBSET),
+    "oracle-4": Scenario("oracle, 4 updates a step", _oracle, model_updates=4, max_runs=SUBSET),
 }
 
 
