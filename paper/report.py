@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Hashable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -63,7 +65,17 @@ def results(folder: Path) -> dict[str, str]:
 def _cartpole(folder: Path) -> dict[str, str]:
     """The settings of the cart-pole as they stand, and its results if there are any."""
     fragments = {"cartpole:settings": _settings(), "cartpole:updates": _updates()}
-    names = ("curves", "iqm", "seconds", "sampled", "deterministic", "claims", "targets", "time", "model")
+    names = (
+        "curves",
+        "iqm",
+        "seconds",
+        "sampled",
+        "deterministic",
+        "claims",
+        "targets",
+        "time",
+        "model",
+    )
     if not (folder / "table.csv").exists():
         return fragments | {f"cartpole:{name}": NOT_RUN for name in names}
     table, times, claims = (pd.read_csv(folder / f"{n}.csv") for n in ("table", "time", "claims"))

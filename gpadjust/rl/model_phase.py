@@ -46,8 +46,6 @@ class ModelPhase:
                     "coverage": float(score.coverage.mean()),
                 }
                 names = [agent.dynamics.spec.states[i] for i in agent.dynamics.spec.moving]
-                if len(score.rmse) < len(names):
-                    names = [agent.dynamics.spec.states[i] for i in agent.dynamics.spec.predicted]
                 metrics |= {f"rmse/{n}": float(e) for n, e in zip(names, score.rmse, strict=True)}
             agent.dynamics.update(*transitions)
         metrics["fit_seconds"] = agent.wall_time["fit"] - before

@@ -23,7 +23,7 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, or a target of our own, the verdict, and the measured number behind it."""
+    """A claim of the paper or a target of our own, its verdict, and the number behind it."""
 
     id: str
     claim: str

@@ -63,7 +63,9 @@ def draw_curves(trials: pd.DataFrame, model_until: int, path: Path) -> None:
 def _curve_panel(ax: Axes, trials: pd.DataFrame, label: str) -> None:
     by_trial = trials.groupby("trial")
     mean, sd = by_trial["cost"].mean(), by_trial["cost"].std().fillna(0)
-    ax.fill_between(mean.index, mean - sd, mean + sd, color="navy", alpha=0.15, lw=0, label="sampled, sd")
+    ax.fill_between(
+        mean.index, mean - sd, mean + sd, color="navy", alpha=0.15, lw=0, label="sampled, sd"
+    )
     ax.plot(mean.index, mean, color="navy", lw=1.4, label="sampled actions, mean of runs")
     evaluation = by_trial["evaluation"].mean()
     label = "deterministic, mean of runs"
@@ -115,7 +117,11 @@ def draw_time(trials: pd.DataFrame, path: Path) -> None:
     figure = Figure(figsize=(8, 0.3 * len(labels) + 1.4), layout="constrained")
     ax = figure.subplots()
     left = np.zeros(len(table))
-    described = {"fit": "fits of the model", "rollout": "steps in the model", "sac": "SAC's updates"}
+    described = {
+        "fit": "fits of the model",
+        "rollout": "steps in the model",
+        "sac": "SAC's updates",
+    }
     for part, color in zip(PARTS, ("tab:orange", "tab:green", "navy"), strict=True):
         seconds = table[f"{part}_seconds"].to_numpy()
         ax.barh(labels, seconds, left=left, color=color, label=described[part])

@@ -160,12 +160,14 @@ def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
 
 def _compared(trials: pd.DataFrame, name: str, measure: str) -> dict[str, float]:
     """How far behind Dyna-CKA a scenario is, which is not said of Dyna-CKA itself."""
-    columns = {}
+    columns: dict[str, float] = {}
     for first, last in _COMPARED:
         found = (np.nan, np.nan)
         if name != REFERENCE:
             found = behind(trials, name, measure, first, last)
-        columns |= dict(zip((f"behind_{first}_{last}", f"behind_{first}_{last}_se"), found, strict=True))
+        columns |= dict(
+            zip((f"behind_{first}_{last}", f"behind_{first}_{last}_se"), found, strict=True)
+        )
     return columns
 
 

@@ -59,10 +59,8 @@ class Targets:
     def _t1(self) -> tuple[bool, str]:
         by_trial = curve(self.trials, "cka", self.measure)
         first = first_below(by_trial, 0.5)
-        return (
-            first is not None and first <= 6,
-            f"{'never' if first is None else f'at trial {first}'}; at 6 {self._window('cka', 6, 6)}",
-        )
+        reached = "never" if first is None else f"at trial {first}"
+        return first is not None and first <= 6, f"{reached}; at 6 {self._window('cka', 6, 6)}"
 
     def _t2(self) -> tuple[bool, str]:
         return self._at_most(0.4, 13, 25)

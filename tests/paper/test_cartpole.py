@@ -114,8 +114,8 @@ def test_scenarios_of_a_seed_share_physics_and_updates():
 
 
 def test_tasks_go_seed_by_seed():
-    tasks = make_tasks(("mf", "cka-x4"), SUBSET + 1, 7)
-    assert tasks[:4] == [("mf", 7), ("cka-x4", 7), ("mf", 8), ("cka-x4", 8)]
+    tasks = make_tasks(("mf", "cka-4"), SUBSET + 1, 7)
+    assert tasks[:4] == [("mf", 7), ("cka-4", 7), ("mf", 8), ("cka-4", 8)]
     assert tasks[-1] == ("mf", 7 + SUBSET)
     assert len(tasks) == 2 * SUBSET + 1
 
