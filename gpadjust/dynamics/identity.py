@@ -26,12 +26,15 @@ def identity(dynamics: Dynamics, **settings: Any) -> dict[str, str]:
 
 
 def check_identity(state: dict[str, Any], expected: dict[str, str]) -> None:
-    """Raise an error if a state is of other dynamics; that of unfitted ones is empty."""
+    """Raise a RuntimeError, as PyTorch does, if a state is of other dynamics.
+
+    The state of dynamics that learnt nothing is empty, and fits all.
+    """
     if not state:
         return
     found = state.get("identity")
     if found is None:
-        raise ValueError(
+        raise RuntimeError(
             "The state does not say of what dynamics it is; expected one that `state_dict` gave, "
             f"with an 'identity'. It holds {sorted(map(str, state))}."
         )
@@ -42,7 +45,7 @@ def check_identity(state: dict[str, Any], expected: dict[str, str]) -> None:
             "here"
             for name in names
         )
-        raise ValueError(
+        raise RuntimeError(
             f"The state is of {found.get('class')} with other settings than this "
             f"{expected['class']}: {different}. Load it into dynamics built as they were."
         )

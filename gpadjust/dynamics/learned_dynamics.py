@@ -184,7 +184,7 @@ class LearnedDynamics(ModelDynamics):
             state: Of dynamics of the same class, options, spec and physics.
 
         Raises:
-            ValueError: If it is of dynamics of another class, spec, target or model options.
+            RuntimeError: If it is of dynamics of another class, spec, target or model options.
         """
         check_identity(state, self._identity())
         self._forget_data()

@@ -114,7 +114,7 @@ class ModelDynamics(Dynamics):
         with torch.no_grad():
             flat = X.reshape(-1, X.shape[-1])
             mean, variance = self.model.predict(flat, observation_noise=observation_noise)
-        mean, variance = (t.reshape(*X.shape[:-1], -1) for t in (mean, variance))
+        mean, variance = (t.reshape(*X.shape[:-1], t.shape[-1]) for t in (mean, variance))
         return self.targets.decode(states, mean), variance
 
     def _check_pair(self, states: Tensor, actions: Tensor) -> None:

@@ -84,7 +84,7 @@ class PhysicsDynamics(Dynamics):
         """Check that the state is of such dynamics.
 
         Raises:
-            ValueError: If it is of dynamics of another class or spec.
+            RuntimeError: If it is of dynamics of another class or spec.
         """
         check_identity(state, identity(self))
 

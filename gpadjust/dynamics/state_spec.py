@@ -151,12 +151,13 @@ class StateSpec:
 
         An integrated one must follow its velocity as :math:`q' - q = b\, h (v + v') / 2` with
         :math:`b = 1`. With the way :math:`w = \sum h (|v| + |v'|) / 2`, or :math:`\sum |q' - q|`
-        where that is more, it does not if
+        where that is more,
 
-        - the least squares estimate of :math:`b` is so far from 1 that this makes up more than
-          :math:`0.1\, w` beside three of its standard errors, as a wrong ``step`` does, or
-        - the discrepancies sum up to more than :math:`0.5\, w`, as those of another state's
-          velocity do.
+        - it does not, as with a wrong ``step``, if the least squares estimate of :math:`b` is so
+          far from 1 that this makes up more than :math:`0.1\, w` beside three of its standard
+          errors;
+        - there is a warning if the discrepancies sum up to more than :math:`0.5\, w`, as those of
+          another state's velocity do, or of noisy sensors while nothing moves.
 
         The trapezoid itself errs by :math:`h^3 |\ddot v| / 12` a step: of an oscillation by less
         than a tenth if it is sampled six times a period or more. Discrepancies in angles are taken
@@ -168,6 +169,9 @@ class StateSpec:
 
         Raises:
             ValueError: If a state is not what it is said to be. It is named, with what was found.
+
+        Warns:
+            UserWarning: If an integrated state is far from what its velocity says.
         """
         check_columns(states, self.state_dim, "states")
         check_columns(next_states, self.state_dim, "next_states")

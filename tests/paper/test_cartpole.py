@@ -14,7 +14,7 @@ from paper import report
 from paper.cartpole import summarise
 from paper.cartpole.claims import Judge
 from paper.cartpole.recorder import evaluate, fixed_starts
-from paper.cartpole.results import first_below, load, tabulate, window
+from paper.cartpole.results import behind, first_below, holds_from, load, tabulate, window
 from paper.cartpole.runs import make_tasks, result_path, run_all, run_one
 from paper.cartpole.scenarios import (
     SCENARIOS,
@@ -24,6 +24,7 @@ from paper.cartpole.scenarios import (
     make_dynamics,
     updates_on_trial,
 )
+from paper.cartpole.targets import Targets
 
 TINY = replace(
     SETTINGS, num_trials=3, model_trials=2, model_until=2, later_updates=5, batch_size=16
@@ -237,6 +238,73 @@ def test_tables_of_incomplete_runs(tmp_path):
     assert pd.isna(sampled["first_0.5"]["mf"])
     assert table.loc["deterministic"]["first_0.5"]["phy"] in (44, 45, 46)
     assert len(window(trials, "mf", "cost", 41, 50)) == 3
+
+
+def targets(out, measure="cost", **curves):
+    named = {name.replace("_", "-"): curve for name, curve in curves.items()}
+    trials = load(write(out, named))
+    return {claim.id: claim for claim in Targets(trials, measure).judge()}
+
+
+def test_targets_that_are_met(tmp_path):
+    found = targets(
+        tmp_path,
+        cka=lambda t: 0.9 if t < 6 else 0.39,
+        cka_1=0.6,
+        cka_4=lambda t: 0.9 if t < 4 else 0.3,
+    )
+    met = {name: claim.verdict for name, claim in found.items()}
+    assert met == {
+        "T1": "met",
+        "T2": "met",
+        "T3": "met",
+        "T4": "missed",
+        "T5": "missed",
+        "T6": "met",
+    }
+    assert found["T1"].measured.startswith("at trial 6; at 6 0.39")
+    assert found["T4"].measured.startswith("2.00 of it (fits 50 s, model steps 50 s, updates 50 s)")
+    assert found["T5"].measured == "150 s (4 runs)"
+    assert "Dyna-CKA, 4 updates a step: from trial 4 (10.0 s)" in found["T6"].measured
+    assert "Dyna-CKA, 1 update a step: never" in found["T6"].measured
+
+
+def test_targets_that_are_missed(tmp_path):
+    found = targets(
+        tmp_path,
+        cka=lambda t: 0.9 if t < 7 else 0.45,
+        cka_1=0.6,
+        cka_4=lambda t: 0.4 if t < 20 else 0.6,
+    )
+    assert {found[name].verdict for name in ("T1", "T2", "T3")} == {"missed"}
+    assert found["T6"].verdict == "met"  # by the 2 updates a step, from trial 7
+    found = targets(tmp_path / "later", cka=lambda t: 0.9 if t < 8 else 0.3, cka_1=0.6, cka_4=0.6)
+    assert found["T6"].verdict == "missed"
+
+
+def test_targets_of_what_was_not_run(tmp_path):
+    found = targets(tmp_path, cka=0.3)
+    assert found["T1"].verdict == "met"
+    assert found["T5"].verdict == found["T6"].verdict == "not run"
+    assert found["T6"].measured == "no results of cka-1"
+
+
+def test_trial_from_which_a_threshold_holds():
+    lucky = pd.Series([0.9, 0.3, 0.9, 0.9, 0.4, 0.5, 0.4, 0.55, 0.3], index=range(1, 10))
+    assert holds_from(lucky, 0.5, 9) == 7
+    assert holds_from(lucky, 0.5, 10) is None
+    assert holds_from(lucky, 0.3, 9) is None
+
+
+def test_differences_are_of_the_seeds_that_both_have(tmp_path):
+    out = write(tmp_path, {"cka": 0.4, "mf": 0.6})
+    result_path(out, "cka", 3).unlink()
+    more, error = behind(load(out), "mf", "cost", 1, 25)
+    assert more == pytest.approx(0.2, abs=1e-9)  # the noise of a seed is shared
+    assert error == pytest.approx(0, abs=1e-9)
+    result_path(out, "mf", 0).unlink()
+    result_path(out, "mf", 1).unlink()
+    assert np.isnan(behind(load(out), "mf", "cost", 1, 25)[1])
 
 
 def test_first_trial_below_a_threshold():

@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import (
+    BaseCallback,
     CheckpointCallback,
     EvalCallback,
     StopTrainingOnMaxEpisodes,
@@ -18,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from gpadjust.dynamics import CKADynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics import CKADynamics, GPDynamics, PhysicsDynamics, StateSpec
 from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
 from gpadjust.rl import DynaCallback, DynaSAC
 
@@ -148,6 +149,61 @@ def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
     assert [len(states) for states in seen] == [10, 5, 5]
 
 
+class Stop(BaseCallback):
+    """Stops a run at a step."""
+
+    def __init__(self, step):
+        super().__init__()
+        self.step = step
+
+    def _on_step(self):
+        return self.num_timesteps < self.step
+
+
+def test_a_run_that_was_stopped_within_a_trial_starts_another(point_agent, learnt_dynamics):
+    dynamics = learnt_dynamics()
+    agent = point_agent(dynamics=dynamics)
+    agent.learn(10, callback=Stop(8))
+    assert agent.replay_buffer.size() == 7  # what a callback stops at is not stored
+    agent.learn(10, reset_num_timesteps=False)
+    trials = agent.recorded_trials()
+    follows = (trials.states[1:] == trials.next_states[:-1]).all(-1)
+    assert follows.logical_not().nonzero().flatten().tolist() == [4, 6, 11]
+    assert dynamics.num_transitions == 17
+
+
+def test_each_trial_that_ended_is_followed_by_model_trials(point_agent):
+    agent = point_agent(train_freq=(15, "step"), model_trials=4).learn(15)
+    assert agent.num_trials == 3
+    assert model_rows(agent) == 3 * 4 * 5
+
+
+def test_states_beyond_the_bounds_are_not_followed(point_agent):
+    bounds = torch.tensor([[0.9], [1.1]])
+    agent = point_agent(state_bounds=bounds, initial_states=lambda n: torch.ones(n, 1)).learn(10)
+    assert 0 < model_rows(agent) < 2 * 2 * 5
+    following = agent.replay_buffer.model.next_observations[: model_rows(agent)]
+    assert ((following > 0.9) & (following < 1.1)).all()
+
+
+def test_model_trials_that_teach_nothing_are_warned_of(point_agent):
+    bounds = torch.tensor([[0.99], [1.01]])
+    agent = point_agent(
+        state_bounds=bounds,
+        initial_states=lambda n: torch.ones(n, 1),
+        dynamics=PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 5),
+        reward_tolerance=None,
+    )
+    with pytest.warns(UserWarning, match="has learnt nothing from the model"):
+        agent.learn(5)
+
+
+def test_the_model_buffer_keeps_the_newest(point_agent):
+    agent = point_agent(model_buffer_size=15).learn(10)
+    assert agent.replay_buffer.buffer_size == 500
+    assert model_rows(agent) == 15
+
+
 def test_a_first_trial_of_a_single_step_waits_for_the_second(
     point_agent, point_env, learnt_dynamics
 ):
@@ -158,7 +214,7 @@ def test_a_first_trial_of_a_single_step_waits_for_the_second(
     assert agent.learn(1).num_trials == 0
     agent.learn(2, reset_num_timesteps=False)
     assert agent.num_trials == dynamics.num_transitions == 3
-    assert agent._n_updates == 3 + 2 * 2
+    assert agent._n_updates == 3 + 3 * 2
 
 
 def test_a_trivial_task_is_improved(point_agent):
@@ -383,6 +439,36 @@ def test_with_dynamics_a_loaded_agent_goes_on(saved, point_env, learnt_dynamics,
     assert loaded.num_trials == 3
 
 
+def test_what_the_dynamics_learnt_outlives_an_agent_without_them(saved, tmp_path, learnt_dynamics):
+    agent, path = saved
+    again = tmp_path / "again.zip"
+    DynaSAC.load(path).save(again)
+    dynamics = learnt_dynamics()
+    DynaSAC.load(again, dynamics=dynamics)
+    assert dynamics.num_transitions == agent.dynamics.num_transitions
+
+
+def test_a_termination_that_was_given_is_asked_for_again(
+    point_agent, point_env, point_reward, point_dynamics, tmp_path
+):
+    def over(states):
+        return states[:, 0] > 9
+
+    path = tmp_path / "agent.zip"
+    point_agent(terminated=over).learn(5).save(path)
+    given = {"env": point_env(), "reward": point_reward, "dynamics": point_dynamics}
+    with pytest.raises(ValueError, match=r"needs terminated .*to DynaSAC\.load"):
+        DynaSAC.load(path, **given).learn(5)
+    assert DynaSAC.load(path, **given, terminated=over).learn(5).num_trials == 2
+
+
+def test_dynamics_of_another_kind_are_not_loaded(saved):
+    _, path = saved
+    other = GPDynamics(StateSpec(["x"], ["v"]))
+    with pytest.raises(RuntimeError, match="class is CKADynamics in the state, GPDynamics here"):
+        DynaSAC.load(path, dynamics=other)
+
+
 def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics):
     _, path = saved
     loaded = DynaSAC.load(
@@ -480,6 +566,24 @@ def test_bad_arguments_are_refused(point_agent, options, message):
         point_agent(**options)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dynamics": "cka"}, "dynamics must be an object of a Dynamics; found 'cka'"),
+        ({"reward": 1.0}, "reward must be a function; found 1.0"),
+        ({"reward": lambda states: states}, r"reward is called with 3 .*found reward\(states\)"),
+        ({"terminated": lambda: None}, r"terminated is called with 1 .*found terminated\(\)"),
+        ({"initial_states": torch.ones(3, 1)}, "initial_states must be a function"),
+        ({"model_trials": 2.5}, "model_trials must be a whole number; found 2.5"),
+        ({"model_updates": "2"}, "model_updates must be a number; found '2'"),
+        ({"reward_tolerance": "no"}, "reward_tolerance must be a number; found 'no'"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(point_agent, options, message):
+    with pytest.raises(TypeError, match=message):
+        point_agent(**options)
+
+
 class Shaped(gymnasium.Env):
     def __init__(self, observation_space, action_space):
         self.observation_space, self.action_space = observation_space, action_space
@@ -524,6 +628,26 @@ def test_terminations_that_come_late_are_refused(point_agent, point_env):
     env.unwrapped.end = -9
     with pytest.raises(ValueError, match="terminated=True, but none was given"):
         agent.learn(5, reset_num_timesteps=False)
+
+
+def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
+    def noisy(*transition):
+        return 1.05 * point_reward(*transition)
+
+    with pytest.raises(ValueError, match="raise reward_tolerance; None checks nothing"):
+        point_agent(reward=noisy).learn(5)
+    for tolerance in (0.1, None):
+        assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_trials == 1
+
+
+def test_a_time_limit_put_around_by_hand_is_read(point_agent):
+    agent = point_agent(trial_length=None).learn(5)
+    assert model_rows(agent) == 2 * 5
+
+
+def test_several_environments_cannot_train_by_episodes(point_agent, point_env):
+    with pytest.raises(ValueError, match=r"With 2 environments .*such as \(5, 'step'\)"):
+        point_agent(DummyVecEnv([point_env] * 2)).learn(10)
 
 
 def test_an_unknown_time_limit_is_refused(point_agent, point_env):

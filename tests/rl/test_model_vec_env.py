@@ -7,9 +7,11 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecMonitor
 
-from gpadjust.dynamics import CKADynamics
+from gpadjust.dynamics import CKADynamics, PhysicsDynamics
 from gpadjust.envs import cart_pole_reward, cart_pole_start
+from gpadjust.physics import PhysicsError
 from gpadjust.rl import ModelVecEnv
+from gpadjust.rl.mixed_replay_buffer import CompactReplayBuffer
 
 
 @pytest.fixture
@@ -196,6 +198,55 @@ def test_particles_that_leave_the_numbers_are_truncated(
     assert np.isfinite(obs).all()
     assert np.isfinite(rewards).all()
     assert np.isfinite(infos[1]["terminal_observation"]).all()
+
+
+@pytest.mark.parametrize("particles", ["independent", "functions"])
+def test_particles_at_which_the_physics_fails_are_truncated(
+    point_particles, unsure_dynamics, particles, rise
+):
+    def choosy(X):
+        if (X[:, 1] > 1.5).any():
+            rows = (X[:, 1] > 1.5).nonzero().flatten().tolist()
+            raise PhysicsError("too fast", rows)
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    dynamics = PhysicsDynamics(unsure_dynamics.spec, choosy)
+    env = point_particles(dynamics=dynamics, particles=particles, num_envs=3)
+    env.reset()
+    obs, _, dones, infos = env.step(np.array([[1.0], [2.0], [0.0]], dtype=np.float32))
+    assert dones.tolist() == [False, True, False]
+    assert infos[1]["left_bounds"]
+    assert obs[:, 0].tolist() == pytest.approx([1.4, 1.0, 1.0])
+
+
+def test_bounds_give_way_to_the_starts(point_particles, rise):
+    particles = point_particles(start=4.0, bounds=torch.tensor([[0.0], [2.0]]))
+    particles.reset()
+    _, _, dones, _ = particles.step(rise(3))
+    assert not dones.any()
+    assert particles.bounds.tolist() == [[0.0], [5.0]]
+
+
+@pytest.mark.parametrize("particles", ["independent", "functions"])
+@pytest.mark.parametrize("rows", [0, 1, 7])
+def test_refreshed_transitions_end_as_the_model_has_it(
+    point_particles, unsure_dynamics, point_env, particles, rows
+):
+    env = point_particles(dynamics=unsure_dynamics, particles=particles)
+    spaces_of = point_env()
+    buffer = CompactReplayBuffer(20, spaces_of.observation_space, spaces_of.action_space, "cpu")
+    states = np.linspace(0.1, 0.9, rows, dtype=np.float32)[:, None]
+    zeros = np.zeros(rows, dtype=np.float32)
+    buffer.extend(states, states + 99, 0.2 * states, zeros, zeros, zeros)
+    env.refresh(buffer)
+    assert buffer.size() == rows
+    mean, variance = unsure_dynamics.predict(
+        torch.from_numpy(states).double(), torch.from_numpy(0.4 * states).double()
+    )
+    following = torch.from_numpy(buffer.next_observations[:rows, 0])
+    assert ((following - mean).abs() <= 6 * variance.sqrt() + 1e-6).all()
+    rewards = torch.from_numpy(buffer.rewards[:rows, 0])
+    torch.testing.assert_close(rewards, -following[:, 0].square())
 
 
 def test_whole_numbers_are_rewards(point_particles, rise):

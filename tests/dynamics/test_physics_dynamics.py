@@ -1,0 +1,113 @@
+"""Dynamics that are physics alone."""
+
+import io
+
+import pytest
+import torch
+
+from gpadjust.dynamics import CKADynamics, GPDynamics, PhysicsDynamics, StateSpec
+from gpadjust.physics import ODEPhysics
+
+SPEC = StateSpec(["x", "v"], ["a"])
+
+
+def push(X):
+    x, v, a = X.split(1, -1)
+    return torch.cat([x + 0.1 * v, v + 0.1 * a], -1)
+
+
+def transitions(n=20, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    X = torch.rand(n, 3, generator=generator, dtype=torch.float64) + 1
+    return X[:, :2], X[:, 2:], push(X)
+
+
+def test_it_predicts_the_physics_without_doubt():
+    dynamics = PhysicsDynamics(SPEC, push)
+    assert dynamics.is_fitted
+    states, actions, following = transitions()
+    dynamics.update(states, actions, following)
+    mean, variance = dynamics.predict(states, actions)
+    assert torch.equal(mean, following)
+    assert (variance == 0).all()
+    assert torch.equal(dynamics.sample(states, actions), following)
+    blocks = dynamics.sample_functions(2)(states.view(2, 10, 2), actions.view(2, 10, 1))
+    assert torch.equal(blocks, following.view(2, 10, 2))
+
+
+@pytest.mark.parametrize("learnt", [False, True])
+def test_a_physics_of_differences_is_warned_of(learnt):
+    def change(X):
+        return push(X) - X[:, :2]
+
+    dynamics = CKADynamics(SPEC, change) if learnt else PhysicsDynamics(SPEC, change)
+    with pytest.warns(UserWarning, match="seems to return the change of the state"):
+        dynamics.update(*transitions())
+    dynamics.update(*transitions(seed=1))  # no second warning, which would be an error here
+
+
+@pytest.mark.parametrize("scale", [0.5, 3.0])
+def test_a_crude_physics_of_next_states_is_not(scale):
+    def crude(X):
+        return X[:, :2] + scale * (push(X) - X[:, :2])
+
+    PhysicsDynamics(SPEC, crude).update(*transitions())
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(TypeError, match="Expected spec as a StateSpec"):
+        PhysicsDynamics(["x", "v"], push)
+    with pytest.raises(ValueError, match="difference=False"):
+        PhysicsDynamics(SPEC, ODEPhysics(lambda x, a: x, 0.1, 2, difference=True))
+    dynamics = PhysicsDynamics(SPEC, lambda X: X)
+    with pytest.raises(ValueError, match=r"next values of the 2 states .*got 3 columns"):
+        dynamics.predict(*transitions()[:2])
+
+
+# Whose state is loaded
+
+
+def stored(dynamics):
+    file = io.BytesIO()
+    torch.save(dynamics.state_dict(), file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def learnt(**options):
+    dynamics = CKADynamics(**{"spec": SPEC, "physics": push, **options})
+    dynamics.update(*transitions())
+    return dynamics
+
+
+def test_a_state_is_of_the_same_dynamics():
+    dynamics = PhysicsDynamics(SPEC, push)
+    dynamics.load_state_dict(stored(PhysicsDynamics(SPEC, push)))
+    state = stored(learnt())
+    other = CKADynamics(SPEC, push)
+    other.load_state_dict(state)
+    assert other.num_transitions == 20
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GPDynamics(SPEC), "class is CKADynamics in the state, GPDynamics here"),
+        (lambda: PhysicsDynamics(SPEC, push), "class is CKADynamics in the state"),
+        (lambda: CKADynamics(SPEC, push, target="absolute"), "target is 'difference' in the state"),
+        (lambda: CKADynamics(StateSpec(["y", "v"], ["a"]), push), r"states is \('x', 'v'\)"),
+        (lambda: CKADynamics(StateSpec(["x", "v"], ["a"], step=0.1), push), "step is None"),
+    ],
+)
+def test_a_state_of_others_is_refused(make, message):
+    state = stored(learnt())
+    dynamics = make()
+    with pytest.raises(RuntimeError, match=message):
+        dynamics.load_state_dict(state)
+    if not isinstance(dynamics, PhysicsDynamics):
+        assert not dynamics.is_fitted
+
+
+def test_a_state_that_says_nothing_is_refused():
+    with pytest.raises(RuntimeError, match="does not say of what dynamics it is"):
+        CKADynamics(SPEC, push).load_state_dict({"weights": torch.ones(2)})
