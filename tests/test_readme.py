@@ -3,12 +3,14 @@
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 
 def test_the_examples_run(capsys):
-    first, second, _ = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    first, second, *_ = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     names = {}
     exec(first, names)
     truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
@@ -20,9 +22,10 @@ def test_the_examples_run(capsys):
     assert names["loo"].rmse < 1e-2
 
 
-def test_the_agent_learns(tmp_path, monkeypatch):
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[2]
+    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[2:]
     for long, short in (("=10 * 25", "=2 * 25"), ("model_trials=20", "model_trials=2")):
         assert long in code
         code = code.replace(long, short)
@@ -30,6 +33,9 @@ def test_the_agent_learns(tmp_path, monkeypatch):
     exec(code, names)
     assert names["agent"].num_trials == 2
     assert {path.name for path in tmp_path.iterdir()} == {"cart_pole.ckpt", "cart_pole.zip"}
+    assert "10 * 25" in again
+    exec(again.replace("10 * 25", "3 * 25"), names)
+    assert names["agent"].num_trials == 3
 
 
 def test_ci_runs_the_test_command():

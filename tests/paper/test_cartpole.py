@@ -319,7 +319,7 @@ def test_results_are_summarised_and_reported(tmp_path, capsys):
         assert (tmp_path / f"{name}.png").stat().st_size > 5_000
     assert "P4 not run" in capsys.readouterr().out
     fragments = report._cartpole(tmp_path)
-    assert "| Dyna-CKA | 2 | 0.40 |  |  |  |  | 1 | " in fragments["cartpole:sampled"]
+    assert "| Dyna-CKA | 2 | 0.40 |  |  |  |  |  |  | 1 | " in fragments["cartpole:sampled"]
     assert "**not run**" in fragments["cartpole:claims"]
     assert fragments.keys() == report._cartpole(tmp_path / "nothing").keys()
 
