@@ -62,11 +62,11 @@ def problems(draw):
     n, d = draw(st.integers(2, 12)), draw(st.integers(1, 3))
     torch.manual_seed(draw(st.integers(0, 2**31)))
     X = torch.rand(n, d, dtype=torch.float64)
-    if draw(st.booleans()):
-        X[:, -1] = 0.3  # one input that never changes
     repeat = draw(st.none() | REPEATS)
     if repeat is not None:
         X = torch.cat([X, X[: n // 2 + 1] + repeat[0]])
+    if draw(st.booleans()):
+        X[:, -1] = 0.3  # one input that never changes
     targets = draw(st.sampled_from(list(TARGETS)))
     Y = TARGETS[targets](X)
     if repeat is not None and repeat[1] is not None:
