@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,7 +52,7 @@ class ArmEquation:
         >>> equation = ArmEquation(gains=(8.0, 4.0))
         >>> rest = torch.zeros(1, 4, dtype=torch.float64)
         >>> equation(rest, torch.tensor([[0.0, 0.0, 1.0, 0.0]], dtype=torch.float64))
-        tensor([[  0.0000,   0.0000,  49.2639, -111.9044]], dtype=torch.float64)
+        tensor([[   0.0000,    0.0000,   84.8011, -193.4000]], dtype=torch.float64)
     """
 
     masses: tuple[float, float] = (1.82, 1.43)
@@ -64,19 +64,19 @@ class ArmEquation:
 
     def __post_init__(self) -> None:
         """Check the parameters."""
+        for name in ("masses", "lengths", "centres", "inertias", "gains"):
+            pair = tuple(getattr(self, name))  # hashable, also when given as a list
+            if len(pair) != 2:
+                raise ValueError(f"{name} must be a pair, of two links or joints; found {pair}.")
+            object.__setattr__(self, name, pair)
         for entry in fields(self):
-            value = getattr(self, entry.name)
-            values = (value,) if entry.name == "damping" else tuple(value)
-            if entry.name != "damping" and len(values) != 2:
-                raise ValueError(f"{entry.name} must be a pair; found {value}.")
-            may_be_zero = entry.name in ("centres", "damping", "gains")
-            least = "not negative" if may_be_zero else "positive"
-            if any(
-                not math.isfinite(v) or v < 0 or (v == 0 and not may_be_zero) for v in values
-            ):
-                raise ValueError(f"{entry.name} must be finite and {least}; found {value}.")
-            if entry.name != "damping":
-                object.__setattr__(self, entry.name, values)  # hashable, also when given as a list
+            values = np.array(getattr(self, entry.name))
+            positive = entry.name in ("masses", "lengths", "inertias")
+            if not (np.isfinite(values) & (values > 0 if positive else values >= 0)).all():
+                least = "positive" if positive else "not negative"
+                raise ValueError(
+                    f"{entry.name} must be finite and {least}; found {getattr(self, entry.name)}."
+                )
 
     def __call__(self, state: Tensor, action: Tensor) -> Tensor:
         """The time derivative of the state.
@@ -93,8 +93,8 @@ class ArmEquation:
         """
         if state.shape[-1] != 4 or action.shape[-1] != 4:
             raise ValueError(
-                "Expected states ... x 4 (th_s, th_e, th_s_dot, th_e_dot) and actions ... x 4 "
-                f"(a1, a2, a3, a4), got {tuple(state.shape)} and {tuple(action.shape)}."
+                "Expected states ... x 4 (theta_s, theta_e, theta_s_dot, theta_e_dot) and actions "
+                f"... x 4 (a1, a2, a3, a4), got {tuple(state.shape)} and {tuple(action.shape)}."
             )
         _, elbow, v_s, v_e = state.unbind(-1)
         a1, a2, a3, a4 = action.unbind(-1)
@@ -172,8 +172,8 @@ def torque_arm_physics(strength: float = 0.5) -> ODEPhysics:
         strength: See :func:`torque_arm`.
 
     Returns:
-        A physics of columns ``[th_s, th_e, th_s_dot, th_e_dot, a1, a2, a3, a4]``, in rad and s,
-        by Runge-Kutta of order four with substeps of 5 ms.
+        A physics of columns ``[theta_s, theta_e, theta_s_dot, theta_e_dot, a1, a2, a3, a4]``, in
+        rad and s, by Runge-Kutta of order four with substeps of 5 ms.
 
     Raises:
         ValueError: If there are no gains for this strength.
@@ -181,7 +181,7 @@ def torque_arm_physics(strength: float = 0.5) -> ODEPhysics:
     Example:
         >>> physics = torque_arm_physics()
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
-        tensor([[0.6782, 1.0441, 0.6520, -0.3555]], dtype=torch.float64)
+        tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
     return ODEPhysics(
         torque_arm(strength),

@@ -66,7 +66,7 @@ def load_opensim() -> ModuleType:
             'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
         ) from error
     opensim.Logger.setLevelString("off")
-    return opensim  # type: ignore[no-any-return]
+    return opensim
 
 
 def build_muscle_arm(equation: ArmEquation, strength: float) -> tuple[Any, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from gpadjust.envs.arm_model import (
     load_opensim,
 )
 
+MAX_STRENGTH = 2.0  # beyond, the arm breaks through its joint limits
+
 
 class ArmSimulation:
     """The arm in OpenSim, integrated for 0.2 s at a time by Runge-Kutta-Merson.
@@ -24,18 +26,21 @@ class ArmSimulation:
     built anew.
 
     Args:
-        equation: The links; with ``strength=None`` also the gains of the torques.
+        equation: The links; its gains are not used.
         strength: The factor on the forces of six muscles; None for torques in their place.
         accuracy: The relative accuracy of the integrator.
 
     Raises:
         ImportError: If ``opensim`` is missing.
-        ValueError: If strength or accuracy is not positive and finite, or the accuracy not below 1.
+        ValueError: If strength is not in (0, 2] or accuracy not in (0, 1).
     """
 
     def __init__(self, equation: ArmEquation, strength: float | None, accuracy: float) -> None:
-        if strength is not None and not 0 < strength < math.inf:
-            raise ValueError(f"strength must be positive and finite; found {strength}.")
+        if strength is not None and not 0 < strength <= MAX_STRENGTH:
+            raise ValueError(
+                f"strength must be in (0, {MAX_STRENGTH:g}], where 1 is a healthy arm's; found "
+                f"{strength}."
+            )
         if not 0 < accuracy < 1:
             raise ValueError(f"accuracy must be in (0, 1), such as 1e-5; found {accuracy}.")
         self.equation = equation
@@ -53,21 +58,22 @@ class ArmSimulation:
         Raises:
             RuntimeError: If the integration fails, or ends in numbers that are not finite.
         """
-        for constant, value in zip(self._controls, inputs, strict=True):
-            constant.setValue(float(value))
-        vector, start = self._vector, self._start
-        for i, value in enumerate(state.tolist()):
-            vector.set(i, value)
-        start.setTime(0.0)
-        start.setY(vector)
-        self._manager.initialize(start)
-        # Copied at once: what OpenSim returns is a reference.
-        end = np.array(self._manager.integrate(ARM_TIME_STEP).getY().to_numpy(), dtype=np.float64)
+        with self._lock:
+            for constant, value in zip(self._controls, inputs.tolist(), strict=True):
+                constant.setValue(value)
+            for i, value in enumerate(state.tolist()):
+                self._vector.set(i, value)
+            self._start.setTime(0.0)
+            self._start.setY(self._vector)
+            self._manager.initialize(self._start)
+            # Copied at once: what OpenSim returns is a reference.
+            end = np.array(self._manager.integrate(ARM_TIME_STEP).getY().to_numpy())
         if not np.isfinite(end).all():
             raise RuntimeError("The integration ended in NaN or inf.")
         return end
 
     def _build(self) -> None:
+        self._lock = Lock()
         opensim = load_opensim()
         if self.strength is None:
             self._model, controller = build_torque_arm(self.equation)
