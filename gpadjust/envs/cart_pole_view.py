@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
-from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    import pygame
+from gpadjust.envs.view import BLACK, BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, View
 
 WIDTH, HEIGHT = 600, 300
 METRE = 140.0  # pixels
-SMOOTH = 2  # drawn so many times larger, then scaled down, for smooth edges
 ROAM = 1.5  # the cart moves in the frame up to here (m); beyond, the frame moves with it
 TRACK_LEVEL = 0.5  # of the height
 
-WHITE, BLACK, GREY, LIGHT = (255, 255, 255), (0, 0, 0), (110, 110, 110), (215, 215, 215)
-BLUE, RED, GREEN = (31, 79, 130), (204, 77, 77), (44, 140, 68)
 
-
-class CartPoleView:
+class CartPoleView(View):
     """Frames of a cart-pole, in a window or as arrays.
 
     Args:
@@ -37,49 +30,19 @@ class CartPoleView:
     def __init__(
         self, pole_length: float, max_force: float, frames_per_second: int | None = None
     ) -> None:
-        try:
-            import pygame
-        except ImportError as error:
-            raise DependencyNotInstalled(
-                "Rendering needs pygame-ce; run `pip install pygame-ce`."
-            ) from error
+        super().__init__("Cart-pole", (WIDTH, HEIGHT), frames_per_second)
         self.pole_length = pole_length
         self.max_force = max_force
-        self.frames_per_second = frames_per_second
-        self._canvas = pygame.Surface((SMOOTH * WIDTH, SMOOTH * HEIGHT))
-        self._window: pygame.Surface | None = None
-        if frames_per_second is not None:
-            pygame.display.init()
-            pygame.display.set_caption("Cart-pole")
-            self._window = pygame.display.set_mode((WIDTH, HEIGHT))
-        self._clock = pygame.time.Clock()
 
     def draw(self, x: float, theta: float, force: float) -> NDArray[np.uint8] | None:
         """Draw a frame; return it, ``height x width x 3``, if there is no window."""
-        import pygame
-
         self._draw_scene(float(x), float(theta), float(force))
-        frame = pygame.transform.smoothscale(self._canvas, (WIDTH, HEIGHT))
-        if self._window is None:
-            return np.ascontiguousarray(pygame.surfarray.array3d(frame).swapaxes(0, 1))
-        self._window.blit(frame, (0, 0))
-        pygame.event.pump()
-        self._clock.tick(self.frames_per_second or 0)
-        pygame.display.flip()
-        return None
-
-    def close(self) -> None:
-        """Close the window."""
-        import pygame
-
-        if self._window is not None:
-            pygame.display.quit()
-            self._window = None
+        return self.show()
 
     def _draw_scene(self, x: float, theta: float, force: float) -> None:
         import pygame
 
-        draw, canvas = pygame.draw, self._canvas
+        draw, canvas = pygame.draw, self.canvas
         scale = SMOOTH * METRE
         left = x - min(max(x, -ROAM), ROAM) - WIDTH / METRE / 2  # of the frame, in m
 

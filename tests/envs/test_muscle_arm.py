@@ -1,0 +1,360 @@
+"""The muscle arm as a Gymnasium environment."""
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import gpadjust
+from gpadjust.dynamics import CKADynamics
+from gpadjust.envs import (
+    ARM_SPEC,
+    MuscleArmEnv,
+    arm_reward,
+    hand_distance_cm,
+    torque_arm_physics,
+)
+from gpadjust.envs.arm_model import MUSCLES
+from gpadjust.rl import DynaSAC
+
+ID = "gpadjust/MuscleArm-v0"
+START = np.radians([35.0, 65.0, 0.0, 0.0])
+TARGET = np.radians([70.0, 40.0])
+GENTLE = np.array([0.2, 0.1, 0.3, 0.1], dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """The environment, to be reset by each test."""
+    return MuscleArmEnv()
+
+
+def start(env):
+    env.reset(seed=0, options={"state": START, "target": TARGET})
+    return env
+
+
+def rollout(env, num_steps=5, seed=0):
+    actions = np.random.default_rng(seed).uniform(0, 1, (num_steps, 4)).astype(np.float32)
+    return [env.step(action) for action in actions]
+
+
+def same(transitions, others):
+    pairs = zip(transitions, others, strict=True)
+    return all(np.array_equal(a[0], b[0]) and a[1:] == b[1:] for a, b in pairs)
+
+
+def python(code, folder):
+    """Run Python code in a folder, with this library."""
+    path = str(Path(gpadjust.__file__).parents[1])
+    command = [sys.executable, "-c", code]
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def test_golden_trajectory():
+    env = start(MuscleArmEnv(strength=0.3, accuracy=1e-8))
+    states = []
+    for _ in range(5):
+        env.step(np.array([0.2, 0.1, 0.3, 0.1]))
+        states.append(env.state[:4])
+    first, fifth = [0.6745856, 1.1299697, 0.613568, -0.0042265], [1.4363824, 1.1695989, 0.8287791]
+    np.testing.assert_allclose(states[0], first, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(states[4], [*fifth, 0.0578116], rtol=0, atol=1e-5)
+
+
+def test_default_accuracy_is_enough(arm):
+    fine = MuscleArmEnv(accuracy=1e-8)
+    rollout(start(arm), 15)
+    rollout(start(fine), 15)
+    np.testing.assert_allclose(arm.state[:2], fine.state[:2], rtol=0, atol=5e-5)
+
+
+def test_activations_follow_the_excitations_and_are_hidden(arm):
+    start(arm)
+    assert np.array_equal(arm.activations, np.full(6, 0.01))
+    arm.step(GENTLE)
+    np.testing.assert_allclose(arm.activations, [0.2, 0.1, 0.3, 0.1, 0, 0], atol=1e-3)
+    assert arm.observation_space.shape == (6,)
+
+
+@pytest.mark.parametrize("muscle", range(4))
+def test_each_action_moves_the_joints_to_its_side(arm, muscle):
+    start(arm)
+    arm.step(np.zeros(4))
+    relaxed = arm.state
+    start(arm)
+    arm.step(0.3 * np.eye(4)[muscle])
+    shoulder, elbow = arm.state[:2] - relaxed[:2]
+    moved = {0: elbow, 1: -elbow, 2: shoulder, 3: -shoulder}[muscle]
+    assert moved > 0.05
+
+
+def test_fibres_are_at_their_optimum_at_the_mean_start():
+    simulation = MuscleArmEnv().simulation
+    model, start_state = simulation._model, simulation._start
+    assert [model.getMuscles().get(i).getName() for i in range(6)] == [m.name for m in MUSCLES]
+    for joint, angle in zip(("shoulder", "elbow"), START[:2], strict=True):
+        model.getCoordinateSet().get(joint).setValue(start_state, angle)
+    model.realizeDynamics(start_state)
+    for i, muscle in enumerate(MUSCLES):
+        length = model.getMuscles().get(i).getFiberLength(start_state)
+        np.testing.assert_allclose(length, muscle.fibre, rtol=1e-6)
+    slack = [m.length(*START[:2]) - m.fibre for m in MUSCLES]
+    expected = [0.19921, 0.17302, 0.04580, 0.06340, 0.17287, 0.16803]
+    np.testing.assert_allclose(slack, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:.*For Box action spaces, we recommend:UserWarning")
+def test_gymnasium_finds_no_fault():
+    check_env(gym.make(ID).unwrapped)
+
+
+@pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized:UserWarning")
+def test_stable_baselines_finds_no_fault():
+    sb3_check_env(gym.make(ID, render_mode="rgb_array").unwrapped)
+
+
+def test_episode_is_truncated_after_15_steps():
+    env = gym.make(ID)
+    env.reset(seed=0)
+    ends = [transition[2:4] for transition in rollout(env, 15)]
+    assert ends == [(False, False)] * 14 + [(False, True)]
+
+
+def test_reward_and_distance_are_those_of_the_new_state(arm):
+    start(arm)
+    observation, reward, _, _, info = rollout(arm)[-1]
+    state = torch.from_numpy(arm.state)
+    assert np.array_equal(observation, arm.state.astype(np.float32))
+    assert np.array_equal(arm.state[4:], TARGET)
+    assert reward == arm_reward(state, state, state).item()
+    assert info == {
+        "hand_distance_cm": hand_distance_cm(state).item(),
+        "integration_failed": False,
+    }
+
+
+def test_starts_and_targets_are_drawn(arm):
+    arm.reset(seed=0)
+    states = []
+    for _ in range(2000):
+        arm.reset()
+        states.append(np.degrees(arm.state))
+    np.testing.assert_allclose(np.mean(states, axis=0), [35, 65, 0, 0, 50, 50], atol=2)
+    np.testing.assert_allclose(np.std(states, axis=0), [5, 5, 0, 0, 28.9, 28.9], atol=1)
+    assert np.min(states, axis=0)[4:].min() >= 0
+    assert np.max(states, axis=0)[4:].max() <= 100
+
+
+def test_options_do_not_change_what_else_is_drawn(arm):
+    drawn = arm.reset(seed=5)[0]
+    assert np.array_equal(arm.reset(seed=5, options={"state": START})[0][4:], drawn[4:])
+    assert np.array_equal(arm.reset(seed=5, options={"target": TARGET})[0][:4], drawn[:4])
+
+
+def test_equal_seeds_give_equal_trajectories(arm):
+    other = MuscleArmEnv()
+    for _ in range(2):
+        assert np.array_equal(arm.reset(seed=3)[0], other.reset(seed=3)[0])
+        assert same(rollout(arm), rollout(other))
+        assert np.array_equal(arm.reset()[0], other.reset()[0])
+        assert same(rollout(arm), rollout(other))
+
+
+@pytest.mark.parametrize("render_mode", [None, "rgb_array", "human"])
+@pytest.mark.parametrize("duplicate", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
+def test_copy_goes_on_as_the_original(render_mode, duplicate):
+    env = gym.make(ID, render_mode=render_mode)
+    env.reset(seed=0)
+    rollout(env, 3)
+    if render_mode:
+        env.render()
+    twin = duplicate(env)
+    assert same(rollout(env, 3), rollout(twin, 3))
+    assert np.array_equal(env.reset()[0], twin.reset()[0])
+    if render_mode == "rgb_array":
+        assert np.array_equal(env.render(), twin.render())
+    env.close()
+    twin.close()
+
+
+def test_excitations_are_clipped(arm):
+    full = start(arm).step(np.array([1.0, 0.0, 1.0, 0.0]))
+    beyond = start(arm).step(np.array([7.0, -3.0, 1.5, -0.1]))
+    assert same([full], [beyond])
+
+
+def test_stronger_muscles_move_further(arm):
+    strong = start(MuscleArmEnv(strength=1.0))
+    strong.step(GENTLE)
+    start(arm).step(GENTLE)
+    assert strong.state[0] > arm.state[0] + 0.05
+
+
+@pytest.mark.parametrize(
+    "action", [np.full(4, np.nan), np.array([0.1, np.inf, 0.0, 0.0]), np.zeros(3), 0.5]
+)
+def test_bad_action_is_refused_and_changes_nothing(arm, action):
+    start(arm)
+    with pytest.raises(ValueError, match="four finite excitations"):
+        arm.step(action)
+    assert np.array_equal(arm.state[:4], START)
+    arm.step(GENTLE)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"state": [0.0, 1.0]}, "4 numbers theta_s"),
+        ({"state": [0.0, np.nan, 0.0, 0.0]}, "4 numbers theta_s"),
+        ({"state": [0.0, 0.0, 1e4, 0.0]}, "at most 6.283, 6.283, 100, 100"),
+        ({"target": [0.0, 1.0, 2.0]}, "2 numbers target_s"),
+        ({"start": START}, "Unknown option 'start'"),
+    ],
+)
+def test_bad_options_are_refused(arm, options, message):
+    with pytest.raises(ValueError, match=message):
+        arm.reset(options=options)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"strength": 0.0}, {"strength": np.nan}, {"accuracy": 1.0}, {"render_mode": "ascii"}],
+)
+def test_bad_arguments_are_refused(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        MuscleArmEnv(**arguments)
+
+
+def test_step_and_render_need_a_reset():
+    env = MuscleArmEnv(render_mode="rgb_array")
+    with pytest.raises(gym.error.ResetNeeded, match="before the first step"):
+        env.step(GENTLE)
+    with pytest.raises(gym.error.ResetNeeded, match="reset"):
+        env.render()
+
+
+@pytest.mark.parametrize("speed", [1e3, 1e9])
+def test_failed_integration_truncates_and_reset_recovers(arm, speed):
+    expected = rollout(start(arm))
+    arm.state[2] = speed  # far beyond what the start may have
+    with pytest.warns(UserWarning, match="failed to integrate the arm from .* reset starts"):
+        observation, reward, terminated, truncated, info = arm.step(GENTLE)
+    assert truncated
+    assert not terminated
+    assert info["integration_failed"]
+    assert np.isfinite(reward)
+    assert observation[2] == np.float32(speed)
+    with pytest.raises(gym.error.ResetNeeded, match="after a failed integration"):
+        arm.step(GENTLE)
+    assert same(rollout(start(arm)), expected)
+
+
+def test_200_random_trials_do_not_fail(arm):
+    arm.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for trial in range(200):
+        arm.reset()
+        for _ in range(3 if trial % 10 else 15):
+            # Half of the trials switch the muscles fully on and off.
+            action = rng.uniform(size=4).round(0 if trial % 2 else 6)
+            observation, _, _, truncated, _ = arm.step(action)
+            assert not truncated
+            assert arm.observation_space.contains(observation)
+
+
+def test_resets_do_not_leak_memory(arm):
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    def trial():
+        arm.reset()
+        arm.step(GENTLE)
+
+    for _ in range(50):
+        trial()
+    before = resident()
+    for _ in range(1000):
+        trial()
+    growth = resident() - before
+    print(f"memory growth over 1,000 trials: {growth / 1e6:.2f} MB")
+    assert growth < 10e6
+
+
+def test_frame_shows_muscles_and_target(arm):
+    env = start(MuscleArmEnv(render_mode="rgb_array"))
+    still = env.render()
+    assert still.shape == (400, 480, 3)
+    assert still.dtype == np.uint8
+
+    def count(frame, colour):
+        return (np.abs(frame.astype(int) - colour).sum(-1) < 60).sum()
+
+    blue, red, green = (31, 79, 130), (204, 77, 77), (44, 140, 68)
+    assert count(still, blue) > 200
+    assert count(still, red) == 0
+    env.step(np.ones(4))
+    assert count(env.render(), red) > 200
+    env.reset(options={"state": START, "target": START[:2]})
+    assert count(env.render(), green) < count(still, green) + 200
+    env.close()
+
+
+def test_nothing_is_printed_and_no_log_is_written(tmp_path):
+    code = (
+        "import sys, gymnasium, gpadjust.envs, numpy as np\n"
+        "assert 'opensim' not in sys.modules\n"
+        "env = gymnasium.make('gpadjust.envs:gpadjust/MuscleArm-v0')\n"
+        "env.reset(seed=0)\n"
+        "env.step(np.full(4, 0.5, dtype=np.float32))\n"
+        "import warnings; warnings.simplefilter('ignore')\n"
+        "env.unwrapped.state[2] = 1e4\n"
+        "assert env.step(np.zeros(4, dtype=np.float32))[3]\n"
+    )
+    run = python(code, tmp_path)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_opensim_only_the_arm_is_missing(tmp_path):
+    code = (
+        "import sys; sys.modules['opensim'] = None\n"
+        "import gpadjust, gpadjust.envs, gymnasium\n"
+        "gpadjust.envs.torque_arm_physics()\n"
+        "makers = [lambda: gymnasium.make('gpadjust/MuscleArm-v0'), "
+        "gpadjust.envs.opensim_arm_physics]\n"
+        "for make in makers:\n"
+        "    try: make()\n"
+        "    except ImportError as error: print(error)\n"
+    )
+    run = python(code, tmp_path)
+    assert run.returncode == 0, run.stderr
+    message = 'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
+    assert run.stdout.splitlines() == [message, message]
+
+
+def test_dyna_sac_learns_on_it():
+    agent = DynaSAC(
+        "MlpPolicy",
+        gym.make(ID),
+        CKADynamics(ARM_SPEC, torque_arm_physics()),
+        arm_reward,
+        model_trials=2,
+        batch_size=16,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+        device="cpu",
+    )
+    agent.learn(total_timesteps=2 * 15)
+    assert agent.num_trials == 2
+    assert agent.replay_buffer.model.size() == 2 * 2 * 15
