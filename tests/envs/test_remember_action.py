@@ -5,6 +5,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 
 from gpadjust.dynamics import CKADynamics, StateSpec
@@ -59,8 +60,7 @@ def test_dyna_sac_learns_with_it():
         return cart_pole_reward(states[..., :4], actions, next_states[..., :4])
 
     def starts(n):
-        start = cart_pole_start(n)
-        return start.new_zeros(n, 5).index_copy_(1, start.new_tensor([0, 1, 2, 3]).long(), start)
+        return torch.cat([cart_pole_start(n), torch.zeros(n, 1, dtype=torch.float64)], -1)
 
     agent = DynaSAC(
         "MlpPolicy",
