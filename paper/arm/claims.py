@@ -45,7 +45,7 @@ class Judge:
     "About" is 1 cm more or less, "beaten" below that. Faster is a lower mean over the evaluations
     of trials 3 to 12; slow, to lose less than 2 cm from trial 12 to 30; as fast, to reach 10 cm no
     later than an evaluation (3 trials) after. The variance is the standard deviation over runs,
-    averaged over evaluations from trial 3. RRA has caught up if its mean of 24 to 30 is no more than
+    averaged over evaluations from trial 3. RRA has caught up if its mean of 24-30 is no more than
     two standard errors of the paired difference above CKA's. Low is at most 10 cm at a target, on
     average over the runs; nearly all, nine in ten; only near the start, less than half, and these
     nearer to where the hand starts than the others on average.

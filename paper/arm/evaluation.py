@@ -22,8 +22,6 @@ ACCURACY = 1e-5  # the environment's
 MAPPED = (9, 30)  # trials after which the errors at each target are kept
 _LOG = "evaluation_log"
 
-Scores = dict[str, list[float]]
-
 
 class Policy(Protocol):
     """What is evaluated."""

@@ -78,9 +78,9 @@ class Targets:
     def _t4(self) -> tuple[bool, str]:
         black_box = self.evaluations[self.evaluations["scenario"] == "cka-opensim"]
         seed = int(black_box["seed"].iloc[0])
-        ends = curve(black_box, "cka-opensim", MEASURE)[LAST]
+        end = curve(black_box[black_box["seed"] == seed], "cka-opensim", MEASURE)[LAST]
         seconds = self._seconds("cka-opensim")["total_seconds"]
-        measured = f"seed {seed}: {ends:.1f} cm at {LAST}, {seconds:.0f} s"
+        measured = f"seed {seed}: {end:.1f} cm at {LAST}, {seconds:.0f} s"
         same = self.evaluations[self.evaluations["seed"] == seed]
         equation = curve(same, "cka", MEASURE).get(LAST)
         if equation is not None:
