@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,8 +30,6 @@ from gpadjust.envs import (
 from gpadjust.physics import Physics
 from paper.control.experiment import Env
 from paper.control.scenario import Scenario, Settings
-
-MakeDynamics = Callable[[StateSpec, Physics], Dynamics]
 
 
 @dataclass(frozen=True, kw_only=True)

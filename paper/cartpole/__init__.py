@@ -19,8 +19,6 @@ from paper.control.figure import draw_iqm, draw_time
 from paper.control.results import tabulate_time
 
 FIGURES = ("curves", "iqm", "time")
-
-
 LABELS = {name: scenario.label for name, scenario in SCENARIOS.items()}
 
 
