@@ -62,7 +62,7 @@ class Judge:
 
     def judge(self) -> list[Claim]:
         """All claims; a claim about what was not run to its end is not judged."""
-        full = self.evaluations[self.evaluations["trial"] == LAST]["scenario"].unique()
+        full = set(self.evaluations[self.evaluations["trial"] == LAST]["scenario"])
         return judged(CLAIMS, full, lambda name: getattr(self, f"_{name.lower()}")())
 
     def _a1(self) -> tuple[Verdict, str]:

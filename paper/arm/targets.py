@@ -35,7 +35,7 @@ class Targets:
 
     def judge(self) -> list[Claim]:
         """All targets; one that needs what was not run to its end is not judged."""
-        full = self.evaluations[self.evaluations["trial"] == LAST]["scenario"].unique()
+        full = set(self.evaluations[self.evaluations["trial"] == LAST]["scenario"])
         return judged(TARGETS, full, self._decide)
 
     def _decide(self, name: str) -> tuple[Verdict, str]:

@@ -40,7 +40,7 @@ class Judge:
 
     def judge(self) -> list[Claim]:
         """All claims; a claim about what was not run to its end is not judged."""
-        full = self.trials[self.trials["trial"] == 50]["scenario"].unique()
+        full = set(self.trials[self.trials["trial"] == 50]["scenario"])
         return judged(CLAIMS, full, lambda name: getattr(self, f"_{name.lower()}")())
 
     def _p1(self) -> tuple[Verdict, str]:

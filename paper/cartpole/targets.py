@@ -44,7 +44,7 @@ class Targets:
 
     def judge(self) -> list[Claim]:
         """All targets; one that needs what was not run to its end is not judged."""
-        full = self.trials[self.trials["trial"] == SETTINGS.num_trials]["scenario"].unique()
+        full = set(self.trials[self.trials["trial"] == SETTINGS.num_trials]["scenario"])
         return judged(TARGETS, full, self._decide)
 
     def _decide(self, name: str) -> tuple[Verdict, str]:
