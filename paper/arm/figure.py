@@ -27,7 +27,7 @@ _WORST = 30.0  # cm, the end of the colours
 def draw_curves(evaluations: pd.DataFrame, path: Path) -> None:
     """Draw the hand's error over the trials, mean and standard deviation of each scenario."""
     names = list(evaluations["scenario"].unique())
-    figure, axes = _panels(names, 2.9, 2.5, sharex=True, sharey=True)
+    figure, axes = _panels(names, 2.9, 2.5)
     backdrop = evaluations[evaluations["scenario"] == BACKDROP].groupby("trial")["all_steps"].mean()
     for ax, name in zip(axes, names, strict=True):
         own = evaluations[evaluations["scenario"] == name]
@@ -59,7 +59,7 @@ def draw_map(maps: pd.DataFrame, path: Path) -> None:
     """Draw the error at each target after trial 9: colour for the mean, size for its spread."""
     maps = maps[maps["trial"] == MAP_TRIAL]
     names = list(maps["scenario"].unique())
-    figure, axes = _panels(names, 2.9, 3.0, sharex=True, sharey=True)
+    figure, axes = _panels(names, 2.9, 2.0)
     targets = 100 * hand_position(arm_targets()).numpy()
     dots = None
     for ax, name in zip(axes, names, strict=True):
@@ -73,8 +73,8 @@ def draw_map(maps: pd.DataFrame, path: Path) -> None:
         ax.set_title(f"{SCENARIOS[name].label} ({own['seed'].nunique()})", loc="left", fontsize=10)
         ax.set_aspect("equal")
         ax.tick_params(labelbottom=True)
-    figure.supxlabel("cm")
-    figure.supylabel("cm")
+    figure.supxlabel("along the upper arm at 0°, cm")
+    figure.supylabel("across, cm")
     if dots is not None:
         label = f"mean RMSE after trial {MAP_TRIAL}, all steps, cm"
         figure.colorbar(dots, ax=axes, label=label, shrink=0.7, extend="max")
@@ -94,15 +94,14 @@ def _draw_arm(ax: Axes) -> None:
     ax.plot(*np.stack([[0, 0], elbow, hand]).T, color="0.7", lw=4, marker="o", ms=5, zorder=1)
 
 
-def _panels(
-    names: list[str], width: float, height: float, sharex: bool, sharey: bool
-) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel for each name, and at least one."""
+def _panels(names: list[str], width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel for each name; sizes in inches."""
     number = max(1, len(names))
     columns = min(_COLUMNS, number)
     rows = math.ceil(number / columns)
-    figure = Figure(figsize=(width * columns, height * rows + 0.8), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)
+    size = (max(9.0, width * columns), height * rows + 0.8)  # as wide as the legend
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for ax in axes.flat[len(names) :]:
         ax.set_visible(False)
     return figure, list(axes.flat[: len(names)])
