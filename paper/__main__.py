@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from paper import cartpole, forrester, multifidelity
+from paper import arm, cartpole, forrester, multifidelity
 from paper.report import report
 
 
@@ -23,6 +23,7 @@ def main() -> None:
     cartpole.add_arguments(
         experiments.add_parser("cartpole", help="learners that swing up a cart-pole")
     )
+    arm.add_arguments(experiments.add_parser("arm", help="learners that reach with a muscle arm"))
     experiments.add_parser(
         "report", help="copy the results that are committed into the READMEs"
     ).set_defaults(run=lambda arguments: report())

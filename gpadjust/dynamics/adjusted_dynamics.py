@@ -55,12 +55,13 @@ class CKADynamics(LearnedDynamics):
 
     Each state's change (or next value) is an independent output
     :math:`f_a = \rho f_p + \delta` of the states that move and the action; integrated states
-    follow from their velocities, exogenous ones stay.
+    follow from their velocities, exogenous ones stay, and previous actions are the action taken.
 
     Args:
         spec: What the entries of states and actions are.
-        physics: The next values of the states that are not exogenous, from these and the actions:
-            columns ``[states, actions]`` in the order of the spec, angles in rad.
+        physics: The next values of the states that are neither exogenous nor previous actions,
+            from these and the actions: columns ``[states, actions]`` in the order of the spec,
+            angles in rad.
         target: What the model learns: the ``"difference"`` of next state and state, of an angle
             the shortest way round, or the next state itself (``"absolute"``). A scaling of an
             absolute position or angle depends on where its origin is; one of a change does not.

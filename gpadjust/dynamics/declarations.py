@@ -1,8 +1,9 @@
-"""Whether states are what a spec declares them to be; the rules are said by `StateSpec`."""
+"""Whether a spec names states properly, and they are what it says; `StateSpec` has the rules."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
@@ -16,6 +17,18 @@ def check_exogenous(name: str, change: Tensor, rounding: Tensor) -> None:
             f"State {name!r} is said to be exogenous, which stays as it is during a trial, but it "
             f"changes by {float(change[row]):.3g} in row {row}. Take it out of `exogenous`, so "
             "that the model predicts it, or leave out transitions from one trial into the next."
+        )
+
+
+def check_previous(name: str, action: str, found: Tensor, taken: Tensor, tolerance: Tensor) -> None:
+    """Raise an error if a state is not the action that was taken, to a tolerance."""
+    wrong = ((found - taken).abs() > tolerance).nonzero()
+    if len(wrong):
+        row = int(wrong[0])
+        raise ValueError(
+            f"State {name!r} is said to hold the previous action {action!r}, but is "
+            f"{float(found[row]):.3g} after the action {float(taken[row]):.3g} in row {row}. Mend "
+            f"`previous`, or take {name!r} out of it, so that the model predicts it."
         )
 
 
@@ -59,3 +72,29 @@ def check_integrated(
         raise ValueError(found)
     if total > 0.5 * way + unavoidable:
         warnings.warn(f"{found} Noisy sensors look the same.", UserWarning, stacklevel=5)
+
+
+def checked_mapping(
+    value: Mapping[str, str], argument: str, other: str, example: dict[str, str]
+) -> dict[str, str]:
+    """The pairs of names that an argument holds, checked."""
+    if not isinstance(value, Mapping):
+        raise TypeError(
+            f"{argument} must map the name of a state to that of {other}, such as {example}; "
+            f"found {value!r}."
+        )
+    for name in (*value.keys(), *value.values()):
+        checked_names([name], argument)
+    return dict(value)
+
+
+def checked_names(value: Sequence[str], argument: str) -> tuple[str, ...]:
+    """The names that an argument holds, checked."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise TypeError(f"{argument} must be a sequence of names; found {value!r}.")
+    for name in value:
+        if not isinstance(name, str):
+            raise TypeError(f"{argument} must hold names, as strings; found {name!r}.")
+    if len(set(value)) < len(value):
+        raise ValueError(f"{argument} must be different names; found {tuple(value)}.")
+    return tuple(value)

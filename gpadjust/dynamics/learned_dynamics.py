@@ -237,7 +237,7 @@ class LearnedDynamics(ModelDynamics):
 
     def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
         data = Transitions.checked(self.spec, states, actions, next_states)
-        self.spec.check_transitions(data.states, data.next_states)
+        self.spec.check_transitions(data.states, data.next_states, data.actions)
         return data
 
     def _identity(self) -> dict[str, str]:

@@ -57,13 +57,13 @@ class ModelDynamics(Dynamics):
         """
         following, variance = self._predict(states, actions, observation_noise)
         return Prediction(
-            self.spec.complete(states, following), self.spec.complete_variance(variance)
+            self.spec.complete(states, actions, following), self.spec.complete_variance(variance)
         )
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """Draw next states, noise included, row by row, from PyTorch's generator."""
         mean, variance = self._predict(states, actions, True)
-        return self.spec.complete(states, mean + variance.sqrt() * torch.randn_like(mean))
+        return self.spec.complete(states, actions, mean + variance.sqrt() * torch.randn_like(mean))
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Draw transition functions from the posterior; without noise.
@@ -90,7 +90,7 @@ class ModelDynamics(Dynamics):
                     f"block for each function, got {tuple(states.shape)}."
                 )
             values = functions.each(self.targets.inputs(states, actions))
-            return self.spec.complete(states, self.targets.decode(states, values))
+            return self.spec.complete(states, actions, self.targets.decode(states, values))
 
         return step
 

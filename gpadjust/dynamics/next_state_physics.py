@@ -30,7 +30,7 @@ def next_values(physics: Physics, inputs: Tensor, num_states: int) -> Tensor:
     if Y.shape[-1] != num_states:
         raise ValueError(
             f"Expected physics {physics.name!r} to return the next values of the {num_states} "
-            f"states that are not exogenous, got {Y.shape[-1]} columns."
+            f"states that are neither exogenous nor previous actions, got {Y.shape[-1]} columns."
         )
     return Y
 

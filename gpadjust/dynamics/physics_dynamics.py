@@ -24,8 +24,8 @@ class PhysicsDynamics(Dynamics):
 
     Args:
         spec: What the entries of states and actions are.
-        physics: The next values of the states that are not exogenous, from these and the actions:
-            columns ``[states, actions]`` in the order of the spec.
+        physics: The next values of the states that are neither exogenous nor previous actions,
+            from these and the actions: columns ``[states, actions]`` in the order of the spec.
 
     Example:
         >>> import torch
@@ -97,4 +97,4 @@ class PhysicsDynamics(Dynamics):
             following[..., moving] = next_values(
                 self.physics, torch.cat([states[..., moving], actions], dim=-1), len(moving)
             )
-        return following
+        return self.spec.remember(following, actions)

@@ -10,7 +10,13 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.declarations import check_exogenous, check_integrated
+from gpadjust.dynamics.declarations import (
+    check_exogenous,
+    check_integrated,
+    check_previous,
+    checked_mapping,
+    checked_names,
+)
 
 
 @dataclass(frozen=True)
@@ -30,9 +36,14 @@ class StateSpec:
         integrated: For states that a model need not predict, the states that are their
             velocities: :math:`q' = q + h (v + v') / 2`.
         step: The time step :math:`h`, in the time unit of the velocities; needed by ``integrated``.
+        previous: For states that hold the previous action, the entries of the action that they
+            will hold next. What a system does may depend on them, as where it follows its actions
+            with a delay: policy and models see them, models need not predict them, and the physics
+            knows nothing of them.
 
     Raises:
-        TypeError: If names are not strings, ``integrated`` is no mapping or ``step`` no number.
+        TypeError: If names are not strings, ``integrated`` or ``previous`` is no mapping or
+            ``step`` no number.
         ValueError: If a name is unknown, repeated, or stands for two things that exclude each
             other, no state is left to predict, or ``step`` is missing or not positive.
 
@@ -50,38 +61,47 @@ class StateSpec:
     exogenous: Sequence[str] = ()
     integrated: Mapping[str, str] = field(default_factory=dict, hash=False)
     step: float | None = None
+    previous: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         """Check the names."""
         for name in ("states", "actions", "angles", "exogenous"):
-            object.__setattr__(self, name, _names(getattr(self, name), name))
-        if not isinstance(self.integrated, Mapping):
-            raise TypeError(
-                "integrated must map the name of a state to that of its velocity, such as "
-                f"{{'x': 'x_dot'}}; found {self.integrated!r}."
-            )
-        for name in (*self.integrated.keys(), *self.integrated.values()):
-            _names([name], "integrated")
-        object.__setattr__(self, "integrated", dict(self.integrated))
+            object.__setattr__(self, name, checked_names(getattr(self, name), name))
+        for name, other, example in (
+            ("integrated", "its velocity", {"x": "x_dot"}),
+            ("previous", "an action", {"last_force": "force"}),
+        ):
+            mapping = checked_mapping(getattr(self, name), name, other, example)
+            object.__setattr__(self, name, mapping)
         for name in ("states", "actions"):
             if not getattr(self, name):
                 raise ValueError(f"{name} must be one or more different names; found none.")
         if self.step is not None and not isinstance(self.step, Real):
             raise TypeError(f"step must be a number or None; found {self.step!r}.")
         named = (*self.angles, *self.exogenous, *self.integrated, *self.integrated.values())
+        named = (*named, *self.previous)
         unknown = [name for name in named if name not in self.states]
         if unknown:
             raise ValueError(f"There is no state {unknown[0]!r}; the states are {self.states}.")
-        fixed = (*self.exogenous, *self.integrated)
+        unknown = [name for name in self.previous.values() if name not in self.actions]
+        if unknown:
+            raise ValueError(
+                f"previous names an action {unknown[0]!r}; the actions are {self.actions}."
+            )
+        fixed = (*self.exogenous, *self.integrated, *self.previous)
         twice = [name for name in fixed if fixed.count(name) > 1]
         twice += [name for name in self.integrated.values() if name in fixed]
+        twice += [name for name in self.angles if name in self.previous]
         if twice:
             raise ValueError(
-                f"State {twice[0]!r} is said to be two things: exogenous, integrated and a "
-                "velocity exclude each other."
+                f"State {twice[0]!r} is said to be two things: exogenous, integrated, a "
+                "velocity and a previous action exclude each other, as do an angle and a previous "
+                "action."
             )
         if set(fixed) == set(self.states):
-            raise ValueError("No state is left to predict; all are exogenous or integrated.")
+            raise ValueError(
+                "No state is left to predict; all are exogenous, integrated or previous actions."
+            )
         if self.integrated and self.step is None:
             raise ValueError("step must be the duration of a step, as some states are integrated.")
         if self.step is not None and not 0 < self.step < math.inf:
@@ -105,13 +125,22 @@ class StateSpec:
 
     @property
     def moving(self) -> list[int]:
-        """The states that are not exogenous: what models and physics read, before the action."""
-        return [i for i, name in enumerate(self.states) if name not in self.exogenous]
+        """The states that the physics reads, before the action, and says the next values of.
+
+        They are those neither exogenous nor previous actions.
+        """
+        still = (*self.exogenous, *self.previous)
+        return [i for i, name in enumerate(self.states) if name not in still]
 
     @property
     def predicted(self) -> list[int]:
-        """The states that a model predicts: neither exogenous nor integrated."""
+        """The states that a model predicts: those that move and are not integrated."""
         return [i for i in self.moving if self.states[i] not in self.integrated]
+
+    @property
+    def previous_columns(self) -> list[int]:
+        """The states that hold previous actions: what models read beside moving ones and action."""
+        return [i for i, name in enumerate(self.states) if name in self.previous]
 
     @property
     def angle_columns(self) -> list[int]:
@@ -144,8 +173,10 @@ class StateSpec:
             change[..., i] = torch.atan2(angle.sin(), angle.cos())
         return change
 
-    def check_transitions(self, states: Tensor, next_states: Tensor) -> None:
-        r"""Check ``exogenous``, ``integrated`` and ``step`` against transitions of the system.
+    def check_transitions(
+        self, states: Tensor, next_states: Tensor, actions: Tensor | None = None
+    ) -> None:
+        r"""Check what is declared against transitions of the system.
 
         An exogenous state may change by no more than the rounding of single precision.
 
@@ -163,12 +194,16 @@ class StateSpec:
         than a tenth if it is sampled six times a period or more. Discrepancies in angles are taken
         the shortest way round.
 
+        A previous action must be the action to a thousandth of the largest of all.
+
         Args:
             states: ``N x state_dim``.
             next_states: ``N x state_dim``.
+            actions: ``N x action_dim``; may be left out if no state is a previous action.
 
         Raises:
             ValueError: If a state is not what it is said to be. It is named, with what was found.
+                If there are previous actions, but no ``actions``.
 
         Warns:
             UserWarning: If an integrated state is far from what its velocity says.
@@ -182,6 +217,8 @@ class StateSpec:
         for name in self.exogenous:
             i = self.states.index(name)
             check_exogenous(name, change[..., i], rounding[..., i])
+        if self.previous:
+            self._check_previous(next_states, actions)
         for name, velocity in self.integrated.items():
             i, v = self.states.index(name), self.states.index(velocity)
             assert self.step is not None, "checked at the start"
@@ -191,10 +228,32 @@ class StateSpec:
             velocities = (states[..., v], next_states[..., v])
             check_integrated(name, velocity, self.step, velocities, discrepancy, rounding[..., i])
 
-    def complete(self, states: Tensor, predicted: Tensor) -> Tensor:
+    def _check_previous(self, next_states: Tensor, actions: Tensor | None) -> None:
+        if actions is None:
+            raise ValueError(
+                f"States {tuple(self.previous)} are said to be previous actions, which cannot be "
+                "checked without actions; pass `actions`."
+            )
+        check_columns(actions, self.action_dim, "actions")
+        scale = actions.abs().amax()
+        for name, action in self.previous.items():
+            found, taken = next_states[..., self.states.index(name)], self._taken(actions, action)
+            check_previous(name, action, found, taken, 1e-3 * scale)
+
+    def _taken(self, actions: Tensor, name: str) -> Tensor:
+        return actions[..., self.actions.index(name)]
+
+    def remember(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Let states ``... x state_dim`` hold these actions as the previous ones, in place."""
+        for name, action in self.previous.items():
+            states[..., self.states.index(name)] = self._taken(actions, action)
+        return states
+
+    def complete(self, states: Tensor, actions: Tensor, predicted: Tensor) -> Tensor:
         """The next states, of which a model knows ``predicted``, ``... x len(spec.predicted)``."""
         following = states.expand(*predicted.shape[:-1], self.state_dim).clone()
         following[..., self.predicted] = predicted
+        self.remember(following, actions)
         for name, velocity in self.integrated.items():
             i, v = self.states.index(name), self.states.index(velocity)
             assert self.step is not None, "checked at the start"
@@ -222,15 +281,3 @@ def check_columns(tensor: Tensor, columns: int, name: str) -> None:
             f"Expected {name} of shape ... x {columns}, as the spec says, got "
             f"{tuple(tensor.shape)}."
         )
-
-
-def _names(value: Sequence[str], argument: str) -> tuple[str, ...]:
-    """The names that an argument holds, checked."""
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise TypeError(f"{argument} must be a sequence of names; found {value!r}.")
-    for name in value:
-        if not isinstance(name, str):
-            raise TypeError(f"{argument} must hold names, as strings; found {name!r}.")
-    if len(set(value)) < len(value):
-        raise ValueError(f"{argument} must be different names; found {tuple(value)}.")
-    return tuple(value)

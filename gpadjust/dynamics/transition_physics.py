@@ -40,9 +40,13 @@ class TransitionTargets:
         self.angles = [moving.index(i) for i in spec.angle_columns if i in moving]
 
     def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The raw inputs of model and physics, ``... x d``: states that move, and actions."""
+        """The raw inputs of a model, ``... x d``: states that move, actions, previous actions.
+
+        The physics reads the first two only.
+        """
         moving = states[..., self.spec.moving]
-        return torch.cat([moving, actions.expand(*moving.shape[:-1], -1)], dim=-1)
+        previous = states[..., self.spec.previous_columns]
+        return torch.cat([moving, actions.expand(*moving.shape[:-1], -1), previous], dim=-1)
 
     def encode(self, states: Tensor, next_states: Tensor) -> Tensor:
         """Targets ``... x m`` of transitions."""
@@ -78,7 +82,8 @@ class TransitionPhysics(Physics):
         targets = self.targets
         num_states = len(targets.spec.moving)
         states = X[:, :num_states]
-        change = next_values(self.physics, X, num_states) - states
+        read = X[:, : num_states + targets.spec.action_dim]
+        change = next_values(self.physics, read, num_states) - states
         columns = []
         for i in targets.predicted:
             column = change[:, i]

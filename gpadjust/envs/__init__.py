@@ -11,6 +11,7 @@ except ImportError as error:
 
 from gpadjust.envs.arm import REAL_ARM, ArmEquation, torque_arm, torque_arm_physics
 from gpadjust.envs.arm_task import (
+    ARM_MEMORY_SPEC,
     ARM_SPEC,
     arm_reward,
     arm_start,
@@ -32,6 +33,7 @@ from gpadjust.envs.cart_pole import (
 from gpadjust.envs.cart_pole_swing_up import CartPoleSwingUpEnv
 from gpadjust.envs.muscle_arm import MuscleArmEnv
 from gpadjust.envs.opensim_arm import opensim_arm_physics
+from gpadjust.envs.remember_action import RememberAction
 
 _gymnasium.register(
     id="gpadjust/CartPoleSwingUp-v0",
@@ -45,6 +47,7 @@ _gymnasium.register(
 )
 
 __all__ = [
+    "ARM_MEMORY_SPEC",
     "ARM_SPEC",
     "CART_POLE_RAW_SPEC",
     "CART_POLE_SPEC",
@@ -54,6 +57,7 @@ __all__ = [
     "CartPoleEquation",
     "CartPoleSwingUpEnv",
     "MuscleArmEnv",
+    "RememberAction",
     "arm_reward",
     "arm_start",
     "arm_targets",

@@ -24,6 +24,17 @@ ARM_SPEC = StateSpec(
 Angles are not encoded: joint limits keep them from going round.
 """
 
+ARM_MEMORY_SPEC = StateSpec(
+    [*ARM_SPEC.states, "a1_last", "a2_last", "a3_last", "a4_last"],
+    actions=ARM_SPEC.actions,
+    exogenous=ARM_SPEC.exogenous,
+    previous={f"{name}_last": name for name in ARM_SPEC.actions},
+)
+"""The state of the reaching arm with the previous action, of ``RememberAction(MuscleArmEnv())``.
+
+Muscles follow their excitations with a delay, so that the next state depends on the previous ones.
+"""
+
 
 def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
     r"""The reward of transitions: minus the root mean square error of the angles, in rad.
@@ -33,7 +44,7 @@ def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
     Args:
         states: ``... x 6``; not used.
         actions: ``... x 4``; not used.
-        next_states: ``... x 6``, the states that were reached.
+        next_states: ``... x 6`` (or more, which is not used), the states that were reached.
 
     Returns:
         ``...``.

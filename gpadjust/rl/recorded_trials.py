@@ -66,13 +66,13 @@ class RecordedTrials:
         return starts[torch.randint(len(starts), (n,))]
 
     def bounds(self) -> Tensor:
-        """Bounds ``2 x state_dim`` far beyond all that was seen; angles and constants have none."""
+        """Bounds ``2 x state_dim`` far beyond what was seen; none of angles, constants, actions."""
         seen = torch.cat([self.states, self.next_states])
         low, high = seen.amin(0), seen.amax(0)
         reach = _REACH * (high - low) / 2
         reach[high == low] = torch.inf  # that it has not moved yet tells nothing
         for i, name in enumerate(self.spec.states):
-            if name in self.spec.angles or name in self.spec.exogenous:
+            if name in (*self.spec.angles, *self.spec.exogenous, *self.spec.previous):
                 reach[i] = torch.inf
         return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
 

@@ -9,60 +9,28 @@ from pathlib import Path
 import pandas as pd
 
 from paper.cartpole.claims import Judge
-from paper.cartpole.figure import draw_curves, draw_iqm, draw_time
-from paper.cartpole.results import MEASURES, WINDOWS, load, tabulate, tabulate_time
-from paper.cartpole.runs import make_tasks, run_all
+from paper.cartpole.figure import FLOOR, FLOOR_LABEL, draw_curves
+from paper.cartpole.results import MEASURES, RMSES, WINDOWS, load, tabulate
+from paper.cartpole.runs import CART_POLE
 from paper.cartpole.scenarios import SCENARIOS, SETTINGS
 from paper.cartpole.targets import Targets
-from paper.options import add_options, check_options
+from paper.control import options
+from paper.control.figure import draw_iqm, draw_time
+from paper.control.results import tabulate_time
 
 FIGURES = ("curves", "iqm", "time")
+LABELS = {name: scenario.label for name, scenario in SCENARIOS.items()}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment to its command line."""
-    add_options(parser, "cartpole", num_runs=10)
-    parser.add_argument(
-        "--scenarios",
-        type=lambda text: tuple(text.split(",")),
-        default=tuple(SCENARIOS),
-        metavar="NAME,...",
-        help=f"learners [{','.join(SCENARIOS)}]",
-    )
-    parser.add_argument(
-        "--backend",
-        choices=("loky", "ray"),
-        default="loky",
-        help="processes on this machine, or on a Ray cluster [loky]",
-    )
-    parser.add_argument(
-        "--only-tables",
-        action="store_true",
-        help="run nothing; make tables and figures of the runs that are there",
-    )
-    parser.set_defaults(run=run)
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Run the experiment; write and print its tables, verdicts and figures."""
-    unknown = [name for name in arguments.scenarios if name not in SCENARIOS]
-    if unknown:
-        raise SystemExit(
-            f"--scenarios: there is no scenario {unknown[0]!r}, but there are "
-            f"{', '.join(SCENARIOS)}"
-        )
-    check_options(arguments)
-    out: Path = arguments.out
-    tasks = make_tasks(arguments.scenarios, arguments.runs, arguments.seed)
-    if not arguments.only_tables:
-        run_all(tasks, out, num_jobs=arguments.jobs, backend=arguments.backend)
-    summarise(out)
+    options.add_arguments(parser, CART_POLE, summarise)
 
 
 def summarise(out: Path) -> None:
     """Write and print tables, verdicts and figures of all the runs in a folder."""
     trials = load(out)
-    table, times, claims = tabulate(trials), tabulate_time(trials), verdicts(trials)
+    table, times, claims = tabulate(trials), tabulate_time(trials, RMSES), verdicts(trials)
     table.to_csv(out / "table.csv", index=False, float_format="%.4g")
     times.to_csv(out / "time.csv", index=False, float_format="%.4g")
     claims.to_csv(out / "claims.csv", index=False)
@@ -74,8 +42,16 @@ def summarise(out: Path) -> None:
     print("\nMean of a run:")
     print(times.to_string(index=False, float_format="%.4g", na_rep="-"))
     draw_curves(trials, SETTINGS.model_until, out / "curves.png")
-    draw_iqm(trials, WINDOWS[1:], out / "iqm.png")
-    draw_time(trials, out / "time.png")
+    draw_iqm(
+        trials,
+        LABELS,
+        {measure: f"{label} actions" for measure, label in MEASURES.items()},
+        {(first, last): f"trials {first}-{last}" for first, last in WINDOWS[1:]},
+        (FLOOR, FLOOR_LABEL),
+        "cost",
+        out / "iqm.png",
+    )
+    draw_time(times, LABELS, out / "time.png")
     print(f"\nFigures: {', '.join(str(out / f'{name}.png') for name in FIGURES)}")
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import pandas as pd
 
-from paper.cartpole.results import behind, curve, first_below
-
-Verdict = Literal["reproduced", "not reproduced", "beaten", "met", "missed", "not run"]
+from paper.control.claims import Claim, Verdict, judged, num_runs, signed
+from paper.control.results import behind, curve, first_below
 
 CLAIMS = {
     "P1": ("model-free reaches 0.5 at trial 30 and touches 0.4 by 50", ("mf",)),
@@ -19,27 +17,6 @@ CLAIMS = {
     "P4": ("Dyna-CKA reaches 0.5 in 6 trials, touches 0.4 after 12, holds to 50", ("cka",)),
     "P5": ("Dyna-RRA fails in 1-25 and catches CKA in 26-50", ("rra-paper", "cka")),
 }
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper or a target of our own, its verdict, and the number behind it."""
-
-    id: str
-    claim: str
-    verdict: Verdict
-    measured: str
-
-
-def num_runs(trials: pd.DataFrame, name: str) -> str:
-    """How many runs of a scenario there are, in words."""
-    runs = trials[trials["scenario"] == name]["seed"].nunique()
-    return f"{runs} run{'' if runs == 1 else 's'}"
-
-
-def signed(value: float, error: float) -> str:
-    """A difference, with its standard error unless that is nan, as it is of a single run."""
-    return f"{value:+.3f}" if math.isnan(error) else f"{value:+.3f} ± {error:.3f}"
 
 
 @dataclass(frozen=True)
@@ -63,15 +40,8 @@ class Judge:
 
     def judge(self) -> list[Claim]:
         """All claims; a claim about what was not run to its end is not judged."""
-        full = self.trials[self.trials["trial"] == 50]["scenario"].unique()
-        claims = []
-        for name, (text, needed) in CLAIMS.items():
-            missing = [scenario for scenario in needed if scenario not in full]
-            if missing:
-                claims.append(Claim(name, text, "not run", f"no results of {missing[0]}"))
-            else:
-                claims.append(Claim(name, text, *getattr(self, f"_{name.lower()}")()))
-        return claims
+        full = set(self.trials[self.trials["trial"] == 50]["scenario"])
+        return judged(CLAIMS, full, lambda name: getattr(self, f"_{name.lower()}")())
 
     def _p1(self) -> tuple[Verdict, str]:
         first, touch = self._first("mf", 0.5), self._first("mf", 0.4)

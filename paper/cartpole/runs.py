@@ -1,187 +1,34 @@
-"""All learners with all seeds, in parallel processes, each resumable."""
+"""The runs of this experiment."""
 
 from __future__ import annotations
 
-import json
-import os
-import platform
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any, Literal
-
-import joblib
-import torch
-from stable_baselines3.common.callbacks import BaseCallback
-from tqdm import tqdm
+from functools import partial
+from typing import Any
 
 from gpadjust.envs import random_cart_pole_physics
-from gpadjust.rl import TrialCheckpoint, resume
-from paper.cartpole.recorder import Recorder, trial_log
-from paper.cartpole.scenarios import (
-    SCENARIOS,
-    SETTINGS,
-    Settings,
-    functions,
-    make_agent,
-    make_dynamics,
-    make_env,
+from gpadjust.rl import DynaSAC
+from paper.cartpole.recorder import CartPoleRecorder
+from paper.cartpole.scenarios import SCENARIOS, SETTINGS, functions, make_dynamics, make_env
+from paper.control import runs
+from paper.control.experiment import Experiment
+
+
+def details(agent: DynaSAC, seed: int) -> dict[str, Any]:
+    """The parameters of f_p, which are random."""
+    return {"physics": vars(random_cart_pole_physics(seed).rhs)}
+
+
+CART_POLE = Experiment(
+    name="cartpole",
+    scenarios=SCENARIOS,
+    settings=SETTINGS,
+    make_env=make_env,
+    make_dynamics=make_dynamics,
+    functions=functions,
+    make_recorder=CartPoleRecorder,
+    details=details,
 )
-
-Backend = Literal["loky", "ray"]
-
-
-def result_path(out: Path, name: str, seed: int) -> Path:
-    """The file of a finished run."""
-    return out / "runs" / f"{name}-{seed}.json"
-
-
-def run_one(
-    name: str,
-    seed: int,
-    out: Path,
-    settings: Settings = SETTINGS,
-    callbacks: Sequence[BaseCallback] = (),
-) -> Path:
-    """Run a scenario with a seed, or go on with it, or do nothing if its result is there.
-
-    Args:
-        name: The scenario.
-        seed: Of f_p, the environment and the learner.
-        out: Folder of the results. The state of an unfinished run lies in ``out/unfinished``.
-        settings: The shared settings.
-        callbacks: Further callbacks.
-
-    Returns:
-        The path of the result, a JSON file.
-
-    Raises:
-        ValueError: If there is no such scenario, or what lies in ``out`` is of other settings.
-    """
-    if name not in SCENARIOS:
-        raise ValueError(f"There is no scenario {name!r}; there are {', '.join(SCENARIOS)}.")
-    torch.set_num_threads(1)
-    scenario = SCENARIOS[name]
-    path = result_path(out, name, seed)
-    described = _described(name, settings)
-    if path.exists():
-        _check(path, json.loads(path.read_text())["settings"], described)
-        return path
-    unfinished = out / "unfinished" / f"{name}-{seed}.ckpt"
-    if unfinished.exists():
-        agent = resume(
-            unfinished,
-            make_env(scenario),
-            dynamics=make_dynamics(scenario, seed),
-            **functions(),
-        )
-        _check(unfinished, vars(agent)["described"], described)
-    else:
-        agent = make_agent(scenario, seed, settings)
-        vars(agent)["described"] = described
-    steps = settings.num_trials * settings.trial_length - agent.num_timesteps
-    agent.learn(
-        steps,
-        callback=[Recorder(scenario, settings), *callbacks, TrialCheckpoint(unfinished)],
-        log_interval=settings.num_trials + 1,  # nothing is shown
-        reset_num_timesteps=False,
-    )
-    trials = trial_log(agent)
-    physics = random_cart_pole_physics(seed).rhs
-    result = {
-        "scenario": name,
-        "seed": seed,
-        "settings": described,
-        "physics": _rounded(vars(physics)),
-        "versions": {"python": platform.python_version(), "torch": torch.__version__},
-        "trials": {key: [_rounded(trial[key]) for trial in trials] for key in trials[0]},
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(result, separators=(",", ":")) + "\n")
-    os.replace(temporary, path)
-    unfinished.unlink()
-    return path
-
-
-def run_all(
-    tasks: Sequence[tuple[str, int]],
-    out: Path,
-    *,
-    num_jobs: int,
-    backend: Backend = "loky",
-    settings: Settings = SETTINGS,
-) -> None:
-    """Run the tasks, pairs of scenario and seed, that have no result yet."""
-    missing = [task for task in tasks if not result_path(out, *task).exists()]
-    for name, seed in (task for task in tasks if task not in missing):
-        run_one(name, seed, out, settings)  # checks its settings
-    calls = (joblib.delayed(run_one)(*task, out.absolute(), settings) for task in missing)
-    with _backend(backend):
-        if backend == "ray":  # which cannot return results one by one
-            joblib.Parallel(n_jobs=num_jobs, batch_size=1, verbose=10)(calls)
-            return
-        parallel = joblib.Parallel(n_jobs=num_jobs, return_as="generator_unordered", batch_size=1)
-        progress = tqdm(
-            parallel(calls), total=len(tasks), initial=len(tasks) - len(missing), unit="run"
-        )
-        for path in progress:
-            progress.set_postfix_str(path.stem)
-
-
-def make_tasks(names: Sequence[str], num_runs: int, first_seed: int) -> list[tuple[str, int]]:
-    """Pairs of scenario and seed, seed by seed, so that what is done first can be compared."""
-    return [
-        (name, first_seed + i)
-        for i in range(num_runs)
-        for name in names
-        if i < (SCENARIOS[name].max_runs or num_runs)
-    ]
-
-
-@contextmanager
-def _backend(name: Backend) -> Iterator[None]:
-    """Choose joblib's backend; Ray's uses the cluster that is running, or starts a local one."""
-    if name == "ray":
-        try:
-            from ray.util.joblib import register_ray
-        except ImportError as error:
-            raise SystemExit(
-                "--backend ray needs Ray; install it with `pip install gpadjust[ray]`"
-            ) from error
-        register_ray()
-    with joblib.parallel_config(backend=name):
-        yield
-
-
-def _described(name: str, settings: Settings) -> dict[str, Any]:
-    """The settings of a run, as JSON has them."""
-    scenario = SCENARIOS[name]
-    values = asdict(settings)
-    if scenario.model_updates is not None:
-        values["model_updates"] = scenario.model_updates
-    if scenario.updates is not None:
-        values["updates"] = scenario.updates
-    described: dict[str, Any] = json.loads(json.dumps(values))
-    return described
-
-
-def _check(path: Path, found: dict[str, Any], expected: dict[str, Any]) -> None:
-    if found != expected:
-        differ = [k for k in {**found, **expected} if found.get(k) != expected.get(k)]
-        raise ValueError(
-            f"{path} was made with other settings: {differ[0]} was {found.get(differ[0])} and is "
-            f"now {expected.get(differ[0])}. Remove it, or choose another --out."
-        )
-
-
-def _rounded(value: Any) -> Any:
-    """Five significant digits of numbers, also in lists and dictionaries."""
-    if isinstance(value, float):
-        return float(f"{value:.5g}")
-    if isinstance(value, list):
-        return [_rounded(entry) for entry in value]
-    if isinstance(value, dict):
-        return {key: _rounded(entry) for key, entry in value.items()}
-    return value
+make_agent = CART_POLE.make_agent
+run_one = partial(runs.run_one, CART_POLE)
+run_all = partial(runs.run_all, CART_POLE)
+make_tasks = partial(runs.make_tasks, CART_POLE)

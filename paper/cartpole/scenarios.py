@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
 from gpadjust.dynamics import (
     CKADynamics,
@@ -27,62 +25,34 @@ from gpadjust.envs import (
 )
 from gpadjust.envs.cart_pole import REAL_CART_POLE
 from gpadjust.physics import ODEPhysics
-from gpadjust.rl import DynaSAC
+from paper.control.experiment import Env
+from paper.control.scenario import Scenario, Settings
 
-Env = gym.Env[np.ndarray, np.ndarray]
-MakeDynamics = Callable[[ODEPhysics], Dynamics]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is the same in every scenario, unless it says otherwise."""
-
-    num_trials: int = 50
-    trial_length: int = 25
-    model_trials: int = 20  # after each of the first model_until trials
-    model_until: int = 25
-    model_updates: float = 2  # gradient steps for each step in the model
-    num_particles: int = 5
-    later_updates: int = 100  # gradient steps after each trial after model_until
-    learning_rate: float = 3e-3
-    gamma: float = 0.95
-    tau: float = 0.02
-    batch_size: int = 256
-    net_arch: tuple[int, ...] = (128, 128)
-    ent_coef: str = "auto_0.3"
-    target_entropy: str | float = "auto"
-
-    def matched_updates(self) -> int:
-        """The updates that a scenario with a model makes after each trial until model_until."""
-        steps = self.trial_length
-        return round(steps + self.model_updates * self.model_trials * steps)
-
-
-SETTINGS = Settings()
+SETTINGS = Settings(
+    num_trials=50,
+    trial_length=25,
+    model_trials=20,
+    model_until=25,
+    model_updates=2,
+    num_particles=5,
+    later_updates=100,
+    learning_rate=3e-3,
+    gamma=0.95,
+    tau=0.02,
+    batch_size=256,
+    net_arch=(128, 128),
+    ent_coef="auto_0.3",
+    target_entropy="auto",
+)
 MODEL_FREE_UPDATES = 500  # per trial: what serves a model-free learner best
 SUBSET = 5  # seeds of the scenarios that are beside the point
 
 
 @dataclass(frozen=True)
-class Scenario:
-    """A learner.
+class CartPoleScenario(Scenario):
+    """A learner; ``encode_angle`` says whether its policy sees sine and cosine of the angle."""
 
-    Args:
-        label: Its name in tables and figures.
-        dynamics: Makes the model, given f_p; None for a model-free learner.
-        encode_angle: Whether the policy sees sine and cosine of the angle.
-        model_updates: In place of the shared number.
-        updates: Of a model-free learner, the gradient steps after each of all trials. Default:
-            as many as the others make.
-        max_runs: The most seeds that it is run with.
-    """
-
-    label: str
-    dynamics: MakeDynamics | None
     encode_angle: bool = True
-    model_updates: float | None = None
-    updates: int | None = None
-    max_runs: int | None = None
 
 
 def _oracle(physics: ODEPhysics) -> Dynamics:
@@ -94,35 +64,37 @@ def _cka(physics: ODEPhysics) -> Dynamics:
 
 
 SCENARIOS = {
-    "mf": Scenario("model-free", None),
-    "mf-best": Scenario("model-free, best", None, updates=MODEL_FREE_UPDATES),
-    "phy": Scenario("Dyna-Phy", lambda f_p: PhysicsDynamics(CART_POLE_SPEC, f_p)),
-    "gp": Scenario("Dyna-GP", lambda f_p: GPDynamics(CART_POLE_SPEC)),
-    "gp-paper": Scenario(
+    "mf": CartPoleScenario("model-free", None),
+    "mf-best": CartPoleScenario("model-free, best", None, updates=MODEL_FREE_UPDATES),
+    "phy": CartPoleScenario("Dyna-Phy", lambda f_p: PhysicsDynamics(CART_POLE_SPEC, f_p)),
+    "gp": CartPoleScenario("Dyna-GP", lambda f_p: GPDynamics(CART_POLE_SPEC)),
+    "gp-paper": CartPoleScenario(
         "Dyna-GP, paper",
         lambda f_p: GPDynamics(CART_POLE_RAW_SPEC, target="absolute"),
         encode_angle=False,
     ),
-    "cka": Scenario("Dyna-CKA", _cka),
-    "rra": Scenario("Dyna-RRA", lambda f_p: RRADynamics(CART_POLE_SPEC, f_p)),
-    "rra-paper": Scenario(
+    "cka": CartPoleScenario("Dyna-CKA", _cka),
+    "rra": CartPoleScenario("Dyna-RRA", lambda f_p: RRADynamics(CART_POLE_SPEC, f_p)),
+    "rra-paper": CartPoleScenario(
         "Dyna-RRA, paper",
         lambda f_p: RRADynamics(CART_POLE_SPEC, f_p, prior="paper", target="absolute"),
     ),
-    "oracle": Scenario("oracle", _oracle),
-    "gp-absolute": Scenario(
+    "oracle": CartPoleScenario("oracle", _oracle),
+    "gp-absolute": CartPoleScenario(
         "Dyna-GP, absolute",
         lambda f_p: GPDynamics(CART_POLE_SPEC, target="absolute"),
         max_runs=SUBSET,
     ),
-    "cka-absolute": Scenario(
+    "cka-absolute": CartPoleScenario(
         "Dyna-CKA, absolute",
         lambda f_p: CKADynamics(CART_POLE_SPEC, f_p, target="absolute"),
         max_runs=SUBSET,
     ),
-    "cka-1": Scenario("Dyna-CKA, 1 update a step", _cka, model_updates=1, max_runs=SUBSET),
-    "cka-4": Scenario("Dyna-CKA, 4 updates a step", _cka, model_updates=4, max_runs=SUBSET),
-    "oracle-4": Scenario("oracle, 4 updates a step", _oracle, model_updates=4, max_runs=SUBSET),
+    "cka-1": CartPoleScenario("Dyna-CKA, 1 update a step", _cka, model_updates=1, max_runs=SUBSET),
+    "cka-4": CartPoleScenario("Dyna-CKA, 4 updates a step", _cka, model_updates=4, max_runs=SUBSET),
+    "oracle-4": CartPoleScenario(
+        "oracle, 4 updates a step", _oracle, model_updates=4, max_runs=SUBSET
+    ),
 }
 
 
@@ -133,14 +105,14 @@ def true_dynamics(encode_angle: bool) -> PhysicsDynamics:
     return PhysicsDynamics(CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC, physics)
 
 
-def make_env(scenario: Scenario) -> Env:
+def make_env(scenario: CartPoleScenario, settings: Settings) -> Env:
     """The real system; an environment that can be pickled."""
     return gym.wrappers.TimeLimit(
-        CartPoleSwingUpEnv(encode_angle=scenario.encode_angle), SETTINGS.trial_length
+        CartPoleSwingUpEnv(encode_angle=scenario.encode_angle), settings.trial_length
     )
 
 
-def make_dynamics(scenario: Scenario, seed: int) -> Dynamics:
+def make_dynamics(scenario: CartPoleScenario, seed: int, settings: Settings = SETTINGS) -> Dynamics:
     """The model. All scenarios of a seed have the same f_p; a model-free one does not use it."""
     physics = random_cart_pole_physics(seed)
     if scenario.dynamics is None:
@@ -148,45 +120,6 @@ def make_dynamics(scenario: Scenario, seed: int) -> Dynamics:
     return scenario.dynamics(physics)
 
 
-def functions() -> dict[str, Any]:
+def functions(scenario: CartPoleScenario) -> dict[str, Any]:
     """The known functions, which checkpoints do not hold."""
     return {"reward": cart_pole_reward, "initial_states": cart_pole_start}
-
-
-def make_agent(scenario: Scenario, seed: int, settings: Settings) -> DynaSAC:
-    """The learner, at its start."""
-    chosen = scenario.model_updates
-    return DynaSAC(
-        "MlpPolicy",
-        make_env(scenario),
-        dynamics=make_dynamics(scenario, seed),
-        **functions(),
-        model_trials=settings.model_trials,
-        model_updates=settings.model_updates if chosen is None else chosen,
-        model_until=0 if scenario.dynamics is None else settings.model_until,
-        trial_length=settings.trial_length,
-        num_particles=settings.num_particles,
-        learning_rate=settings.learning_rate,
-        gamma=settings.gamma,
-        tau=settings.tau,
-        batch_size=settings.batch_size,
-        ent_coef=settings.ent_coef,
-        target_entropy=settings.target_entropy,
-        policy_kwargs={
-            "net_arch": list(settings.net_arch),
-            "optimizer_kwargs": {"fused": True},
-        },
-        device="cpu",
-        seed=seed,
-    )
-
-
-def updates_on_trial(scenario: Scenario, settings: Settings, trial: int) -> int:
-    """Gradient steps after this real trial (from 1), without those within the model."""
-    if scenario.dynamics is None and scenario.updates is not None:
-        return scenario.updates
-    if trial > settings.model_until:
-        return settings.later_updates
-    if scenario.dynamics is None:
-        return settings.matched_updates()
-    return settings.trial_length

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import pandas as pd
 
 from gpadjust.envs.cart_pole import TIME_STEP
-from paper.cartpole.claims import Claim, Verdict, num_runs
-from paper.cartpole.results import PARTS, curve, first_below, window
 from paper.cartpole.scenarios import SCENARIOS, SETTINGS
+from paper.control.claims import Claim, Verdict, judged, num_runs
+from paper.control.results import PARTS, curve, first_below, window
 
 TARGETS = {
     "T1": ("Dyna-CKA's mean cost is at most 0.5 at trial 6 or before", ("cka",)),
@@ -44,17 +44,12 @@ class Targets:
 
     def judge(self) -> list[Claim]:
         """All targets; one that needs what was not run to its end is not judged."""
-        full = self.trials[self.trials["trial"] == SETTINGS.num_trials]["scenario"].unique()
-        claims = []
-        for name, (text, needed) in TARGETS.items():
-            missing = [scenario for scenario in needed if scenario not in full]
-            if missing:
-                claims.append(Claim(name, text, "not run", f"no results of {missing[0]}"))
-                continue
-            met, measured = getattr(self, f"_{name.lower()}")()
-            verdict: Verdict = "met" if met else "missed"
-            claims.append(Claim(name, text, verdict, measured))
-        return claims
+        full = set(self.trials[self.trials["trial"] == SETTINGS.num_trials]["scenario"])
+        return judged(TARGETS, full, self._decide)
+
+    def _decide(self, name: str) -> tuple[Verdict, str]:
+        met, measured = getattr(self, f"_{name.lower()}")()
+        return ("met" if met else "missed"), measured
 
     def _t1(self) -> tuple[bool, str]:
         by_trial = curve(self.trials, "cka", self.measure)

@@ -19,6 +19,9 @@ ARM = StateSpec(
 )
 
 
+MEMORY = StateSpec(["last", "x", "goal"], ["b", "a"], exogenous=["goal"], previous={"last": "a"})
+
+
 def swing(num_steps, step=0.1, rate=2.0, goal=0.3):
     """A pendulum's states at equal times: goal, angle and its velocity."""
     t = step * torch.arange(num_steps + 1, dtype=torch.float64)
@@ -73,6 +76,12 @@ def test_equal_specs_are_equal_and_hashable():
         ({"integrated": ["x"]}, TypeError, r"such as {'x': 'x_dot'}; found \['x'\]"),
         ({"integrated": {"x": "v"}}, ValueError, "step must be the duration of a step"),
         ({"integrated": {"x": 2}, "step": 0.1}, TypeError, "as strings; found 2"),
+        ({"previous": ["x"]}, TypeError, r"such as {'last_force': 'force'}; found \['x'\]"),
+        ({"previous": {"y": "a"}}, ValueError, "There is no state 'y'"),
+        ({"previous": {"x": "b"}}, ValueError, r"an action 'b'; the actions are \('a',\)"),
+        ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' is said to be two things"),
+        ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is said to be two things"),
+        ({"previous": {"x": "a", "v": "a"}}, ValueError, "No state is left to predict"),
         ({"step": "fast"}, TypeError, "step must be a number or None; found 'fast'"),
         ({"step": 0}, ValueError, "step must be positive and finite; found 0"),
         ({"step": math.inf}, ValueError, "step must be positive and finite; found inf"),
@@ -132,3 +141,28 @@ def test_noise_in_motion_passes_and_at_rest_is_no_error():
     ARM.check_transitions(states + noise[0], following + noise[1])
     with pytest.warns(UserWarning, match="Noisy sensors look the same"):
         ARM.check_transitions(noise[0], noise[1])
+
+
+# Previous actions
+
+
+def test_previous_actions_are_neither_moved_nor_predicted():
+    assert MEMORY.moving == MEMORY.predicted == [1]
+    assert MEMORY.previous_columns == [0]
+    states, actions = torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([[4.0, 5.0]])
+    following = MEMORY.complete(states, actions, torch.tensor([[0.9]]))
+    assert torch.equal(following, torch.tensor([[5.0, 0.9, 0.3]]))
+    variance = MEMORY.complete_variance(torch.tensor([[0.5]]))
+    assert torch.equal(variance, torch.tensor([[0.0, 0.5, 0.0]]))
+
+
+def test_what_is_no_previous_action_is_named():
+    generator = torch.Generator().manual_seed(0)
+    states, actions = torch.rand(5, 3, generator=generator), torch.rand(5, 2, generator=generator)
+    following = MEMORY.complete(states, actions, states[:, 1:2])
+    MEMORY.check_transitions(states, following + 1e-7 * (following == actions[:, 1:]), actions)
+    following[3, 0] += 0.1
+    with pytest.raises(ValueError, match=r"'last' .* previous action 'a', but is .* in row 3"):
+        MEMORY.check_transitions(states, following, actions)
+    with pytest.raises(ValueError, match="without actions; pass `actions`"):
+        MEMORY.check_transitions(states, following)

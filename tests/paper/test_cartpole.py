@@ -14,17 +14,18 @@ from paper import report
 from paper.cartpole import summarise
 from paper.cartpole.claims import Judge
 from paper.cartpole.recorder import evaluate, fixed_starts
-from paper.cartpole.results import behind, first_below, holds_from, load, tabulate, window
-from paper.cartpole.runs import make_tasks, result_path, run_all, run_one
+from paper.cartpole.results import holds_from, load, tabulate
+from paper.cartpole.runs import make_agent, make_tasks, run_all, run_one
 from paper.cartpole.scenarios import (
     SCENARIOS,
     SETTINGS,
     SUBSET,
-    make_agent,
     make_dynamics,
-    updates_on_trial,
 )
 from paper.cartpole.targets import Targets
+from paper.control.results import behind, first_below, window
+from paper.control.runs import result_path
+from paper.control.scenario import updates_on_trial
 
 TINY = replace(
     SETTINGS, num_trials=3, model_trials=2, model_until=2, later_updates=5, batch_size=16

@@ -1,0 +1,73 @@
+"""Observations that hold the previous action."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+class RememberAction(gym.Wrapper[Array, Array, Array, Array]):
+    """Appends the action that was taken last to the observation; zeros at the start of an episode.
+
+    Where a system follows its actions with a delay that the observation does not show, such as the
+    activation of muscles, the next observation depends on earlier actions. The last one says much
+    of what is hidden. A :class:`~gpadjust.dynamics.StateSpec` declares it in ``previous``.
+
+    Args:
+        env: An environment whose observations and actions are boxes of one dimension; zero is an
+            action.
+
+    Raises:
+        ValueError: If they are not.
+
+    Example:
+        >>> import gymnasium
+        >>> from gpadjust.envs import RememberAction
+        >>> env = RememberAction(gymnasium.make("gpadjust/CartPoleSwingUp-v0"))
+        >>> _ = env.reset(seed=0)
+        >>> observation, *_ = env.step(np.array([3.0], dtype=np.float32))
+        >>> observation[-1]
+        np.float32(3.0)
+    """
+
+    def __init__(self, env: gym.Env[Array, Array]) -> None:
+        super().__init__(env)
+        seen, taken = env.observation_space, env.action_space
+        for name, space in (("observation", seen), ("action", taken)):
+            if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+                raise ValueError(
+                    f"RememberAction needs an {name} space that is a Box of one dimension; found "
+                    f"{space}. Put gymnasium.wrappers.FlattenObservation or RescaleAction inside."
+                )
+        assert isinstance(seen, gym.spaces.Box), "checked above"
+        assert isinstance(taken, gym.spaces.Box), "checked above"
+        self._start = np.zeros(taken.shape, dtype=np.float32)
+        if not taken.contains(self._start.astype(taken.dtype)):
+            raise ValueError(
+                f"RememberAction starts from the action zero, which is not in {taken}. Put "
+                "gymnasium.wrappers.RescaleAction inside."
+            )
+        self.observation_space = gym.spaces.Box(
+            np.concatenate([seen.low, taken.low]).astype(np.float32),
+            np.concatenate([seen.high, taken.high]).astype(np.float32),
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode; its first observation ends with zeros."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._extended(observation, self._start), info
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Take an action; the observation ends with it."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._extended(observation, action), float(reward), terminated, truncated, info
+
+    def _extended(self, observation: Array, action: Array) -> Array:
+        return np.concatenate([observation, action]).astype(np.float32)

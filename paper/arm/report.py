@@ -1,0 +1,81 @@
+"""What the READMEs show of this experiment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+
+from paper.arm.results import MEASURES, RMSES, SHOWN, THRESHOLDS
+from paper.arm.runs import ARM
+from paper.arm.scenarios import SCENARIOS
+from paper.control.report import (
+    claims_table,
+    describe_settings,
+    describe_updates,
+    interval,
+    model_table,
+    numbers,
+    paired,
+)
+from paper.markdown import NOT_RUN, markdown
+
+NAMES = ("curves", "iqm", "map", "seconds", "all", "last", "claims", "targets", "time", "model")
+
+
+def fragments(folder: Path) -> dict[str, str]:
+    """The settings of the arm as they stand, and its results if there are any."""
+    found = {"arm:settings": describe_settings(ARM), "arm:updates": describe_updates(ARM)}
+    if not (folder / "table.csv").exists():
+        return found | {f"arm:{name}": NOT_RUN for name in NAMES}
+    table, times, claims = (pd.read_csv(folder / f"{n}.csv") for n in ("table", "time", "claims"))
+    for name, figure, caption in (
+        ("curves", "curves", "Error over the trials; the number of runs is in brackets"),
+        ("iqm", "iqm", "Interquartile means of the error; the number of runs is in brackets"),
+        ("map", "map", "Error at each target after trial 9; the number of runs is in brackets"),
+        ("seconds", "time", "Seconds of a run"),
+    ):
+        found[f"arm:{name}"] = f"![{caption}](results/arm/{figure}.png)"
+    for name, steps in zip(("all", "last"), MEASURES.values(), strict=True):
+        found[f"arm:{name}"] = _errors(table[table["steps"] == steps])
+    ours = claims["id"].str.startswith("T")
+    parts = {steps: steps for steps in MEASURES.values()}
+    found["arm:claims"] = claims_table(claims[~ours], "claim", "steps", parts)
+    found["arm:targets"] = claims_table(
+        claims[ours], "target", "steps", {MEASURES["all_steps"]: ""}
+    )
+    times = times.set_index(times["scenario"].map(lambda name: SCENARIOS[name].label))
+    parts = {
+        "fit_seconds": "fits, s",
+        "rollout_seconds": "model steps, s",
+        "sac_seconds": "updates, s",
+        "evaluation_seconds": "evaluations, s",
+        "total_seconds": "all, s",
+        "updates": "updates",
+    }
+    found["arm:time"] = numbers(times[list(parts)], ["mean of a run", *parts.values()], "{:.0f}")
+    errors = ("theta_s, rad", "theta_e, rad", "theta_s', rad/s", "theta_e', rad/s")
+    found["arm:model"] = model_table(times, RMSES, errors)
+    return found
+
+
+def _errors(table: pd.DataFrame) -> str:
+    header = ["", "runs", *(f"at {trial}" for trial in SHOWN), "sd of runs"]
+    header += ["IQM at 30 (95 %)", "100 targets, at 30", "3-9, less Dyna-CKA's"]
+    header += ["24-30, less Dyna-CKA's", *(f"first at {t}" for t in THRESHOLDS)]
+    rows = []
+    for row in table.to_dict("records"):
+        values = [*(row[f"at_{trial}"] for trial in SHOWN), row["sd"]]
+        firsts = [row[f"first_{t}"] for t in THRESHOLDS]
+        rows.append(
+            [
+                SCENARIOS[row["scenario"]].label,
+                f"{row['runs']}",
+                *("" if pd.isna(value) else f"{value:.1f}" for value in values),
+                "" if pd.isna(row["iqm"]) else interval(row, 1),
+                "" if pd.isna(row["hundred"]) else f"{row['hundred']:.1f}",
+                *(paired(row, f"behind_{trials}", 1) for trials in ("3_9", "24_30")),
+                *("never" if pd.isna(first) else f"{first:.0f}" for first in firsts),
+            ]
+        )
+    return markdown(header, rows)

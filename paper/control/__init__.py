@@ -1,0 +1,1 @@
+"""What the control experiments share: learners, resumable runs, records and summaries."""

@@ -1,0 +1,154 @@
+"""The results of the runs that there are, and how they are summarised."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rliable import metrics
+from rliable.library import get_interval_estimates
+
+PARTS = ("fit", "rollout", "sac")
+REFERENCE = "cka"  # which the others are compared with, seed by seed
+FEWEST = 4  # runs that a bootstrap interval is given of
+_BOOTSTRAPS = 1000
+
+
+def results(out: Path, scenarios: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """What the files of all finished runs of some scenarios hold.
+
+    Raises:
+        FileNotFoundError: If there is none.
+    """
+    found = False
+    for path in (out / "runs").glob("*.json"):
+        result = json.loads(path.read_text())
+        if result["scenario"] in scenarios:
+            found = True
+            yield result
+    if not found:
+        raise FileNotFoundError(f"There are no results in {out / 'runs'}.")
+
+
+def load_trials(out: Path, scenarios: Sequence[str], rmses: Sequence[str]) -> pd.DataFrame:
+    """The records of all finished runs: a row for each scenario, seed and trial (from 1).
+
+    The model's errors stand in a column for each state, ``rmses``.
+    """
+    frames = []
+    for result in results(out, scenarios):
+        frame = pd.DataFrame(result["trials"])
+        frame.insert(0, "trial", np.arange(len(frame)) + 1)
+        errors = [found or [np.nan] * len(rmses) for found in frame.pop("rmse")]
+        frame[list(rmses)] = np.array(errors, dtype=float)
+        frames.append(of_run(frame.astype({"nlpd": float, "coverage": float}), result))
+    return in_order(frames, scenarios)
+
+
+def of_run(frame: pd.DataFrame, result: dict[str, Any]) -> pd.DataFrame:
+    """Say in a table of whose run it is; the table itself is changed."""
+    frame.insert(0, "scenario", result["scenario"])
+    frame.insert(1, "seed", result["seed"])
+    return frame
+
+
+def in_order(frames: Sequence[pd.DataFrame], scenarios: Sequence[str]) -> pd.DataFrame:
+    """Tables as one, sorted by scenario (as listed), seed and trial."""
+    rank = list(scenarios).index
+    return (
+        pd.concat(frames)
+        .sort_values(
+            ["scenario", "seed", "trial"],
+            key=lambda c: c.map(rank) if c.name == "scenario" else c,
+            kind="stable",
+        )
+        .reset_index(drop=True)
+    )
+
+
+def curve(trials: pd.DataFrame, name: str, measure: str) -> pd.Series[float]:
+    """The mean of a measure over the runs of a scenario, by trial."""
+    return trials[trials["scenario"] == name].groupby("trial")[measure].mean()
+
+
+def window(
+    trials: pd.DataFrame, name: str, measure: str, first: int, last: int
+) -> pd.Series[float]:
+    """The mean of a measure over some trials of a scenario, by seed."""
+    chosen = trials[(trials["scenario"] == name) & trials["trial"].between(first, last)]
+    return chosen.groupby("seed")[measure].mean()
+
+
+def first_below(curve: pd.Series[float], threshold: float) -> int | None:
+    """The first trial at which a curve is not above a threshold."""
+    below = curve.index[curve <= threshold]
+    return int(below[0]) if len(below) else None
+
+
+def behind(
+    trials: pd.DataFrame, name: str, measure: str, first: int, last: int
+) -> tuple[float, float]:
+    """How much more a scenario costs than Dyna-CKA with the same seeds: mean, standard error."""
+    own, others = (window(trials, n, measure, first, last) for n in (name, REFERENCE))
+    more = (own - others).dropna()
+    return float(more.mean()), float(more.sem()) if len(more) > 1 else np.nan
+
+
+def compared(
+    trials: pd.DataFrame, name: str, measure: str, windows: Sequence[tuple[int, int]]
+) -> dict[str, float]:
+    """How far behind Dyna-CKA a scenario is, which is not said of Dyna-CKA itself."""
+    columns: dict[str, float] = {}
+    for first, last in windows:
+        found = (np.nan, np.nan)
+        if name != REFERENCE:
+            found = behind(trials, name, measure, first, last)
+        columns |= dict(
+            zip((f"behind_{first}_{last}", f"behind_{first}_{last}_se"), found, strict=True)
+        )
+    return columns
+
+
+def iqm(scores: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Interquartile means of runs, with the 95 % bootstrap intervals of rliable.
+
+    Of fewer than ``FEWEST`` runs an interval says nothing, and is nan.
+    """
+    runs = {name: values.reshape(-1, 1) for name, values in scores.items()}
+    with warnings.catch_warnings():
+        # arch, below rliable, renames the seed's argument, which rliable does not know yet.
+        warnings.filterwarnings("ignore", message="random_state is deprecated")
+        points, intervals = get_interval_estimates(
+            runs,
+            lambda x: np.array([metrics.aggregate_iqm(x)]),
+            reps=_BOOTSTRAPS,
+            random_state=np.random.RandomState(0),
+        )
+    return (
+        {name: float(value[0]) for name, value in points.items()},
+        {
+            name: value[:, 0] if len(scores[name]) >= FEWEST else np.full(2, np.nan)
+            for name, value in intervals.items()
+        },
+    )
+
+
+def tabulate_time(trials: pd.DataFrame, rmses: Sequence[str]) -> pd.DataFrame:
+    """Mean seconds of a run in each part, its updates, and how well the model foresaw trials.
+
+    Scores are over the trials from the second, which is the first that a learnt model foresees.
+    """
+    trials = trials.assign(total_seconds=sum(trials[f"{part}_seconds"] for part in PARTS))
+    sums = [*(f"{part}_seconds" for part in PARTS), "total_seconds", "updates", "left_bounds"]
+    by_run = trials.groupby(["scenario", "seed"], sort=False)[sums].sum()
+    table = by_run.groupby("scenario", sort=False).mean()
+    scores = trials[trials["trial"] > 1].groupby("scenario", sort=False)
+    table["nlpd_median"] = scores["nlpd"].median()
+    table["coverage"] = scores["coverage"].mean()
+    table[list(rmses)] = scores[list(rmses)].median()
+    return table.reset_index()
