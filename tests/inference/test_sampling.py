@@ -149,6 +149,7 @@ def logs(result):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The chains")  # the effective sample sizes are allowed for
 def test_hmc_and_nuts_agree(XY):
     marginals, sizes = [], []
     for method, num_samples in (("hmc", 1600), ("nuts", 600)):
