@@ -68,7 +68,14 @@ def draw_map(maps: pd.DataFrame, path: Path) -> None:
         mean, sd = by_target.mean().to_numpy(), by_target.std().fillna(0).to_numpy()
         _draw_arm(ax)
         dots = ax.scatter(
-            *targets.T, c=mean, s=6 + 6 * sd, cmap="viridis_r", vmin=0, vmax=_WORST, zorder=2
+            targets[:, 0],
+            targets[:, 1],
+            c=mean,
+            s=6 + 6 * sd,
+            cmap="viridis_r",
+            vmin=0,
+            vmax=_WORST,
+            zorder=2,
         )
         ax.set_title(f"{SCENARIOS[name].label} ({own['seed'].nunique()})", loc="left", fontsize=10)
         ax.set_aspect("equal")
