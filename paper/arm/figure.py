@@ -68,7 +68,14 @@ def draw_map(maps: pd.DataFrame, path: Path) -> None:
         mean, sd = by_target.mean().to_numpy(), by_target.std().fillna(0).to_numpy()
         _draw_arm(ax)
         dots = ax.scatter(
-            *targets.T, c=mean, s=6 + 6 * sd, cmap="viridis_r", vmin=0, vmax=_WORST, zorder=2
+            targets[:, 0],
+            targets[:, 1],
+            c=mean,
+            s=6 + 6 * sd,
+            cmap="viridis_r",
+            vmin=0,
+            vmax=_WORST,
+            zorder=2,
         )
         ax.set_title(f"{SCENARIOS[name].label} ({own['seed'].nunique()})", loc="left", fontsize=10)
         ax.set_aspect("equal")
@@ -76,8 +83,8 @@ def draw_map(maps: pd.DataFrame, path: Path) -> None:
     figure.supxlabel("along the upper arm at 0°, cm")
     figure.supylabel("across, cm")
     if dots is not None:
-        label = f"mean RMSE after trial {MAP_TRIAL}, all steps, cm"
-        figure.colorbar(dots, ax=axes, label=label, shrink=0.7, extend="max")
+        label = f"RMSE after trial {MAP_TRIAL}, cm"
+        figure.colorbar(dots, ax=axes, label=label, shrink=0.9, extend="max")
         sizes = [
             axes[0].scatter([], [], s=6 + 6 * sd, color="0.4", label=f"sd of runs {sd} cm")
             for sd in (0, 5, 10)

@@ -32,7 +32,7 @@ def test_the_observation_ends_with_the_last_action():
     assert env.reset(seed=0)[0][-1] == 0
 
 
-@pytest.mark.filterwarnings("ignore:.*For Box action spaces, we recommend:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*WARN:UserWarning")  # of other things than faults
 def test_gymnasium_finds_no_fault():
     check_env(RememberAction(CartPoleSwingUpEnv()), skip_render_check=True)
 
