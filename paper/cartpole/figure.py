@@ -50,7 +50,7 @@ def draw_curves(trials: pd.DataFrame, model_until: int, path: Path) -> None:
     save(figure, path)
 
 
-def _curve_panel(ax: Axes, trials: pd.DataFrame, label: str) -> None:
+def _curve_panel(ax: Axes, trials: pd.DataFrame, title: str) -> None:
     by_trial = trials.groupby("trial")
     mean, sd = by_trial["cost"].mean(), by_trial["cost"].std().fillna(0)
     ax.fill_between(
@@ -60,4 +60,4 @@ def _curve_panel(ax: Axes, trials: pd.DataFrame, label: str) -> None:
     evaluation = by_trial["evaluation"].mean()
     label = "deterministic, mean of runs"
     ax.plot(evaluation.index + 1, evaluation, color="tab:red", lw=1, label=label)
-    ax.set_title(f"{label} ({trials['seed'].nunique()})", loc="left", fontsize=10)
+    ax.set_title(f"{title} ({trials['seed'].nunique()})", loc="left", fontsize=10)
