@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -120,15 +119,14 @@ def iqm(scores: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, np.n
     Of fewer than ``FEWEST`` runs an interval says nothing, and is nan.
     """
     runs = {name: values.reshape(-1, 1) for name, values in scores.items()}
-    with warnings.catch_warnings():
-        # arch, below rliable, renames the seed's argument, which rliable does not know yet.
-        warnings.filterwarnings("ignore", message="random_state is deprecated")
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(0)  # noqa: NPY002  rliable draws from the global generator, whatever it is given
+    try:
         points, intervals = get_interval_estimates(
-            runs,
-            lambda x: np.array([metrics.aggregate_iqm(x)]),
-            reps=_BOOTSTRAPS,
-            random_state=np.random.RandomState(0),
+            runs, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=_BOOTSTRAPS
         )
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
     return (
         {name: float(value[0]) for name, value in points.items()},
         {

@@ -23,7 +23,7 @@ from paper.cartpole.scenarios import (
     make_dynamics,
 )
 from paper.cartpole.targets import Targets
-from paper.control.results import behind, first_below, window
+from paper.control.results import behind, first_below, iqm, window
 from paper.control.runs import result_path
 from paper.control.scenario import updates_on_trial
 
@@ -306,6 +306,15 @@ def test_differences_are_of_the_seeds_that_both_have(tmp_path):
     result_path(out, "mf", 0).unlink()
     result_path(out, "mf", 1).unlink()
     assert np.isnan(behind(load(out), "mf", "cost", 1, 25)[1])
+
+
+def test_intervals_are_the_same_each_time():
+    scores = {"mf": np.random.default_rng(0).normal(size=7)}
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    first, second = (iqm(scores)[1]["mf"] for _ in range(2))
+    assert first[0] < first[1]
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
 
 def test_first_trial_below_a_threshold():
