@@ -62,6 +62,10 @@ class Dynamics(ABC):
         """
 
     @abstractmethod
+    def describe(self) -> dict[str, str]:
+        """What these dynamics are, each setting as a text; of objects, the class."""
+
+    @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt, in tensors and plain values; without physics and spec."""
 

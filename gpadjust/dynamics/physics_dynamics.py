@@ -76,9 +76,13 @@ class PhysicsDynamics(Dynamics):
         """The physics, whatever the number."""
         return self._step
 
+    def describe(self) -> dict[str, str]:
+        """What these dynamics are, each setting as a text."""
+        return identity(self)
+
     def state_dict(self) -> dict[str, Any]:
         """What these dynamics are; there is nothing learnt."""
-        return {"identity": identity(self)}
+        return {"identity": self.describe()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Check that the state is of such dynamics.
@@ -86,7 +90,7 @@ class PhysicsDynamics(Dynamics):
         Raises:
             RuntimeError: If it is of dynamics of another class or spec.
         """
-        check_identity(state, identity(self))
+        check_identity(state, self.describe())
 
     def _step(self, states: Tensor, actions: Tensor) -> Tensor:
         moving = self.spec.moving

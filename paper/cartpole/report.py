@@ -77,7 +77,7 @@ def _costs(table: pd.DataFrame) -> str:
                 f"{row['runs']}",
                 *("" if pd.isna(cost) else f"{cost:.2f}" for cost in costs),
                 "" if pd.isna(row["iqm"]) else interval(row),
-                *(paired(row, f"behind_{trials}") for trials in ("1_25", "41_50")),
+                *(paired(row, f"more_{trials}") for trials in ("1_25", "41_50")),
                 *("never" if pd.isna(first) else f"{first:.0f}" for first in firsts),
             ]
         )

@@ -45,7 +45,7 @@ SETTINGS = Settings(
     target_entropy="auto",
 )
 MODEL_FREE_UPDATES = 500  # per trial, of all trials; not tuned yet
-SUBSET = 5  # seeds of the scenarios that are beside the point
+SUBSET = 5  # seeds of some scenarios
 
 
 @dataclass(frozen=True)
