@@ -87,4 +87,4 @@ def _beside(curves: Curves, name: str) -> str:
     runs = len(curves.seeds(name, 50))
     if not runs:
         return ""
-    return f"; {SCENARIOS[name].label}: {_described(curves, name)} ({counted(runs)})"
+    return f"; {SCENARIOS[name].label}, {counted(runs)}: {_described(curves, name)}"

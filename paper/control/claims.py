@@ -62,7 +62,7 @@ def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
             found.append(Judged(claim.id, claim.text, "not run", lacking))
             continue
         verdict, measured = claim.decide(curves.restricted(shared))
-        measured += f" ({counted(len(shared))})"
+        measured = f"{counted(len(shared))}: {measured}"
         found.append(Judged(claim.id, claim.text, verdict, measured))
     return found
 

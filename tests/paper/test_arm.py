@@ -215,8 +215,12 @@ def test_verdicts_of_the_papers_curves(tmp_path):
     found = {name: claim.verdict for name, claim in judged.items()}
     assert found == dict.fromkeys(("A1", "A2", "A3", "A4", "A5", "A6"), "reproduced")
     assert "10 cm never" in judged["A2"].measured
-    assert judged["A4"].measured.startswith("10 cm at trial 3, 8 cm at trial 3, at 30 6.0 cm")
-    assert judged["A6"].measured.startswith("at most 10 cm at 121 of 121 targets by CKA, at ")
+    assert judged["A4"].measured.startswith(
+        "4 runs: 10 cm at trial 3, 8 cm at trial 3, at 30 6.0 cm"
+    )
+    assert judged["A6"].measured.startswith(
+        "4 runs: at most 10 cm at 121 of 121 targets by CKA, at "
+    )
 
 
 def test_verdicts_of_other_curves(tmp_path):
@@ -255,10 +259,12 @@ def test_targets(tmp_path):
     curves = {**AS_PUBLISHED, "cka-opensim": 6.5}
     found = judged_targets(tmp_path / "met", curves, spreads={"cka-opensim": 0})
     assert {claim.verdict for claim in found.values()} == {"met"}
-    assert found["T1"].measured == "at trial 3; at 6 7.2 cm (4 runs)"
-    assert found["T2"].measured.startswith("6.0 cm; the best of the others 6.0 cm (Dyna-RRA)")
-    assert found["T3"].measured.startswith("30 s; of wall time, fits 30, ")
-    assert found["T4"].measured.startswith("6.5 cm at 30, 30 s; with the equation")
+    assert found["T1"].measured == "4 runs: at trial 3; at 6 7.2 cm"
+    assert found["T2"].measured.startswith(
+        "4 runs: 6.0 cm; the best of the others 6.0 cm (Dyna-RRA)"
+    )
+    assert found["T3"].measured.startswith("4 runs: 30 s; of wall time, fits 30, ")
+    assert found["T4"].measured.startswith("4 runs: 6.5 cm at 30, 30 s; with the equation")
     found = judged_targets(tmp_path / "missed", dict.fromkeys(PAPER, 5) | {"cka": 9})
     assert found["T1"].verdict == found["T2"].verdict == "missed"
     assert found["T4"].verdict == "not run"

@@ -203,7 +203,7 @@ def test_verdicts_of_the_papers_curves(tmp_path):
     assert {name: claim.verdict for name, claim in claims.items()} == dict.fromkeys(
         ("P1", "P2", "P3", "P4", "P5"), "reproduced"
     )
-    assert "Dyna-GP: 0.5 at trial 1" in claims["P3"].measured
+    assert "Dyna-GP, 4 runs: 0.5 at trial 1" in claims["P3"].measured
 
 
 def test_verdicts_of_other_curves(tmp_path):
@@ -265,9 +265,11 @@ def test_targets_that_are_met(tmp_path):
         "T5": "missed",
         "T6": "met",
     }
-    assert found["T1"].measured.startswith("at trial 6; at 6 0.39")
-    assert found["T4"].measured.startswith("2.00 of it (fits 50 s, model steps 50 s, updates 50 s)")
-    assert found["T5"].measured == "150 s (4 runs)"
+    assert found["T1"].measured.startswith("4 runs: at trial 6; at 6 0.39")
+    assert found["T4"].measured.startswith(
+        "4 runs: 2.00 of it (fits 50 s, model steps 50 s, updates 50 s)"
+    )
+    assert found["T5"].measured == "4 runs: 150 s"
     assert "Dyna-CKA, 4 updates a step: from trial 4 (10.0 s)" in found["T6"].measured
     assert "Dyna-CKA, 1 update a step: never" in found["T6"].measured
 

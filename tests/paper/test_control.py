@@ -64,7 +64,7 @@ def test_claims_are_judged_by_the_seeds_that_all_their_scenarios_have():
     ]
     found = {claim.id: (claim.verdict, claim.measured) for claim in judge(claims, of, last=2)}
     assert found == {
-        "T1": ("met", "1 (2 runs)"),
+        "T1": ("met", "2 runs: 1"),
         "T2": ("not run", "too few runs of mf"),
         "T3": ("not run", "no results of gp"),
     }
