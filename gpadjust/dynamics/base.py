@@ -12,6 +12,7 @@ from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.models.prediction import Prediction
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
+"""Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
 
 
 class Dynamics(ABC):

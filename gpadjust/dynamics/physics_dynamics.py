@@ -44,7 +44,7 @@ class PhysicsDynamics(Dynamics):
 
     @property
     def is_fitted(self) -> bool:
-        """True: there is nothing to learn."""
+        """True, as there is nothing to learn."""
         return True
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:

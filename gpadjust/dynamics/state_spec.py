@@ -134,12 +134,12 @@ class StateSpec:
 
     @property
     def predicted(self) -> list[int]:
-        """The states that a model predicts: those that move and are not integrated."""
+        """The states that a model predicts, those that move and are not integrated."""
         return [i for i in self.moving if self.states[i] not in self.integrated]
 
     @property
     def previous_columns(self) -> list[int]:
-        """The states that hold previous actions: what models read beside moving ones and action."""
+        """The states that hold previous actions, read by models beside moving ones and action."""
         return [i for i, name in enumerate(self.states) if name in self.previous]
 
     @property
