@@ -9,7 +9,7 @@ try:
 except ImportError as error:
     raise ImportError('gpadjust.envs needs Gymnasium; run `pip install "gpadjust[rl]"`.') from error
 
-from gpadjust.envs.arm import REAL_ARM, ArmEquation, torque_arm, torque_arm_physics
+from gpadjust.envs.torque_arm import REAL_ARM, ArmEquation, torque_arm, torque_arm_physics
 from gpadjust.envs.arm_task import (
     ARM_MEMORY_SPEC,
     ARM_SPEC,

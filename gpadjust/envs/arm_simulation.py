@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm import ARM_TIME_STEP, ArmEquation
-from gpadjust.envs.arm_model import (
+from gpadjust.envs.torque_arm import ARM_TIME_STEP, ArmEquation
+from gpadjust.envs.opensim_model import (
     build_muscle_arm,
     build_torque_arm,
     controls,

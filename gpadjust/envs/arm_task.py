@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics import StateSpec
-from gpadjust.envs.arm import REAL_ARM
+from gpadjust.envs.torque_arm import REAL_ARM
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm import ARM_TIME_STEP, REAL_ARM
-from gpadjust.envs.arm_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION
+from gpadjust.envs.torque_arm import ARM_TIME_STEP, REAL_ARM
+from gpadjust.envs.opensim_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION
 from gpadjust.envs.arm_simulation import ArmSimulation
 from gpadjust.envs.arm_task import MAX_TARGET, START_MEAN, START_STD, arm_reward, hand_distance_cm
 from gpadjust.envs.arm_view import ArmView

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm import ArmEquation, torque_arm
+from gpadjust.envs.torque_arm import ArmEquation, torque_arm
 from gpadjust.envs.arm_simulation import ArmSimulation
 from gpadjust.physics import BlackBoxPhysics
 

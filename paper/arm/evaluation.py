@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.envs import REAL_ARM, arm_targets, hand_distance_cm
-from gpadjust.envs.arm_model import MUSCLES, REST_ACTIVATION
+from gpadjust.envs.opensim_model import MUSCLES, REST_ACTIVATION
 from gpadjust.envs.arm_simulation import ArmSimulation
 from gpadjust.envs.arm_task import START_MEAN
 from gpadjust.rl import DynaSAC

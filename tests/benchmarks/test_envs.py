@@ -5,7 +5,7 @@ import opensim
 import pytest
 
 from gpadjust.envs import REAL_ARM, MuscleArmEnv
-from gpadjust.envs.arm_model import build_muscle_arm, controls
+from gpadjust.envs.opensim_model import build_muscle_arm, controls
 
 START = np.radians([35.0, 65.0, 0.0, 0.0])
 ACCURACY = 1e-5

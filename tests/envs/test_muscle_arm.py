@@ -23,7 +23,7 @@ from gpadjust.envs import (
     hand_distance_cm,
     torque_arm_physics,
 )
-from gpadjust.envs.arm_model import MUSCLES
+from gpadjust.envs.opensim_model import MUSCLES
 from gpadjust.rl import DynaSAC
 
 ID = "gpadjust/MuscleArm-v0"
