@@ -235,11 +235,6 @@ class LearnedDynamics(ModelDynamics):
         warn_of_differences(self.physics.name, self.spec, data, self.spec.predicted, change)
         self._compared = True
 
-    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
-        data = Transitions.checked(self.spec, states, actions, next_states)
-        self.spec.check_transitions(data.states, data.next_states, data.actions)
-        return data
-
     def _identity(self) -> dict[str, str]:
         return identity(
             self,
