@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.prediction import Prediction
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
@@ -73,3 +74,9 @@ class Dynamics(ABC):
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take back what :meth:`state_dict` gave; predictions and later fits are the same."""
+
+    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
+        """Transitions that are what the spec says."""
+        data = Transitions.checked(self.spec, states, actions, next_states)
+        self.spec.check_transitions(data.states, data.next_states, data.actions)
+        return data

@@ -244,11 +244,6 @@ class LearnedDynamics(ModelDynamics):
         warn_of_differences(self.physics.name, self.spec, data, self.spec.predicted, change)
         self._compared = True
 
-    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
-        data = Transitions.checked(self.spec, states, actions, next_states)
-        self.spec.check_transitions(data.states, data.next_states, data.actions)
-        return data
-
     def _build(self, data: Transitions, quiet: bool) -> MultiOutputGP:
         """The model of some transitions; quiet where the first one has given its warnings."""
         options = {

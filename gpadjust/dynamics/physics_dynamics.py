@@ -12,7 +12,6 @@ from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.identity import check_identity, identity
 from gpadjust.dynamics.next_state_physics import check_physics, next_values, warn_of_differences
 from gpadjust.dynamics.state_spec import StateSpec, check_columns
-from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.prediction import Prediction
 from gpadjust.physics import Physics
 
@@ -52,9 +51,10 @@ class PhysicsDynamics(Dynamics):
 
         Raises:
             TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, or values are not finite.
+            ValueError: If shapes disagree, there are no rows, values are not finite, or states are
+                not what the spec says (:meth:`StateSpec.check_transitions`).
         """
-        data = Transitions.checked(self.spec, states, actions, next_states)
+        data = self._checked(states, actions, next_states)
         if self._compared:
             return
         columns = self.spec.moving

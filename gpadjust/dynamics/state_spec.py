@@ -194,7 +194,7 @@ class StateSpec:
         than a tenth if it is sampled six times a period or more. Discrepancies in angles are taken
         the shortest way round.
 
-        A previous action must be the action to a thousandth of the largest of all.
+        A previous action must be the action to a thousandth of the largest of that action.
 
         Args:
             states: ``N x state_dim``.
@@ -235,10 +235,9 @@ class StateSpec:
                 "checked without actions; pass `actions`."
             )
         check_columns(actions, self.action_dim, "actions")
-        scale = actions.abs().amax()
         for name, action in self.previous.items():
             found, taken = next_states[..., self.states.index(name)], self._taken(actions, action)
-            check_previous(name, action, found, taken, 1e-3 * scale)
+            check_previous(name, action, found, taken, 1e-3 * taken.abs().amax())
 
     def _taken(self, actions: Tensor, name: str) -> Tensor:
         return actions[..., self.actions.index(name)]

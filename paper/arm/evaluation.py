@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.envs import REAL_ARM, arm_targets, hand_distance_cm
-from gpadjust.envs.arm_model import MUSCLES, REST_ACTIVATION
 from gpadjust.envs.arm_simulation import ArmSimulation
 from gpadjust.envs.arm_task import START_MEAN
+from gpadjust.envs.opensim_model import MUSCLES, REST_ACTIVATION, build_muscle_arm
 from gpadjust.rl import DynaSAC
 from paper.arm.scenarios import MAP_TRIAL, ArmScenario, ArmSettings
 
@@ -69,7 +69,7 @@ def reach(policy: Policy, settings: ArmSettings, memory: bool) -> NDArray[np.flo
 
 @lru_cache(maxsize=1)
 def _simulation(strength: float) -> ArmSimulation:
-    return ArmSimulation(REAL_ARM, strength, ACCURACY)
+    return ArmSimulation(partial(build_muscle_arm, REAL_ARM, strength), ACCURACY)
 
 
 def score(distances: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

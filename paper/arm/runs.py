@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from gpadjust.envs import arm_reward
-from gpadjust.envs.arm_model import load_opensim
+from gpadjust.envs.opensim_model import load_opensim
 from gpadjust.rl import DynaSAC
 from paper.arm.evaluation import evaluate, evaluation_log
 from paper.arm.scenarios import (

@@ -116,11 +116,7 @@ def make_env(scenario: ArmScenario, settings: ArmSettings) -> Env:
 
 def make_dynamics(scenario: ArmScenario, seed: int, settings: ArmSettings = SETTINGS) -> Dynamics:
     """The model; nothing in it is random. A model-free learner does not use it."""
-    physics: Physics = (
-        opensim_arm_physics(settings.strength)
-        if scenario.black_box
-        else torque_arm_physics(settings.strength)
-    )
+    physics: Physics = opensim_arm_physics() if scenario.black_box else torque_arm_physics()
     make = scenario.dynamics or PhysicsDynamics
     return make(scenario.spec, physics)
 
