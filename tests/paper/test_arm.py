@@ -27,6 +27,7 @@ TINY = replace(
     num_trials=2,
     trial_length=5,
     model_trials=2,
+    model_updates=1,
     model_until=2,
     batch_size=16,
     net_arch=(16,),
