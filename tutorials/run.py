@@ -56,6 +56,7 @@ def execute(notebook: NotebookNode) -> None:
         timeout=600,
         kernel_name="python3",
         record_timing=False,
+        coalesce_streams=True,
         resources={"metadata": {"path": FOLDER}},
     )
     client.execute()
