@@ -10,9 +10,12 @@ from pathlib import Path
 def add_options(parser: argparse.ArgumentParser, experiment: str, num_runs: int) -> None:
     """Add the options of a grid of runs to an experiment's command line."""
     parser.add_argument(
-        "--runs", type=int, default=num_runs, help=f"number of data sets [{num_runs}]"
+        "--runs",
+        type=int,
+        default=num_runs,
+        help=f"number of runs, each with a seed of its own [{num_runs}]",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first data set [0]")
+    parser.add_argument("--seed", type=int, default=0, help="the first seed [0]")
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count(), help="parallel processes [all cores]"
     )

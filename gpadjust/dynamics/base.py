@@ -9,9 +9,11 @@ from typing import Any
 from torch import Tensor
 
 from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.prediction import Prediction
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
+"""Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
 
 
 class Dynamics(ABC):
@@ -62,9 +64,19 @@ class Dynamics(ABC):
         """
 
     @abstractmethod
+    def describe(self) -> dict[str, str]:
+        """What these dynamics are, each setting as a text; of objects, the class."""
+
+    @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt, in tensors and plain values; without physics and spec."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take back what :meth:`state_dict` gave; predictions and later fits are the same."""
+
+    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
+        """Transitions that are what the spec says."""
+        data = Transitions.checked(self.spec, states, actions, next_states)
+        self.spec.check_transitions(data.states, data.next_states, data.actions)
+        return data

@@ -164,12 +164,21 @@ class LearnedDynamics(ModelDynamics):
             self._known = torch.cat([self._known, known])
         self._chunks = [*self._chunks, len(data.states)]
 
+    def describe(self) -> dict[str, str]:
+        """What these dynamics are, each setting as a text; of objects, the class."""
+        return identity(
+            self,
+            target=self.targets.target,
+            encode_angles=self.encode_angles,
+            model_options=self.model_options,
+        )
+
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt, in tensors and plain values: data, f_p there, hyper-parameters."""
         if self._model is None or self._data is None:
             return {}
         return {
-            "identity": self._identity(),
+            "identity": self.describe(),
             "transitions": {name: t.clone() for name, t in self._data._asdict().items()},
             "physics": None if self._known is None else self._known.clone(),
             "chunks": [*self._chunks],
@@ -186,7 +195,7 @@ class LearnedDynamics(ModelDynamics):
         Raises:
             RuntimeError: If it is of dynamics of another class, spec, target or model options.
         """
-        check_identity(state, self._identity())
+        check_identity(state, self.describe())
         self._forget_data()
         self.fit_result = None
         if not state:
@@ -234,19 +243,6 @@ class LearnedDynamics(ModelDynamics):
         change = self.targets.decode(data.states, known) - data.states[:, self.spec.predicted]
         warn_of_differences(self.physics.name, self.spec, data, self.spec.predicted, change)
         self._compared = True
-
-    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
-        data = Transitions.checked(self.spec, states, actions, next_states)
-        self.spec.check_transitions(data.states, data.next_states, data.actions)
-        return data
-
-    def _identity(self) -> dict[str, str]:
-        return identity(
-            self,
-            target=self.targets.target,
-            encode_angles=self.encode_angles,
-            model_options=self.model_options,
-        )
 
     def _build(self, data: Transitions, quiet: bool) -> MultiOutputGP:
         """The model of some transitions; quiet where the first one has given its warnings."""

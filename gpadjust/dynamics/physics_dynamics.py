@@ -12,7 +12,6 @@ from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.identity import check_identity, identity
 from gpadjust.dynamics.next_state_physics import check_physics, next_values, warn_of_differences
 from gpadjust.dynamics.state_spec import StateSpec, check_columns
-from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.prediction import Prediction
 from gpadjust.physics import Physics
 
@@ -44,7 +43,7 @@ class PhysicsDynamics(Dynamics):
 
     @property
     def is_fitted(self) -> bool:
-        """True: there is nothing to learn."""
+        """True, as there is nothing to learn."""
         return True
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
@@ -52,9 +51,10 @@ class PhysicsDynamics(Dynamics):
 
         Raises:
             TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, or values are not finite.
+            ValueError: If shapes disagree, there are no rows, values are not finite, or states are
+                not what the spec says (:meth:`StateSpec.check_transitions`).
         """
-        data = Transitions.checked(self.spec, states, actions, next_states)
+        data = self._checked(states, actions, next_states)
         if self._compared:
             return
         columns = self.spec.moving
@@ -76,9 +76,13 @@ class PhysicsDynamics(Dynamics):
         """The physics, whatever the number."""
         return self._step
 
+    def describe(self) -> dict[str, str]:
+        """What these dynamics are, each setting as a text."""
+        return identity(self)
+
     def state_dict(self) -> dict[str, Any]:
         """What these dynamics are; there is nothing learnt."""
-        return {"identity": identity(self)}
+        return {"identity": self.describe()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Check that the state is of such dynamics.
@@ -86,7 +90,7 @@ class PhysicsDynamics(Dynamics):
         Raises:
             RuntimeError: If it is of dynamics of another class or spec.
         """
-        check_identity(state, identity(self))
+        check_identity(state, self.describe())
 
     def _step(self, states: Tensor, actions: Tensor) -> Tensor:
         moving = self.spec.moving

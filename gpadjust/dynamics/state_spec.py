@@ -134,12 +134,12 @@ class StateSpec:
 
     @property
     def predicted(self) -> list[int]:
-        """The states that a model predicts: those that move and are not integrated."""
+        """The states that a model predicts, those that move and are not integrated."""
         return [i for i in self.moving if self.states[i] not in self.integrated]
 
     @property
     def previous_columns(self) -> list[int]:
-        """The states that hold previous actions: what models read beside moving ones and action."""
+        """The states that hold previous actions, read by models beside moving ones and action."""
         return [i for i, name in enumerate(self.states) if name in self.previous]
 
     @property
@@ -194,7 +194,7 @@ class StateSpec:
         than a tenth if it is sampled six times a period or more. Discrepancies in angles are taken
         the shortest way round.
 
-        A previous action must be the action to a thousandth of the largest of all.
+        A previous action must be the action to a thousandth of the largest of that action.
 
         Args:
             states: ``N x state_dim``.
@@ -235,10 +235,9 @@ class StateSpec:
                 "checked without actions; pass `actions`."
             )
         check_columns(actions, self.action_dim, "actions")
-        scale = actions.abs().amax()
         for name, action in self.previous.items():
             found, taken = next_states[..., self.states.index(name)], self._taken(actions, action)
-            check_previous(name, action, found, taken, 1e-3 * scale)
+            check_previous(name, action, found, taken, 1e-3 * taken.abs().amax())
 
     def _taken(self, actions: Tensor, name: str) -> Tensor:
         return actions[..., self.actions.index(name)]

@@ -9,7 +9,6 @@ try:
 except ImportError as error:
     raise ImportError('gpadjust.envs needs Gymnasium; run `pip install "gpadjust[rl]"`.') from error
 
-from gpadjust.envs.arm import REAL_ARM, ArmEquation, torque_arm, torque_arm_physics
 from gpadjust.envs.arm_task import (
     ARM_MEMORY_SPEC,
     ARM_SPEC,
@@ -34,6 +33,7 @@ from gpadjust.envs.cart_pole_swing_up import CartPoleSwingUpEnv
 from gpadjust.envs.muscle_arm import MuscleArmEnv
 from gpadjust.envs.opensim_arm import opensim_arm_physics
 from gpadjust.envs.remember_action import RememberAction
+from gpadjust.envs.torque_arm import REAL_ARM, ArmEquation, torque_arm, torque_arm_physics
 
 _gymnasium.register(
     id="gpadjust/CartPoleSwingUp-v0",

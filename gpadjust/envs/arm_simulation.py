@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm import ARM_TIME_STEP, ArmEquation
-from gpadjust.envs.arm_model import (
-    build_muscle_arm,
-    build_torque_arm,
-    controls,
-    load_opensim,
-)
-
-MAX_STRENGTH = 2.0  # beyond, the arm breaks through its joint limits
+from gpadjust.envs.opensim_model import controls, load_opensim
+from gpadjust.envs.torque_arm import ARM_TIME_STEP
 
 
 class ArmSimulation:
@@ -26,34 +20,37 @@ class ArmSimulation:
     built anew.
 
     Args:
-        equation: The links; its gains are not used.
-        strength: The factor on the forces of six muscles; None for torques in their place.
+        build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` and
+            :func:`build_torque_arm` do (:mod:`gpadjust.envs.opensim_model`): a
+            ``functools.partial`` of one of these can be pickled.
         accuracy: The relative accuracy of the integrator.
 
     Raises:
         ImportError: If ``opensim`` is missing.
-        ValueError: If strength is not in (0, 2] or accuracy not in (0, 1).
+        ValueError: If accuracy is not in (0, 1), or ``build`` refuses its arguments.
+
+    Example:
+        >>> from functools import partial
+        >>> from gpadjust.envs.opensim_model import build_torque_arm
+        >>> from gpadjust.envs.torque_arm import REAL_ARM
+        >>> simulation = ArmSimulation(partial(build_torque_arm, REAL_ARM), accuracy=1e-6)
+        >>> simulation.step(np.array([0.6, 1.1, 0.0, 0.0]), np.zeros(2)).round(6)
+        array([0.6, 1.1, 0. , 0. ])
     """
 
-    def __init__(self, equation: ArmEquation, strength: float | None, accuracy: float) -> None:
-        if strength is not None and not 0 < strength <= MAX_STRENGTH:
-            raise ValueError(
-                f"strength must be in (0, {MAX_STRENGTH:g}], where 1 is a healthy arm's; found "
-                f"{strength}."
-            )
+    def __init__(self, build: Callable[[], Any], accuracy: float) -> None:
         if not 0 < accuracy < 1:
             raise ValueError(f"accuracy must be in (0, 1), such as 1e-5; found {accuracy}.")
-        self.equation = equation
-        self.strength = strength
+        self.build = build
         self.accuracy = accuracy
-        self._build()
+        self._start_anew()
 
     def step(self, state: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """The state after 0.2 s.
 
         Args:
             state: Angles and velocities, then the six activations if there are muscles.
-            inputs: Excitations of the four driven muscles, or torques of shoulder and elbow.
+            inputs: Excitations of the four driven muscles, or torques of shoulder and elbow in N m.
 
         Raises:
             RuntimeError: If the integration fails, or ends in numbers that are not finite.
@@ -72,15 +69,12 @@ class ArmSimulation:
             raise RuntimeError("The integration ended in NaN or inf.")
         return end
 
-    def _build(self) -> None:
+    def _start_anew(self) -> None:
         self._lock = Lock()
         opensim = load_opensim()
-        if self.strength is None:
-            self._model, controller = build_torque_arm(self.equation)
-        else:
-            self._model, controller = build_muscle_arm(self.equation, self.strength)
+        self._model = self.build()
         self._start = self._model.initSystem()
-        self._controls = controls(controller)
+        self._controls = controls(self._model)
         self._vector = opensim.Vector(self._start.getNY(), 0.0)
         self._manager = opensim.Manager(self._model)
         self._manager.setWriteToStorage(False)
@@ -90,9 +84,8 @@ class ArmSimulation:
         self._manager.setIntegratorAccuracy(self.accuracy)
 
     def __getstate__(self) -> dict[str, Any]:
-        names = ("equation", "strength", "accuracy")
-        return {name: getattr(self, name) for name in names}
+        return {"build": self.build, "accuracy": self.accuracy}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._build()
+        self._start_anew()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics import StateSpec
-from gpadjust.envs.arm import REAL_ARM
+from gpadjust.envs.torque_arm import REAL_ARM
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)
@@ -36,6 +36,12 @@ Muscles follow their excitations with a delay, so that the next state depends on
 """
 
 
+def angle_error(states: Tensor) -> Tensor:
+    """The root mean square error of the angles, ``...`` in rad, of states ``... x 6`` or more."""
+    error = states[..., :2] - states[..., 4:6]
+    return error.square().mean(-1).sqrt()
+
+
 def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
     r"""The reward of transitions: minus the root mean square error of the angles, in rad.
 
@@ -54,8 +60,7 @@ def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
         >>> arm_reward(torch.zeros(6), torch.zeros(4), reached)
         tensor(-0.3536)
     """
-    error = next_states[..., :2] - next_states[..., 4:6]
-    return -error.square().mean(-1).sqrt()
+    return -angle_error(next_states)
 
 
 def arm_start(n: int) -> Tensor:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm import REAL_ARM
+from gpadjust.envs.torque_arm import REAL_ARM
 from gpadjust.envs.view import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, Colour, View
 
 WIDTH, HEIGHT = 480, 400
@@ -51,20 +51,20 @@ class ArmView(View):
         """
         self.canvas.fill(WHITE)
         self._line((0.0, -0.12), (0.0, 0.12), GREY, 0.012)
-        target = _frames(*state[4:])
+        target = _poses(*state[4:])
         self._arm(target, LIGHT)
         self._circle(_place(target, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.03, ring=True)
-        frames = _frames(*state[:2])
-        self._arm(frames, GREY)
+        links = _poses(*state[:2])
+        self._arm(links, GREY)
         for ends, activation in zip(MUSCLE_LINES, activations.clip(0, 1), strict=True):
-            start, end = (_place(frames, place) for place in ends)
+            start, end = (_place(links, place) for place in ends)
             self._line(start, end, _mixed(float(activation)), 0.008 + 0.012 * float(activation))
-        self._circle(_place(frames, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.016)
+        self._circle(_place(links, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.016)
         return self.show()
 
-    def _arm(self, frames: list[Frame], colour: Colour) -> None:
+    def _arm(self, links: list[LinkPose], colour: Colour) -> None:
         for link, length in zip((1, 2), REAL_ARM.lengths, strict=True):
-            start, end = _place(frames, (link, 0.0, 0.0)), _place(frames, (link, length, 0.0))
+            start, end = _place(links, (link, 0.0, 0.0)), _place(links, (link, length, 0.0))
             self._line(start, end, colour, 0.02)
             self._circle(start, colour, 0.018)
 
@@ -94,18 +94,18 @@ class ArmView(View):
         pygame.draw.circle(self.canvas, colour, _pixel(centre), radius * SMOOTH * METRE, width)
 
 
-Frame = tuple[float, float, float]  # of a link: where its joint is, in m, and its direction
+LinkPose = tuple[float, float, float]  # where the link's joint is, in m, and its direction
 
 
-def _frames(shoulder: float, elbow: float) -> list[Frame]:
+def _poses(shoulder: float, elbow: float) -> list[LinkPose]:
     length = REAL_ARM.lengths[0]
     elbow_at = (length * math.cos(shoulder), length * math.sin(shoulder))
     return [(0.0, 0.0, 0.0), (0.0, 0.0, shoulder), (*elbow_at, shoulder + elbow)]
 
 
-def _place(frames: list[Frame], place: Place) -> tuple[float, float]:
+def _place(links: list[LinkPose], place: Place) -> tuple[float, float]:
     link, along, aside = place
-    x, y, direction = frames[link]
+    x, y, direction = links[link]
     cos, sin = math.cos(direction), math.sin(direction)
     return x + along * cos - aside * sin, y + along * sin + aside * cos
 

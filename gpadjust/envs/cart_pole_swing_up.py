@@ -21,11 +21,12 @@ from gpadjust.envs.cart_pole import (
     equation_physics,
 )
 from gpadjust.envs.cart_pole_view import CartPoleView
+from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv, checked_options
 
 MAX_FORCE = 10.0
 
 
-class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
     r"""Swing up the pole of a cart-pole and balance it, by pushing the cart.
 
     The pole hangs at first. The action, a force in [-10, 10] N, is held for 0.1 s; stronger forces
@@ -58,7 +59,7 @@ class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         -0.004
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / TIME_STEP)}  # noqa: RUF012
+    metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / TIME_STEP)}  # noqa: RUF012
 
     def __init__(
         self,
@@ -67,11 +68,7 @@ class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         encode_angle: bool = True,
         equation: CartPoleEquation = REAL_CART_POLE,
     ) -> None:
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
-                f"render_mode must be None, 'human' or 'rgb_array'; found {render_mode!r}."
-            )
-        self.render_mode = render_mode
+        super().__init__(render_mode)
         self.equation = equation
         self.physics = equation_physics(equation)
         self.state_spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
@@ -79,9 +76,7 @@ class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         bound = np.array(high, dtype=np.float32)
         self.observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
         self.action_space = gym.spaces.Box(-MAX_FORCE, MAX_FORCE, (1,), dtype=np.float32)
-        self.state: NDArray[np.float64] | None = None
         self._force = 0.0
-        self._view: CartPoleView | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -100,10 +95,7 @@ class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             ValueError: If ``options`` has another key, or the state is not four finite numbers.
         """
         super().reset(seed=seed)
-        options = options or {}
-        unknown = set(options) - {"state"}
-        if unknown:
-            raise ValueError(f"Unknown option {unknown.pop()!r}; the only option is 'state'.")
+        options = checked_options(options, ("state",))
         if "state" in options:
             state = np.array(options["state"], dtype=np.float64)
             if state.shape != (4,) or not np.isfinite(state).all():
@@ -115,8 +107,7 @@ class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             state = self.np_random.normal(START_MEAN, START_STD)
         self.state = state
         self._force = 0.0
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         return self._observe(state), {}
 
     def step(
@@ -146,42 +137,14 @@ class CartPoleSwingUpEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             cost = cart_pole_cost(state, self.equation.pole_length).item()
         self.state = state.numpy()
         self._force = float(force[0])
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         return self._observe(self.state), -cost, False, False, {"cost": cost}
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the system.
+    def _open_view(self, frames_per_second: int | None) -> CartPoleView:
+        return CartPoleView(self.equation.pole_length, MAX_FORCE, frames_per_second)
 
-        Returns:
-            The frame ``height x width x 3`` in mode ``"rgb_array"``, else None.
-
-        Raises:
-            gymnasium.error.DependencyNotInstalled: If ``pygame-ce`` is missing.
-            gymnasium.error.ResetNeeded: If no episode was started.
-        """
-        if self.render_mode is None:
-            gym.logger.warn(
-                "There is nothing to render without a render mode; build the environment with "
-                "render_mode='human' or 'rgb_array'."
-            )
-            return None
-        if self.state is None:
-            raise gym.error.ResetNeeded("Call reset before render.")
-        if self._view is None:
-            pace = self.metadata["render_fps"] if self.render_mode == "human" else None
-            self._view = CartPoleView(self.equation.pole_length, MAX_FORCE, frames_per_second=pace)
-        return self._view.draw(self.state[0], self.state[1], self._force)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-            self._view = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A window cannot be pickled; the copy opens its own when it is rendered.
-        return {**self.__dict__, "_view": None}
+    def _draw(self, view: CartPoleView, state: NDArray[np.float64]) -> NDArray[np.uint8] | None:
+        return view.draw(state[0], state[1], self._force)
 
     def _observe(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
         return self.state_spec.observe(torch.from_numpy(state)).numpy().astype(np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -11,17 +12,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm import ARM_TIME_STEP, REAL_ARM
-from gpadjust.envs.arm_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION
 from gpadjust.envs.arm_simulation import ArmSimulation
-from gpadjust.envs.arm_task import MAX_TARGET, START_MEAN, START_STD, arm_reward, hand_distance_cm
+from gpadjust.envs.arm_task import MAX_TARGET, START_MEAN, START_STD, angle_error, hand_distance_cm
 from gpadjust.envs.arm_view import ArmView
+from gpadjust.envs.opensim_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION, build_muscle_arm
+from gpadjust.envs.torque_arm import ARM_TIME_STEP, REAL_ARM
+from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv, checked_options
 
 # The arm itself stays within 3 rad and 20 rad/s.
 HIGH = np.array([2 * math.pi, 2 * math.pi, 100, 100, 2 * math.pi, 2 * math.pi], dtype=np.float32)
 
 
-class MuscleArmEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class MuscleArmEnv(ViewedEnv[ArmView]):
     r"""Reach for targets with a planar arm, by exciting four of its six muscles.
 
     OpenSim computes the arm: Hill-type muscles with rigid tendons, joint damping and limits. The
@@ -71,23 +73,17 @@ class MuscleArmEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         True
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / ARM_TIME_STEP)}  # noqa: RUF012
+    metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / ARM_TIME_STEP)}  # noqa: RUF012
 
     def __init__(
         self, render_mode: str | None = None, *, strength: float = 0.5, accuracy: float = 1e-5
     ) -> None:
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
-                f"render_mode must be None, 'human' or 'rgb_array'; found {render_mode!r}."
-            )
-        self.render_mode = render_mode
-        self.simulation = ArmSimulation(REAL_ARM, strength, accuracy)
+        super().__init__(render_mode)
+        self.simulation = ArmSimulation(partial(build_muscle_arm, REAL_ARM, strength), accuracy)
         self.observation_space = gym.spaces.Box(-HIGH, HIGH, dtype=np.float32)
         self.action_space = gym.spaces.Box(0.0, 1.0, (NUM_EXCITED,), dtype=np.float32)
-        self.state: NDArray[np.float64] | None = None
         self.activations = np.full(len(MUSCLES), REST_ACTIVATION)
         self._failed = False
-        self._view: ArmView | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -107,12 +103,7 @@ class MuscleArmEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 of the bounds of the observation.
         """
         super().reset(seed=seed)
-        options = options or {}
-        unknown = set(options) - {"state", "target"}
-        if unknown:
-            raise ValueError(
-                f"Unknown option {unknown.pop()!r}; the options are 'state' and 'target'."
-            )
+        options = checked_options(options, ("state", "target"))
         # Both are drawn in any case, so that an option does not change the other one.
         angles = self.np_random.normal(START_MEAN, START_STD)
         target = self.np_random.uniform(0, MAX_TARGET, 2)
@@ -125,8 +116,7 @@ class MuscleArmEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.state = np.concatenate([start, target])
         self.activations = np.full(len(MUSCLES), REST_ACTIVATION)
         self._failed = False
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         return self.state.astype(np.float32), {}
 
     def step(
@@ -167,48 +157,20 @@ class MuscleArmEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         else:
             self.state = np.concatenate([end[:4], self.state[4:]])
             self.activations = end[4:]
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         state = torch.from_numpy(self.state)
-        reward = arm_reward(state, state, state).item()
+        reward = -angle_error(state).item()
         info = {
             "hand_distance_cm": hand_distance_cm(state).item(),
             "integration_failed": self._failed,
         }
         return self.state.astype(np.float32), reward, False, self._failed, info
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the arm.
+    def _open_view(self, frames_per_second: int | None) -> ArmView:
+        return ArmView(frames_per_second)
 
-        Returns:
-            The frame ``height x width x 3`` in mode ``"rgb_array"``, else None.
-
-        Raises:
-            gymnasium.error.DependencyNotInstalled: If ``pygame-ce`` is missing.
-            gymnasium.error.ResetNeeded: If no episode was started.
-        """
-        if self.render_mode is None:
-            gym.logger.warn(
-                "There is nothing to render without a render mode; build the environment with "
-                "render_mode='human' or 'rgb_array'."
-            )
-            return None
-        if self.state is None:
-            raise gym.error.ResetNeeded("Call reset before render.")
-        if self._view is None:
-            pace = self.metadata["render_fps"] if self.render_mode == "human" else None
-            self._view = ArmView(frames_per_second=pace)
-        return self._view.draw(self.state, self.activations)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-            self._view = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A window cannot be pickled; the copy opens its own when it is rendered.
-        return {**self.__dict__, "_view": None}
+    def _draw(self, view: ArmView, state: NDArray[np.float64]) -> NDArray[np.uint8] | None:
+        return view.draw(state, self.activations)
 
 
 def _checked(value: Any, option: str, names: str, high: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm import ArmEquation, torque_arm
 from gpadjust.envs.arm_simulation import ArmSimulation
+from gpadjust.envs.opensim_model import build_torque_arm
+from gpadjust.envs.torque_arm import ArmEquation, torque_arm
 from gpadjust.physics import BlackBoxPhysics
 
 FD_STEP = 1e-3  # in rad, rad/s and 1: far above the error of the integration
 
 
-def opensim_arm_physics(strength: float = 0.5, accuracy: float = 1e-6) -> BlackBoxPhysics:
+def opensim_arm_physics(
+    gains: tuple[float, float] = (8.0, 4.0), accuracy: float = 1e-6
+) -> BlackBoxPhysics:
     """The physics of :func:`torque_arm_physics`, computed by OpenSim, a row at a time.
 
     The two agree to 1e-5 rad. In parallel it runs in processes (``joblib``'s ``loky``): threads
     take turns.
 
     Args:
-        strength: See :func:`torque_arm`.
+        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
+            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
         accuracy: The relative accuracy of the integrator.
 
     Returns:
@@ -30,7 +34,8 @@ def opensim_arm_physics(strength: float = 0.5, accuracy: float = 1e-6) -> BlackB
 
     Raises:
         ImportError: If ``opensim`` is missing.
-        ValueError: If there are no gains for this strength, or ``accuracy`` is not in (0, 1).
+        ValueError: If the gains are not two finite numbers that are not negative, or ``accuracy``
+            is not in (0, 1).
 
     Example:
         >>> import torch
@@ -38,7 +43,7 @@ def opensim_arm_physics(strength: float = 0.5, accuracy: float = 1e-6) -> BlackB
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
-    step = _TorqueStep(torque_arm(strength), accuracy)
+    step = _TorqueStep(torque_arm(gains), accuracy)
     return BlackBoxPhysics(step, batched=False, fd_step=FD_STEP, name="opensim_arm")
 
 
@@ -60,4 +65,4 @@ class _TorqueStep:
 
 @lru_cache(maxsize=8)
 def _simulation(equation: ArmEquation, accuracy: float) -> ArmSimulation:
-    return ArmSimulation(equation, strength=None, accuracy=accuracy)
+    return ArmSimulation(partial(build_torque_arm, equation), accuracy)

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 
-class RememberAction(gym.Wrapper[Array, Array, Array, Array]):
+class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordConstructorArgs):
     """Appends the action that was taken last to the observation; zeros at the start of an episode.
 
     Where a system follows its actions with a delay that the observation does not show, such as the
     activation of muscles, the next observation depends on earlier actions. The last one says much
     of what is hidden. A :class:`~gpadjust.dynamics.StateSpec` declares it in ``previous``.
+
+    What is appended is the action clipped to its space, as the environments of this library take
+    it. Observations keep their data type, if that is floating-point.
 
     Args:
         env: An environment whose observations and actions are boxes of one dimension; zero is an
@@ -36,7 +39,8 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array]):
     """
 
     def __init__(self, env: gym.Env[Array, Array]) -> None:
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
         seen, taken = env.observation_space, env.action_space
         for name, space in (("observation", seen), ("action", taken)):
             if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
@@ -46,15 +50,20 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array]):
                 )
         assert isinstance(seen, gym.spaces.Box), "checked above"
         assert isinstance(taken, gym.spaces.Box), "checked above"
-        self._start = np.zeros(taken.shape, dtype=np.float32)
-        if not taken.contains(self._start.astype(taken.dtype)):
+        self._taken = taken
+        self._start = np.zeros(taken.shape, dtype=taken.dtype)
+        if not taken.contains(self._start):
             raise ValueError(
                 f"RememberAction starts from the action zero, which is not in {taken}. Put "
                 "gymnasium.wrappers.RescaleAction inside."
             )
+        floating = np.issubdtype(seen.dtype, np.floating)
+        # Integers could not hold the action.
+        self._dtype = seen.dtype if floating else np.result_type(seen.dtype, taken.dtype)
         self.observation_space = gym.spaces.Box(
-            np.concatenate([seen.low, taken.low]).astype(np.float32),
-            np.concatenate([seen.high, taken.high]).astype(np.float32),
+            self._extended(seen.low, taken.low),
+            self._extended(seen.high, taken.high),
+            dtype=self._dtype.type,
         )
 
     def reset(
@@ -65,9 +74,10 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array]):
         return self._extended(observation, self._start), info
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Take an action; the observation ends with it."""
+        """Take an action; the observation ends with it, clipped."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._extended(observation, action), float(reward), terminated, truncated, info
+        taken = np.clip(action, self._taken.low, self._taken.high)
+        return self._extended(observation, taken), float(reward), terminated, truncated, info
 
     def _extended(self, observation: Array, action: Array) -> Array:
-        return np.concatenate([observation, action]).astype(np.float32)
+        return np.concatenate([observation, action]).astype(self._dtype)

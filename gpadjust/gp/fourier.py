@@ -80,7 +80,7 @@ class FourierKernel(Kernel):
 
     @property
     def is_stationary(self) -> bool:
-        """False: a finite sum of features is not stationary."""
+        """False, as a finite sum of features is not stationary."""
         return False
 
     def feature_map(self, x: Tensor) -> Tensor:

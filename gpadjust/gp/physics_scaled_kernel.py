@@ -56,7 +56,7 @@ class PhysicsScaledKernel(Kernel):
 
     @property
     def is_stationary(self) -> bool:
-        """False: the covariance follows f_p."""
+        """False, as the covariance follows f_p."""
         return False
 
     def forward(

@@ -1,4 +1,4 @@
-"""Fitting the models."""
+"""Fitting the models, by maximum likelihood or full Bayes, and choosing between them."""
 
 from gpadjust.inference.comparison import STRUCTURES, Candidate, Comparison, compare
 from gpadjust.inference.fitting import fit

@@ -37,6 +37,7 @@ _STRUCTURES: dict[str, Callable[..., MultiOutputGP]] = {
     "RRA": RRA,
 }
 STRUCTURES = tuple(_STRUCTURES)
+"""The names of the structures that :func:`compare` knows."""
 _UNKNOWNS = {"constant rho": 2, "CKA centred, learnt rho mean": 1}  # constant means
 _WITHOUT_PHYSICS = ("zero mean",)
 # Without physics these are the zero mean; the others have a kernel or a constant of their own.
@@ -129,15 +130,15 @@ def compare(
 ) -> Comparison:
     r"""Fit models of several structures and rank them: how should this physics be adjusted?
 
-    ==============================  ===========================================================
-    ``"zero mean"``                 no physics, :class:`~gpadjust.ZeroMeanGP`
-    ``"physics mean"``              :math:`f_p + \delta(x)`, :class:`~gpadjust.PhysicsMeanGP`
-    ``"constant rho"``              :math:`\rho f_p + \mu + \delta(x)` with unknown constants
-    ``"CKA"``                       :math:`\rho(x) f_p + \delta(x)`, :class:`~gpadjust.CKA`
-    ``"CKA centred"``               with the kernel on f_p less its mean
+    ==================================  ===========================================================
+    ``"zero mean"``                     no physics, :class:`~gpadjust.ZeroMeanGP`
+    ``"physics mean"``                  :math:`f_p + \delta(x)`, :class:`~gpadjust.PhysicsMeanGP`
+    ``"constant rho"``                  :math:`\rho f_p + \mu + \delta(x)` with unknown constants
+    ``"CKA"``                           :math:`\rho(x) f_p + \delta(x)`, :class:`~gpadjust.CKA`
+    ``"CKA centred"``                   with the kernel on f_p less its mean
     ``"CKA centred, learnt rho mean"``  and an unknown constant mean of :math:`\rho`
-    ``"RRA"``                       on random features, :class:`~gpadjust.RRA`
-    ==============================  ===========================================================
+    ``"RRA"``                           on random features, :class:`~gpadjust.RRA`
+    ==================================  ===========================================================
 
     Two numbers tell how good a structure is: its *evidence*, the marginal likelihood at the best
     hyper-parameters, and the *leave-one-out* log predictive density, which judges predictions and

@@ -149,7 +149,7 @@ class AdjustmentGP(MultiOutputGP):
 
     @property
     def constant_means(self) -> dict[str, Callable[[Tensor], Tensor]]:
-        """The unknown constant means: the names of their (log) prior variances, and their bases."""
+        """The unknown constant means, bases by the names of their (log) prior variances."""
         rho = self._kernel("rho")
         bases: dict[str, Callable[[Tensor], Tensor]] = {}
         for name, module in self.covar_module.named_modules(prefix="covar_module"):

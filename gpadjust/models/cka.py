@@ -19,7 +19,7 @@ from gpadjust.physics import Physics
 
 
 class CKA(AdjustmentGP):
-    r"""Co-kriging adjustment of a physics model (Wannawas and Faisal 2023, sec. 2.1):
+    r"""Co-kriging adjustment of a physics model (Wannawas and Faisal 2023, section 2.1):
 
     .. math::
         f_a(x) = \rho(x) f_p(x) + \delta(x), \quad

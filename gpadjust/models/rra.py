@@ -28,7 +28,7 @@ from gpadjust.physics import Physics
 
 
 class RRA(AdjustmentGP):
-    r"""Ridge regression adjustment (Wannawas and Faisal 2023, sec. 2.2): Bayesian linear regression
+    r"""Ridge regression adjustment (Wannawas and Faisal 2023, section 2.2), a Bayesian linear model
 
     .. math:: f_a(x) = f_p(x) + [f_p(x)\, \varphi_\rho(x)^T, \; \varphi_\delta(x)^T]\, \beta, \quad
         \beta_\rho \sim N(0, s_\rho^2 I), \; \beta_\delta \sim N(0, s_\delta^2 I)

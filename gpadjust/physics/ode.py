@@ -19,7 +19,7 @@ ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
 class ODEPhysics(Physics):
     r"""One time step of an equation of motion, differentiable by autograd.
 
-    With :math:`x = (s, a)``, a state and an action that is held during the step :math:``h`,
+    With :math:`x = (s, a)`, a state and an action that is held during the step :math:`h`,
 
     .. math:: f_p(s, a) = s(h), \qquad \dot{s}(t) = g(s(t), a), \quad s(0) = s,
 

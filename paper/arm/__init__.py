@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 
-import pandas as pd
-
-from paper.arm.claims import Judge
+from paper.arm.claims import claims
 from paper.arm.figure import BOUND, BOUND_LABEL, draw_curves, draw_map
 from paper.arm.results import (
-    LAST,
+    LAST_TRIAL,
     MEASURES,
     load,
     load_evaluations,
     load_maps,
     tabulate,
+    tabulate_memory,
     tabulate_seconds,
 )
 from paper.arm.runs import ARM
-from paper.arm.scenarios import SCENARIOS
-from paper.arm.targets import Targets
+from paper.arm.targets import targets
 from paper.control import options
+from paper.control.claims import judge
+from paper.control.curves import Curves
 from paper.control.figure import draw_iqm, draw_time
+from paper.control.summary import Summary, verdicts
 
 FIGURES = ("curves", "iqm", "map", "time")
-LABELS = {name: scenario.label for name, scenario in SCENARIOS.items()}
-ENDS = {(6, 6): "after trial 6", (15, 15): "after trial 15", (LAST, LAST): f"after trial {LAST}"}
+ENDS = {(t, t): f"after trial {t}" for t in (6, 15, LAST_TRIAL)}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,33 +37,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def summarise(out: Path) -> None:
     """Write and print tables, verdicts and figures of all the runs in a folder."""
     trials, evaluations, maps = load(out), load_evaluations(out), load_maps(out)
-    table, times = tabulate(evaluations), tabulate_seconds(trials, evaluations)
-    claims = verdicts(trials, evaluations, maps)
-    table.to_csv(out / "table.csv", index=False, float_format="%.4g")
-    times.to_csv(out / "time.csv", index=False, float_format="%.4g")
-    claims.to_csv(out / "claims.csv", index=False)
-    for steps, part in table.groupby("steps", sort=False):
-        print(f"\nHand's RMSE in cm, {steps}:")
-        print(part.drop(columns="steps").to_string(index=False, float_format="%.1f", na_rep="-"))
-        for claim in claims[claims["steps"] == steps].itertuples():
-            print(f"  {claim.id} {claim.verdict}: {claim.claim} ({claim.measured})")
-    print("\nMean of a run:")
-    print(times.to_string(index=False, float_format="%.4g", na_rep="-"))
+    judged = {
+        label: judge(claims(maps), Curves(evaluations, measure), LAST_TRIAL)
+        for measure, label in MEASURES.items()
+    }
+    every = Curves(evaluations, "all_steps")
+    judged[MEASURES["all_steps"]] += judge(targets(trials, evaluations), every, LAST_TRIAL)
+    times = tabulate_seconds(trials, evaluations)
+    summary = Summary("steps", tabulate(evaluations), times, verdicts("steps", judged))
+    summary.write(out)
+    summary.show("Hand's RMSE in cm", digits=1)
+    memory = tabulate_memory(evaluations)
+    if len(memory):
+        print("\nWith and without the previous action, all steps, cm:")
+        print(memory.to_string(index=False, float_format="%.1f", na_rep="-"))
+    memory.to_csv(out / "memory.csv", index=False, float_format="%.4g")
     draw_curves(evaluations, out / "curves.png")
     line = (BOUND, BOUND_LABEL)
-    draw_iqm(evaluations, LABELS, MEASURES, ENDS, line, "hand's RMSE, cm", out / "iqm.png")
+    draw_iqm(evaluations, ARM.labels, MEASURES, ENDS, line, "hand's RMSE, cm", out / "iqm.png")
     draw_map(maps, out / "map.png")
-    draw_time(times, LABELS, out / "time.png")
+    draw_time(times, ARM.labels, out / "time.png")
     print(f"\nFigures: {', '.join(str(out / f'{name}.png') for name in FIGURES)}")
-
-
-def verdicts(trials: pd.DataFrame, evaluations: pd.DataFrame, maps: pd.DataFrame) -> pd.DataFrame:
-    """Judge the paper's claims, over all steps and over the last, and our targets over all."""
-    rows = [
-        {"steps": label, **asdict(claim)}
-        for measure, label in MEASURES.items()
-        for claim in Judge(evaluations, maps, measure).judge()
-    ]
-    label = MEASURES["all_steps"]
-    rows += [{"steps": label, **asdict(c)} for c in Targets(trials, evaluations).judge()]
-    return pd.DataFrame(rows)

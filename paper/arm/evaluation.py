@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from functools import lru_cache
+import warnings
+from functools import lru_cache, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,15 +12,14 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.envs import REAL_ARM, arm_targets, hand_distance_cm
-from gpadjust.envs.arm_model import MUSCLES, REST_ACTIVATION
 from gpadjust.envs.arm_simulation import ArmSimulation
 from gpadjust.envs.arm_task import START_MEAN
+from gpadjust.envs.opensim_model import MUSCLES, REST_ACTIVATION, build_muscle_arm
 from gpadjust.rl import DynaSAC
-from paper.arm.scenarios import ArmScenario, ArmSettings
+from paper.arm.scenarios import MAP_TRIAL, ArmScenario, ArmSettings
 
-LAST = 5  # steps of the second score
+NUM_LAST_STEPS = 5  # of the second score
 ACCURACY = 1e-5  # the environment's
-MAPPED = (9, 30)  # trials after which the errors at each target are kept
 _LOG = "evaluation_log"
 
 
@@ -37,7 +37,8 @@ def reach(policy: Policy, settings: ArmSettings, memory: bool) -> NDArray[np.flo
     """The distance of the hand, ``121 x trial_length`` in cm, by the deterministic policy.
 
     The real arm starts at rest at 35° and 65° for each target. All go a step at a time, so that the
-    policy is asked once a step. No random number is drawn.
+    policy is asked once a step. No random number is drawn. An arm whose integration fails stays
+    where it is for the rest of its trial, with a warning.
 
     Args:
         policy: The agent.
@@ -49,29 +50,26 @@ def reach(policy: Policy, settings: ArmSettings, memory: bool) -> NDArray[np.flo
     rest = [*START_MEAN, 0.0, 0.0, *[REST_ACTIVATION] * len(MUSCLES)]
     arms = np.tile(np.array(rest), (len(targets), 1))
     actions = np.zeros((len(targets), 4))
+    failed = np.zeros(len(targets), dtype=bool)
     distances = []
     for _ in range(settings.trial_length):
         seen = np.concatenate([arms[:, :4], targets, *([actions] if memory else [])], axis=1)
         chosen, _ = policy.predict(seen.astype(np.float32), deterministic=True)
         actions = np.asarray(chosen, dtype=np.float64).clip(0, 1)
-        arms = np.stack([_step(simulation, *pair) for pair in zip(arms, actions, strict=True)])
+        for i in np.flatnonzero(~failed):
+            try:
+                arms[i] = simulation.step(arms[i], actions[i])
+            except RuntimeError as error:
+                failed[i] = True
+                warnings.warn(f"The arm of target {i} stays: {error}", UserWarning, stacklevel=2)
         reached = torch.from_numpy(np.concatenate([arms[:, :4], targets], axis=1))
         distances.append(hand_distance_cm(reached).numpy())
     return np.stack(distances, axis=1)
 
 
-def _step(
-    simulation: ArmSimulation, arm: NDArray[np.float64], action: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    try:
-        return simulation.step(arm, action)
-    except RuntimeError:
-        return arm  # as in the environment
-
-
 @lru_cache(maxsize=1)
 def _simulation(strength: float) -> ArmSimulation:
-    return ArmSimulation(REAL_ARM, strength, ACCURACY)
+    return ArmSimulation(partial(build_muscle_arm, REAL_ARM, strength), ACCURACY)
 
 
 def score(distances: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -79,7 +77,7 @@ def score(distances: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
     squares = np.square(distances)
     return {
         "all_steps": np.sqrt(squares.mean(1)),
-        "last_five": np.sqrt(squares[:, -LAST:].mean(1)),
+        "last_five": np.sqrt(squares[:, -NUM_LAST_STEPS:].mean(1)),
     }
 
 
@@ -111,5 +109,5 @@ def evaluate(agent: DynaSAC, scenario: ArmScenario, settings: ArmSettings, trial
     row["evaluation_seconds"] = time.perf_counter() - start
     for name, value in row.items():
         log["evaluations"].setdefault(name, []).append(value)
-    if trial in MAPPED:
+    if trial in (MAP_TRIAL, settings.num_trials):
         log["maps"][f"{trial}"] = {name: errors.tolist() for name, errors in by_target.items()}

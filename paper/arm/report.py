@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from paper.arm.results import MEASURES, RMSES, SHOWN, THRESHOLDS
+from paper.arm.results import MEASURES, RMSES, SHOWN, THRESHOLDS, WINDOWS
 from paper.arm.runs import ARM
 from paper.arm.scenarios import SCENARIOS
 from paper.control.report import (
@@ -20,7 +20,19 @@ from paper.control.report import (
 )
 from paper.markdown import NOT_RUN, markdown
 
-NAMES = ("curves", "iqm", "map", "seconds", "all", "last", "claims", "targets", "time", "model")
+NAMES = (
+    "curves",
+    "iqm",
+    "map",
+    "seconds",
+    "all",
+    "last",
+    "memory",
+    "claims",
+    "targets",
+    "time",
+    "model",
+)
 
 
 def fragments(folder: Path) -> dict[str, str]:
@@ -45,12 +57,15 @@ def fragments(folder: Path) -> dict[str, str]:
         claims[ours], "target", "steps", {MEASURES["all_steps"]: ""}
     )
     times = times.set_index(times["scenario"].map(lambda name: SCENARIOS[name].label))
+    memory = folder / "memory.csv"
+    found["arm:memory"] = _memory(pd.read_csv(memory)) if memory.stat().st_size > 2 else NOT_RUN
     parts = {
         "fit_seconds": "fits, s",
         "rollout_seconds": "model steps, s",
         "sac_seconds": "updates, s",
         "evaluation_seconds": "evaluations, s",
-        "total_seconds": "all, s",
+        "total_seconds": "sum, s",
+        "cpu_seconds": "core's time, s",
         "updates": "updates",
     }
     found["arm:time"] = numbers(times[list(parts)], ["mean of a run", *parts.values()], "{:.0f}")
@@ -74,8 +89,23 @@ def _errors(table: pd.DataFrame) -> str:
                 *("" if pd.isna(value) else f"{value:.1f}" for value in values),
                 "" if pd.isna(row["iqm"]) else interval(row, 1),
                 "" if pd.isna(row["hundred"]) else f"{row['hundred']:.1f}",
-                *(paired(row, f"behind_{trials}", 1) for trials in ("3_9", "24_30")),
+                *(paired(row, f"more_{trials}", 1) for trials in ("3_9", "24_30")),
                 *("never" if pd.isna(first) else f"{first:.0f}" for first in firsts),
             ]
         )
+    return markdown(header, rows)
+
+
+def _memory(table: pd.DataFrame) -> str:
+    header = ["", "runs"]
+    for first, last in WINDOWS:
+        header += [f"{first}-{last} without", "with", "difference"]
+    rows = []
+    for row in table.to_dict("records"):
+        cells = [SCENARIOS[row["scenario"]].label, f"{row['runs']}"]
+        for first, last in WINDOWS:
+            trials = f"{first}_{last}"
+            cells += [f"{row[f'{form}_{trials}']:.1f}" for form in ("without", "with")]
+            cells.append(paired(row, f"more_{trials}", 1))
+        rows.append(cells)
     return markdown(header, rows)

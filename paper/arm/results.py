@@ -7,26 +7,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from paper.arm.scenarios import SCENARIOS
-from paper.control.results import (
-    compared,
-    curve,
-    first_below,
-    in_order,
-    iqm,
-    load_trials,
-    of_run,
-    results,
-    tabulate_time,
-    window,
-)
+from paper.arm.scenarios import SCENARIOS, SETTINGS
+from paper.control.curves import Curves
+from paper.control.results import in_order, iqm, load_trials, of_run, results, tabulate_time
 
 MEASURES = {"all_steps": "all steps", "last_five": "last five steps"}
 SHOWN = (3, 6, 9, 12, 18, 24, 30)  # trials
 THRESHOLDS = (10, 8)  # cm
 RMSES = ("rmse_theta_s", "rmse_theta_e", "rmse_theta_s_dot", "rmse_theta_e_dot")  # rad, rad/s
 WINDOWS = ((3, 9), (24, 30))
-LAST = 30
+LAST_TRIAL = SETTINGS.num_trials
 _NAMES = list(SCENARIOS)
 
 
@@ -58,35 +48,28 @@ def load_maps(out: Path) -> pd.DataFrame:
     return in_order(frames, _NAMES)
 
 
-def spread(evaluations: pd.DataFrame, name: str, measure: str) -> pd.Series[float]:
-    """The standard deviation of a measure over the runs of a scenario, by trial."""
-    return evaluations[evaluations["scenario"] == name].groupby("trial")[measure].std()
-
-
 def tabulate(evaluations: pd.DataFrame) -> pd.DataFrame:
     """Summarise the evaluations: a row for each scenario, over all steps and over the last."""
-    names = list(evaluations["scenario"].unique())
     rows = []
     for measure, label in MEASURES.items():
-        ends = {name: window(evaluations, name, measure, LAST, LAST).to_numpy() for name in names}
+        curves, hundred = Curves(evaluations, measure), Curves(evaluations, f"{measure}_100")
+        ends = {n: curves.window(n, LAST_TRIAL, LAST_TRIAL).to_numpy() for n in curves.names}
         points, intervals = iqm({name: values for name, values in ends.items() if len(values)})
-        for name in names:
-            by_trial = curve(evaluations, name, measure)
+        for name in curves.names:
             low, high = intervals.get(name, (np.nan, np.nan))
-            hundred = curve(evaluations, name, f"{measure}_100")
             rows.append(
                 {
                     "scenario": name,
                     "steps": label,
-                    "runs": evaluations[evaluations["scenario"] == name]["seed"].nunique(),
-                    **{f"at_{trial}": by_trial.get(trial, np.nan) for trial in SHOWN},
-                    "sd": spread(evaluations, name, measure).loc[3:].mean(),
-                    "hundred": hundred.get(LAST, np.nan),
+                    "runs": len(curves.seeds(name)),
+                    **{f"at_{trial}": curves.at(name, trial) for trial in SHOWN},
+                    "sd": curves.spread(name).loc[3:].mean(),
+                    "hundred": hundred.at(name, LAST_TRIAL),
                     "iqm": points.get(name, np.nan),
                     "iqm_low": low,
                     "iqm_high": high,
-                    **compared(evaluations, name, measure, WINDOWS),
-                    **{f"first_{t}": first_below(by_trial, t) for t in THRESHOLDS},
+                    **curves.more_columns(name, WINDOWS),
+                    **{f"first_{t}": curves.first(name, t) for t in THRESHOLDS},
                 }
             )
     return pd.DataFrame(rows).astype({f"first_{t}": "Int64" for t in THRESHOLDS})
@@ -100,3 +83,26 @@ def tabulate_seconds(trials: pd.DataFrame, evaluations: pd.DataFrame) -> pd.Data
     table.insert(3, "evaluation_seconds", seconds)
     table["total_seconds"] += seconds
     return table.reset_index()
+
+
+def tabulate_memory(evaluations: pd.DataFrame) -> pd.DataFrame:
+    """What the previous action as an input brings: a row for each learner that has both forms.
+
+    Errors are over all steps, in cm, of the seeds that both forms have; differences are less than
+    without it, with their standard errors.
+    """
+    rows = []
+    every = Curves(evaluations, "all_steps")
+    for name in SCENARIOS:
+        remembering = f"{name}-memory"
+        if not {name, remembering} <= set(every.names):
+            continue
+        curves = every.restricted(every.seeds(name) & every.seeds(remembering))
+        row = {"scenario": name, "runs": len(curves.seeds(name))}
+        for first, last in WINDOWS:
+            row[f"without_{first}_{last}"] = curves.window(name, first, last).mean()
+            row[f"with_{first}_{last}"] = curves.window(remembering, first, last).mean()
+            gap = curves.more(remembering, first, last, reference=name)
+            row[f"more_{first}_{last}"], row[f"more_{first}_{last}_se"] = gap
+        rows.append(row)
+    return pd.DataFrame(rows)

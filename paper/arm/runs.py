@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from gpadjust.envs import arm_reward
+from gpadjust.envs.opensim_model import load_opensim
 from gpadjust.rl import DynaSAC
 from paper.arm.evaluation import evaluate, evaluation_log
 from paper.arm.scenarios import (
@@ -60,5 +61,6 @@ ARM = Experiment(
     functions=functions,
     make_recorder=ArmRecorder,
     details=details,
+    check=load_opensim,
 )
 run_one = partial(runs.run_one, ARM)

@@ -30,7 +30,9 @@ NAMES = (
     "targets",
     "time",
     "model",
+    "short",
 )
+SHORT = ("mf-best", "phy", "gp", "cka", "rra", "oracle")  # the learners of the main README
 
 
 def fragments(folder: Path) -> dict[str, str]:
@@ -50,6 +52,7 @@ def fragments(folder: Path) -> dict[str, str]:
         found[f"cartpole:{name}"] = f"![{caption}](results/cartpole/{figure}.png)"
     for actions, part in table.groupby("actions"):
         found[f"cartpole:{actions}"] = _costs(part)
+    found["cartpole:short"] = _short(table[table["actions"] == "sampled"])
     ours = claims["id"].str.startswith("T")
     parts = {name: f"{name} actions" for name in ("sampled", "deterministic")}
     found["cartpole:claims"] = claims_table(claims[~ours], "claim", "actions", parts)
@@ -77,8 +80,24 @@ def _costs(table: pd.DataFrame) -> str:
                 f"{row['runs']}",
                 *("" if pd.isna(cost) else f"{cost:.2f}" for cost in costs),
                 "" if pd.isna(row["iqm"]) else interval(row),
-                *(paired(row, f"behind_{trials}") for trials in ("1_25", "41_50")),
+                *(paired(row, f"more_{trials}") for trials in ("1_25", "41_50")),
                 *("never" if pd.isna(first) else f"{first:.0f}" for first in firsts),
+            ]
+        )
+    return markdown(header, rows)
+
+
+def _short(table: pd.DataFrame) -> str:
+    header = ["mean cost of trials", "1-6", "at 6", "13-25", "41-50", "first at 0.5"]
+    rows = []
+    for row in table[table["scenario"].isin(SHORT)].to_dict("records"):
+        costs = [row[f"cost_{name}"] for name in ("1_6", "6", "13_25", "41_50")]
+        first = row["first_0.5"]
+        rows.append(
+            [
+                SCENARIOS[row["scenario"]].label,
+                *("" if pd.isna(cost) else f"{cost:.2f}" for cost in costs),
+                "never" if pd.isna(first) else f"trial {first:.0f}",
             ]
         )
     return markdown(header, rows)

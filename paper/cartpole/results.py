@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 
 from paper.cartpole.scenarios import SCENARIOS, SETTINGS
-from paper.control.results import compared, curve, first_below, iqm, load_trials, window
+from paper.control.curves import Curves
+from paper.control.results import iqm, load_trials
 
 MEASURES = {"cost": "sampled", "evaluation": "deterministic"}
 WINDOWS = ((1, 6), (13, 25), (41, 50))
@@ -48,19 +49,19 @@ def holds_from(curve: pd.Series[float], threshold: float, until: int) -> int | N
 
 def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
     """Summarise the costs: a row for each scenario, for sampled and deterministic actions."""
-    names = list(trials["scenario"].unique())
     rows = []
     for measure, label in MEASURES.items():
-        ends = {name: window(trials, name, measure, *WINDOWS[-1]).to_numpy() for name in names}
+        curves = Curves(trials, measure)
+        ends = {name: curves.window(name, *WINDOWS[-1]).to_numpy() for name in curves.names}
         points, intervals = iqm({name: values for name, values in ends.items() if len(values)})
-        for name in names:
-            by_trial = curve(trials, name, measure)
+        for name in curves.names:
+            by_trial = curves.mean(name)
             low, high = intervals.get(name, (np.nan, np.nan))
             rows.append(
                 {
                     "scenario": name,
                     "actions": label,
-                    "runs": trials[trials["scenario"] == name]["seed"].nunique(),
+                    "runs": len(curves.seeds(name)),
                     **{
                         f"cost_{first}_{last}": by_trial.loc[first:last].mean()
                         for first, last in WINDOWS
@@ -69,8 +70,8 @@ def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
                     "iqm": points.get(name, np.nan),
                     "iqm_low": low,
                     "iqm_high": high,
-                    **compared(trials, name, measure, _COMPARED),
-                    **{f"first_{t}": first_below(by_trial, t) for t in THRESHOLDS},
+                    **curves.more_columns(name, _COMPARED),
+                    **{f"first_{t}": curves.first(name, t) for t in THRESHOLDS},
                     "holds_0.5": holds_from(by_trial, 0.5, _until(name)),
                 }
             )

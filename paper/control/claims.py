@@ -3,18 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import pandas as pd
+from paper.control.curves import Curves
 
 Verdict = Literal["reproduced", "not reproduced", "beaten", "met", "missed", "not run"]
+Finding = tuple[Verdict, str]
+FEWEST = 2  # runs that a verdict is given of
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper or a target of our own, its verdict, and the number behind it."""
+    """A claim of the paper, or a target of our own.
+
+    Args:
+        id: The paper's, or ours.
+        text: What it says.
+        needed: The scenarios that it is about.
+        decide: Gives verdict and numbers, from curves of the seeds with which all of ``needed``
+            were run to their end; other scenarios may lack some of these.
+        fewest: Runs without which there is no verdict.
+    """
+
+    id: str
+    text: str
+    needed: tuple[str, ...]
+    decide: Callable[[Curves], Finding]
+    fewest: int = FEWEST
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A claim, its verdict, and the numbers behind it."""
 
     id: str
     claim: str
@@ -22,32 +44,49 @@ class Claim:
     measured: str
 
 
-def judged(
-    claims: Mapping[str, tuple[str, tuple[str, ...]]],
-    finished: Collection[str],
-    decide: Callable[[str], tuple[Verdict, str]],
-) -> list[Claim]:
-    """All claims; one that needs what was not run to its end is not judged.
+def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
+    """All claims, each by the seeds that all its scenarios have; one that lacks them is not judged.
 
     Args:
-        claims: By their ids, what they say and the scenarios that they need.
-        finished: The scenarios that were run to their end.
-        decide: Verdict and number of the claim of an id.
+        claims: What is judged.
+        curves: Of all runs.
+        last: The trial that a run must have reached.
     """
     found = []
-    for name, (text, needed) in claims.items():
-        missing = [scenario for scenario in needed if scenario not in finished]
-        if missing:
-            found.append(Claim(name, text, "not run", f"no results of {missing[0]}"))
-        else:
-            found.append(Claim(name, text, *decide(name)))
+    for claim in claims:
+        shared = set.intersection(*(curves.seeds(name, last) for name in claim.needed))
+        if len(shared) < claim.fewest:
+            runs = {name: len(curves.seeds(name, last)) for name in claim.needed}
+            least = min(runs, key=lambda name: runs[name])
+            lacking = f"no results of {least}" if not runs[least] else f"too few runs of {least}"
+            found.append(Judged(claim.id, claim.text, "not run", lacking))
+            continue
+        verdict, measured = claim.decide(curves.restricted(shared))
+        measured = f"{counted(len(shared))}: {measured}"
+        found.append(Judged(claim.id, claim.text, verdict, measured))
     return found
 
 
-def num_runs(trials: pd.DataFrame, name: str) -> str:
-    """How many runs of a scenario there are, in words."""
-    runs = trials[trials["scenario"] == name]["seed"].nunique()
+def reproduced(held: bool, beaten: bool = False) -> Verdict:
+    """The verdict on a claim of the paper."""
+    if not held:
+        return "not reproduced"
+    return "beaten" if beaten else "reproduced"
+
+
+def met(held: bool) -> Verdict:
+    """The verdict on a target of our own."""
+    return "met" if held else "missed"
+
+
+def counted(runs: int) -> str:
+    """A number of runs, in words."""
     return f"{runs} run{'' if runs == 1 else 's'}"
+
+
+def reached(trial: int | None) -> str:
+    """When a threshold was reached, in words."""
+    return "never" if trial is None else f"at trial {trial}"
 
 
 def signed(value: float, error: float, digits: int = 3) -> str:

@@ -31,6 +31,7 @@ class Experiment:
         functions: The known functions of a scenario, which checkpoints do not hold.
         make_recorder: Writes down the trials of a scenario with some settings.
         details: What a result says beside its trials, of the agent at the end and its seed.
+        check: Raises an ImportError if something that it needs is not installed.
     """
 
     name: str
@@ -41,6 +42,12 @@ class Experiment:
     functions: Callable[[Any], dict[str, Any]]
     make_recorder: Callable[[Any, Any], Recorder]
     details: Callable[[DynaSAC, int], dict[str, Any]]
+    check: Callable[[], object] = lambda: None
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The names of the scenarios in tables and figures."""
+        return {name: scenario.label for name, scenario in self.scenarios.items()}
 
     def known(self, scenario: Scenario, seed: int, settings: Settings) -> dict[str, Any]:
         """Dynamics and functions, as DynaSAC and ``resume`` take them."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import matplotlib as mpl
@@ -11,7 +12,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from paper.control.results import PARTS, iqm, window
+from paper.control.curves import Curves
+from paper.control.results import PARTS, iqm
 
 _DPI = {"savefig.dpi": 110}
 _COLORS = ("navy", "tab:red")
@@ -23,7 +25,50 @@ def save(figure: Figure, path: Path) -> None:
         figure.savefig(path)
 
 
-def one_legend(figure: Figure, axes: Sequence[Axes]) -> None:
+def panels(
+    records: pd.DataFrame, labels: Mapping[str, str], columns: int, size: tuple[float, float]
+) -> tuple[Figure, dict[str, Axes]]:
+    """A figure with a panel for each scenario, its name and number of runs above it.
+
+    Args:
+        records: A row for each scenario, seed and trial.
+        labels: The names of the scenarios.
+        columns: Panels in a row.
+        size: Of a panel, in inches.
+    """
+    runs = records.groupby("scenario", sort=False)["seed"].nunique()
+    columns = min(columns, len(runs))
+    rows = math.ceil(len(runs) / columns)
+    width = max(9.0, size[0] * columns)  # as wide as the legend
+    figure = Figure(figsize=(width, size[1] * rows + 0.8), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flatten()
+    for ax in axes[len(runs) :]:
+        ax.set_visible(False)
+    for ax, (name, number) in zip(axes, runs.items(), strict=False):
+        ax.set_title(f"{labels[str(name)]} ({number})", loc="left", fontsize=10)
+        ax.tick_params(labelbottom=True)
+    return figure, dict(zip(map(str, runs.index), axes, strict=False))
+
+
+def draw_mean(ax: Axes, records: pd.DataFrame, measure: str, color: str, label: str) -> None:
+    """Draw the mean over runs by trial, and a standard deviation to either side."""
+    by_trial = records.groupby("trial")[measure]
+    mean, sd = by_trial.mean(), by_trial.std().fillna(0)
+    ax.fill_between(mean.index, mean - sd, mean + sd, color=color, alpha=0.14, lw=0)
+    ax.plot(mean.index, mean, color=color, lw=1.4, label=f"{label}: mean, sd of runs")
+
+
+def draw_backdrop(
+    axes: Mapping[str, Axes], records: pd.DataFrame, name: str, measure: str, label: str
+) -> None:
+    """Draw the mean of a scenario into the panels of all others, for comparison."""
+    mean = records[records["scenario"] == name].groupby("trial")[measure].mean()
+    for other, ax in axes.items():
+        if other != name and len(mean):
+            ax.plot(mean.index, mean, color="0.55", lw=1.2, label=label, zorder=1.5)
+
+
+def one_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     """A legend above a figure, of the lines in any of its panels, of which not all have all."""
     handles = {
         label: handle
@@ -62,7 +107,8 @@ def draw_iqm(
         for shift, color, (measure, label) in zip(
             (-0.14, 0.14), _COLORS, measures.items(), strict=True
         ):
-            scores = {n: window(trials, n, measure, first, last).to_numpy() for n in names}
+            curves = Curves(trials, measure)
+            scores = {n: curves.window(n, first, last).to_numpy() for n in names}
             scores = {name: values for name, values in scores.items() if len(values)}
             if not scores:
                 continue

@@ -58,6 +58,10 @@ def _run(
     check_options(arguments)
     tasks = make_tasks(experiment, arguments.scenarios, arguments.runs, arguments.seed)
     if not arguments.only_tables:
+        try:
+            experiment.check()
+        except ImportError as error:
+            raise SystemExit(str(error)) from error
         run_all(
             experiment, tasks, arguments.out, num_jobs=arguments.jobs, backend=arguments.backend
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
@@ -25,8 +26,9 @@ class Recorder(BaseCallback):
     """Records each trial, and sets the number of updates that follows it.
 
     A record is begun when the trial ends, and finished after the updates, before the next trial. A
-    checkpoint belongs after this callback in the list. An experiment says in a subclass what it
-    writes down of a trial, and of the policy that has learnt from it.
+    checkpoint belongs after this callback in the list. Seconds of the parts are of wall time,
+    ``"cpu_seconds"`` what this process took for all of it, on its one core. An experiment says in a
+    subclass what it writes down of a trial, and of the policy that has learnt from it.
 
     Args:
         scenario: The learner.
@@ -40,6 +42,7 @@ class Recorder(BaseCallback):
         self.scenario = scenario
         self.settings = settings
         self._record: dict[str, Any] | None = None
+        self._begun = 0.0  # of this process's time
 
     def of_trial(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
         """What is recorded of a trial's transitions."""
@@ -54,13 +57,16 @@ class Recorder(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._finish()
+        self._begun = time.process_time()
         trial = len(trial_log(self.model)) + 1
         self.model.gradient_steps = updates_on_trial(self.scenario, self.settings, trial)
 
     def _on_rollout_end(self) -> None:
-        trial = self.model.recorded_trials(newest=self.settings.trial_length)
+        steps = self.num_timesteps - sum(past["steps"] for past in trial_log(self.model))
+        trial = self.model.recorded_trials(newest=steps)
         transitions = (trial.states, trial.actions, trial.next_states)
-        self._record = {**self.of_trial(*transitions), **self._scores(transitions)}
+        scores = self._scores(transitions)
+        self._record = {"steps": steps, **self.of_trial(*transitions), **scores}
 
     def _on_training_end(self) -> None:
         self._finish()
@@ -105,5 +111,6 @@ class Recorder(BaseCallback):
         }
         for part, seconds in agent.wall_time.items():
             record[f"{part}_seconds"] = seconds - sum(past[f"{part}_seconds"] for past in log)
+        record["cpu_seconds"] = time.process_time() - self._begun
         log.append(record)
         self._record = None

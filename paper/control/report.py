@@ -30,7 +30,8 @@ def describe_updates(experiment: Experiment) -> str:
         real = updates_on_trial(scenario, settings, trial)
         if scenario.dynamics is None or trial > until:
             return f"{real}"
-        per_step = scenario.model_updates or settings.model_updates
+        chosen = scenario.model_updates
+        per_step = settings.model_updates if chosen is None else chosen
         in_model = per_step * settings.model_trials * settings.trial_length
         return f"{real} + {in_model:.0f}"
 

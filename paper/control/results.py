@@ -13,7 +13,6 @@ from rliable import metrics
 from rliable.library import get_interval_estimates
 
 PARTS = ("fit", "rollout", "sac")
-REFERENCE = "cka"  # which the others are compared with, seed by seed
 FEWEST = 4  # runs that a bootstrap interval is given of
 _BOOTSTRAPS = 1000
 
@@ -70,49 +69,6 @@ def in_order(frames: Sequence[pd.DataFrame], scenarios: Sequence[str]) -> pd.Dat
     )
 
 
-def curve(trials: pd.DataFrame, name: str, measure: str) -> pd.Series[float]:
-    """The mean of a measure over the runs of a scenario, by trial."""
-    return trials[trials["scenario"] == name].groupby("trial")[measure].mean()
-
-
-def window(
-    trials: pd.DataFrame, name: str, measure: str, first: int, last: int
-) -> pd.Series[float]:
-    """The mean of a measure over some trials of a scenario, by seed."""
-    chosen = trials[(trials["scenario"] == name) & trials["trial"].between(first, last)]
-    return chosen.groupby("seed")[measure].mean()
-
-
-def first_below(curve: pd.Series[float], threshold: float) -> int | None:
-    """The first trial at which a curve is not above a threshold."""
-    below = curve.index[curve <= threshold]
-    return int(below[0]) if len(below) else None
-
-
-def behind(
-    trials: pd.DataFrame, name: str, measure: str, first: int, last: int
-) -> tuple[float, float]:
-    """How much more a scenario costs than Dyna-CKA with the same seeds: mean, standard error."""
-    own, others = (window(trials, n, measure, first, last) for n in (name, REFERENCE))
-    more = (own - others).dropna()
-    return float(more.mean()), float(more.sem()) if len(more) > 1 else np.nan
-
-
-def compared(
-    trials: pd.DataFrame, name: str, measure: str, windows: Sequence[tuple[int, int]]
-) -> dict[str, float]:
-    """How far behind Dyna-CKA a scenario is, which is not said of Dyna-CKA itself."""
-    columns: dict[str, float] = {}
-    for first, last in windows:
-        found = (np.nan, np.nan)
-        if name != REFERENCE:
-            found = behind(trials, name, measure, first, last)
-        columns |= dict(
-            zip((f"behind_{first}_{last}", f"behind_{first}_{last}_se"), found, strict=True)
-        )
-    return columns
-
-
 def iqm(scores: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Interquartile means of runs, with the 95 % bootstrap intervals of rliable.
 
@@ -139,10 +95,12 @@ def iqm(scores: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, np.n
 def tabulate_time(trials: pd.DataFrame, rmses: Sequence[str]) -> pd.DataFrame:
     """Mean seconds of a run in each part, its updates, and how well the model foresaw trials.
 
-    Scores are over the trials from the second, which is the first that a learnt model foresees.
+    ``cpu_seconds`` are of the whole run on its core, the others of wall time. Scores are over the
+    trials from the second, which is the first that a learnt model foresees.
     """
     trials = trials.assign(total_seconds=sum(trials[f"{part}_seconds"] for part in PARTS))
     sums = [*(f"{part}_seconds" for part in PARTS), "total_seconds", "updates", "left_bounds"]
+    sums += [name for name in ["cpu_seconds"] if name in trials]
     by_run = trials.groupby(["scenario", "seed"], sort=False)[sums].sum()
     table = by_run.groupby("scenario", sort=False).mean()
     scores = trials[trials["trial"] > 1].groupby("scenario", sort=False)

@@ -6,8 +6,9 @@ import json
 import os
 import platform
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -61,7 +62,7 @@ def run_one(
     settings = experiment.settings if settings is None else settings
     scenario = experiment.scenarios[name]
     path = result_path(out, name, seed)
-    described = _described(scenario, settings)
+    described = _described(experiment, scenario, settings)
     if path.exists():
         _check(path, json.loads(path.read_text())["settings"], described)
         return path
@@ -87,7 +88,7 @@ def run_one(
         "seed": seed,
         "settings": described,
         **{key: _rounded(value) for key, value in experiment.details(agent, seed).items()},
-        "versions": {"python": platform.python_version(), "torch": torch.__version__},
+        "versions": versions(),
         "trials": {key: [_rounded(trial[key]) for trial in trials] for key in trials[0]},
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -153,13 +154,16 @@ def _backend(name: Backend) -> Iterator[None]:
         yield
 
 
-def _described(scenario: Scenario, settings: Settings) -> dict[str, Any]:
-    """The settings of a run, as JSON has them."""
+def _described(experiment: Experiment, scenario: Scenario, settings: Settings) -> dict[str, Any]:
+    """The settings of a run and what its model is, as JSON has them."""
     values = asdict(settings)
     if scenario.model_updates is not None:
         values["model_updates"] = scenario.model_updates
     if scenario.updates is not None:
         values["updates"] = scenario.updates
+    if scenario.dynamics is not None:
+        dynamics = experiment.make_dynamics(scenario, 0, settings)
+        values |= {f"model.{name}": text for name, text in dynamics.describe().items()}
     described: dict[str, Any] = json.loads(json.dumps(values))
     return described
 
@@ -171,6 +175,15 @@ def _check(path: Path, found: dict[str, Any], expected: dict[str, Any]) -> None:
             f"{path} was made with other settings: {differ[0]} was {found.get(differ[0])} and is "
             f"now {expected.get(differ[0])}. Remove it, or choose another --out."
         )
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of what the numbers come from."""
+    found = {"python": platform.python_version()}
+    for name in ("gpadjust", "torch", "gpytorch", "stable_baselines3", "opensim"):
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def _rounded(value: Any) -> Any:

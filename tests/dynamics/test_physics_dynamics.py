@@ -35,6 +35,34 @@ def test_it_predicts_the_physics_without_doubt():
     assert torch.equal(blocks, following.view(2, 10, 2))
 
 
+@pytest.mark.parametrize(
+    ("declared", "message"),
+    [
+        ({"previous": {"x": "a"}}, "'x' is said to hold the previous action 'a'"),
+        ({"exogenous": ["x"]}, "'x' is said to be exogenous"),
+        ({"integrated": {"x": "v"}, "step": 0.3}, "'x' is said to be integrated"),
+    ],
+)
+@pytest.mark.parametrize("make", [PhysicsDynamics, CKADynamics])
+def test_states_that_are_not_as_declared_are_named(make, declared, message):
+    dynamics = make(StateSpec(["x", "v"], ["a"], **declared), push)
+    with pytest.raises(ValueError, match=message):
+        dynamics.update(*transitions())
+
+
+def test_every_update_is_checked():
+    def still(X):
+        return X[:, :1] + 0.1 * X[:, 1:]
+
+    dynamics = PhysicsDynamics(StateSpec(["x", "goal"], ["a"], exogenous=["goal"]), still)
+    states, actions, following = transitions()
+    following = torch.cat([still(torch.cat([states[:, :1], actions], -1)), states[:, 1:]], -1)
+    dynamics.update(states, actions, following)
+    following[5, 1] += 0.5
+    with pytest.raises(ValueError, match=r"'goal' .* changes by 0.5 in row 5"):
+        dynamics.update(states, actions, following)
+
+
 @pytest.mark.parametrize("learnt", [False, True])
 def test_a_physics_of_differences_is_warned_of(learnt):
     def change(X):

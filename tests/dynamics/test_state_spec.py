@@ -164,5 +164,8 @@ def test_what_is_no_previous_action_is_named():
     following[3, 0] += 0.1
     with pytest.raises(ValueError, match=r"'last' .* previous action 'a', but is .* in row 3"):
         MEMORY.check_transitions(states, following, actions)
+    scales = torch.tensor([1e4, 1.0])  # another action's does not matter
+    with pytest.raises(ValueError, match=r"'last' .* in row 3"):
+        MEMORY.check_transitions(states, following, scales * actions)
     with pytest.raises(ValueError, match="without actions; pass `actions`"):
         MEMORY.check_transitions(states, following)

@@ -11,13 +11,15 @@ from gpadjust.rl.random_state import RandomState
 from paper import __main__ as command_line
 from paper import report
 from paper.arm import evaluation, summarise
-from paper.arm.claims import CLAIMS, Judge, distance_from_start
-from paper.arm.evaluation import evaluation_log, hundred, reach, score
+from paper.arm.claims import claims, distance_from_start
+from paper.arm.evaluation import hundred, reach, score
 from paper.arm.figure import HELD
-from paper.arm.results import load, load_evaluations, load_maps, tabulate
+from paper.arm.results import load, load_evaluations, load_maps, tabulate, tabulate_memory
 from paper.arm.runs import ARM, run_one
 from paper.arm.scenarios import PAPER, SCENARIOS, SETTINGS, make_dynamics, make_env
-from paper.arm.targets import Targets
+from paper.arm.targets import targets
+from paper.control.claims import judge
+from paper.control.curves import Curves
 from paper.control.runs import result_path
 
 TINY = replace(
@@ -25,6 +27,7 @@ TINY = replace(
     num_trials=2,
     trial_length=5,
     model_trials=2,
+    model_updates=1,
     model_until=2,
     batch_size=16,
     net_arch=(16,),
@@ -108,7 +111,7 @@ def test_scores():
 
 @pytest.mark.usefixtures("_few_targets")
 def test_an_interrupted_run_gives_the_numbers_of_one_that_was_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "MAPPED", (1,))
+    monkeypatch.setattr(evaluation, "MAP_TRIAL", 1)
     whole = run_one("cka-memory", 0, tmp_path / "whole", TINY)
     expected = numbers_of(whole)
     assert expected["evaluations"]["trial"] == [0, 1, 2]
@@ -140,15 +143,6 @@ def test_the_models_of_the_scenarios():
     assert make_dynamics(SCENARIOS["cka-opensim"], 0).physics.name == "opensim_arm"
 
 
-def test_a_log_is_kept_by_the_agent():
-    class Agent:
-        pass
-
-    agent = Agent()
-    evaluation_log(agent)["evaluations"]["trial"] = [0]
-    assert evaluation_log(agent)["evaluations"]["trial"] == [0]
-
-
 def test_unknown_scenarios(tmp_path, monkeypatch):
     arguments = ["paper", "arm", "--scenarios", "mf,ck", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", arguments)
@@ -174,7 +168,7 @@ def write(out, curves, maps=None, spreads=None, num_runs=4, last=30):
                     evaluations[measure + suffix] = [error - less for error in errors]
             at_target = (maps or {}).get(name, lambda far: 5 + 0 * far)(far).tolist()
             nothing = [None] * last
-            times = ("fit_seconds", "rollout_seconds", "sac_seconds")
+            times = ("fit_seconds", "rollout_seconds", "sac_seconds", "cpu_seconds")
             result = {
                 "scenario": name,
                 "seed": seed,
@@ -194,7 +188,7 @@ def write(out, curves, maps=None, spreads=None, num_runs=4, last=30):
 
 def verdicts(out, *args, measure="all_steps", **kwargs):
     write(out, *args, **kwargs)
-    found = Judge(load_evaluations(out), load_maps(out), measure).judge()
+    found = judge(claims(load_maps(out)), Curves(load_evaluations(out), measure), 30)
     return {claim.id: claim for claim in found}
 
 
@@ -213,53 +207,66 @@ AS_PUBLISHED = {
 
 
 def test_verdicts_of_the_papers_curves(tmp_path):
-    claims = verdicts(
+    judged = verdicts(
         tmp_path,
         AS_PUBLISHED,
         maps={"mf": lambda far: 5 + far / 3},
         spreads={"cka": 0.2},
     )
-    found = {name: claim.verdict for name, claim in claims.items()}
-    assert found == dict.fromkeys(CLAIMS, "reproduced")
-    assert "10 cm never" in claims["A2"].measured
-    assert claims["A4"].measured.startswith("10 cm at trial 3, 8 cm at trial 3, at 30 6.0 cm")
-    assert claims["A6"].measured.startswith("at most 10 cm at 121 of 121 targets by CKA, at ")
+    found = {name: claim.verdict for name, claim in judged.items()}
+    assert found == dict.fromkeys(("A1", "A2", "A3", "A4", "A5", "A6"), "reproduced")
+    assert "10 cm never" in judged["A2"].measured
+    assert judged["A4"].measured.startswith(
+        "4 runs: 10 cm at trial 3, 8 cm at trial 3, at 30 6.0 cm"
+    )
+    assert judged["A6"].measured.startswith(
+        "4 runs: at most 10 cm at 121 of 121 targets by CKA, at "
+    )
 
 
 def test_verdicts_of_other_curves(tmp_path):
-    claims = verdicts(
+    judged = verdicts(
         tmp_path,
         {"mf": 6, "gp": falls(40, 6, 9), "phy": 20, "cka": 4, "rra": 20},
         maps={"cka": lambda far: 20 + 0 * far},
         spreads={"cka": 0.2},
     )
-    found = {name: claim.verdict for name, claim in claims.items()}
+    found = {name: claim.verdict for name, claim in judged.items()}
     assert found["A1"] == found["A4"] == "beaten"
     assert {found[name] for name in ("A2", "A3", "A5", "A6")} == {"not reproduced"}
 
 
 def test_claims_about_what_was_not_run(tmp_path):
-    claims = verdicts(tmp_path, {"cka": 5, "mf": 9}, num_runs=1)
-    assert claims["A4"].verdict == "not run"
-    assert claims["A4"].measured == "no results of phy"
-    assert claims["A1"].verdict == "reproduced"
+    judged = verdicts(tmp_path, {"cka": 5, "mf": 9})
+    assert judged["A4"].verdict == "not run"
+    assert judged["A4"].measured == "no results of phy"
+    assert judged["A1"].verdict == "reproduced"
 
 
-def targets(out, curves, **kwargs):
+def test_learning_nowhere_is_not_learning_near_the_start(tmp_path):
+    judged = verdicts(tmp_path, AS_PUBLISHED, maps={"mf": lambda far: 20 + 0 * far})
+    assert judged["A6"].verdict == "not reproduced"
+    assert "at none by model-free" in judged["A6"].measured
+
+
+def judged_targets(out, curves, **kwargs):
     write(out, curves, **kwargs)
-    found = Targets(load(out), load_evaluations(out)).judge()
+    evaluations = load_evaluations(out)
+    found = judge(targets(load(out), evaluations), Curves(evaluations, "all_steps"), 30)
     return {claim.id: claim for claim in found}
 
 
 def test_targets(tmp_path):
     curves = {**AS_PUBLISHED, "cka-opensim": 6.5}
-    found = targets(tmp_path / "met", curves, spreads={"cka-opensim": 0})
+    found = judged_targets(tmp_path / "met", curves, spreads={"cka-opensim": 0})
     assert {claim.verdict for claim in found.values()} == {"met"}
-    assert found["T1"].measured == "at trial 3; at 6 7.2 cm (4 runs)"
-    assert found["T2"].measured.startswith("6.0 cm; the best of the others 6.0 cm (Dyna-RRA)")
-    assert found["T3"].measured.startswith("101 s (fits 30, ")
-    assert found["T4"].measured.startswith("seed 0: 6.5 cm at 30, 101 s; with the equation")
-    found = targets(tmp_path / "missed", dict.fromkeys(PAPER, 5) | {"cka": 9})
+    assert found["T1"].measured == "4 runs: at trial 3; at 6 7.2 cm"
+    assert found["T2"].measured.startswith(
+        "4 runs: 6.0 cm; the best of the others 6.0 cm (Dyna-RRA)"
+    )
+    assert found["T3"].measured.startswith("4 runs: 30 s; of wall time, fits 30, ")
+    assert found["T4"].measured.startswith("4 runs: 6.5 cm at 30, 30 s; with the equation")
+    found = judged_targets(tmp_path / "missed", dict.fromkeys(PAPER, 5) | {"cka": 9})
     assert found["T1"].verdict == found["T2"].verdict == "missed"
     assert found["T4"].verdict == "not run"
 
@@ -272,10 +279,20 @@ def test_tables(tmp_path):
     assert list(every.index) == ["mf", "cka"]
     assert list(every["runs"]) == [3, 4]
     assert every["at_6"]["mf"] == pytest.approx(27, abs=0.2)
-    assert every["behind_24_30"]["mf"] == pytest.approx(11.5)
-    assert every["behind_24_30_se"]["mf"] == pytest.approx(0, abs=1e-9)
+    assert every["more_24_30"]["mf"] == pytest.approx(11.5)
+    assert every["more_24_30_se"]["mf"] == pytest.approx(0, abs=1e-9)
     assert every["first_8"]["cka"] == 0
     assert table.loc["last five steps"]["hundred"]["cka"] == pytest.approx(4)
+
+
+def test_what_the_previous_action_brings(tmp_path):
+    out = write(tmp_path, {"cka": 9, "cka-memory": 7, "gp": 9}, spreads={"cka": 2})
+    result_path(out, "cka-memory", 3).unlink()
+    row = tabulate_memory(load_evaluations(out)).set_index("scenario").loc["cka"]
+    assert row["runs"] == 3
+    assert row["without_3_9"] == pytest.approx(8.75)
+    assert row["more_3_9"] == pytest.approx(row["with_3_9"] - 8.75)
+    assert row["more_24_30_se"] == pytest.approx(0.375 / np.sqrt(3))
 
 
 def test_results_are_summarised_and_reported(tmp_path, capsys):

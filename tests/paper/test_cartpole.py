@@ -12,7 +12,7 @@ from gpadjust.rl.random_state import RandomState
 from paper import __main__ as command_line
 from paper import report
 from paper.cartpole import summarise
-from paper.cartpole.claims import Judge
+from paper.cartpole.claims import CLAIMS
 from paper.cartpole.recorder import evaluate, fixed_starts
 from paper.cartpole.results import holds_from, load, tabulate
 from paper.cartpole.runs import make_agent, make_tasks, run_all, run_one
@@ -22,15 +22,17 @@ from paper.cartpole.scenarios import (
     SUBSET,
     make_dynamics,
 )
-from paper.cartpole.targets import Targets
-from paper.control.results import behind, first_below, iqm, window
+from paper.cartpole.targets import TARGETS
+from paper.control.claims import judge
+from paper.control.curves import Curves
+from paper.control.results import iqm
 from paper.control.runs import result_path
 from paper.control.scenario import updates_on_trial
 
 TINY = replace(
     SETTINGS, num_trials=3, model_trials=2, model_until=2, later_updates=5, batch_size=16
 )
-TIMES = ("fit_seconds", "rollout_seconds", "sac_seconds")
+TIMES = ("fit_seconds", "rollout_seconds", "sac_seconds", "cpu_seconds")
 
 
 class Interrupts(BaseCallback):
@@ -184,8 +186,8 @@ def write(out, curves, num_runs=4, num_trials=50):
 
 def verdicts(out, **curves):
     named = {name.replace("_", "-"): curve for name, curve in curves.items()}
-    trials = load(write(out, named))
-    return {claim.id: claim for claim in Judge(trials, "cost").judge()}
+    curves = Curves(load(write(out, named)), "cost")
+    return {claim.id: claim for claim in judge(CLAIMS, curves, 50)}
 
 
 def test_verdicts_of_the_papers_curves(tmp_path):
@@ -201,7 +203,7 @@ def test_verdicts_of_the_papers_curves(tmp_path):
     assert {name: claim.verdict for name, claim in claims.items()} == dict.fromkeys(
         ("P1", "P2", "P3", "P4", "P5"), "reproduced"
     )
-    assert "gp: 0.5 at trial 1" in claims["P3"].measured
+    assert "Dyna-GP, 4 runs: 0.5 at trial 1" in claims["P3"].measured
 
 
 def test_verdicts_of_other_curves(tmp_path):
@@ -238,13 +240,13 @@ def test_tables_of_incomplete_runs(tmp_path):
     assert sampled["iqm"]["phy"] == pytest.approx(0.545, abs=1e-3)
     assert pd.isna(sampled["first_0.5"]["mf"])
     assert table.loc["deterministic"]["first_0.5"]["phy"] in (44, 45, 46)
-    assert len(window(trials, "mf", "cost", 41, 50)) == 3
+    assert len(Curves(trials, "cost").window("mf", 41, 50)) == 3
 
 
 def targets(out, measure="cost", **curves):
     named = {name.replace("_", "-"): curve for name, curve in curves.items()}
-    trials = load(write(out, named))
-    return {claim.id: claim for claim in Targets(trials, measure).judge()}
+    curves = Curves(load(write(out, named)), measure)
+    return {claim.id: claim for claim in judge(TARGETS, curves, 50)}
 
 
 def test_targets_that_are_met(tmp_path):
@@ -263,9 +265,11 @@ def test_targets_that_are_met(tmp_path):
         "T5": "missed",
         "T6": "met",
     }
-    assert found["T1"].measured.startswith("at trial 6; at 6 0.39")
-    assert found["T4"].measured.startswith("2.00 of it (fits 50 s, model steps 50 s, updates 50 s)")
-    assert found["T5"].measured == "150 s (4 runs)"
+    assert found["T1"].measured.startswith("4 runs: at trial 6; at 6 0.39")
+    assert found["T4"].measured.startswith(
+        "4 runs: 2.00 of it (fits 50 s, model steps 50 s, updates 50 s)"
+    )
+    assert found["T5"].measured == "4 runs: 150 s"
     assert "Dyna-CKA, 4 updates a step: from trial 4 (10.0 s)" in found["T6"].measured
     assert "Dyna-CKA, 1 update a step: never" in found["T6"].measured
 
@@ -297,17 +301,6 @@ def test_trial_from_which_a_threshold_holds():
     assert holds_from(lucky, 0.3, 9) is None
 
 
-def test_differences_are_of_the_seeds_that_both_have(tmp_path):
-    out = write(tmp_path, {"cka": 0.4, "mf": 0.6})
-    result_path(out, "cka", 3).unlink()
-    more, error = behind(load(out), "mf", "cost", 1, 25)
-    assert more == pytest.approx(0.2, abs=1e-9)  # the noise of a seed is shared
-    assert error == pytest.approx(0, abs=1e-9)
-    result_path(out, "mf", 0).unlink()
-    result_path(out, "mf", 1).unlink()
-    assert np.isnan(behind(load(out), "mf", "cost", 1, 25)[1])
-
-
 def test_intervals_are_the_same_each_time():
     scores = {"mf": np.random.default_rng(0).normal(size=7)}
     before = np.random.get_state()[1].copy()  # noqa: NPY002
@@ -315,12 +308,6 @@ def test_intervals_are_the_same_each_time():
     assert first[0] < first[1]
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-
-
-def test_first_trial_below_a_threshold():
-    curve = pd.Series([0.9, 0.5, 0.6], index=[1, 2, 3])
-    assert first_below(curve, 0.5) == 2
-    assert first_below(curve, 0.4) is None
 
 
 def test_results_are_summarised_and_reported(tmp_path, capsys):

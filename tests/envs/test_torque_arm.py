@@ -124,21 +124,23 @@ def test_impossible_parameters_are_refused(name, value):
         ArmEquation(**{name: value})
 
 
-def test_torque_arm_is_a_tenth_too_heavy_and_has_gains_for_two_strengths():
+def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
     np.testing.assert_allclose(torque_arm().masses, (1.1 * 1.82, 1.1 * 1.43))
     np.testing.assert_allclose(torque_arm().inertias, (1.1 * 0.018, 1.1 * 0.018))
     assert torque_arm().lengths == REAL_ARM.lengths
-    assert torque_arm(0.5).gains == (8.0, 4.0)
-    assert torque_arm(0.3).gains == (5.0, 2.5)
+    assert torque_arm().gains == (8.0, 4.0)
+    assert torque_arm([5, 2.5]).gains == (5.0, 2.5)
     for physics in (torque_arm, torque_arm_physics, opensim_arm_physics):
-        with pytest.raises(ValueError, match=r"0\.5, 0\.3.*found 0\.4"):
-            physics(0.4)
+        with pytest.raises(ValueError, match=r"gains must be a pair.*found \(0\.5,\)"):
+            physics(0.5)
+        with pytest.raises(ValueError, match="gains must be finite and not negative"):
+            physics((8.0, -4.0))
 
 
-@pytest.mark.parametrize("strength", [0.5, 0.3])
-def test_ode_agrees_with_opensim(states_and_actions, strength):
+@pytest.mark.parametrize("gains", [(8.0, 4.0), (5.0, 2.5), (1.0, 9.0)])
+def test_ode_agrees_with_opensim(states_and_actions, gains):
     X = torch.cat(states_and_actions(100), dim=-1)
-    gap = (torque_arm_physics(strength)(X) - opensim_arm_physics(strength)(X)).abs()
+    gap = (torque_arm_physics(gains)(X) - opensim_arm_physics(gains)(X)).abs()
     assert gap[:, :2].max() < 1e-5
     assert gap[:, 2:].max() < 1e-4
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
-from gpadjust.envs.arm import ArmEquation
+from gpadjust.envs.torque_arm import ArmEquation
 
 JOINTS = ("shoulder", "elbow")
 LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow
 SLACK_POSE = (math.radians(35), math.radians(65))  # where each fibre is at its optimum
 REST_ACTIVATION = 0.01
+MAX_STRENGTH = 2.0  # beyond, the arm breaks through its joint limits
 
 
 @dataclass(frozen=True)
@@ -53,15 +55,21 @@ Actions excite the first four, in this order; the last two are passive.
 NUM_EXCITED = 4
 
 
+@lru_cache(maxsize=1)
 def load_opensim() -> ModuleType:
     """OpenSim, silenced: else it prints, and writes ``opensim.log`` to the working directory.
 
+    The first call switches the logger off, which is the process's own; later ones leave it alone,
+    so that ``opensim.Logger.setLevelString("info")`` after the first arm was built lets it speak.
+
     Raises:
-        ImportError: If it is missing.
+        ImportError: If it is missing. One that is installed but broken raises its own error.
     """
     try:
         import opensim
-    except ImportError as error:
+    except ModuleNotFoundError as error:
+        if error.name != "opensim":
+            raise
         raise ImportError(
             'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
         ) from error
@@ -69,7 +77,7 @@ def load_opensim() -> ModuleType:
     return opensim
 
 
-def build_muscle_arm(equation: ArmEquation, strength: float) -> tuple[Any, Any]:
+def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
     """The arm with six muscles, of which four are excited.
 
     Args:
@@ -77,9 +85,18 @@ def build_muscle_arm(equation: ArmEquation, strength: float) -> tuple[Any, Any]:
         strength: The factor on the forces of the muscles.
 
     Returns:
-        The model of OpenSim, whose state is angles, velocities and six activations; and its
-        controller, see :func:`controls`.
+        An ``opensim.Model``, whose state is angles, velocities and six activations, and whose
+        inputs are the excitations, see :func:`controls`.
+
+    Raises:
+        ImportError: If ``opensim`` is missing.
+        ValueError: If strength is not in (0, 2].
     """
+    if not 0 < strength <= MAX_STRENGTH:
+        raise ValueError(
+            f"strength must be in (0, {MAX_STRENGTH:g}], where 1 is a healthy arm's; found "
+            f"{strength}."
+        )
     opensim = load_opensim()
     model = _skeleton(opensim, equation)
     for joint, (low, high) in zip(JOINTS, LIMITS, strict=True):
@@ -89,11 +106,22 @@ def build_muscle_arm(equation: ArmEquation, strength: float) -> tuple[Any, Any]:
     muscles = [_muscle(opensim, muscle, strength) for muscle in MUSCLES]
     for muscle in muscles:
         model.addForce(muscle)
-    return model, _controller(opensim, model, muscles[:NUM_EXCITED])
+    _add_controller(opensim, model, muscles[:NUM_EXCITED])
+    return model
 
 
-def build_torque_arm(equation: ArmEquation) -> tuple[Any, Any]:
-    """The arm with a torque at shoulder and elbow, in N m, and the controller of these."""
+def build_torque_arm(equation: ArmEquation) -> Any:
+    """The arm whose inputs are torques at shoulder and elbow, in N m; without limits.
+
+    Args:
+        equation: The links; its gains do not matter.
+
+    Returns:
+        An ``opensim.Model``, whose state is angles and velocities.
+
+    Raises:
+        ImportError: If ``opensim`` is missing.
+    """
     opensim = load_opensim()
     model = _skeleton(opensim, equation)
     torques = []
@@ -103,16 +131,19 @@ def build_torque_arm(equation: ArmEquation) -> tuple[Any, Any]:
         torque.setOptimalForce(1.0)
         model.addForce(torque)
         torques.append(torque)
-    return model, _controller(opensim, model, torques)
+    _add_controller(opensim, model, torques)
+    return model
 
 
-def controls(controller: Any) -> list[Any]:
-    """The ``opensim.Constant`` that a controller prescribes, one for each actuator.
+def controls(model: Any) -> list[Any]:
+    """The ``opensim.Constant`` of each input of an arm that was built here, in their order.
 
     To be asked for after ``initSystem``: the controller holds copies of what it was given.
     """
+    opensim = load_opensim()
+    controller = opensim.PrescribedController.safeDownCast(model.getControllerSet().get(0))
     functions = controller.get_ControlFunctions()
-    constant = load_opensim().Constant
+    constant = opensim.Constant
     return [constant.safeDownCast(functions.get(i)) for i in range(functions.getSize())]
 
 
@@ -179,10 +210,9 @@ def _path(opensim: ModuleType, muscle: Muscle) -> Any:
     return path
 
 
-def _controller(opensim: ModuleType, model: Any, actuators: list[Any]) -> Any:
+def _add_controller(opensim: ModuleType, model: Any, actuators: list[Any]) -> None:
     controller = opensim.PrescribedController()
     for actuator in actuators:
         controller.addActuator(actuator)
         controller.prescribeControlForActuator(actuator.getName(), opensim.Constant(0.0))
     model.addController(controller)
-    return controller

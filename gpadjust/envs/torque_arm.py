@@ -12,7 +12,6 @@ from gpadjust.physics import ODEPhysics
 
 ARM_TIME_STEP = 0.2
 SUBSTEPS = 40  # of 5 ms: the damping of the light forearm makes the equation stiff
-GAINS = {0.5: (8.0, 4.0), 0.3: (5.0, 2.5)}  # N m, by the strength of the muscles they stand for
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,8 @@ class ArmEquation:
     def __post_init__(self) -> None:
         """Check the parameters."""
         for name in ("masses", "lengths", "centres", "inertias", "gains"):
-            pair = tuple(getattr(self, name))  # hashable, also when given as a list
+            # Hashable, also when given as a list.
+            pair = tuple(np.ravel(getattr(self, name)).tolist())
             if len(pair) != 2:
                 raise ValueError(f"{name} must be a pair, of two links or joints; found {pair}.")
             object.__setattr__(self, name, pair)
@@ -129,54 +129,47 @@ REAL_ARM = ArmEquation()
 """The links of the muscle arm; segments after Nijhof and Kouwenhoven (2000). No torques."""
 
 
-def torque_arm(strength: float = 0.5) -> ArmEquation:
+def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
     """The arm as someone may believe it to be, who has no model of its muscles.
 
     Its links are a tenth too heavy, its joints damped twice as much as the real ones; the torques
     follow the actions at once, whatever the angles, and nothing limits the joints.
 
     Args:
-        strength: That of the muscles which the torques stand for: 0.5, gains of 8 and 4 N m, or
-            0.3, gains of 5 and 2.5 N m.
-
-    Returns:
-        An equation; with ``dataclasses.replace(..., gains=...)`` it gets other gains.
+        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
+            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
 
     Raises:
-        ValueError: If the strength is another one.
+        ValueError: If the gains are not two finite numbers that are not negative.
 
     Example:
-        >>> torque_arm().gains
-        (8.0, 4.0)
+        >>> torque_arm().damping
+        1.0
     """
-    if strength not in GAINS:
-        raise ValueError(
-            f"strength must be one of {', '.join(map(str, GAINS))}, for which there are gains; "
-            f"found {strength}. For others write ArmEquation(..., gains=(...)) as an ODEPhysics."
-        )
     return replace(
         REAL_ARM,
         masses=(1.1 * REAL_ARM.masses[0], 1.1 * REAL_ARM.masses[1]),
         inertias=(1.1 * REAL_ARM.inertias[0], 1.1 * REAL_ARM.inertias[1]),
         damping=1.0,
-        gains=GAINS[strength],
+        gains=gains,
     )
 
 
-def torque_arm_physics(strength: float = 0.5) -> ODEPhysics:
+def torque_arm_physics(gains: tuple[float, float] = (8.0, 4.0)) -> ODEPhysics:
     """The state of the arm 0.2 s later, under torques that follow the actions at once.
 
-    It does not limit the actions, as the environment does.
+    Unlike the environment, it does not clip actions.
 
     Args:
-        strength: See :func:`torque_arm`.
+        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
+            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
 
     Returns:
         A physics of columns ``[theta_s, theta_e, theta_s_dot, theta_e_dot, a1, a2, a3, a4]``, in
         rad and s, by Runge-Kutta of order four with substeps of 5 ms.
 
     Raises:
-        ValueError: If there are no gains for this strength.
+        ValueError: If the gains are not two finite numbers that are not negative.
 
     Example:
         >>> physics = torque_arm_physics()
@@ -184,7 +177,7 @@ def torque_arm_physics(strength: float = 0.5) -> ODEPhysics:
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
     return ODEPhysics(
-        torque_arm(strength),
+        torque_arm(gains),
         step=ARM_TIME_STEP,
         state_dim=4,
         substeps=SUBSTEPS,

@@ -1,0 +1,103 @@
+"""What the documents speak of exists: files, extras, commands, versions, pages of the reference."""
+
+import re
+import shlex
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import gpadjust
+from paper.__main__ import main
+
+ROOT = Path(__file__).parents[1]
+CI = (ROOT / ".ci" / "run").read_text()
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "paper/README.md"]
+TOOLS = {"ruff", "mypy", "sphinx-build", "twine"}  # of the extra `dev`
+BUILT = {"docs/_build", "docs/_build/index.html"}
+
+each_document = pytest.mark.parametrize("name", DOCUMENTS)
+
+
+def commands(name):
+    """Those of the shell blocks of a document, and what it quotes of `python -m`."""
+    text = (ROOT / name).read_text()
+    blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    quoted = re.findall(r"`(python -m [^`]*)`", text)
+    parts = [part.strip() for line in lines + quoted for part in line.split("&&")]
+    return [shlex.split(part, comments=True) for part in parts if part]
+
+
+@each_document
+def test_linked_and_quoted_files_exist(name):
+    text = (ROOT / name).read_text()
+    links = {link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link}
+    quoted = set(re.findall(r"`((?:gpadjust|paper|tests|docs|\.ci)/[\w./-]*)`", text))
+    quoted |= set(re.findall(r"`(\w+\.(?:md|cff|toml))`", text))
+    quoted = {path for path in quoted - BUILT if not re.search(r"-v\d$", path)}  # environments' ids
+    assert [link for link in links if not (ROOT / name).parent.joinpath(link).exists()] == []
+    assert [path for path in quoted if not (ROOT / path).exists()] == []
+
+
+@each_document
+def test_extras_exist(name):
+    text = (ROOT / name).read_text()
+    named = set(re.findall(r"extra\s+`(\w+)`", text))
+    named |= {e for found in re.findall(r'\.\[([\w,]+)\]"', text) for e in found.split(",")}
+    assert named <= set(PROJECT["optional-dependencies"])
+
+
+@each_document
+def test_commands_exist(name, monkeypatch, capsys):
+    for command in commands(name):
+        match command:
+            case ["python", "-m", "paper", *arguments]:
+                monkeypatch.setattr("sys.argv", ["paper", *arguments, "--help"])
+                with pytest.raises(SystemExit) as end:
+                    main()
+                assert end.value.code == 0, command
+            case ["python", "-m", module, *arguments]:
+                assert find_spec(module) is not None or module == "build", command
+                assert all((ROOT / a).exists() for a in arguments if a.startswith("tests")), command
+            case ["pip", "install", "--constraint", file, *_]:
+                assert (ROOT / file).is_file()
+            case [tool, *_]:
+                assert tool in TOOLS, command
+
+
+def test_ci_runs_the_checks_that_contributors_are_told():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    checks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)[1].splitlines()
+    assert len(checks) > 5
+    for check in checks:
+        assert check.removesuffix(" docs/_build") in CI
+
+
+def test_the_tools_come_with_the_extra_dev_and_are_pinned():
+    dev = " ".join(PROJECT["optional-dependencies"]["dev"])
+    assert "gpadjust[docs,test]" in dev
+    pins = (ROOT / "constraints.txt").read_text().lower()
+    for requirements in PROJECT["optional-dependencies"].values():
+        for requirement in requirements:
+            package = re.match(r"[\w.-]+", requirement)[0].lower()
+            assert package == "gpadjust" or re.search(
+                rf"^{re.sub('[-_.]', '[-_.]', package)}==", pins, flags=re.MULTILINE
+            ), package
+
+
+def test_one_version():
+    assert f"\nversion: {gpadjust.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert gpadjust.__version__ in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
+    rooms = {path.parent.name for path in (ROOT / "gpadjust").glob("*/__init__.py")}
+    assert {page.stem for page in (ROOT / "docs").glob("*.rst")} == rooms | {"index"}
+    index = (ROOT / "docs" / "index.rst").read_text()
+    tree = index.partition(".. toctree::")[2].split()
+    assert set(tree[2:]) == rooms
+    listed = re.search(r"autosummary::\n\n(.*?)\n\n", index, flags=re.DOTALL)[1].split()
+    assert sorted(listed) == sorted(gpadjust.__all__)
