@@ -1,0 +1,93 @@
+"""The tutorials run, and what is committed of them is their output."""
+
+import re
+
+import nbformat
+import pytest
+
+from tutorials.run import FOLDER, KEPT, execute, notebooks, quick_settings, shrink
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+LARGEST = 500_000  # bytes
+# Paths of a machine: homes, temporary folders, the kernel's files and packages.
+PATHS = re.compile(r"/home/|/root/|/tmp/|/Users/|[A-Z]:\\|ipykernel|site-packages|0x[0-9a-f]{6,}")
+by_name = pytest.mark.parametrize("path", notebooks(), ids=lambda path: path.stem)
+
+
+def code_cells(path):
+    cells = nbformat.read(path, as_version=4).cells
+    return [cell for cell in cells if cell.cell_type == "code"]
+
+
+def texts(cell):
+    for output in cell.outputs:
+        yield output.get("text", "")
+        yield output.get("data", {}).get("text/plain", "")
+
+
+@pytest.mark.slow
+@by_name
+def test_a_tutorial_runs_without_a_warning(path):
+    notebook = nbformat.read(path, as_version=4)
+    shrink(notebook, quick_settings().get(path.name, {}))
+    execute(notebook)  # raises what a cell raises
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            assert output.get("name") != "stderr", output.text
+
+
+def test_there_are_tutorials_and_their_settings():
+    names = [path.name for path in notebooks()]
+    assert names
+    assert set(quick_settings()) <= set(names)
+
+
+@by_name
+def test_quick_settings_are_in_the_notebook(path):
+    shrink(nbformat.read(path, as_version=4), quick_settings().get(path.name, {}))
+
+
+def test_a_setting_that_is_gone_is_an_error():
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("steps = 100")])
+    shrink(notebook, {"steps = 100": "steps = 1"})
+    assert notebook.cells[0].source == "steps = 1"
+    with pytest.raises(ValueError, match="which no code cell has"):
+        shrink(notebook, {"steps = 100": "steps = 1"})
+
+
+@by_name
+def test_committed_outputs_are_those_of_one_clean_run(path):
+    cells = code_cells(path)
+    assert [cell.execution_count for cell in cells] == [*range(1, len(cells) + 1)]
+    kinds = [(o.output_type, o.get("name")) for cell in cells for o in cell.outputs]
+    assert kinds
+    assert not [kind for kind in kinds if kind[0] == "error" or kind[1] == "stderr"]
+    assert any("image/png" in o.get("data", {}) for cell in cells for o in cell.outputs)
+
+
+@by_name
+def test_committed_outputs_name_no_machine(path):
+    found = [PATHS.search(text) for cell in code_cells(path) for text in texts(cell)]
+    assert not [match.group() for match in found if match]
+
+
+@by_name
+def test_committed_notebooks_are_small_and_without_volatile_metadata(path):
+    notebook = nbformat.read(path, as_version=4)
+    assert path.stat().st_size < LARGEST
+    assert notebook.metadata == KEPT
+    assert not [cell.metadata for cell in notebook.cells if cell.metadata]
+
+
+@by_name
+def test_a_tutorial_says_what_one_learns_and_what_goes_wrong(path):
+    texts = [cell.source for cell in nbformat.read(path, as_version=4).cells]
+    assert texts[0].startswith(f"# {path.name[0]}. ")
+    assert "You will learn" in texts[0].replace("\n", " ")
+    assert texts[0].count("\n- ") == 3
+    assert any("## What goes wrong, and how to see it" in text for text in texts)
+
+
+def test_the_readme_lists_every_tutorial():
+    readme = (FOLDER / "README.md").read_text()
+    assert set(re.findall(r"\]\((\w+\.ipynb)\)", readme)) == {path.name for path in notebooks()}
