@@ -12,16 +12,14 @@ from botorch.utils.transforms import (
     t_batch_mode_transform,
 )
 from gpytorch.distributions import MultivariateNormal
-from gpytorch.kernels import Kernel
-from gpytorch.settings import lazily_evaluate_kernels, min_variance
-from linear_operator import to_dense
+from gpytorch.settings import min_variance
 from linear_operator.operators import DiagLinearOperator
 from linear_operator.utils.cholesky import psd_safe_cholesky
 from torch import Tensor
 
+from gpadjust.active.conditional_covariance import ConditionalCovariance
 from gpadjust.models import RRA, AdjustmentGP
 from gpadjust.models.adjustment_gp import Component
-from gpadjust.models.cholesky_strategy import CholeskyStrategy
 
 About = Literal["rho", "delta", "both"]
 
@@ -124,11 +122,10 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         inputs = inputs.unsqueeze(-3) if model.num_outputs > 1 else inputs
         batch_shape = torch.broadcast_shapes(inputs.shape[:-2], model.train_inputs[0].shape[:-2])
         inputs = inputs.expand(*batch_shape, *inputs.shape[-2:])
-        information = _log_sds(self._rests().whole.covariance(inputs), self._noise(inputs))
-        remaining = self._rests().remaining
-        if remaining is not None:
-            known = _log_sds(remaining.covariance(inputs), self._noise(inputs))
-            information = information - known
+        rest, noise = self._rests(), self._noise(inputs)
+        information = _log_sds(rest.whole(inputs), noise)
+        if rest.remaining is not None:
+            information = information - _log_sds(rest.remaining(inputs), noise)
         return information.sum(-1) if model.num_outputs > 1 else information
 
     def _noise(self, inputs: Tensor) -> Tensor:
@@ -157,36 +154,9 @@ class _Rest:
 
     def __init__(self, model: AdjustmentGP, about: About) -> None:
         self.source = model.prediction_strategy
-        self.whole = _Conditional(model, model.covar_module)
+        self.whole = ConditionalCovariance(model, model.covar_module)
         other = {"rho": model._kernel("delta"), "delta": model._kernel("rho"), "both": None}[about]
-        self.remaining = None if other is None else _Conditional(model, other)
-
-
-class _Conditional:
-    """A zero-mean Gaussian process of one kernel, given the model's inputs and noise.
-
-    Args:
-        model: The model, in eval mode.
-        kernel: The kernel, on transformed inputs.
-    """
-
-    def __init__(self, model: AdjustmentGP, kernel: Kernel) -> None:
-        self.kernel = kernel
-        (self.train,) = model.train_inputs
-        self.strategy = model.prediction_strategy
-        if kernel is not model.covar_module or not isinstance(self.strategy, CholeskyStrategy):
-            with lazily_evaluate_kernels():
-                prior = MultivariateNormal(torch.zeros_like(self.train[..., 0]), kernel(self.train))
-            targets = model.train_targets
-            self.strategy = CholeskyStrategy([self.train], prior, targets, model.likelihood)
-
-    def covariance(self, inputs: Tensor) -> Tensor:
-        """The covariance ``... x q x q`` at transformed inputs ``... x q x d``, without noise."""
-        train = self.train.expand(*inputs.shape[:-2], *self.train.shape[-2:])
-        with lazily_evaluate_kernels(False):
-            prior, cross = to_dense(self.kernel(inputs)), to_dense(self.kernel(inputs, train))
-        covariance: Tensor = to_dense(self.strategy.exact_predictive_covar(prior, cross))
-        return covariance
+        self.remaining = None if other is None else ConditionalCovariance(model, other)
 
 
 def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
