@@ -48,7 +48,7 @@ def as_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
     """Return measured values as ``n x m``, float64; they may be NaN or infinite.
 
     Args:
-        Y: The values, ``n x m`` or ``n``.
+        Y: The values, ``n x m`` or ``n``; one number for one point will do.
         num_points: Number ``n`` of points.
         num_outputs: Number ``m`` of outputs, if it is known.
 
@@ -60,7 +60,7 @@ def as_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
         Y = torch.as_tensor(Y, dtype=torch.float64).detach()
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"Expected numbers as measured values, got {Y!r}.") from error
-    columns = Y.unsqueeze(-1) if Y.dim() == 1 else Y
+    columns = Y.reshape(-1, 1) if Y.dim() < 2 else Y
     right = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
     if not right or num_outputs not in (None, columns.shape[-1]):
         m = "m" if num_outputs is None else num_outputs

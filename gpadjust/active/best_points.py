@@ -45,8 +45,9 @@ def best_points(
             acquisition.set_X_pending(taken if own is None else torch.cat([own, taken]))
         except UnsupportedError:
             away = taken  # it is to be kept from pending points by hand, too
-    options = {"num_restarts": 8, "raw_samples": 128, **options}
-    points, _ = optimize_acqf(acquisition, bounds, q=q, **options)
+    # A line search that rounding errors end has converged: no second try is needed.
+    defaults = {"num_restarts": 8, "raw_samples": 128, "retry_on_optimization_warning": False}
+    points, _ = optimize_acqf(acquisition, bounds, q=q, **{**defaults, **options})
     points = points.detach()
     for i in range(q):
         if _near(points[i : i + 1], away, bounds).any():

@@ -11,11 +11,12 @@ import torch
 from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from gpadjust.active.arguments import as_bounds, as_outcomes, as_points
 from gpadjust.active.best_points import best_points
+from gpadjust.active.design import among, sobol_points
 from gpadjust.active.measurement_log import MeasurementLog, Record
+from gpadjust.active.measurements import Measurements
 from gpadjust.active.refitting import hyperparameters, load_hyperparameters, refit
 from gpadjust.models.sampled_functions import check_number, seeded
 
@@ -26,7 +27,7 @@ class MeasurementWarning(UserWarning):
     """A measurement failed."""
 
 
-class Collection:
+class Collection(Measurements):
     """Chooses where to measure, for a laboratory that measures when it can.
 
     :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points. The
@@ -100,7 +101,8 @@ class Collection:
         self.bounds = as_bounds(bounds)
         d = self.bounds.shape[-1]
         check_number(batch_size, "batch_size")
-        check_number(seed + 1, "seed + 1")
+        if not isinstance(seed, int) or seed < 0:
+            raise ValueError(f"Expected seed to be a whole number >= 0, got {seed!r}.")
         self.batch_size, self.seed = batch_size, seed
         initial = 2 * (d + 1) if initial is None else initial
         self._first_points = self.bounds[:0]
@@ -114,21 +116,9 @@ class Collection:
         self._options = optimizer_options or {}
         if num_outputs is not None:
             check_number(num_outputs, "num_outputs")
-        self.num_outputs = num_outputs
-        self.X = self.failed_X = self.pending = self.bounds[:0]
-        self.Y = self.bounds[:0, :0]
-        self.num_measured = 0
-        """Number of measurements told, failed ones included, those of ``data`` not."""
-        self._num_asks = 0
+        super().__init__(d, num_outputs, data)
         self._model: Any = None
         self._last_model: Any = None
-        self._last_fit: tuple[int, Record] | None = None
-        if data is not None:
-            X = as_points(data[0], d, "the X of data")
-            Y = as_outcomes(data[1], len(X), num_outputs)
-            if not Y.isfinite().all():
-                raise ValueError("Expected the Y of data to be finite; leave failed points out.")
-            self.X, self.Y, self.num_outputs = X, Y, Y.shape[-1]
         self.log = None if log is None else MeasurementLog(log)
         if self.log is not None:
             self._resume(self.log)
@@ -227,13 +217,10 @@ class Collection:
     def _design(self, q: int) -> Tensor | None:
         """The next points that need no model, ``q x d``, or None if a model is to choose."""
         known = torch.cat([self.X, self.failed_X, self.pending])
-        first = self._first_points[~_among(self._first_points, known)]
+        first = self._first_points[~among(self._first_points, known)]
         if not len(first) and len(self.X) >= self._initial:
             return None
-        sobol = SobolEngine(self.bounds.shape[-1], scramble=True, seed=self.seed)
-        drawn = sobol.draw(len(known) + q, dtype=torch.float64)
-        drawn = self.bounds[0] + (self.bounds[1] - self.bounds[0]) * drawn
-        return torch.cat([first, drawn[~_among(drawn, known)]])[:q]
+        return torch.cat([first, sobol_points(self.bounds, q, known, self.seed)])[:q]
 
     def _acquisition_function(self, q: int) -> AcquisitionFunction:
         """The user's acquisition function of the model."""
@@ -261,44 +248,12 @@ class Collection:
 
     def _enter(self, records: list[Record]) -> None:
         """Log records, then take them in."""
+        known = len(self.X)
         if self.log is not None:
             self.log.append(records)
         for record in records:
             self._take(record)
-
-    def _take(self, record: Record) -> None:
-        """Take in one record, a new one or one of the log."""
-        if "asked" in record:
-            self.pending = torch.cat([self.pending, self._rows(record["asked"])])
-            self._num_asks += 1
-            if record.get("hyperparameters"):
-                self._last_fit = (len(self.X), record["hyperparameters"])
-            return
-        if "withdrawn" in record:
-            for x in self._rows(record["withdrawn"]):
-                self._no_longer_pending(x)
-            return
-        x = self._rows([record["x"]])
-        self._no_longer_pending(x[0])
-        self.num_measured += 1
-        if "failed" in record:
-            self.failed_X = torch.cat([self.failed_X, x])
-            return
-        y = as_outcomes([record["y"]], 1, self.num_outputs)
-        self.num_outputs = y.shape[-1]
-        self.X = torch.cat([self.X, x])
-        self.Y = torch.cat([self.Y, y]) if len(self.Y) else y
-        self._model = None
-
-    def _no_longer_pending(self, x: Tensor) -> None:
-        """Remove one point from those that are pending, if it is one."""
-        here = (self.pending == x).all(-1).nonzero()
-        if len(here):
-            i = int(here[0])
-            self.pending = torch.cat([self.pending[:i], self.pending[i + 1 :]])
-
-    def _rows(self, points: list[list[float]]) -> Tensor:
-        return torch.tensor(points, dtype=torch.float64).reshape(-1, self.bounds.shape[-1])
+        self._model = None if len(self.X) > known else self._model
 
     def _resume(self, log: MeasurementLog) -> None:
         """Take in what is in the log, or begin it."""
@@ -334,8 +289,3 @@ class Collection:
                 MeasurementWarning,
                 stacklevel=3,
             )
-
-
-def _among(points: Tensor, others: Tensor) -> Tensor:
-    """Whether each of ``n x d`` points is one of the others, ``n``."""
-    return (points.unsqueeze(-2) == others).all(-1).any(-1)

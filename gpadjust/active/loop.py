@@ -49,8 +49,8 @@ def collect(
 ) -> Collection:
     """Measure where it teaches most, until the budget is spent.
 
-    A :class:`Collection` chooses the points, and its log makes the loop resumable: called again with
-    the same arguments it goes on where it was killed, first with the points it was killed at.
+    A :class:`Collection` chooses the points, and its log makes the loop resumable: called again
+    with the same arguments it goes on where it was killed, first with the points it was killed at.
 
     A measurement that fails (the oracle raises an exception or returns NaN, infinity or a wrong
     shape) is logged with its message and skipped, with a warning. It counts against the budget, and
@@ -98,6 +98,7 @@ def collect(
         ...     acquisition=qAdjustmentInformationGain,
         ...     budget=6,
         ...     batch_size=2,
+        ...     optimizer_options={"num_restarts": 2, "raw_samples": 16},
         ... )
         >>> result.Y.shape
         torch.Size([6, 1])
@@ -106,7 +107,6 @@ def collect(
         raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
     check_number(budget, "budget")
     check_number(max_failures, "max_failures")
-    bar_of = _bar if progress else None
     collection = Collection(
         model_factory,
         bounds,
@@ -121,7 +121,7 @@ def collect(
         seed=seed,
     )
     failures = 0
-    with bar_of(budget, collection) if bar_of else nullcontext() as bar:
+    with _bar(budget, collection) if progress else nullcontext() as bar:
         while (left := budget - collection.num_measured) > 0:
             q = min(batch_size, left)
             # After a resumption the points that it was killed at come first.
