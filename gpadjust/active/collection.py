@@ -17,7 +17,7 @@ from gpadjust.active.best_points import best_points
 from gpadjust.active.design import among, sobol_points
 from gpadjust.active.measurement_log import MeasurementLog, Record
 from gpadjust.active.measurements import Measurements
-from gpadjust.active.refitting import hyperparameters, load_hyperparameters, refit
+from gpadjust.active.refitting import load_parameter_values, parameter_values, refit
 from gpadjust.models.sampled_functions import check_number, seeded
 
 _FORMAT = "gpadjust measurements, version 1"
@@ -118,7 +118,7 @@ class Collection(Measurements):
             check_number(num_outputs, "num_outputs")
         super().__init__(d, num_outputs, data)
         self._model: Any = None
-        self._last_model: Any = None
+        self._last_model: tuple[Any, int] = (None, 0)
         self.log = None if log is None else MeasurementLog(log)
         if self.log is not None:
             self._resume(self.log)
@@ -135,9 +135,12 @@ class Collection(Measurements):
                 raise RuntimeError(
                     f"A model needs at least 2 measurements, there are {len(self.X)}."
                 )
-            model = self.model_factory(self.X, self.Y)
-            refit(model, self._previous(), self._fit)
-            self._model = self._last_model = model
+            previous, count = self._previous()
+            if count < len(self.X):
+                model = self.model_factory(self.X, self.Y)
+                refit(model, previous, self._fit)
+                self._last_model = model, len(self.X)
+            self._model = self._last_model[0]
         return self._model
 
     def ask(self, q: int | None = None) -> Tensor:
@@ -163,7 +166,7 @@ class Collection(Measurements):
                 points = best_points(
                     function, self.bounds, q, self.pending, self.failed_X, self._options
                 )
-            record = {"hyperparameters": hyperparameters(self.model)}
+            record = {"parameters": parameter_values(self.model)}
         self._enter([{"asked": points.tolist(), **record}])
         return points
 
@@ -237,13 +240,12 @@ class Collection(Measurements):
             )
         return function
 
-    def _previous(self) -> Any:
-        """The model that was fitted last, made again from the log if need be."""
-        if self._last_model is None and self._last_fit is not None:
+    def _previous(self) -> tuple[Any, int]:
+        """The model fitted last, made again from the log if need be, and its number of points."""
+        if self._last_model[0] is None and self._last_fit is not None:
             count, values = self._last_fit
-            previous = self.model_factory(self.X[:count], self.Y[:count])
-            if load_hyperparameters(previous, values):
-                self._last_model = previous
+            model = self.model_factory(self.X[:count], self.Y[:count])
+            self._last_model = (model, count) if load_parameter_values(model, values) else (None, 0)
         return self._last_model
 
     def _enter(self, records: list[Record]) -> None:

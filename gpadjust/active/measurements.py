@@ -14,8 +14,8 @@ class Measurements:
 
     A record is one of
 
-    - ``{"asked": [x, ...], "hyperparameters": {...}}``: points that are to be measured, and the
-      hyper-parameters of the model that chose them, if one did;
+    - ``{"asked": [x, ...], "parameters": {...}}``: points that are to be measured, and the
+      parameters of the model that chose them, if one did;
     - ``{"x": x, "y": y}``: a measurement;
     - ``{"x": x, "failed": message}``: one that failed;
     - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more.
@@ -56,8 +56,8 @@ class Measurements:
         if "asked" in record:
             self.pending = torch.cat([self.pending, self._points(record["asked"])])
             self._num_asks += 1
-            if record.get("hyperparameters"):
-                self._last_fit = (len(self.X), record["hyperparameters"])
+            if record.get("parameters"):
+                self._last_fit = (len(self.X), record["parameters"])
         elif "withdrawn" in record:
             for x in self._points(record["withdrawn"]):
                 self._no_longer_pending(x)

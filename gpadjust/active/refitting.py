@@ -37,24 +37,25 @@ def refit(model: Any, previous: Any, fit: Callable[[Any], Any] | None) -> None:
             fit_model(model, num_screened=64, num_starts=4)
 
 
-def hyperparameters(model: Any) -> dict[str, Any]:
-    """The learnable parameters, as lists; none of a model that a warm start cannot begin from."""
+def parameter_values(model: Any) -> dict[str, Any]:
+    """All parameters of a model as lists; none of one that no fit can begin from."""
     if not isinstance(model, MultiOutputGP) or model.num_samples is not None:
         return {}
-    return {name: p.tolist() for name, p in model.named_parameters() if p.requires_grad}
+    return {name: parameter.tolist() for name, parameter in model.named_parameters()}
 
 
-def load_hyperparameters(model: Any, values: dict[str, Any]) -> bool:
+def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
     """Give a model parameters, unless it has others; tell whether it was done."""
     if not isinstance(model, MultiOutputGP):
         return False
-    named = {name: p for name, p in model.named_parameters() if p.requires_grad}
+    named = dict(model.named_parameters())
     tensors = {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()}
     if {name: p.shape for name, p in named.items()} != {n: t.shape for n, t in tensors.items()}:
         return False
     with torch.no_grad():
         for name, parameter in named.items():
             parameter.copy_(tensors[name])
+    model.eval()
     return True
 
 
