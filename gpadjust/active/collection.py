@@ -161,7 +161,7 @@ class Collection(Measurements):
         record: Record = {}
         points = self._design(q)
         if points is None:
-            with seeded(1_000_003 * self.seed + self._num_asks):
+            with seeded((1_000_003 * self.seed + self._num_asks) % 2**63):
                 function = self._acquisition_function(q)
                 points = best_points(
                     function, self.bounds, q, self.pending, self.failed_X, self._options
