@@ -13,18 +13,17 @@ def f_p(X):
     return 2 + (2 * X[..., :1]).sin()
 
 
-def truth(X):
-    return 1.4 * f_p(X) + X[..., 1:].square()
-
-
 @pytest.fixture
 def bounds():
     return BOUNDS.clone()
 
 
 @pytest.fixture
-def laboratory():
-    """Arguments of `collect` that take little time; `laboratory(**changes)`."""
+def laboratory(request):
+    """Arguments of `collect` that take little time; `laboratory(**changes)`.
+
+    The oracle is the `truth` of the test's module.
+    """
     points = BOUNDS[0] + 2 * torch.rand(
         16, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(7)
     )
@@ -34,7 +33,7 @@ def laboratory():
             "model_factory": lambda X, Y: CKA(
                 X, Y, physics=lambda X: f_p(X).repeat(1, Y.shape[-1])
             ),
-            "oracle": truth,
+            "oracle": request.module.truth,
             "bounds": BOUNDS,
             "acquisition": lambda model: qNegIntegratedPosteriorVariance(model, mc_points=points),
             "budget": 7,
