@@ -4,6 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
+
+from gpadjust import CKA
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -22,10 +25,21 @@ def test_the_examples_run(capsys):
     assert names["loo"].rmse < 1e-2
 
 
+def test_measuring(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[2]
+    names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
+    exec(code, names)
+    X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
+    error = names["result"].model.posterior(X).mean - 2 * names["f_p"](X) - X
+    assert error.abs().max() < 1e-2
+    assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8
+
+
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[2:]
+    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[3:]
     for long, short in (("=10 * 25", "=2 * 25"), ("model_trials=20", "model_trials=2")):
         assert long in code
         code = code.replace(long, short)

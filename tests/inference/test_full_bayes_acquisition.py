@@ -9,6 +9,7 @@ from botorch.acquisition import (
     qNegIntegratedPosteriorVariance,
 )
 from botorch.acquisition.bayesian_active_learning import qBayesianActiveLearningByDisagreement
+from botorch.acquisition.monte_carlo import qPosteriorStandardDeviation
 from botorch.acquisition.objective import LinearMCObjective
 from botorch.optim import optimize_acqf
 from botorch.sampling import SobolQMCNormalSampler
@@ -19,6 +20,7 @@ ACQUISITIONS = {
     "qLogEI": lambda model, X: qLogExpectedImprovement(model, 1.0, **SAMPLER),
     "LogEI": lambda model, X: LogExpectedImprovement(model, best_f=1.0),
     "NIPV": lambda model, X: qNegIntegratedPosteriorVariance(model, mc_points=X),
+    "PSTD": lambda model, X: qPosteriorStandardDeviation(model, **SAMPLER),
     "BALD": lambda model, X: qBayesianActiveLearningByDisagreement(model, **SAMPLER),
 }
 BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
@@ -30,13 +32,29 @@ def test_optimize(held, data, name, kind):
     X, Y = data()
     model, _ = held(kind, X, Y)
     acquisition = ACQUISITIONS[name](model, X)
-    q = 2 if name.startswith("q") else 1
+    q = 2 if name.startswith("q") or name == "PSTD" else 1
     point, value = optimize_acqf(
         acquisition, BOUNDS, q=q, num_restarts=2, raw_samples=4, options={"maxiter": 3}
     )
     assert point.shape == (q, 2)
     assert value.isfinite().all()
     assert acquisition(torch.rand(5, q, 2, dtype=torch.float64)).shape == (5,)
+
+
+@pytest.mark.parametrize("name", ["qLogNEI", "LogEI", "NIPV", "PSTD"])
+def test_gradients_through_the_physics(held, data, uniform, name):
+    X, Y = data()
+    model, _ = held("CKA", X, Y)
+    function = ACQUISITIONS[name](model, X)
+    Z = uniform(1, 1, 2, high=2.0, seed=5)
+    leaf = Z.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(leaf).sum(), leaf)
+    steps = 1e-5 * torch.eye(2, dtype=torch.float64)
+    with torch.no_grad():
+        changes = [(function(Z + h) - function(Z - h)).item() / 2e-5 for h in steps]
+    expected = torch.tensor(changes, dtype=torch.float64).reshape(1, 1, 2)
+    size = expected.abs().max().item()
+    torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-4 * size)
 
 
 def test_analytic_ones_average_over_the_samples(held, data, uniform):

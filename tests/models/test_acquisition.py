@@ -3,10 +3,12 @@
 import pytest
 import torch
 from botorch.acquisition import (
+    PosteriorStandardDeviation,
     qKnowledgeGradient,
     qLogNoisyExpectedImprovement,
     qNegIntegratedPosteriorVariance,
 )
+from botorch.acquisition.monte_carlo import qPosteriorStandardDeviation
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
@@ -52,15 +54,24 @@ def test_one_point_of_cka(data, build, uniform):
     best_of(acquisition, value, uniform)
 
 
-@pytest.mark.parametrize("acquisition", ["variance", "knowledge gradient"])
-def test_gradients_through_fantasies(data, build, costly_kind, uniform, acquisition):
-    model = build(costly_kind, *data()).eval()
-    if acquisition == "variance":
-        function = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
-        X = uniform(1, 2, 2, high=2.0, seed=5)
-    else:
-        function = qKnowledgeGradient(model, num_fantasies=4)
-        X = uniform(1, 5, 2, high=2.0, seed=5)
+def acquisition_function(name, model, baseline, points):
+    """An acquisition function, and the number of points that it takes."""
+    sampler = SobolQMCNormalSampler(torch.Size([16]), seed=0)
+    if name == "variance":
+        return qNegIntegratedPosteriorVariance(model, mc_points=points), 2
+    if name == "deviation":
+        return qPosteriorStandardDeviation(model, sampler=sampler), 2
+    if name == "noisy improvement":
+        return qLogNoisyExpectedImprovement(model, baseline, sampler=sampler), 2
+    if name == "one deviation":
+        return PosteriorStandardDeviation(model), 1
+    return qKnowledgeGradient(model, num_fantasies=4), 5
+
+
+NAMES = ["variance", "deviation", "noisy improvement", "one deviation", "knowledge gradient"]
+
+
+def gradient_is_right(function, X):
     leaf = X.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(function(leaf).sum(), leaf)
     differences = torch.zeros_like(X)
@@ -70,7 +81,34 @@ def test_gradients_through_fantasies(data, build, costly_kind, uniform, acquisit
         change = function(X + step) - function(X - step)
         differences.view(-1)[i] = change.item() / 2e-5
     size = differences.abs().max().item()
+    assert size > 0
     torch.testing.assert_close(gradient, differences, rtol=1e-4, atol=1e-4 * size)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_through_the_physics(data, build, costly_kind, uniform, name):
+    X, Y = data()
+    model = build(costly_kind, X, Y).eval()
+    function, q = acquisition_function(name, model, X, uniform(30, 2, high=2.0))
+    Z = uniform(1, q, 2, high=2.0, seed=5)
+    assert function(Z).isfinite().all()
+    gradient_is_right(function, Z)
+
+
+@pytest.mark.parametrize("name", ["variance", "deviation", "noisy improvement"])
+def test_gradients_of_a_black_box_by_differences(data, uniform, crude_physics, name):
+    X, Y = data()
+    physics = BlackBoxPhysics(lambda X: crude_physics(torch.from_numpy(X))[:, :1].numpy())
+    model = CKA(X, Y, physics=physics).eval()
+    function, q = acquisition_function(name, model, X, uniform(30, 2, high=2.0))
+    gradient_is_right(function, uniform(1, q, 2, high=2.0, seed=5))
+
+
+def test_posterior_standard_deviation(model, uniform):
+    acquisition = acquisition_function("deviation", model, None, None)[0]
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=2, **QUICK)
+    inside(candidates, q=2)
+    best_of(acquisition, value, uniform, q=2)
 
 
 def test_noisy_expected_improvement(model, data, uniform):
@@ -108,5 +146,14 @@ def test_a_black_box_without_gradient(data, uniform):
     acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
     options = {"num_restarts": 2, "raw_samples": 8, "options": {"with_grad": False, "maxiter": 5}}
     candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **options)
+    inside(candidates)
+    best_of(acquisition, value, uniform)
+
+
+def test_a_black_box_with_finite_differences(data, uniform, crude_physics):
+    physics = BlackBoxPhysics(lambda X: crude_physics(torch.from_numpy(X))[:, :1].numpy())
+    model = CKA(*data(), physics=physics).eval()
+    acquisition = qNegIntegratedPosteriorVariance(model, mc_points=uniform(30, 2, high=2.0))
+    candidates, value = optimize_acqf(acquisition, BOUNDS, q=1, **QUICK)
     inside(candidates)
     best_of(acquisition, value, uniform)

@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture(scope="module")
 def loaded():
-    code = "import sys, gpadjust; print('\\n'.join(sys.modules))"
+    code = "import sys, gpadjust.active; print('\\n'.join(sys.modules))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(run.stdout.split())
 

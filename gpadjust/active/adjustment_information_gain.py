@@ -1,0 +1,195 @@
+"""Where a measurement would teach most about the error of the physics."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, cast, get_args
+
+import torch
+from botorch.acquisition import AcquisitionFunction
+from botorch.utils.transforms import (
+    average_over_ensemble_models,
+    concatenate_pending_points,
+    t_batch_mode_transform,
+)
+from gpytorch.distributions import MultivariateNormal
+from gpytorch.settings import min_variance
+from linear_operator.operators import DiagLinearOperator
+from linear_operator.utils.cholesky import psd_safe_cholesky
+from torch import Tensor
+
+from gpadjust.active.conditional_covariance import ConditionalCovariance
+from gpadjust.models import RRA, AdjustmentGP
+from gpadjust.models.adjustment_gp import Component
+
+About = Literal["rho", "delta", "both"]
+
+
+class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch names its own
+    r"""The information that measurements at a batch of points give about rho, delta, or both.
+
+    For :math:`y(x) = \rho(x) f_p(x) + \delta(x) + \varepsilon` it is the mutual information of the
+    observations at the points X and the whole function :math:`\rho`, given the data D (Lindley
+    1956; MacKay 1992), in nats, written as the observations' loss of entropy (Houlsby et al. 2011):
+
+    .. math::
+        I(y(X); \rho \mid D)
+        = \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D)
+        - \tfrac{1}{2} \log\det \mathrm{Cov}(y(X) \mid D, \rho).
+
+    Both are known exactly. The first is the model's own. For the second, subtract the known
+    :math:`\rho f_p` from all observations: what is left is
+    :math:`\delta(x) + \varepsilon`, and as rho and delta are independent a priori (Kennedy and
+    O'Hagan 2000), it is a regression on delta alone, at the same points with the same noise S,
+
+    .. math::
+        \mathrm{Cov}(y(X) \mid D, \rho) = k_\delta(X, X)
+        - k_\delta(X, D) \, (k_\delta(D, D) + S_D)^{-1} \, k_\delta(D, X) + S_X.
+
+    About :math:`\delta` it is the same with :math:`F_p k_\rho F_p^T` in the place of
+    :math:`k_\delta`; about both, only the noise :math:`S_X` is left. Each determinant is taken in
+    units of the noise, :math:`\det(I + S_X^{-1/2} C S_X^{-1/2})` for the covariance C of what is
+    not noise, which is never singular. Thus
+
+    .. math:: I(y; \rho, \delta) = I(y; \rho) + I(y; \delta \mid \rho) \geq I(y; \rho) \geq 0.
+
+    Where :math:`f_p(x) = 0` an observation is of delta alone. It still tells about rho as far as
+    it tells what delta was at measured points nearby.
+
+    It needs no samples, is differentiable as far as f_p is, and counts independent outputs
+    together. An unknown constant mean (``learn_rho_mean``) is a part of its function. Of a model
+    that holds samples of its hyper-parameters, the information is averaged over them. New
+    observations are as noisy as the model thinks; with known noise (``train_Yvar``), as noisy as
+    the old ones on average.
+
+    References:
+        M. C. Kennedy and A. O'Hagan, *Predicting the output from a complex computer code when fast
+        approximations are available*, Biometrika 87, 2000. D. V. Lindley, *On a measure of the
+        information provided by an experiment*, Annals of Mathematical Statistics 27, 1956. D. J. C.
+        MacKay, *Information-based objective functions for active data selection*, Neural
+        Computation 4, 1992. N. Houlsby, F. Huszar, Z. Ghahramani and M. Lengyel, *Bayesian active
+        learning for classification and preference learning*, arXiv:1112.5745, 2011.
+
+    Args:
+        model: A :class:`~gpadjust.CKA`, :class:`~gpadjust.RRA` (with ``prior="physics"``),
+            :class:`~gpadjust.ScaleGP`, :class:`~gpadjust.PhysicsMeanGP` or
+            :class:`~gpadjust.BiasGP`.
+        about: ``"rho"``, ``"delta"``, or ``"both"``: all that the model does not know. Of a model
+            with one of them only, ``"both"`` is about that one.
+        X_pending: Points that are being measured, ``k x d``.
+
+    Raises:
+        TypeError: If the model has no such adjustment, or is no adjustment of a physics.
+        ValueError: If ``about`` is unknown, or ``"delta"`` of a model with ``center``, whose delta
+            is not independent of rho a priori.
+
+    Example:
+        >>> import torch
+        >>> from botorch.optim import optimize_acqf
+        >>> from gpadjust import CKA
+        >>> train_X = torch.tensor([[0.1], [0.2], [0.9]], dtype=torch.float64)
+        >>> model = CKA(train_X, 2 * train_X.exp(), physics=torch.exp)
+        >>> acquisition = qAdjustmentInformationGain(model, about="rho")
+        >>> bounds = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+        >>> X, value = optimize_acqf(acquisition, bounds, q=2, num_restarts=2, raw_samples=8)
+        >>> X.shape
+        torch.Size([2, 1])
+    """
+
+    def __init__(
+        self, model: AdjustmentGP, about: About = "both", X_pending: Tensor | None = None
+    ) -> None:
+        _check(model, about)
+        super().__init__(model=model)
+        self.about = about
+        self.set_X_pending(X_pending)
+        self._rest: _Rest | None = None
+
+    @concatenate_pending_points  # type: ignore[untyped-decorator]
+    @t_batch_mode_transform()  # type: ignore[untyped-decorator]
+    @average_over_ensemble_models  # type: ignore[untyped-decorator]
+    def forward(self, X: Tensor) -> Tensor:
+        """Return the information in nats.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+
+        Returns:
+            The information of each batch of ``q`` points, ``batch_shape``.
+        """
+        model = self.model
+        model.eval()
+        inputs = model.transform_inputs(model._for_samples(X))
+        inputs = inputs.unsqueeze(-3) if model.num_outputs > 1 else inputs
+        batch_shape = torch.broadcast_shapes(inputs.shape[:-2], model.train_inputs[0].shape[:-2])
+        inputs = inputs.expand(*batch_shape, *inputs.shape[-2:])
+        rest, noise = self._rests(), self._noise(inputs)
+        information = _log_sds(rest.whole(inputs), noise)
+        if rest.remaining is not None:
+            information = information - _log_sds(rest.remaining(inputs), noise)
+        return information.sum(-1) if model.num_outputs > 1 else information
+
+    def _noise(self, inputs: Tensor) -> Tensor:
+        """The noise variances of observations at transformed inputs, ``... x q``."""
+        nothing = torch.zeros_like(inputs[..., 0])
+        silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
+        with min_variance(double_value=0.0):
+            noise: Tensor = self.model._apply_noise(inputs, silent, True).variance
+        return noise
+
+    def _rests(self) -> _Rest:
+        """What is unknown given the data; made anew after the model is given other data."""
+        self.model._remember_training_data()
+        if self._rest is None or self._rest.source is not self.model.prediction_strategy:
+            self._rest = _Rest(self.model, self.about)
+        return self._rest
+
+
+class _Rest:
+    """What the data leave unknown of f_a, and what they and the adjustment in question would.
+
+    Args:
+        model: The model, in eval mode.
+        about: The adjustment in question.
+    """
+
+    def __init__(self, model: AdjustmentGP, about: About) -> None:
+        self.source = model.prediction_strategy
+        self.whole = ConditionalCovariance(model, model.covar_module)
+        other = {"rho": model._kernel("delta"), "delta": model._kernel("rho"), "both": None}[about]
+        self.remaining = None if other is None else ConditionalCovariance(model, other)
+
+
+def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
+    """Half the log-determinant of noisy observations' covariance, in units of their noise."""
+    sd = noise.sqrt()
+    scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+    chol = psd_safe_cholesky(scaled + torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device))
+    log_sds: Tensor = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+    return log_sds
+
+
+def _check(model: Any, about: str) -> None:
+    """Raise what :class:`qAdjustmentInformationGain` raises."""
+    if about not in get_args(About):
+        raise ValueError(f"Unknown {about=}; expected 'rho', 'delta' or 'both'.")
+    name = type(model).__name__
+    if not isinstance(model, AdjustmentGP):
+        raise TypeError(
+            f"Expected a model with rho or delta (CKA, RRA, ScaleGP, PhysicsMeanGP, BiasGP), got "
+            f"{name}; for a model without them, take BoTorch's qNegIntegratedPosteriorVariance."
+        )
+    if isinstance(model, RRA) and model.prior == "paper":
+        raise TypeError(
+            "RRA(prior='paper') has a covariance that is not a posterior's, so that there is no "
+            "information to speak of; take prior='physics'."
+        )
+    if about == "both":
+        return
+    if model._kernel(cast(Component, about)) is None:
+        other = "delta" if about == "rho" else "rho"
+        raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
+    if about == "delta" and model._kernel("rho") is not None and model._column.offset.any():
+        raise ValueError(
+            "With `center`, delta is not independent of rho a priori, and its information has no "
+            "closed form: ask about 'rho' or 'both', or build the model with center=0."
+        )

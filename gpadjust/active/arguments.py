@@ -1,0 +1,71 @@
+"""Checks of what a collection is told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def as_bounds(bounds: Any) -> Tensor:
+    """Return bounds as ``2 x d``, float64.
+
+    Raises:
+        ValueError: If they are not finite, lower below upper.
+    """
+    bounds = torch.as_tensor(bounds, dtype=torch.float64)
+    if bounds.dim() != 2 or len(bounds) != 2 or not bounds.shape[1]:
+        raise ValueError(
+            "Expected bounds of shape 2 x d, the lower ones and then the upper ones, got "
+            f"{tuple(bounds.shape)}."
+        )
+    if not bounds.isfinite().all() or (bounds[0] >= bounds[1]).any():
+        raise ValueError(
+            f"Expected finite bounds, each lower one below its upper one, got {bounds.tolist()}."
+        )
+    return bounds
+
+
+def as_points(X: Any, num_inputs: int, name: str = "X") -> Tensor:
+    """Return points as ``n x d``, float64.
+
+    Raises:
+        ValueError: If they have another number of columns, or are not finite.
+    """
+    X = torch.as_tensor(X, dtype=torch.float64).detach()
+    if X.dim() != 2 or X.shape[-1] != num_inputs:
+        raise ValueError(
+            f"Expected {name} of shape n x {num_inputs}, a row for each point, got "
+            f"{tuple(X.shape)}."
+        )
+    if not X.isfinite().all():
+        raise ValueError(f"Expected {name} to be finite, got {X.tolist()}.")
+    return X
+
+
+def as_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
+    """Return measured values as ``n x m``, float64; they may be NaN or infinite.
+
+    Args:
+        Y: The values, ``n x m`` or ``n``; one number for one point will do.
+        num_points: Number ``n`` of points.
+        num_outputs: Number ``m`` of outputs, if it is known.
+
+    Raises:
+        TypeError: If they are no numbers.
+        ValueError: If they have another shape.
+    """
+    try:
+        Y = torch.as_tensor(Y, dtype=torch.float64).detach()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"Expected numbers as measured values, got {Y!r}.") from error
+    columns = Y.reshape(-1, 1) if Y.dim() < 2 else Y
+    right = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
+    if not right or num_outputs not in (None, columns.shape[-1]):
+        m = "m" if num_outputs is None else num_outputs
+        raise ValueError(
+            f"Expected measured values of shape {num_points} x {m}, a row for each point, got "
+            f"{tuple(Y.shape)}."
+        )
+    return columns

@@ -1,0 +1,293 @@
+"""Asking for measurements and being told them."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
+from botorch.models.model import Model
+from torch import Tensor
+
+from gpadjust.active.arguments import as_bounds, as_outcomes, as_points
+from gpadjust.active.best_points import best_points
+from gpadjust.active.design import among, sobol_points
+from gpadjust.active.measurement_log import MeasurementLog, Record
+from gpadjust.active.measurements import Measurements
+from gpadjust.active.refitting import load_parameter_values, parameter_values, refit
+from gpadjust.models.sampled_functions import check_number, seeded
+
+_FORMAT = "gpadjust measurements, version 1"
+
+
+class MeasurementWarning(UserWarning):
+    """A measurement failed."""
+
+
+class Collection(Measurements):
+    """Chooses where to measure, for a laboratory that measures when it can.
+
+    :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points. The
+    first points are a scrambled Sobol design; later ones maximise the acquisition function of a
+    model of all data so far, which is fitted from the last one's hyper-parameters. Points that were
+    asked for and not yet told are pending: acquisition functions that take ``X_pending`` count on
+    them.
+
+    With a log, each measurement is on the disk before :meth:`tell` does anything else, as a line of
+    JSON; so are the points asked for, before :meth:`ask` returns them. A new collection with the
+    same log goes on where the last one stopped, asks for the same points (with the same seed), and
+    has the same points pending.
+
+    Args:
+        model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64.
+        bounds: Bounds of the inputs, ``2 x d``: lower, then upper.
+        acquisition: Makes a BoTorch acquisition function of the fitted model.
+        batch_size: Number of points that :meth:`ask` returns.
+        initial: Number of measurements, those of ``data`` included, before the first model; or the
+            first points, ``k x d``, in place of Sobol's. Default: ``2 (d + 1)``.
+        data: ``(X, Y)`` measured before. They are not logged: give them each time.
+        num_outputs: Number ``m`` of outputs. Default: that of the first measurement.
+        fit: Fits a new model, in place. Default: :func:`gpadjust.fit`. Take
+            ``lambda model: fit(model, "hmc")`` for full Bayes.
+        optimizer_options: Arguments of ``optimize_acqf``.
+        log: The file of the log.
+        seed: Seed of the design and of the acquisition function's maximisation. The global random
+            state is left alone.
+
+    Raises:
+        TypeError: If ``model_factory``, ``acquisition`` or ``fit`` is not callable.
+        ValueError: If another argument is out of range, or the log is of another problem.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import CKA
+        >>> from gpadjust.active import Collection, qAdjustmentInformationGain
+        >>> collection = Collection(
+        ...     lambda X, Y: CKA(X, Y, physics=torch.sin),
+        ...     bounds=[[0.0], [3.0]],
+        ...     acquisition=lambda model: qAdjustmentInformationGain(model, about="rho"),
+        ... )
+        >>> for _ in range(5):
+        ...     X = collection.ask()
+        ...     collection.tell(X, 2 * torch.sin(X) + X)
+        >>> collection.X.shape, collection.model.num_outputs
+        (torch.Size([5, 1]), 1)
+    """
+
+    def __init__(
+        self,
+        model_factory: Callable[[Tensor, Tensor], Model],
+        bounds: Tensor | list[list[float]],
+        acquisition: Callable[[Any], AcquisitionFunction],
+        *,
+        batch_size: int = 1,
+        initial: int | Tensor | None = None,
+        data: tuple[Tensor, Tensor] | None = None,
+        num_outputs: int | None = None,
+        fit: Callable[[Any], Any] | None = None,
+        optimizer_options: dict[str, Any] | None = None,
+        log: str | os.PathLike[str] | None = None,
+        seed: int = 0,
+    ) -> None:
+        for name, given in (("model_factory", model_factory), ("acquisition", acquisition)):
+            if not callable(given):
+                raise TypeError(f"Expected {name} to be callable, got {given!r}.")
+        if fit is not None and not callable(fit):
+            raise TypeError(f"Expected fit to be callable, got {fit!r}.")
+        self.model_factory, self.acquisition = model_factory, acquisition
+        self.bounds = as_bounds(bounds)
+        d = self.bounds.shape[-1]
+        check_number(batch_size, "batch_size")
+        if not isinstance(seed, int) or seed < 0:
+            raise ValueError(f"Expected seed to be a whole number >= 0, got {seed!r}.")
+        self.batch_size, self.seed = batch_size, seed
+        initial = 2 * (d + 1) if initial is None else initial
+        self._first_points = self.bounds[:0]
+        if isinstance(initial, Tensor):
+            self._first_points, initial = as_points(initial, d, "initial"), 2
+        if not isinstance(initial, int) or initial < 2:
+            raise ValueError(
+                f"Expected initial to be a number of points >= 2, or the points, got {initial!r}."
+            )
+        self._initial, self._fit = initial, fit
+        self._options = optimizer_options or {}
+        if num_outputs is not None:
+            check_number(num_outputs, "num_outputs")
+        super().__init__(d, num_outputs, data)
+        self._model: Any = None
+        self._last_model: tuple[Any, int] = (None, 0)
+        self.log = None if log is None else MeasurementLog(log)
+        if self.log is not None:
+            self._resume(self.log)
+
+    @property
+    def model(self) -> Any:
+        """The model of all data so far, fitted when it is asked for first.
+
+        Raises:
+            RuntimeError: If there are fewer than two measurements.
+        """
+        if self._model is None:
+            if len(self.X) < 2:
+                raise RuntimeError(
+                    f"A model needs at least 2 measurements, there are {len(self.X)}."
+                )
+            previous, count = self._previous()
+            if count < len(self.X):
+                model = self.model_factory(self.X, self.Y)
+                refit(model, previous, self._fit)
+                self._last_model = model, len(self.X)
+            self._model = self._last_model[0]
+        return self._model
+
+    def ask(self, q: int | None = None) -> Tensor:
+        """Say where to measure next.
+
+        Args:
+            q: Number of points. Default: ``batch_size``.
+
+        Returns:
+            The points, ``q x d``, which are pending from now on.
+
+        Raises:
+            TypeError: If ``acquisition`` makes no acquisition function.
+            ValueError: If it takes single points, and ``q`` is larger.
+        """
+        q = self.batch_size if q is None else q
+        check_number(q, "q")
+        record: Record = {}
+        points = self._design(q)
+        if points is None:
+            with seeded((1_000_003 * self.seed + self._num_asks) % 2**63):
+                function = self._acquisition_function(q)
+                points = best_points(
+                    function, self.bounds, q, self.pending, self.failed_X, self._options
+                )
+            record = {"parameters": parameter_values(self.model)}
+        self._enter([{"asked": points.tolist(), **record}])
+        return points
+
+    def tell(self, X: Tensor, Y: Tensor) -> None:
+        """Take measurements, of points asked for or of others.
+
+        Args:
+            X: The points, ``n x d``.
+            Y: What was measured, ``n x m`` or ``n``. A row with NaN or infinity has failed.
+
+        Raises:
+            TypeError: If they are no numbers.
+            ValueError: If shapes disagree.
+
+        Warns:
+            MeasurementWarning: If one of them has failed.
+        """
+        X = as_points(X, self.bounds.shape[-1])
+        Y = as_outcomes(Y, len(X), self.num_outputs)
+        records = []
+        for x, y in zip(X.tolist(), Y.tolist(), strict=True):
+            finite = torch.tensor(y).isfinite().all()
+            records.append({"x": x, "y": y} if finite else {"x": x, "failed": f"measured {y}"})
+        self._enter(records)
+        self._warn(records)
+
+    def fail(self, X: Tensor, message: str) -> None:
+        """Take it that measurements failed. Their points are not asked for again.
+
+        Args:
+            X: The points, ``n x d``.
+            message: Why.
+
+        Warns:
+            MeasurementWarning: In any case.
+        """
+        X = as_points(X, self.bounds.shape[-1])
+        records: list[Record] = [{"x": x, "failed": message} for x in X.tolist()]
+        self._enter(records)
+        self._warn(records)
+
+    def withdraw(self, X: Tensor | None = None) -> None:
+        """Take it that points asked for will not be measured, but may be asked for again.
+
+        Args:
+            X: The points, ``n x d``. Default: all that are pending.
+        """
+        X = self.pending if X is None else as_points(X, self.bounds.shape[-1])
+        self._enter([{"withdrawn": X.tolist()}])
+
+    def _design(self, q: int) -> Tensor | None:
+        """The next points that need no model, ``q x d``, or None if a model is to choose."""
+        known = torch.cat([self.X, self.failed_X, self.pending])
+        first = self._first_points[~among(self._first_points, known)]
+        if not len(first) and len(self.X) >= self._initial:
+            return None
+        return torch.cat([first, sobol_points(self.bounds, q, known, self.seed)])[:q]
+
+    def _acquisition_function(self, q: int) -> AcquisitionFunction:
+        """The user's acquisition function of the model."""
+        function = self.acquisition(self.model)
+        if not isinstance(function, AcquisitionFunction):
+            raise TypeError(
+                "Expected acquisition(model) to be a BoTorch AcquisitionFunction, got "
+                f"{type(function).__name__}."
+            )
+        if q > 1 and isinstance(function, AnalyticAcquisitionFunction):
+            raise ValueError(
+                f"{type(function).__name__} takes one point at a time, got q = {q}: set "
+                "batch_size=1, or take the acquisition function whose name begins with q."
+            )
+        return function
+
+    def _previous(self) -> tuple[Any, int]:
+        """The model fitted last, made again from the log if need be, and its number of points."""
+        if self._last_model[0] is None and self._last_fit is not None:
+            count, values = self._last_fit
+            model = self.model_factory(self.X[:count], self.Y[:count])
+            self._last_model = (model, count) if load_parameter_values(model, values) else (None, 0)
+        return self._last_model
+
+    def _enter(self, records: list[Record]) -> None:
+        """Log records, then take them in."""
+        known = len(self.X)
+        if self.log is not None:
+            self.log.append(records)
+        for record in records:
+            self._take(record)
+        self._model = None if len(self.X) > known else self._model
+
+    def _resume(self, log: MeasurementLog) -> None:
+        """Take in what is in the log, or begin it."""
+        records = log.read()
+        header = {"format": _FORMAT, "bounds": self.bounds.tolist()}
+        if not records:
+            log.append([header])
+            return
+        if records[0].get("format") != _FORMAT:
+            raise ValueError(f"{log.path} is no log of measurements; name another file.")
+        if records[0]["bounds"] != header["bounds"]:
+            raise ValueError(
+                f"The log {log.path} is of measurements within the bounds {records[0]['bounds']}, "
+                f"got {header['bounds']}; name another file, or take those bounds."
+            )
+        for number, record in enumerate(records[1:], start=2):
+            try:
+                self._take(record)
+            except (KeyError, TypeError, ValueError, RuntimeError) as error:
+                raise ValueError(
+                    f"Line {number} of the log {log.path} does not belong to this collection of "
+                    f"{self.bounds.shape[-1]} inputs and {self.num_outputs} outputs: {error}"
+                ) from error
+
+    def _warn(self, records: list[Record]) -> None:
+        """Warn of failed measurements."""
+        failed = [record for record in records if "failed" in record]
+        if failed:
+            warnings.warn(
+                f"{len(failed)} of {len(records)} measurements failed, the first at x = "
+                f"{failed[0]['x']}: {failed[0]['failed']}. They count against a budget, and are "
+                "not asked for again.",
+                MeasurementWarning,
+                stacklevel=3,
+            )

@@ -1,0 +1,89 @@
+"""What was measured, what failed, and what is being measured."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gpadjust.active.arguments import as_outcomes, as_points
+from gpadjust.active.measurement_log import Record
+
+
+class Measurements:
+    """The state that records add up to, whether new ones or those of a log.
+
+    A record is one of
+
+    - ``{"asked": [x, ...], "parameters": {...}}``: points that are to be measured, and the
+      parameters of the model that chose them, if one did;
+    - ``{"x": x, "y": y}``: a measurement;
+    - ``{"x": x, "failed": message}``: one that failed;
+    - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more.
+
+    Args:
+        num_inputs: Number ``d`` of inputs.
+        num_outputs: Number ``m`` of outputs, or None for that of the first measurement.
+        data: ``(X, Y)`` measured before, or None.
+
+    Attributes:
+        X: The points measured, ``n x d``, those of ``data`` first.
+        Y: What was measured there, ``n x m``.
+        failed_X: Where measuring failed, ``k x d``.
+        pending: Points asked for and not told yet, ``l x d``.
+        num_measured: Number of measurements, failed ones included, those of ``data`` not.
+        num_outputs: Number ``m`` of outputs; None before the first measurement.
+    """
+
+    def __init__(
+        self, num_inputs: int, num_outputs: int | None, data: tuple[Tensor, Tensor] | None
+    ) -> None:
+        none = torch.zeros(0, num_inputs, dtype=torch.float64)
+        self.X = self.failed_X = self.pending = none
+        self.Y = torch.zeros(0, num_outputs or 0, dtype=torch.float64)
+        self.num_measured = 0
+        self.num_outputs = num_outputs
+        self._num_asks = 0
+        self._last_fit: tuple[int, Record] | None = None  # of how many points, and its result
+        if data is not None:
+            X = as_points(data[0], num_inputs, "the X of data")
+            Y = as_outcomes(data[1], len(X), num_outputs)
+            if not Y.isfinite().all():
+                raise ValueError("Expected the Y of data to be finite; leave failed points out.")
+            self.X, self.Y, self.num_outputs = X, Y, Y.shape[-1]
+
+    def _take(self, record: Record) -> None:
+        """Take in one record."""
+        if "asked" in record:
+            self.pending = torch.cat([self.pending, self._points(record["asked"])])
+            self._num_asks += 1
+            if record.get("parameters"):
+                self._last_fit = (len(self.X), record["parameters"])
+        elif "withdrawn" in record:
+            for x in self._points(record["withdrawn"]):
+                self._no_longer_pending(x)
+        else:
+            self._take_measurement(record)
+
+    def _take_measurement(self, record: Record) -> None:
+        """Take in one measurement."""
+        x = self._points([record["x"]])
+        if "failed" in record:
+            self.failed_X = torch.cat([self.failed_X, x])
+        else:
+            y = as_outcomes([record["y"]], 1, self.num_outputs)
+            self.num_outputs = y.shape[-1]
+            self.X, self.Y = torch.cat([self.X, x]), torch.cat([self.Y, y]) if len(self.Y) else y
+        self._no_longer_pending(x[0])
+        self.num_measured += 1
+
+    def _no_longer_pending(self, x: Tensor) -> None:
+        """Remove one point from those that are pending, if it is one."""
+        here = (self.pending == x).all(-1).nonzero()
+        if len(here):
+            i = int(here[0])
+            self.pending = torch.cat([self.pending[:i], self.pending[i + 1 :]])
+
+    def _points(self, rows: list[list[float]]) -> Tensor:
+        """The points of a record, ``n x d``."""
+        d = self.X.shape[-1]
+        return as_points(rows, d) if rows else self.X.new_zeros(0, d)

@@ -1,0 +1,409 @@
+"""The loop: what it measures, what it survives, and how it goes on."""
+
+import builtins
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+from botorch.acquisition import LogExpectedImprovement, qKnowledgeGradient
+from botorch.models import SingleTaskGP
+from botorch.models.transforms import Normalize
+
+from gpadjust import fit
+from gpadjust.active import (
+    CollectionError,
+    MeasurementWarning,
+    collect,
+    qAdjustmentInformationGain,
+)
+
+
+def truth(X):
+    return 1.4 * (2 + (2 * X[..., :1]).sin()) + X[..., 1:].square()
+
+
+quiet = pytest.mark.filterwarnings("ignore::gpadjust.active.MeasurementWarning")
+
+
+class Oracle:
+    """The truth, which counts, and does something else at some measurements."""
+
+    def __init__(self, **instead):
+        self.instead = {int(k[1:]): v for k, v in instead.items()}
+        self.asked = []
+
+    def __call__(self, X):
+        self.asked.append(X)
+        Y = truth(X)
+        what = self.instead.get(len(self.asked))
+        return what(Y) if what else Y
+
+
+def throw(error):
+    def do(Y):
+        raise error
+
+    return do
+
+
+def same(a, b):
+    return a.X.shape == b.X.shape and torch.equal(a.X, b.X) and torch.equal(a.Y, b.Y)
+
+
+class TestMeasuring:
+    @pytest.mark.parametrize("batch_size", [1, 3])
+    def test_budget(self, laboratory, bounds, batch_size):
+        oracle = Oracle()
+        result = collect(**laboratory(oracle=oracle, batch_size=batch_size))
+        assert result.X.shape == (7, 2)
+        assert result.Y.shape == (7, 1)
+        assert torch.equal(torch.cat(oracle.asked), result.X)
+        assert [len(X) for X in oracle.asked] == ([1] * 7 if batch_size == 1 else [3, 3, 1])
+        assert ((bounds[0] <= result.X) & (bounds[1] >= result.X)).all()
+        torch.testing.assert_close(result.Y, truth(result.X))
+        assert result.model.train_targets.shape == (7,)
+
+    def test_it_teaches_more_than_chance(self, laboratory, bounds):
+        options = {"num_restarts": 2, "raw_samples": 16}
+        result = collect(**laboratory(budget=10, fit=None, optimizer_options=options))
+        grid = torch.cartesian_prod(*(torch.linspace(*b, 9, dtype=torch.float64) for b in bounds.T))
+        error = (result.model.posterior(grid).mean - truth(grid)).abs().max()
+        assert error < 0.1 * truth(grid).std()
+
+    def test_the_seed_decides(self, laboratory):
+        state = torch.get_rng_state()
+        first, again = collect(**laboratory(budget=5)), collect(**laboratory(budget=5))
+        assert torch.equal(torch.get_rng_state(), state)
+        assert same(first, again)
+        assert not same(first, collect(**laboratory(budget=5, seed=1)))
+
+    def test_several_outputs(self, laboratory):
+        result = collect(
+            **laboratory(
+                oracle=lambda X: torch.cat([truth(X), -truth(X)], -1).numpy(),
+                acquisition=lambda model: qAdjustmentInformationGain(model, "rho"),
+                budget=5,
+            )
+        )
+        assert result.Y.shape == (5, 2)
+
+    @pytest.mark.parametrize(
+        "squeeze", [lambda Y: Y[:, 0], lambda Y: Y.numpy(), lambda Y: Y.float(), lambda Y: Y.item()]
+    )
+    def test_forms_of_outcomes(self, laboratory, squeeze):
+        result = collect(**laboratory(oracle=lambda X: squeeze(truth(X)), budget=3))
+        torch.testing.assert_close(result.Y, truth(result.X), rtol=1e-6, atol=1e-6)
+        assert result.Y.dtype == torch.float64
+
+    def test_points_to_start_with(self, laboratory, uniform):
+        first = uniform(5, 2, seed=3)
+        result = collect(**laboratory(initial=first, budget=6))
+        assert torch.equal(result.X[:5], first)
+
+    def test_data_from_before(self, laboratory, uniform):
+        X = uniform(4, 2, seed=3)
+        result = collect(**laboratory(data=(X, truth(X)), budget=2))
+        assert result.X.shape == (6, 2)
+        assert torch.equal(result.X[:4], X)
+        # Four points are enough for a model, so that no design was measured.
+        design = collect(**laboratory(budget=2))
+        assert not (result.X[4:, None] == design.X).all(-1).any()
+
+    def test_warm_started_fits(self, laboratory, monkeypatch):
+        started = []
+        from gpadjust.active import refitting
+
+        def watch(model, previous):
+            started.append((len(model.train_targets), len(previous.train_targets)))
+
+        monkeypatch.setattr(refitting, "warm_start", watch)
+        collect(**laboratory(budget=7)).model  # noqa: B018
+        assert started == [(5, 4), (6, 5), (7, 6)]
+
+    def test_the_default_fit(self, laboratory):
+        result = collect(**laboratory(budget=6, fit=None))
+        assert result.model.num_samples is None
+
+    def test_full_bayes(self, laboratory):
+        sample = {"num_samples": 4, "num_warmup": 8, "num_starts": 1, "num_screened": 8}
+        result = collect(**laboratory(budget=5, fit=lambda m: _sampled(m, sample)))
+        assert result.model.num_samples == 4
+
+    def test_a_model_of_botorch(self, laboratory, bounds):
+
+        def factory(X, Y):
+            return SingleTaskGP(X, Y, input_transform=Normalize(2, bounds=bounds))
+
+        result = collect(**laboratory(model_factory=factory, budget=5))
+        assert isinstance(result.model, SingleTaskGP)
+
+    def test_knowledge_gradient(self, laboratory):
+        acquisition = lambda model: qKnowledgeGradient(model, num_fantasies=2)  # noqa: E731
+        result = collect(**laboratory(acquisition=acquisition, budget=5))
+        assert result.X.shape == (5, 2)
+
+
+def _sampled(model, options):
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return fit(model, "hmc", **options)
+
+
+class TestFailures:
+    @pytest.mark.parametrize(
+        ("what", "message"),
+        [
+            (throw(OSError("no gas")), "OSError: no gas"),
+            (lambda Y: Y * float("nan"), r"measured \[nan\]"),
+            (lambda Y: Y + float("inf"), r"measured \[inf\]"),
+            (lambda Y: torch.ones(2, 1), r"Expected measured values of shape 1 x 1, .* \(2, 1\)"),
+            (lambda Y: torch.ones(1, 2), r"Expected measured values of shape 1 x 1, .* \(1, 2\)"),
+            (lambda Y: None, "Expected numbers"),
+        ],
+    )
+    def test_they_are_skipped_and_counted(self, laboratory, tmp_path, what, message):
+        path = tmp_path / "log.jsonl"
+        oracle = Oracle(n6=what)
+        with pytest.warns(MeasurementWarning, match=message):
+            result = collect(**laboratory(oracle=oracle, log=path))
+        assert len(oracle.asked) == 7
+        assert result.X.shape == (6, 2)
+        assert torch.equal(result.failed_X, oracle.asked[5])
+        (record,) = [r for r in map(json.loads, path.read_text().splitlines()) if "failed" in r]
+        assert record["x"] == result.failed_X[0].tolist()
+        distance = (result.X - result.failed_X).abs().amax(-1)
+        assert distance.min() > 1e-3
+
+    @quiet
+    @pytest.mark.parametrize("analytic", [False, True])
+    def test_a_failing_region_does_not_hold_the_loop(self, laboratory, analytic):
+        options = {}
+        if analytic:
+            options["acquisition"] = lambda model: LogExpectedImprovement(model, best_f=10.0)
+        seen = []
+
+        def oracle(X):
+            seen.append(X)
+            if X[0, 1] > 0.8:
+                raise ValueError("out of reach")
+            return truth(X)
+
+        result = collect(**laboratory(oracle=oracle, budget=10, max_failures=10, **options))
+        seen = torch.cat(seen)
+        assert len(result.X) + len(result.failed_X) == 10
+        apart = (seen[:, None] - seen).abs().amax(-1) + torch.eye(10)
+        assert apart[(seen[:, 1] > 0.8)].min() > 1e-3
+
+    @quiet
+    def test_rows_of_a_batch_fail_by_themselves(self, laboratory):
+        def oracle(X):
+            Y = truth(X)
+            Y[0] = float("nan")
+            return Y
+
+        result = collect(**laboratory(oracle=oracle, batch_size=3, budget=6))
+        assert (len(result.X), len(result.failed_X)) == (4, 2)
+
+    @quiet
+    def test_several_in_a_row_stop_it(self, laboratory, tmp_path):
+        path = tmp_path / "log.jsonl"
+        broken = {f"n{i}": throw(OSError("no gas")) for i in range(3, 20)}
+        with pytest.raises(
+            CollectionError, match=r"failed 3 times in a row.*no gas.*log is at .*log\.jsonl"
+        ) as error:
+            collect(**laboratory(oracle=Oracle(**broken), log=path, max_failures=3, budget=20))
+        assert isinstance(error.value.__cause__, OSError)
+        assert error.value.collection.X.shape == (2, 2)
+        # After a repair it goes on.
+        result = collect(**laboratory(log=path, budget=8))
+        assert (len(result.X), len(result.failed_X)) == (5, 3)
+
+
+class TestResuming:
+    @pytest.mark.parametrize(
+        ("batch_size", "at", "fit"),
+        [(1, 1, "given"), (1, 6, "given"), (2, 4, "given"), (2, 3, "default")],
+    )
+    def test_an_interrupted_run_ends_as_if_it_had_not_been(
+        self, laboratory, tmp_path, batch_size, at, fit
+    ):
+        options = {"batch_size": batch_size, "initial": 3}
+        if fit == "default":
+            options["fit"] = None
+        whole = collect(**laboratory(**options))
+        path = tmp_path / "log.jsonl"
+        oracle = Oracle(**{f"n{at}": throw(KeyboardInterrupt())})
+        with pytest.raises(KeyboardInterrupt):
+            collect(**laboratory(oracle=oracle, log=path, **options))
+        state = len(path.read_bytes().splitlines())
+        again = Oracle()
+        result = collect(**laboratory(oracle=again, log=path, **options))
+        assert state > 1
+        assert torch.equal(again.asked[0], oracle.asked[-1])
+        assert same(result, whole)
+        assert torch.equal(_parameters(result.model), _parameters(whole.model))
+
+    @pytest.mark.parametrize("learn", [False, True])
+    def test_killed_at_any_byte(self, laboratory, tmp_path, learn):
+        options = {"batch_size": 2, "budget": 6, "initial": 4}
+        if learn:
+            from gpadjust import CKA
+
+            options["model_factory"] = lambda X, Y: CKA(
+                X, Y, physics=lambda X: 2 + X[..., :1], learn_rho_mean=True, learn_delta_mean=True
+            )
+        path = tmp_path / "log.jsonl"
+        whole = collect(**laboratory(log=path, **options))
+        content = path.read_bytes()
+        line_ends = [i + 1 for i, byte in enumerate(content) if byte == ord("\n")]
+        for size in [3, line_ends[-4] - 5, line_ends[-2]]:
+            path.write_bytes(content[:size])
+            oracle = Oracle()
+            result = collect(**laboratory(oracle=oracle, log=path, **options))
+            lost = 6 - content[: size + 1].count(b'"y"')
+            assert same(result, whole)
+            measured = 0 if not oracle.asked else len(torch.cat(oracle.asked))
+            assert measured in (lost, lost + 1)
+
+    @quiet
+    def test_failures_and_an_unchanged_model(self, laboratory, tmp_path):
+        bad = {"n5": lambda Y: Y * float("nan"), "n6": lambda Y: Y * float("nan")}
+        whole = collect(**laboratory(oracle=Oracle(**bad)))
+        path = tmp_path / "log.jsonl"
+        oracle = Oracle(**{**bad, "n6": throw(KeyboardInterrupt())})
+        with pytest.raises(KeyboardInterrupt):
+            collect(**laboratory(oracle=oracle, log=path))
+        result = collect(**laboratory(oracle=Oracle(n1=bad["n6"]), log=path))
+        assert same(result, whole)
+        assert torch.equal(result.failed_X, whole.failed_X)
+
+    def test_a_larger_budget_goes_on(self, laboratory, tmp_path):
+        path = tmp_path / "log.jsonl"
+        collect(**laboratory(log=path, budget=5))
+        oracle = Oracle()
+        result = collect(**laboratory(oracle=oracle, log=path, budget=6))
+        assert len(oracle.asked) == 1
+        assert same(result, collect(**laboratory(budget=6)))
+
+    def test_a_log_that_does_not_belong(self, laboratory, tmp_path, bounds):
+        path = tmp_path / "log.jsonl"
+        collect(**laboratory(log=path, budget=2))
+        with pytest.raises(ValueError, match=r"log\.jsonl is of measurements within the bounds"):
+            collect(**laboratory(log=path, bounds=2 * bounds))
+        with pytest.raises(ValueError, match="within the bounds"):
+            collect(**laboratory(log=path, bounds=bounds[:, :1]))
+        with pytest.raises(ValueError, match=r"Line 3 of the log .* 2 inputs and 2 outputs"):
+            collect(**laboratory(log=path, num_outputs=2))
+        path.write_text('{"loss": 1.0}\n')
+        with pytest.raises(ValueError, match=r"log\.jsonl is no log of measurements"):
+            collect(**laboratory(log=path))
+
+    @pytest.mark.slow
+    def test_a_killed_process(self, tmp_path):
+        code = """
+import os, signal, sys, torch
+from gpadjust import CKA
+from gpadjust.active import collect, qAdjustmentInformationGain
+def oracle(X):
+    if os.path.exists("first") or open("log.jsonl").read().count('"y"') < 5:
+        return 2 * X.sin() + X
+    open("first", "w").close()
+    os.kill(os.getpid(), signal.SIGKILL)
+result = collect(lambda X, Y: CKA(X, Y, physics=torch.sin), oracle, [[0.0], [3.0]],
+    qAdjustmentInformationGain, budget=7, log="log.jsonl",
+    optimizer_options={"num_restarts": 1, "raw_samples": 4})
+print(result.X.flatten().tolist())
+"""
+        run = [sys.executable, "-c", code]
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        first = subprocess.run(run, cwd=tmp_path, env=env, capture_output=True, check=False)
+        assert first.returncode == -signal.SIGKILL
+        second = subprocess.run(run, cwd=tmp_path, env=env, capture_output=True, check=True)
+        (tmp_path / "log.jsonl").unlink()
+        whole = subprocess.run(run, cwd=tmp_path, env=env, capture_output=True, check=True)
+        assert second.stdout == whole.stdout
+
+
+def _parameters(model):
+    return torch.cat([parameter.detach().reshape(-1) for parameter in model.parameters()])
+
+
+class TestProgress:
+    def test_bar(self, laboratory, capsys):
+        collect(**laboratory(budget=2, progress=True))
+        assert "2/2" in capsys.readouterr().err
+        collect(**laboratory(budget=2))
+        assert capsys.readouterr().err == ""
+
+    def test_without_tqdm(self, laboratory, monkeypatch):
+        real = builtins.__import__
+
+        def without(name, *args, **kwargs):
+            if name == "tqdm":
+                raise ImportError(name)
+            return real(name, *args, **kwargs)
+
+        monkeypatch.setattr(builtins, "__import__", without)
+        with pytest.raises(ImportError, match="pip install tqdm"):
+            collect(**laboratory(progress=True))
+
+
+class TestErrors:
+    @pytest.mark.parametrize("name", ["budget", "batch_size", "max_failures", "num_outputs"])
+    @pytest.mark.parametrize("value", [0, -1, 2.5, "3"])
+    def test_numbers(self, laboratory, name, value):
+        with pytest.raises(ValueError, match=f"Expected {name} to be a whole number >= 1, got"):
+            collect(**laboratory(**{name: value}))
+
+    @pytest.mark.parametrize(
+        ("bounds", "message"),
+        [
+            ([0.0, 1.0], r"shape 2 x d.* got \(2,\)"),
+            ([[0.0, 0.0]], r"got \(1, 2\)"),
+            ([[0.0, 1.0], [1.0, 0.0]], "each lower one below its upper one"),
+            ([[0.0, float("nan")], [1.0, 1.0]], "Expected finite bounds"),
+        ],
+    )
+    def test_bounds(self, laboratory, bounds, message):
+        with pytest.raises(ValueError, match=message):
+            collect(**laboratory(bounds=bounds))
+
+    @pytest.mark.parametrize("name", ["model_factory", "acquisition", "oracle", "fit"])
+    def test_callables(self, laboratory, name):
+        with pytest.raises(TypeError, match=f"Expected (the )?{name} to be callable, got 3"):
+            collect(**laboratory(**{name: 3}))
+
+    def test_no_acquisition_function(self, laboratory):
+        with pytest.raises(TypeError, match="to be a BoTorch AcquisitionFunction, got CKA"):
+            collect(**laboratory(acquisition=lambda model: model))
+
+    def test_an_acquisition_function_of_single_points(self, laboratory):
+        analytic = lambda model: LogExpectedImprovement(model, best_f=1.0)  # noqa: E731
+        with pytest.raises(ValueError, match=r"LogExpectedImprovement takes one .* got q = 2"):
+            collect(**laboratory(acquisition=analytic, batch_size=2))
+
+    @pytest.mark.parametrize("initial", [1, 0, "three"])
+    def test_initial(self, laboratory, initial):
+        with pytest.raises(ValueError, match="Expected initial to be a number of points >= 2"):
+            collect(**laboratory(initial=initial))
+
+    def test_initial_points(self, laboratory):
+        with pytest.raises(ValueError, match=r"Expected initial of shape n x 2"):
+            collect(**laboratory(initial=torch.ones(3, 1)))
+
+    def test_data(self, laboratory, uniform):
+        X = uniform(4, 2)
+        with pytest.raises(ValueError, match="Expected the Y of data to be finite"):
+            collect(**laboratory(data=(X, X[:, :1].log() * float("nan"))))
+        with pytest.raises(ValueError, match=r"shape 4 x m, .* got \(3, 1\)"):
+            collect(**laboratory(data=(X, X[:3, :1])))
+
+    def test_seed(self, laboratory):
+        with pytest.raises(ValueError, match="seed to be a whole number >= 0"):
+            collect(**laboratory(seed=-1))

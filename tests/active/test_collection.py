@@ -1,0 +1,138 @@
+"""Asking and telling in any order."""
+
+import pytest
+import torch
+
+from gpadjust.active import Collection, MeasurementWarning
+
+
+def truth(X):
+    return 1.4 * (2 + (2 * X[..., :1]).sin()) + X[..., 1:].square()
+
+
+@pytest.fixture
+def make(laboratory):
+    def make(**changes):
+        arguments = laboratory(**changes)
+        return Collection(**{k: v for k, v in arguments.items() if k not in ("oracle", "budget")})
+
+    return make
+
+
+def filled(collection, n=4):
+    for _ in range(n):
+        X = collection.ask(1)
+        collection.tell(X, truth(X))
+    return collection
+
+
+def test_asked_points_are_pending_until_told(make):
+    collection = make(batch_size=3)
+    X = collection.ask()
+    assert X.shape == (3, 2)
+    assert torch.equal(collection.pending, X)
+    collection.tell(X[1:2], truth(X[1:2]))
+    assert torch.equal(collection.pending, X[[0, 2]])
+    more = collection.ask(2)
+    assert torch.equal(collection.pending, torch.cat([X[[0, 2]], more]))
+
+
+def test_the_design_is_spread(make):
+    collection = make()
+    points = torch.cat([collection.ask(1) for _ in range(4)] + [collection.ask(4)])
+    quadrants = {tuple(x) for x in (points > torch.tensor([1.0, 0.0])).tolist()}
+    assert len(quadrants) == 4
+    assert len(points.unique(dim=0)) == 8
+
+
+def test_asking_without_telling_asks_elsewhere(make):
+    collection = filled(make())
+    points = torch.cat([collection.ask() for _ in range(3)])
+    apart = (points[:, None] - points).abs().amax(-1) + torch.eye(3)
+    assert apart.min() > 1e-3
+    assert torch.equal(collection.pending, points)
+
+
+def test_points_that_nobody_asked_for(make, uniform):
+    collection = make()
+    X = uniform(5, 2, seed=2)
+    collection.tell(X, truth(X)[:, 0])
+    assert torch.equal(collection.X, X)
+    assert collection.num_measured == 5
+    assert collection.ask().shape == (1, 2)  # by a model: five are enough
+    assert collection.model.train_targets.shape == (5,)
+
+
+def test_told_again_is_a_repeated_measurement(make):
+    collection = make()
+    X = collection.ask()
+    collection.tell(X, truth(X))
+    collection.tell(X, truth(X) + 0.1)
+    assert torch.equal(collection.X, X.repeat(2, 1))
+
+
+def test_failing_and_withdrawing(make):
+    collection = make()
+    X = collection.ask(4)
+    with pytest.warns(MeasurementWarning, match="1 of 1 measurements failed.*the pump leaks"):
+        collection.fail(X[:1], "the pump leaks")
+    assert torch.equal(collection.failed_X, X[:1])
+    collection.withdraw(X[1:2])
+    assert torch.equal(collection.pending, X[2:])
+    collection.withdraw()
+    assert len(collection.pending) == 0
+    # Withdrawn points may be asked for again, failed ones may not.
+    assert torch.equal(collection.ask(3), X[1:])
+
+
+def test_all_of_it_comes_back_from_the_log(make, tmp_path, uniform):
+    path = tmp_path / "log.jsonl"
+    collection = filled(make(log=path))
+    X = collection.ask(3)
+    with pytest.warns(MeasurementWarning):
+        collection.fail(X[:1], "no")
+    collection.withdraw(X[1:2])
+    other = uniform(1, 2)
+    collection.tell(other, truth(other))
+    again = make(log=path)
+    for name in ("X", "Y", "failed_X", "pending"):
+        assert torch.equal(getattr(again, name), getattr(collection, name))
+    assert again.num_measured == collection.num_measured == 6
+    assert torch.equal(again.ask(), collection.ask())
+    assert torch.equal(again.ask(), collection.ask())
+
+
+def test_a_log_of_another_structure_is_no_hindrance(make, tmp_path):
+    from gpadjust import PhysicsMeanGP
+
+    path = tmp_path / "log.jsonl"
+    filled(make(log=path), 6)
+    factory = lambda X, Y: PhysicsMeanGP(X, Y, physics=lambda X: X[..., :1])  # noqa: E731
+    collection = make(log=path, model_factory=factory)
+    assert collection.ask().shape == (1, 2)
+    assert isinstance(collection.model, PhysicsMeanGP)
+
+
+def test_a_model_needs_data(make):
+    with pytest.raises(RuntimeError, match="at least 2 measurements, there are 0"):
+        make().model  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("X", "Y", "message"),
+    [
+        (torch.ones(2), torch.ones(1), r"Expected X of shape n x 2, .* got \(2,\)"),
+        (torch.ones(1, 3), torch.ones(1), r"got \(1, 3\)"),
+        (torch.ones(2, 2), torch.ones(3, 1), r"shape 2 x 1, .* got \(3, 1\)"),
+        (torch.ones(2, 2), torch.ones(2, 2), r"shape 2 x 1, .* got \(2, 2\)"),
+        (torch.full((1, 2), float("nan")), torch.ones(1), "Expected X to be finite"),
+    ],
+)
+def test_bad_tellings_change_nothing(make, tmp_path, X, Y, message):
+    path = tmp_path / "log.jsonl"
+    collection = filled(make(log=path), 1)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=message):
+        collection.tell(X, Y)
+    assert path.read_bytes() == before
+    assert len(collection.X) == 1
