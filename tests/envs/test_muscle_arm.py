@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import gpadjust
 from gpadjust.dynamics import CKADynamics
@@ -435,6 +437,27 @@ def test_the_logger_is_switched_off_once():
         assert opensim.Logger.getLevelString().lower() == "critical"
     finally:
         opensim.Logger.setLevelString("off")
+
+
+@pytest.mark.slow
+def test_arms_in_processes_of_their_own_are_the_same():
+    make = [partial(gym.make, f"gpadjust.envs:{ID}")] * 2
+    here, there = DummyVecEnv(make), SubprocVecEnv(make)
+    try:
+        for envs in (here, there):
+            envs.seed(3)
+        assert np.array_equal(here.reset(), there.reset())
+        actions = np.random.default_rng(0).uniform(0, 1, (16, 2, 4)).astype(np.float32)
+        for action in actions:  # beyond the end of an episode
+            states, rewards, ends, _ = there.step(action)
+            expected = here.step(action)
+            assert np.array_equal(states, expected[0])
+            assert np.array_equal(
+                rewards.astype(np.float32), expected[1]
+            )  # as DummyVecEnv has them
+            assert np.array_equal(ends, expected[2])
+    finally:
+        there.close()
 
 
 def test_dyna_sac_learns_on_it():
