@@ -1,10 +1,10 @@
+import argparse
 import math
-import sys
+from dataclasses import replace
 
 import pandas as pd
 import pytest
 
-from paper import __main__ as command_line
 from paper.arm.runs import ARM
 from paper.control import options
 from paper.control.claims import Claim, judge, met, reproduced, signed
@@ -78,8 +78,12 @@ def test_words_of_verdicts():
 
 
 def test_what_an_experiment_needs_and_lacks(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "opensim", None)
+    def check():
+        raise ImportError("It needs a simulator; install it.")
+
     monkeypatch.setattr(options, "run_all", lambda *args, **kwargs: pytest.fail("was run"))
-    monkeypatch.setattr(sys, "argv", ["paper", ARM.name, "--out", str(tmp_path)])
-    with pytest.raises(SystemExit, match=r"pip install .*gpadjust\[arm\]"):
-        command_line.main()
+    parser = argparse.ArgumentParser()
+    options.add_arguments(parser, replace(ARM, check=check), pytest.fail)
+    arguments = parser.parse_args(["--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match="It needs a simulator"):
+        arguments.run(arguments)
