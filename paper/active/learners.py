@@ -42,8 +42,8 @@ def integrated_variance(model: Any, points: Tensor) -> AcquisitionFunction:
     """
     if model.num_outputs == 1:
         return qNegIntegratedPosteriorVariance(model, mc_points=points)
-    weights = 1 / model.train_targets.std(-1)
-    in_units = ScalarizedPosteriorTransform(weights)
+    measured, _ = model.outcome_transform.untransform(model.train_targets.mT)
+    in_units = ScalarizedPosteriorTransform(1 / measured.std(0))
     return qNegIntegratedPosteriorVariance(model, mc_points=points, posterior_transform=in_units)
 
 

@@ -101,12 +101,13 @@ def measured(system: Problem, learner: Learner, settings: Settings, seed: int, l
     if learner.design == "random":
         return torch.cat([first, system.uniform(budget - initial, seed)])
     points = system.sobol(settings.integration_points, 10_000 + seed)
-    assert learner.acquisition is not None, "there is no design"
+    acquisition = learner.acquisition
+    assert acquisition is not None, "there is no design"
     collection = collect(
         partial(system.model, with_physics=learner.with_physics),
         system.truth,
         system.bounds,
-        partial(learner.acquisition, points=points),
+        lambda model: acquisition(model, points),
         budget,
         initial=first,
         fit=partial(fitted, settings),

@@ -45,7 +45,7 @@ SETTINGS = {
     "park91a": Settings(**{**vars(_CHEAP), "initial": 10, "budget": 40, "every": 2}),
     # Four outputs: more to compute at every step.
     "cartpole": Settings(
-        initial=12,
+        initial=8,
         budget=48,
         every=4,
         num_test=500,
