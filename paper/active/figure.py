@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from paper.active.learners import LABELS
 from paper.active.results import REFERENCE
+from paper.control.claims import counted
 from paper.control.figure import one_legend, save
 
 COLORS = {
@@ -41,7 +42,8 @@ def draw(runs: pd.DataFrame, titles: dict[str, str], path: Path) -> None:
     for ax, name in zip(axes, names, strict=False):
         part = runs[runs["problem"] == name]
         _panel(ax, part)
-        ax.set_title(f"{titles[name]} ({part['seed'].nunique()} runs)", loc="left", fontsize=10)
+        runs_of = counted(part["seed"].nunique())
+        ax.set_title(f"{titles[name]} ({runs_of})", loc="left", fontsize=10)
     for ax in axes[::columns]:
         ax.set_ylabel("RMSE / sd of the truth")
     figure.supxlabel("measurements, those of the initial design included", fontsize="medium")
