@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from paper import arm, cartpole, forrester, multifidelity
+from paper import active, arm, cartpole, forrester, multifidelity
 from paper.report import report
 
 
@@ -24,6 +24,9 @@ def main() -> None:
         experiments.add_parser("cartpole", help="learners that swing up a cart-pole")
     )
     arm.add_arguments(experiments.add_parser("arm", help="learners that reach with a muscle arm"))
+    active.add_arguments(
+        experiments.add_parser("active", help="error over measurements, by who chooses them")
+    )
     experiments.add_parser(
         "report", help="copy the results that are committed into the READMEs"
     ).set_defaults(run=lambda arguments: report())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -34,3 +35,36 @@ def check_options(arguments: argparse.Namespace) -> None:
     if arguments.jobs < 1:
         raise SystemExit(f"--jobs: expected at least 1 process, got {arguments.jobs}")
     arguments.out.mkdir(parents=True, exist_ok=True)
+
+
+def add_names(
+    parser: argparse.ArgumentParser, option: str, default: Sequence[str], what: str
+) -> None:
+    """Add an option that takes names, separated by commas; see :func:`check_names`."""
+    parser.add_argument(
+        option,
+        type=lambda text: tuple(text.split(",")),
+        default=tuple(default),
+        metavar="NAME,...",
+        help=f"{what} [{','.join(default)}]",
+    )
+
+
+def add_only_tables(parser: argparse.ArgumentParser) -> None:
+    """Add the option of not running anything."""
+    parser.add_argument(
+        "--only-tables",
+        action="store_true",
+        help="run nothing; make tables and figures of the runs that are there",
+    )
+
+
+def check_names(option: str, kind: str, given: Sequence[str], known: Sequence[str]) -> None:
+    """End the program if a name is unknown or given twice."""
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise SystemExit(
+            f"{option}: there is no {kind} {unknown[0]!r}, but there are {', '.join(known)}"
+        )
+    if len(set(given)) < len(given):
+        raise SystemExit(f"{option}: expected each {kind} once, got {','.join(given)}")

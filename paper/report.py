@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from paper.active.report import fragments as _active
 from paper.arm.report import fragments as _arm
 from paper.cartpole.report import fragments as _cartpole
 from paper.markdown import NOT_RUN, markdown
@@ -57,7 +58,8 @@ def results(folder: Path) -> dict[str, str]:
     for name, column in SCORES.items():
         fragments[f"multifidelity:{name}"] = NOT_RUN if pairs is None else _scores_of(pairs, column)
     fragments["multifidelity:short"] = NOT_RUN if pairs is None else _short(pairs)
-    return fragments | _cartpole(folder / "cartpole") | _arm(folder / "arm")
+    fragments |= _cartpole(folder / "cartpole") | _arm(folder / "arm")
+    return fragments | _active(folder / "active")
 
 
 def _rmse(table: pd.DataFrame) -> str:

@@ -9,7 +9,13 @@ from pathlib import Path
 
 from paper.control.experiment import Experiment
 from paper.control.runs import make_tasks, run_all
-from paper.options import add_options, check_options
+from paper.options import (
+    add_names,
+    add_only_tables,
+    add_options,
+    check_names,
+    check_options,
+)
 
 
 def add_arguments(
@@ -23,24 +29,14 @@ def add_arguments(
         summarise: Writes and prints the summary of all the runs in a folder.
     """
     add_options(parser, experiment.name, num_runs=10)
-    parser.add_argument(
-        "--scenarios",
-        type=lambda text: tuple(text.split(",")),
-        default=tuple(experiment.scenarios),
-        metavar="NAME,...",
-        help=f"learners [{','.join(experiment.scenarios)}]",
-    )
+    add_names(parser, "--scenarios", tuple(experiment.scenarios), "learners")
     parser.add_argument(
         "--backend",
         choices=("loky", "ray"),
         default="loky",
         help="processes on this machine, or on a Ray cluster [loky]",
     )
-    parser.add_argument(
-        "--only-tables",
-        action="store_true",
-        help="run nothing; make tables and figures of the runs that are there",
-    )
+    add_only_tables(parser)
     parser.set_defaults(run=partial(_run, experiment, summarise))
 
 
@@ -48,13 +44,7 @@ def _run(
     experiment: Experiment, summarise: Callable[[Path], None], arguments: argparse.Namespace
 ) -> None:
     """Run the experiment; write and print its tables, verdicts and figures."""
-    scenarios = experiment.scenarios
-    unknown = [name for name in arguments.scenarios if name not in scenarios]
-    if unknown:
-        raise SystemExit(
-            f"--scenarios: there is no scenario {unknown[0]!r}, but there are "
-            f"{', '.join(scenarios)}"
-        )
+    check_names("--scenarios", "scenario", arguments.scenarios, tuple(experiment.scenarios))
     check_options(arguments)
     tasks = make_tasks(experiment, arguments.scenarios, arguments.runs, arguments.seed)
     if not arguments.only_tables:

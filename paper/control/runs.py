@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 import joblib
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm import tqdm
 
 from gpadjust.rl import TrialCheckpoint, resume
 from paper.control.experiment import Experiment
 from paper.control.recorder import trial_log
 from paper.control.scenario import Scenario, Settings
+from paper.result_file import (
+    check_settings,
+    result_path,
+    rounded,
+    run_with_progress,
+    versions,
+    write_result,
+)
 
 Backend = Literal["loky", "ray"]
-
-
-def result_path(out: Path, name: str, seed: int) -> Path:
-    """The file of a finished run."""
-    return out / "runs" / f"{name}-{seed}.json"
 
 
 def run_one(
@@ -64,13 +63,13 @@ def run_one(
     path = result_path(out, name, seed)
     described = _described(experiment, scenario, settings)
     if path.exists():
-        _check(path, json.loads(path.read_text())["settings"], described)
+        check_settings(path, json.loads(path.read_text())["settings"], described)
         return path
     unfinished = out / "unfinished" / f"{name}-{seed}.ckpt"
     if unfinished.exists():
         env = experiment.make_env(scenario, settings)
         agent = resume(unfinished, env, **experiment.known(scenario, seed, settings))
-        _check(unfinished, vars(agent)["described"], described)
+        check_settings(unfinished, vars(agent)["described"], described)
     else:
         agent = experiment.make_agent(scenario, seed, settings)
         vars(agent)["described"] = described
@@ -87,14 +86,11 @@ def run_one(
         "scenario": name,
         "seed": seed,
         "settings": described,
-        **{key: _rounded(value) for key, value in experiment.details(agent, seed).items()},
+        **{key: rounded(value) for key, value in experiment.details(agent, seed).items()},
         "versions": versions(),
-        "trials": {key: [_rounded(trial[key]) for trial in trials] for key in trials[0]},
+        "trials": {key: [rounded(trial[key]) for trial in trials] for key in trials[0]},
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(result, separators=(",", ":")) + "\n")
-    os.replace(temporary, path)
+    write_result(path, result)
     unfinished.unlink()
     return path
 
@@ -112,19 +108,14 @@ def run_all(
     missing = [task for task in tasks if not result_path(out, *task).exists()]
     for name, seed in (task for task in tasks if task not in missing):
         run_one(experiment, name, seed, out, settings)  # checks its settings
-    calls = (
+    calls = [
         joblib.delayed(run_one)(experiment, *task, out.absolute(), settings) for task in missing
-    )
+    ]
     with _backend(backend):
         if backend == "ray":  # which cannot return results one by one
             joblib.Parallel(n_jobs=num_jobs, batch_size=1, verbose=10)(calls)
             return
-        parallel = joblib.Parallel(n_jobs=num_jobs, return_as="generator_unordered", batch_size=1)
-        progress = tqdm(
-            parallel(calls), total=len(tasks), initial=len(tasks) - len(missing), unit="run"
-        )
-        for path in progress:
-            progress.set_postfix_str(path.stem)
+        run_with_progress(calls, len(tasks) - len(missing), num_jobs)
 
 
 def make_tasks(
@@ -166,32 +157,3 @@ def _described(experiment: Experiment, scenario: Scenario, settings: Settings) -
         values |= {f"model.{name}": text for name, text in dynamics.describe().items()}
     described: dict[str, Any] = json.loads(json.dumps(values))
     return described
-
-
-def _check(path: Path, found: dict[str, Any], expected: dict[str, Any]) -> None:
-    if found != expected:
-        differ = [k for k in {**found, **expected} if found.get(k) != expected.get(k)]
-        raise ValueError(
-            f"{path} was made with other settings: {differ[0]} was {found.get(differ[0])} and is "
-            f"now {expected.get(differ[0])}. Remove it, or choose another --out."
-        )
-
-
-def versions() -> dict[str, str]:
-    """Of Python and of what the numbers come from."""
-    found = {"python": platform.python_version()}
-    for name in ("gpadjust", "torch", "gpytorch", "stable_baselines3", "opensim"):
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
-
-
-def _rounded(value: Any) -> Any:
-    """Five significant digits of numbers, also in lists and dictionaries."""
-    if isinstance(value, float):
-        return float(f"{value:.5g}")
-    if isinstance(value, list):
-        return [_rounded(entry) for entry in value]
-    if isinstance(value, dict):
-        return {key: _rounded(entry) for key, entry in value.items()}
-    return value

@@ -11,7 +11,7 @@ from paper.multifidelity.figure import draw
 from paper.multifidelity.models import METHODS
 from paper.multifidelity.problem import names
 from paper.multifidelity.runs import run_all
-from paper.options import add_options, check_options
+from paper.options import add_names, add_options, check_names, check_options
 
 PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
 
@@ -19,21 +19,15 @@ PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of this experiment to its command line."""
     add_options(parser, "multifidelity", num_runs=10)
-    for option, default, of in (("--pairs", PAIRS, "pairs of mf2"), ("--methods", METHODS, "")):
-        parser.add_argument(
-            option,
-            type=lambda text: tuple(text.split(",")),
-            default=default,
-            metavar="NAME,...",
-            help=f"{of or 'methods'} [{','.join(default)}]",
-        )
+    add_names(parser, "--pairs", PAIRS, "pairs of mf2")
+    add_names(parser, "--methods", METHODS, "methods")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Run the experiment; write and print its tables and figures."""
-    _check_names("--pairs", "pair", arguments.pairs, names())
-    _check_names("--methods", "method", arguments.methods, METHODS)
+    check_names("--pairs", "pair", arguments.pairs, names())
+    check_names("--methods", "method", arguments.methods, METHODS)
     check_options(arguments)
     out: Path = arguments.out
     runs = run_all(
@@ -69,15 +63,3 @@ def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
 def _counted(chosen: pd.Series[str]) -> str:
     """How often each structure was chosen, the most frequent first."""
     return ", ".join(f"{name} {count}" for name, count in chosen.dropna().value_counts().items())
-
-
-def _check_names(
-    option: str, kind: str, given: tuple[str, ...], known: tuple[str, ...] | list[str]
-) -> None:
-    unknown = [name for name in given if name not in known]
-    if unknown:
-        raise SystemExit(
-            f"{option}: there is no {kind} {unknown[0]!r}, but there are {', '.join(known)}"
-        )
-    if len(set(given)) < len(given):
-        raise SystemExit(f"{option}: expected each {kind} once, got {','.join(given)}")

@@ -20,7 +20,7 @@ from paper.arm.scenarios import PAPER, SCENARIOS, SETTINGS, make_dynamics, make_
 from paper.arm.targets import targets
 from paper.control.claims import judge
 from paper.control.curves import Curves
-from paper.control.runs import result_path
+from paper.result_file import result_path
 
 TINY = replace(
     SETTINGS,

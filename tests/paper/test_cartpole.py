@@ -26,8 +26,8 @@ from paper.cartpole.targets import TARGETS
 from paper.control.claims import judge
 from paper.control.curves import Curves
 from paper.control.results import iqm
-from paper.control.runs import result_path
 from paper.control.scenario import updates_on_trial
+from paper.result_file import result_path
 
 TINY = replace(
     SETTINGS, num_trials=3, model_trials=2, model_until=2, later_updates=5, batch_size=16

@@ -1,0 +1,130 @@
+"""What is measured: the truth, the physics, and where one may measure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from botorch.utils.sampling import draw_sobol_samples
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpadjust import CKA, BlackBoxPhysics, ZeroMeanGP
+from gpadjust.envs import REAL_CART_POLE, CartPoleEquation, random_cart_pole_physics
+from gpadjust.envs.cart_pole import SUBSTEPS, TIME_STEP
+from gpadjust.gp import AngleInput
+from gpadjust.physics import ODEPhysics
+from paper.forrester.problem import LOWER, UPPER, crude_b, truth
+from paper.multifidelity.problem import pair
+
+CART_POLE_LIMITS = (1.0, math.pi, 3.0, 8.0, 10.0)  # m, rad, m/s, rad/s, N, to either side
+_TEST_SEED = 20_000  # beyond those of runs, so that their points are others
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A system to measure, and what is believed of it.
+
+    Attributes:
+        title: Its name in tables and figures.
+        bounds: Lower and upper bounds of the inputs, ``2 x d``.
+        truth: Maps ``n x d`` to ``n x m``, without noise.
+        physics: f_p, of the same shapes.
+        angles: The inputs that are angles.
+    """
+
+    title: str
+    bounds: Tensor
+    truth: Callable[[Tensor], Tensor]
+    physics: Callable[[Tensor], Tensor]
+    angles: tuple[int, ...] = ()
+
+    def sobol(self, n: int, seed: int) -> Tensor:
+        """The first ``n`` points of a scrambled Sobol sequence in the bounds, ``n x d``."""
+        return draw_sobol_samples(self.bounds, n=n, q=1, seed=seed).squeeze(-2)
+
+    def uniform(self, n: int, seed: int) -> Tensor:
+        """Independent points in the bounds, ``n x d``."""
+        generator = torch.Generator().manual_seed(seed)
+        unit = torch.rand(n, self.bounds.shape[1], generator=generator, dtype=torch.float64)
+        return self.bounds[0] + (self.bounds[1] - self.bounds[0]) * unit
+
+    def test_points(self, n: int) -> tuple[Tensor, Tensor]:
+        """The points that all runs are scored at, and the truth there."""
+        X = self.sobol(n, _TEST_SEED)
+        return X, self.truth(X)
+
+    def model(self, X: Tensor, Y: Tensor, with_physics: bool) -> CKA | ZeroMeanGP:
+        """A new model of measurements: CKA, or a Gaussian process without physics."""
+        transform = AngleInput(self.angles) if self.angles else None
+        if with_physics:
+            return CKA(X, Y, physics=self.physics, input_transform=transform)
+        return ZeroMeanGP(X, Y, input_transform=transform)
+
+
+def problem(name: str, seed: int) -> Problem:
+    """The problem of a given name.
+
+    Args:
+        name: One of ``NAMES``.
+        seed: Of the physics, where it is random.
+
+    Raises:
+        ValueError: If there is no such problem.
+    """
+    if name not in _MAKE:
+        raise ValueError(f"There is no problem {name!r}; there are {', '.join(NAMES)}.")
+    return _MAKE[name](seed)
+
+
+def _forrester(seed: int) -> Problem:
+    bounds = torch.tensor([[LOWER], [UPPER]], dtype=torch.float64)
+    return Problem("Forrester, reading B", bounds, truth, crude_b)
+
+
+def _pair(name: str) -> Callable[[int], Problem]:
+    """A pair of low and high fidelity."""
+
+    def make(seed: int) -> Problem:
+        functions = pair(name)
+        lower, upper = functions.bounds.numpy()
+
+        def low(X: NDArray[np.float64]) -> NDArray[np.float64]:
+            # Finite differences reach beyond the bounds, where these functions need not exist.
+            return functions.low(np.clip(X, lower, upper))
+
+        physics = BlackBoxPhysics(low, name=f"{name}, low fidelity")
+        return Problem(name, functions.bounds, functions.truth, physics)
+
+    return make
+
+
+def _cart_pole(seed: int) -> Problem:
+    upper = torch.tensor(CART_POLE_LIMITS, dtype=torch.float64)
+    believed = random_cart_pole_physics(seed).rhs
+    return Problem(
+        "cart-pole transitions",
+        torch.stack([-upper, upper]),
+        _change(REAL_CART_POLE),
+        _change(believed),
+        angles=(1,),
+    )
+
+
+def _change(equation: CartPoleEquation | Callable[[Tensor, Tensor], Tensor]) -> ODEPhysics:
+    """The change of the state in a time step, from state and force."""
+    return ODEPhysics(
+        equation, TIME_STEP, state_dim=4, substeps=SUBSTEPS, difference=True, name="cart_pole"
+    )
+
+
+_MAKE: dict[str, Callable[[int], Problem]] = {
+    "forrester": _forrester,
+    "currin": _pair("currin"),
+    "park91a": _pair("park91a"),
+    "cartpole": _cart_pole,
+}
+NAMES = tuple(_MAKE)
