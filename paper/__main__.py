@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from paper import arm, cartpole, forrester, multifidelity
+from paper import arm, cartpole, exploration, forrester, multifidelity
 from paper.report import report
 
 
@@ -24,6 +24,11 @@ def main() -> None:
         experiments.add_parser("cartpole", help="learners that swing up a cart-pole")
     )
     arm.add_arguments(experiments.add_parser("arm", help="learners that reach with a muscle arm"))
+    exploration.add_arguments(
+        experiments.add_parser(
+            "exploration", help="cart-poles whose real trials are random, SAC's or informative"
+        )
+    )
     experiments.add_parser(
         "report", help="copy the results that are committed into the READMEs"
     ).set_defaults(run=lambda arguments: report())

@@ -9,6 +9,7 @@ import pandas as pd
 
 from paper.arm.report import fragments as _arm
 from paper.cartpole.report import fragments as _cartpole
+from paper.exploration.report import fragments as _exploration
 from paper.markdown import NOT_RUN, markdown
 
 PAPER = Path(__file__).parent
@@ -57,7 +58,13 @@ def results(folder: Path) -> dict[str, str]:
     for name, column in SCORES.items():
         fragments[f"multifidelity:{name}"] = NOT_RUN if pairs is None else _scores_of(pairs, column)
     fragments["multifidelity:short"] = NOT_RUN if pairs is None else _short(pairs)
-    return fragments | _cartpole(folder / "cartpole") | _arm(folder / "arm")
+    for name, of_experiment in (
+        ("cartpole", _cartpole),
+        ("arm", _arm),
+        ("exploration", _exploration),
+    ):
+        fragments |= of_experiment(folder / name)
+    return fragments
 
 
 def _rmse(table: pd.DataFrame) -> str:

@@ -278,9 +278,6 @@ class DynaSAC(SAC):
                 "There are no real trials yet that particles could start from; pass initial_states "
                 "to DynaSAC, or call learn() first."
             )
-        bounds = self.state_bounds
-        if bounds is None and trials.num_transitions:
-            bounds = trials.bounds()
         return ModelVecEnv(
             self.dynamics,
             self.reward,
@@ -291,8 +288,15 @@ class DynaSAC(SAC):
             self.action_space,
             terminated=self.terminated,
             particles=self.particles,
-            bounds=bounds,
+            bounds=self.model_bounds(),
         )
+
+    def model_bounds(self) -> Tensor | None:
+        """Bounds ``2 x state_dim`` beyond which particles are not followed, as they stand."""
+        if self.state_bounds is not None:
+            return self.state_bounds
+        trials = self.recorded_trials()
+        return trials.bounds() if trials.num_transitions else None
 
     def recorded_trials(self, newest: int | None = None) -> RecordedTrials:
         """The real transitions in the buffer; or the newest steps of each environment only."""
@@ -378,13 +382,6 @@ class DynaSAC(SAC):
             raise ValueError(
                 f"Unknown particles {self.particles!r}; use 'independent' or 'functions'."
             )
-        if self.exploration is not None:
-            if not isinstance(self.exploration, InformativeTrials):
-                raise TypeError(
-                    "exploration must be an object of InformativeTrials, or None; found "
-                    f"{self.exploration!r}."
-                )
-            check_informative(self.dynamics)
         for name, kind, least in (
             ("explore_trials", int, 0),
             ("model_trials", int, 0),
@@ -402,6 +399,13 @@ class DynaSAC(SAC):
                 raise TypeError(f"{name} must be a {whole}number; found {value!r}.")
             if not value >= least:
                 raise ValueError(f"{name} must be at least {least}; found {value}.")
+        if self.exploration is not None:
+            if not isinstance(self.exploration, InformativeTrials):
+                raise TypeError(
+                    "exploration must be an object of InformativeTrials, or None; found "
+                    f"{self.exploration!r}."
+                )
+            check_informative(self.dynamics)
 
     def _setup_model(self) -> None:
         """Check the spaces before SB3 builds its networks on them."""

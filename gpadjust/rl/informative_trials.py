@@ -144,11 +144,11 @@ class InformativeTrials:
             steps = rollouts.follow(state, sequences)
             if not steps.made.any():
                 return torch.zeros(len(sequences), dtype=torch.float64)
-            parts = (steps.states, steps.actions, steps.made)
-            if past is not None:
-                done = (*past, torch.ones(len(past[0]), dtype=torch.bool))
-                parts = tuple(_prepend(p, ahead) for p, ahead in zip(done, parts, strict=True))
-            return information(*parts).mean(0)
+            if past is None:
+                return information(*steps).mean(0)
+            done = (*past, torch.ones(len(past[0]), dtype=torch.bool))
+            whole = (_prepend(part, ahead) for part, ahead in zip(done, steps, strict=True))
+            return information(*whole).mean(0)
 
         num_random = self.num_random + (self.num_policy if policy is None else 0)
         first = [random_sequences(num_random, num_steps, action_bounds, self.max_hold)]

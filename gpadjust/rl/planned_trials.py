@@ -108,14 +108,13 @@ class PlannedTrials:
         if num_steps < 1:
             return
         space = agent.action_space
-        bounds = agent.state_bounds
         plan = options.plan(
             dynamics,
             state,
             num_steps,
             _doubles(np.stack([space.low, space.high])),
             policy=lambda states: _doubles(agent.act_in_model(_observed(agent, states))),
-            state_bounds=agent.recorded_trials().bounds() if bounds is None else bounds,
+            state_bounds=agent.model_bounds(),
             terminated=agent.terminated,
             past=(trial.states, trial.actions) if len(trial.states) else None,
             known=trial.ahead if len(trial.ahead) else None,
