@@ -62,11 +62,12 @@ def test_the_test_trials_are_of_the_real_system():
         following = real.sample(data.states, data.actions)
         assert real.spec.change(following, data.next_states).abs().max() < 1e-5
     cost = {
-        kind: cart_pole_cost(data.next_states).reshape(NUM_STARTS, NUM_STEPS).mean(1)
+        kind: cart_pole_cost(data.next_states).reshape(NUM_STARTS, NUM_STEPS)
         for kind, data in held_out().items()
     }
-    assert cost["swing-up"].max() < 0.5
-    assert cost["random"].min() > 0.6
+    assert cost["swing-up"].amin(1).max() < 0.1  # all get there
+    assert cost["swing-up"].mean() < 0.5
+    assert cost["random"].mean(1).min() > 0.8
 
 
 def test_test_trials_are_made_anew_alike():
