@@ -116,6 +116,7 @@ class DynaSAC(SAC):
         num_trials: Real trials that have ended and were learnt from.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"sac"``; with ``exploration`` on
             ``"plan"``, too.
+        planned: Of the real trials that are planned, ``planned.num_planned`` is the number so far.
 
     Raises:
         ValueError: If observations or actions are not boxes of the spec's entries, ``reward`` is

@@ -92,7 +92,8 @@ class PlannedTrials:
         assert agent.dynamics is not None
         over = agent.model_until is not None and agent.num_trials >= agent.model_until
         # The first trial is the policy's, even of dynamics that have learnt from other data.
-        if over or self.num_planned >= agent.explore_trials or not agent.num_trials:
+        ready = agent.num_trials > 0 and agent.dynamics.is_fitted
+        if over or not ready or self.num_planned >= agent.explore_trials:
             return None
         self.num_planned += 1
         spec = agent.dynamics.spec
