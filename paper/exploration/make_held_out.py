@@ -26,8 +26,10 @@ SEED = 20_000  # no run has it
 _MAX_HOLD = 5
 
 
-def make_trials(rounds: int = 20, num_sequences: int = 100) -> pd.DataFrame:
-    """Make trials of the real system from 10 starts, a swing-up and a random one from each.
+def make_trials(
+    num_starts: int = NUM_STARTS, rounds: int = 20, num_sequences: int = 100
+) -> pd.DataFrame:
+    """Make trials of the real system from some starts, a swing-up and a random one from each.
 
     The actions of a swing-up are the open loop that the cross-entropy method finds for the known
     system; those of a random trial are uniform, each held for up to 5 steps.
@@ -36,7 +38,7 @@ def make_trials(rounds: int = 20, num_sequences: int = 100) -> pd.DataFrame:
     bounds = torch.tensor([[-MAX_FORCE], [MAX_FORCE]], dtype=torch.float64)
     tables = []
     with seeded(SEED):
-        for start in cart_pole_start(NUM_STARTS):
+        for start in cart_pole_start(num_starts):
 
             def gain(sequences: Tensor, start: Tensor = start) -> Tensor:
                 return -cart_pole_cost(_path(real, start, sequences)[:, 1:]).mean(-1)

@@ -72,7 +72,7 @@ def test_the_test_trials_are_of_the_real_system():
 
 def test_test_trials_are_made_anew_alike():
     before = RandomState.capture()
-    made = [make_trials(rounds=1, num_sequences=4) for _ in range(2)]
+    made = [make_trials(num_starts=2, rounds=1, num_sequences=3) for _ in range(2)]
     pd.testing.assert_frame_equal(*made)
     assert torch.equal(RandomState.capture().torch, before.torch)
     kept = pd.read_csv(PATH)
@@ -101,8 +101,9 @@ def test_a_run_records_the_errors_of_the_newest_model(tmp_path, small_plans):
 
 
 def test_only_the_real_trials_differ(tmp_path, small_plans):
+    settings = replace(TINY, num_trials=2)
     runs = {
-        name: trials_of(run_one(f"gp-{name}", 0, tmp_path, TINY))
+        name: trials_of(run_one(f"gp-{name}", 0, tmp_path, settings))
         for name in ("random", "sac", "info")
     }
     first = {name: run["error"][0] for name, run in runs.items()}
