@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from paper import active, arm, cartpole, forrester, multifidelity
+from paper import active, arm, cartpole, exploration, forrester, multifidelity
 from paper.report import report
 
 
@@ -26,6 +26,11 @@ def main() -> None:
     arm.add_arguments(experiments.add_parser("arm", help="learners that reach with a muscle arm"))
     active.add_arguments(
         experiments.add_parser("active", help="error over measurements, by who chooses them")
+    )
+    exploration.add_arguments(
+        experiments.add_parser(
+            "exploration", help="cart-poles whose real trials are random, SAC's or informative"
+        )
     )
     experiments.add_parser(
         "report", help="copy the results that are committed into the READMEs"

@@ -10,6 +10,7 @@ import pandas as pd
 from paper.active.report import fragments as _active
 from paper.arm.report import fragments as _arm
 from paper.cartpole.report import fragments as _cartpole
+from paper.exploration.report import fragments as _exploration
 from paper.markdown import NOT_RUN, markdown
 
 PAPER = Path(__file__).parent
@@ -58,8 +59,14 @@ def results(folder: Path) -> dict[str, str]:
     for name, column in SCORES.items():
         fragments[f"multifidelity:{name}"] = NOT_RUN if pairs is None else _scores_of(pairs, column)
     fragments["multifidelity:short"] = NOT_RUN if pairs is None else _short(pairs)
-    fragments |= _cartpole(folder / "cartpole") | _arm(folder / "arm")
-    return fragments | _active(folder / "active")
+    for name, of_experiment in (
+        ("cartpole", _cartpole),
+        ("arm", _arm),
+        ("active", _active),
+        ("exploration", _exploration),
+    ):
+        fragments |= of_experiment(folder / name)
+    return fragments
 
 
 def _rmse(table: pd.DataFrame) -> str:

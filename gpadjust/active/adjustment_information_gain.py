@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from typing import Any, Literal, cast, get_args
 
-import torch
 from botorch.acquisition import AcquisitionFunction
 from botorch.utils.transforms import (
     average_over_ensemble_models,
     concatenate_pending_points,
     t_batch_mode_transform,
 )
-from gpytorch.distributions import MultivariateNormal
-from gpytorch.settings import min_variance
-from linear_operator.operators import DiagLinearOperator
-from linear_operator.utils.cholesky import psd_safe_cholesky
 from torch import Tensor
 
-from gpadjust.active.conditional_covariance import ConditionalCovariance
 from gpadjust.models import RRA, AdjustmentGP
 from gpadjust.models.adjustment_gp import Component
+from gpadjust.models.conditional_covariance import ConditionalCovariance
+from gpadjust.models.information import information_gain
 
 About = Literal["rho", "delta", "both"]
 
@@ -118,23 +114,8 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         """
         model = self.model
         model.eval()
-        inputs = model.transform_inputs(model._for_samples(X))
-        inputs = inputs.unsqueeze(-3) if model.num_outputs > 1 else inputs
-        batch_shape = torch.broadcast_shapes(inputs.shape[:-2], model.train_inputs[0].shape[:-2])
-        inputs = inputs.expand(*batch_shape, *inputs.shape[-2:])
-        rest, noise = self._rests(), self._noise(inputs)
-        information = _log_sds(rest.whole(inputs), noise)
-        if rest.remaining is not None:
-            information = information - _log_sds(rest.remaining(inputs), noise)
-        return information.sum(-1) if model.num_outputs > 1 else information
-
-    def _noise(self, inputs: Tensor) -> Tensor:
-        """The noise variances of observations at transformed inputs, ``... x q``."""
-        nothing = torch.zeros_like(inputs[..., 0])
-        silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
-        with min_variance(double_value=0.0):
-            noise: Tensor = self.model._apply_noise(inputs, silent, True).variance
-        return noise
+        rest = self._rests()
+        return information_gain(model, X, rest.whole, rest.remaining)
 
     def _rests(self) -> _Rest:
         """What is unknown given the data; made anew after the model is given other data."""
@@ -157,15 +138,6 @@ class _Rest:
         self.whole = ConditionalCovariance(model, model.covar_module)
         other = {"rho": model._kernel("delta"), "delta": model._kernel("rho"), "both": None}[about]
         self.remaining = None if other is None else ConditionalCovariance(model, other)
-
-
-def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
-    """Half the log-determinant of noisy observations' covariance, in units of their noise."""
-    sd = noise.sqrt()
-    scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
-    chol = psd_safe_cholesky(scaled + torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device))
-    log_sds: Tensor = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
-    return log_sds
 
 
 def _check(model: Any, about: str) -> None:

@@ -12,6 +12,7 @@ from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.trajectory_information import TrajectoryInformation
 from gpadjust.dynamics.transition_scores import TransitionScores
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "RRADynamics",
     "ScaleDynamics",
     "StateSpec",
+    "TrajectoryInformation",
     "TransitionFunctions",
     "TransitionScores",
 ]

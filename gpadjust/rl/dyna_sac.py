@@ -9,10 +9,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import (
     GymEnv,
@@ -26,6 +29,8 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics
+from gpadjust.dynamics.trajectory_information import check_informative
+from gpadjust.rl.informative_trials import InformativeTrials
 from gpadjust.rl.mixed_replay_buffer import MixedReplayBuffer
 from gpadjust.rl.model_phase import ModelPhase
 from gpadjust.rl.model_vec_env import (
@@ -37,6 +42,7 @@ from gpadjust.rl.model_vec_env import (
     check_function,
     check_spaces,
 )
+from gpadjust.rl.planned_trials import PlannedTrials
 from gpadjust.rl.recorded_trials import RecordedTrials
 
 if TYPE_CHECKING:
@@ -92,6 +98,9 @@ class DynaSAC(SAC):
         trial_length: Steps of a trial. Default: the time limit of ``env``.
         num_particles: Model trials that run side by side. Default: all.
         particles: How they are sampled, see :class:`ModelVecEnv`.
+        exploration: How to plan real trials by what they teach the dynamics. Default: the policy
+            acts in all.
+        explore_trials: How many trials after the first are planned, if ``exploration`` is given.
         learning_rate: As in SAC.
         buffer_size: Real transitions that are kept.
         learning_starts: As in SAC. Default: the untrained policy acts in the first trial.
@@ -105,13 +114,16 @@ class DynaSAC(SAC):
 
     Attributes:
         num_trials: Real trials that have ended and were learnt from.
-        wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"sac"``.
+        wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"sac"``; with ``exploration`` on
+            ``"plan"``, too.
+        planned: Of the real trials that are planned, ``planned.num_planned`` is the number so far.
 
     Raises:
         ValueError: If observations or actions are not boxes of the spec's entries, ``reward`` is
             missing, n-step returns are asked for, or a number is out of range; after a real trial
             if its rewards or terminations are not those of the functions given.
-        TypeError: If dynamics or functions are of another kind.
+        TypeError: If dynamics or functions are of another kind, or ``exploration`` is given with
+            dynamics that cannot tell what transitions teach.
         AssertionError: By Stable-Baselines3, if the actions are no box.
 
     Example:
@@ -153,6 +165,8 @@ class DynaSAC(SAC):
         trial_length: int | None = None,
         num_particles: int | None = None,
         particles: Particles = "independent",
+        exploration: InformativeTrials | None = None,
+        explore_trials: int = 3,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
@@ -196,8 +210,13 @@ class DynaSAC(SAC):
         self.trial_length = trial_length
         self.num_particles = num_particles
         self.particles = particles
+        self.exploration = exploration
+        self.explore_trials = explore_trials
         self.num_trials = 0
         self.wall_time = {"fit": 0.0, "rollout": 0.0, "sac": 0.0}
+        if exploration is not None:
+            self.wall_time["plan"] = 0.0
+        self.planned = PlannedTrials()
         self._num_stored = 0  # of the time steps, how many came into the buffer
         self.owed_updates = 0.0
         self.model_hooks: list[DynaCallback] = []
@@ -260,28 +279,69 @@ class DynaSAC(SAC):
                 "There are no real trials yet that particles could start from; pass initial_states "
                 "to DynaSAC, or call learn() first."
             )
-        bounds = self.state_bounds
-        if bounds is None and trials.num_transitions:
-            bounds = trials.bounds()
         return ModelVecEnv(
             self.dynamics,
             self.reward,
             self.initial_states or trials.draw_starts,
             num_envs,
-            self._trial_length(),
+            self.real_trial_length(),
             self.observation_space,
             self.action_space,
             terminated=self.terminated,
             particles=self.particles,
-            bounds=bounds,
+            bounds=self.model_bounds(),
         )
+
+    def model_bounds(self) -> Tensor | None:
+        """Bounds ``2 x state_dim`` beyond which particles are not followed, as they stand."""
+        if self.state_bounds is not None:
+            return self.state_bounds
+        trials = self.recorded_trials()
+        return trials.bounds() if trials.num_transitions else None
 
     def recorded_trials(self, newest: int | None = None) -> RecordedTrials:
         """The real transitions in the buffer; or the newest steps of each environment only."""
         assert self.dynamics is not None, "checked when learning starts"
         return RecordedTrials(self.replay_buffer, self.policy, self.dynamics.spec, newest)
 
-    def _trial_length(self) -> int:
+    def act_in_model(self, observations: np.ndarray) -> np.ndarray:
+        """Sample the policy's actions at observations of model trials, which are not normalised."""
+        self.policy.set_training_mode(False)
+        normalizer = self._vec_normalize_env
+        seen = observations if normalizer is None else normalizer.normalize_obs(observations)
+        return self.predict(seen, deterministic=False)[0]
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The actions of a real step, and as the buffer keeps them; SB3 calls this."""
+        actions, scaled = super()._sample_action(learning_starts, action_noise, n_envs)
+        if self.exploration is None:
+            return actions, scaled
+        seen = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        assert isinstance(seen, np.ndarray), "observations are boxes"
+        scaled = self.policy.scale_action(self.planned.act(self, seen, actions))
+        return self.policy.unscale_action(scaled), scaled
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """As in SB3; it also notices where trials end."""
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self.planned.end(dones)
+
+    def real_trial_length(self) -> int:
+        """Steps of a trial: ``trial_length``, or else the time limit of the environment.
+
+        Raises:
+            ValueError: If there is neither.
+        """
         if self.trial_length is not None:
             return self.trial_length
         assert self.env is not None
@@ -305,7 +365,8 @@ class DynaSAC(SAC):
         try:
             yield
         finally:
-            self.wall_time[part] += time.perf_counter() - start
+            spent = time.perf_counter() - start
+            self.wall_time[part] = self.wall_time.get(part, 0.0) + spent
 
     def _check_options(self) -> None:
         for name in ("dynamics", *self._had, "reward"):
@@ -323,6 +384,7 @@ class DynaSAC(SAC):
                 f"Unknown particles {self.particles!r}; use 'independent' or 'functions'."
             )
         for name, kind, least in (
+            ("explore_trials", int, 0),
             ("model_trials", int, 0),
             ("model_updates", (int, float), 0),
             ("model_until", int, 0),
@@ -338,6 +400,13 @@ class DynaSAC(SAC):
                 raise TypeError(f"{name} must be a {whole}number; found {value!r}.")
             if not value >= least:
                 raise ValueError(f"{name} must be at least {least}; found {value}.")
+        if self.exploration is not None:
+            if not isinstance(self.exploration, InformativeTrials):
+                raise TypeError(
+                    "exploration must be an object of InformativeTrials, or None; found "
+                    f"{self.exploration!r}."
+                )
+            check_informative(self.dynamics)
 
     def _setup_model(self) -> None:
         """Check the spaces before SB3 builds its networks on them."""
@@ -372,13 +441,15 @@ class DynaSAC(SAC):
         if self.n_envs > 1 and self.train_freq.unit is TrainFrequencyUnit.EPISODE:
             raise ValueError(
                 f"With {self.n_envs} environments Stable-Baselines3 cannot train by episodes; pass "
-                f"a number of steps as train_freq, such as ({self._trial_length()}, 'step')."
+                f"a number of steps as train_freq, such as ({self.real_trial_length()}, 'step')."
             )
-        self._trial_length()
+        self.real_trial_length()
         self.model_hooks = []  # callbacks that have some add themselves
         if self._num_stored != self.num_timesteps:
             # A callback stopped the last call at a step that SB3 made, but did not store.
             self._last_obs = None
+        if reset_num_timesteps or self._last_obs is None:
+            self.planned.forget()  # the trials under way, which SB3 ends
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

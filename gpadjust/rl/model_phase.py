@@ -93,10 +93,7 @@ class ModelPhase:
         running = np.ones(env.num_envs, dtype=bool)
         while running.any():
             with agent.timed("rollout"):
-                agent.policy.set_training_mode(False)
-                normalizer = agent._vec_normalize_env
-                seen = obs if normalizer is None else normalizer.normalize_obs(obs)
-                actions, _ = agent.predict(seen, deterministic=False)
+                actions = agent.act_in_model(obs)
                 step = env.transition(actions)
                 kept = running & ~step.left_bounds
                 rows = (obs, step.observations, agent.policy.scale_action(actions), step.rewards)

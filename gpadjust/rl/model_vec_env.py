@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics, TransitionFunctions
-from gpadjust.physics import PhysicsError
 from gpadjust.rl.mixed_replay_buffer import CompactReplayBuffer
+from gpadjust.rl.sound_steps import sound_steps
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
 
@@ -194,7 +194,7 @@ class ModelVecEnv(VecEnv):
 
     def _outcome(self, states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Next states, rewards, termination, and who would have left the bounds."""
-        following = self._following(states, actions)
+        following = sound_steps(self._move, states, actions)
         left = ~following.isfinite().all(-1)
         if self.bounds is not None:
             low, high = self.bounds
@@ -205,23 +205,6 @@ class ModelVecEnv(VecEnv):
         if self.terminated is not None:
             terminated = per_particle(self.terminated(following), len(states), "terminated").bool()
         return following, rewards.masked_fill(left, 0.0), terminated & ~left, left
-
-    def _following(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The next states; not finite where the physics fails."""
-        states, actions = states.clone(), actions.clone()
-        failed = torch.zeros(len(states), dtype=torch.bool)
-        while True:
-            try:
-                following = self._move(states, actions)
-            except PhysicsError as error:
-                failed[list(error.rows)] = True
-                if not error.rows or failed.all():
-                    raise
-                # They are evaluated with the others, at a place where the physics does not fail.
-                sound = int((~failed).nonzero()[0])
-                states[failed], actions[failed] = states[sound], actions[sound]
-            else:
-                return following.masked_fill(failed.unsqueeze(-1), torch.nan)
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states of ``N`` rows, which follow the functions in blocks, if there are any."""

@@ -152,6 +152,9 @@ def _described(experiment: Experiment, scenario: Scenario, settings: Settings) -
         values["model_updates"] = scenario.model_updates
     if scenario.updates is not None:
         values["updates"] = scenario.updates
+    if scenario.exploration is not None:
+        planned = {"trials": scenario.explore_trials, **asdict(scenario.exploration)}
+        values |= {f"exploration.{name}": value for name, value in planned.items()}
     if scenario.dynamics is not None:
         dynamics = experiment.make_dynamics(scenario, 0, settings)
         values |= {f"model.{name}": text for name, text in dynamics.describe().items()}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gpadjust.dynamics import Dynamics
+from gpadjust.rl import InformativeTrials
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +46,8 @@ class Scenario:
         updates: Of a model-free learner, the gradient steps after each of all trials. Default:
             as many as the others make.
         max_runs: The most seeds that it is run with.
+        exploration: How real trials are planned. Default: the policy acts in all.
+        explore_trials: Of how many trials after the first that is.
     """
 
     label: str
@@ -52,6 +55,8 @@ class Scenario:
     model_updates: float | None = None
     updates: int | None = None
     max_runs: int | None = None
+    exploration: InformativeTrials | None = None
+    explore_trials: int = 0
 
 
 def agent_options(scenario: Scenario, settings: Settings) -> dict[str, Any]:
@@ -63,6 +68,8 @@ def agent_options(scenario: Scenario, settings: Settings) -> dict[str, Any]:
         "model_until": 0 if scenario.dynamics is None else settings.model_until,
         "trial_length": settings.trial_length,
         "num_particles": settings.num_particles,
+        "exploration": scenario.exploration,
+        "explore_trials": scenario.explore_trials,
         "learning_rate": settings.learning_rate,
         "gamma": settings.gamma,
         "tau": settings.tau,

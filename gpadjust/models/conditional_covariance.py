@@ -12,8 +12,8 @@ from linear_operator import to_dense
 from torch import Tensor
 
 from gpadjust.gp import UnknownMeanKernel
-from gpadjust.models import AdjustmentGP
 from gpadjust.models.cholesky_strategy import CholeskyStrategy
+from gpadjust.models.multi_output_gp import MultiOutputGP
 
 _NOTHING = -230.0  # the logarithm of a variance that adds nothing to others
 
@@ -35,7 +35,7 @@ class ConditionalCovariance:
         kernel: ``covar_module``, or the covariance of one adjustment in it.
     """
 
-    def __init__(self, model: AdjustmentGP, kernel: Kernel) -> None:
+    def __init__(self, model: MultiOutputGP, kernel: Kernel) -> None:
         (self.train,) = model.train_inputs
         own = {id(parameter) for parameter in kernel.parameters()}
         named = dict(model.named_parameters())

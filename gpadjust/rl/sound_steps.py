@@ -1,0 +1,39 @@
+"""Steps of many particles, of which some may be where the physics fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gpadjust.physics import PhysicsError
+
+
+def sound_steps(
+    move: Callable[[Tensor, Tensor], Tensor], states: Tensor, actions: Tensor
+) -> Tensor:
+    """The next states ``N x state_dim``; not finite where the physics fails.
+
+    Args:
+        move: A model, from states and actions to next states.
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+
+    Raises:
+        PhysicsError: If the physics fails everywhere, or does not say where.
+    """
+    states, actions = states.clone(), actions.clone()
+    failed = torch.zeros(len(states), dtype=torch.bool)
+    while True:
+        try:
+            following = move(states, actions)
+        except PhysicsError as error:
+            failed[list(error.rows)] = True
+            if not error.rows or failed.all():
+                raise
+            # They are evaluated with the others, at a place where the physics does not fail.
+            sound = int((~failed).nonzero()[0])
+            states[failed], actions[failed] = states[sound], actions[sound]
+        else:
+            return following.masked_fill(failed.unsqueeze(-1), torch.nan)
