@@ -6,6 +6,7 @@ Outputs are written into the notebooks, unless --quick shrinks them by the setti
 from __future__ import annotations
 
 import argparse
+import os
 import tomllib
 from pathlib import Path
 
@@ -59,7 +60,8 @@ def execute(notebook: NotebookNode) -> None:
         coalesce_streams=True,
         resources={"metadata": {"path": FOLDER}},
     )
-    client.execute()
+    # Models this small are slower with more threads.
+    client.execute(env={"OMP_NUM_THREADS": "1", **os.environ})
     notebook.metadata = nbformat.from_dict(KEPT)
     for cell in notebook.cells:
         cell.metadata = nbformat.from_dict({})
