@@ -43,18 +43,8 @@ class ArmSettings(Settings):
 SETTINGS = ArmSettings(
     num_trials=30,
     trial_length=15,
-    model_trials=20,
     model_until=30,
-    model_updates=2,
-    num_particles=5,
     later_updates=15,
-    learning_rate=3e-3,
-    gamma=0.95,
-    tau=0.02,
-    batch_size=256,
-    net_arch=(128, 128),
-    ent_coef="auto_0.3",
-    target_entropy="auto",
     evaluate_every=3,
     strength=0.5,
 )

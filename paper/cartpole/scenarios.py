@@ -31,18 +31,8 @@ from paper.control.scenario import Scenario, Settings
 SETTINGS = Settings(
     num_trials=50,
     trial_length=25,
-    model_trials=20,
     model_until=25,
-    model_updates=2,
-    num_particles=5,
     later_updates=100,
-    learning_rate=3e-3,
-    gamma=0.95,
-    tau=0.02,
-    batch_size=256,
-    net_arch=(128, 128),
-    ent_coef="auto_0.3",
-    target_entropy="auto",
 )
 MODEL_FREE_UPDATES = 100  # per trial, of all trials; the best of 25, 50, 100, 200
 SUBSET = 4  # seeds of some scenarios

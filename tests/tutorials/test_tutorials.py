@@ -1,6 +1,8 @@
 """The tutorials run, and what is committed of them is their output."""
 
 import re
+import sys
+import tempfile
 
 import nbformat
 import pytest
@@ -9,8 +11,11 @@ from tutorials.run import FOLDER, KEPT, execute, notebooks, quick_settings, shri
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 LARGEST = 500_000  # bytes
-# Paths of a machine: homes, temporary folders, the kernel's files and packages.
-PATHS = re.compile(r"/home/|/root/|/tmp/|/Users/|[A-Z]:\\|ipykernel|site-packages|0x[0-9a-f]{6,}")
+# What differs from machine to machine: folders, the kernel's files, packages, addresses.
+FOLDERS = [re.escape(f"{folder}") for folder in (FOLDER, sys.prefix, tempfile.gettempdir())]
+PATHS = re.compile(
+    "|".join([*FOLDERS, r"[A-Z]:\\", "ipykernel", "site-packages", "0x[0-9a-f]{6,}"])
+)
 by_name = pytest.mark.parametrize("path", notebooks(), ids=lambda path: path.stem)
 
 
