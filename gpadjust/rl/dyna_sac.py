@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,7 +29,6 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics
-from gpadjust.dynamics.trajectory_information import check_informative
 from gpadjust.rl.informative_trials import InformativeTrials
 from gpadjust.rl.mixed_replay_buffer import MixedReplayBuffer
 from gpadjust.rl.model_phase import ModelPhase
@@ -39,17 +38,16 @@ from gpadjust.rl.model_vec_env import (
     Particles,
     Reward,
     Termination,
-    check_function,
     check_spaces,
 )
+from gpadjust.rl.options import FUNCTIONS, check_options, time_limit
 from gpadjust.rl.planned_trials import PlannedTrials
 from gpadjust.rl.recorded_trials import RecordedTrials
 
 if TYPE_CHECKING:
     from gpadjust.rl.callbacks import DynaCallback
 
-_FUNCTIONS = ("reward", "terminated", "initial_states")
-_NOT_SAVED = ("dynamics", *_FUNCTIONS, "model_hooks", "_random_state", "_unread_dynamics")
+_NOT_SAVED = ("dynamics", *FUNCTIONS, "model_hooks", "_random_state", "_unread_dynamics")
 
 
 def _on_cpu(state: Any) -> Any:
@@ -222,9 +220,9 @@ class DynaSAC(SAC):
         self.model_hooks: list[DynaCallback] = []
         self._random_state: Any = None
         self._unread_dynamics: dict[str, Any] = {}  # of an agent that was loaded without dynamics
-        self._had = [name for name in _FUNCTIONS if getattr(self, name) is not None]
+        self._needed = tuple(name for name in FUNCTIONS if getattr(self, name) is not None)
         if _init_setup_model:
-            self._check_options()
+            check_options(self, self._needed)
         super().__init__(
             policy,
             env,
@@ -270,7 +268,7 @@ class DynaSAC(SAC):
         Raises:
             ValueError: If there are no dynamics, or neither real trials nor ``initial_states``.
         """
-        self._check_options()
+        check_options(self, self._needed)
         assert self.dynamics is not None
         assert self.reward is not None
         trials = self.recorded_trials()
@@ -345,18 +343,7 @@ class DynaSAC(SAC):
         if self.trial_length is not None:
             return self.trial_length
         assert self.env is not None
-        spec = self.env.get_attr("spec")[0]
-        length = None if spec is None else spec.max_episode_steps
-        if length is None:
-            # A TimeLimit that was put around an environment by hand.
-            with suppress(AttributeError):
-                length = self.env.get_attr("_max_episode_steps")[0]
-        if length is None:
-            raise ValueError(
-                "The environment has no time limit that could be read; pass trial_length, the "
-                "number of steps of a trial."
-            )
-        return int(length)
+        return time_limit(self.env)
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -367,46 +354,6 @@ class DynaSAC(SAC):
         finally:
             spent = time.perf_counter() - start
             self.wall_time[part] = self.wall_time.get(part, 0.0) + spent
-
-    def _check_options(self) -> None:
-        for name in ("dynamics", *self._had, "reward"):
-            if getattr(self, name) is None:
-                raise ValueError(
-                    f"DynaSAC needs {name} to learn; found None. Pass {name}=... to DynaSAC or, as "
-                    "it is not saved, to DynaSAC.load. Without it the agent can only predict."
-                )
-        if not isinstance(self.dynamics, Dynamics):
-            raise TypeError(f"dynamics must be an object of a Dynamics; found {self.dynamics!r}.")
-        for name, arguments in (("reward", 3), ("terminated", 1), ("initial_states", 1)):
-            check_function(getattr(self, name), name, arguments)
-        if self.particles not in get_args(Particles):
-            raise ValueError(
-                f"Unknown particles {self.particles!r}; use 'independent' or 'functions'."
-            )
-        for name, kind, least in (
-            ("explore_trials", int, 0),
-            ("model_trials", int, 0),
-            ("model_updates", (int, float), 0),
-            ("model_until", int, 0),
-            ("trial_length", int, 1),
-            ("num_particles", int, 1),
-            ("reward_tolerance", (int, float), 0),
-        ):
-            value = getattr(self, name)
-            if value is None:
-                continue
-            if not isinstance(value, kind):
-                whole = "whole " if kind is int else ""
-                raise TypeError(f"{name} must be a {whole}number; found {value!r}.")
-            if not value >= least:
-                raise ValueError(f"{name} must be at least {least}; found {value}.")
-        if self.exploration is not None:
-            if not isinstance(self.exploration, InformativeTrials):
-                raise TypeError(
-                    "exploration must be an object of InformativeTrials, or None; found "
-                    f"{self.exploration!r}."
-                )
-            check_informative(self.dynamics)
 
     def _setup_model(self) -> None:
         """Check the spaces before SB3 builds its networks on them."""
@@ -432,7 +379,7 @@ class DynaSAC(SAC):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         """Refuse to spend a real trial on an agent that could not learn from it."""
-        self._check_options()
+        check_options(self, self._needed)
         if self.env is None:
             raise ValueError(
                 "There is no environment to learn in; pass env to DynaSAC.load, or use set_env()."

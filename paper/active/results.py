@@ -13,7 +13,7 @@ from paper.active.problems import NAMES
 from paper.control.claims import FEWEST, Judged, counted, met
 
 REFERENCE = "gp"  # whose final error the others are to reach
-CLAIMS = {"forrester": "A1", "currin": "A2", "park91a": "A3", "cartpole": "A4"}
+CLAIMS = {"forrester": "M1", "currin": "M2", "park91a": "M3", "cartpole": "M4"}
 _SECONDS = ["choice_seconds", "score_seconds"]
 
 

@@ -68,7 +68,7 @@ def fragments(folder: Path) -> dict[str, str]:
         "cpu_seconds": "core's time, s",
         "updates": "updates",
     }
-    found["arm:time"] = numbers(times[list(parts)], ["mean of a run", *parts.values()], "{:.0f}")
+    found["arm:time"] = numbers(times[list(parts)], ["of a run", *parts.values()], "{:.0f}")
     errors = ("theta_s, rad", "theta_e, rad", "theta_s', rad/s", "theta_e', rad/s")
     found["arm:model"] = model_table(times, RMSES, errors)
     return found

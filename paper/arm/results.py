@@ -9,7 +9,15 @@ import pandas as pd
 
 from paper.arm.scenarios import SCENARIOS, SETTINGS
 from paper.control.curves import Curves
-from paper.control.results import in_order, iqm, load_trials, of_run, results, tabulate_time
+from paper.control.results import (
+    in_order,
+    iqm,
+    load_trials,
+    of_run,
+    results,
+    seconds_of_a_run,
+    tabulate_time,
+)
 
 MEASURES = {"all_steps": "all steps", "last_five": "last five steps"}
 SHOWN = (3, 6, 9, 12, 18, 24, 30)  # trials
@@ -76,10 +84,9 @@ def tabulate(evaluations: pd.DataFrame) -> pd.DataFrame:
 
 
 def tabulate_seconds(trials: pd.DataFrame, evaluations: pd.DataFrame) -> pd.DataFrame:
-    """Mean seconds of a run in each part, and how well the model foresaw trials."""
+    """Median seconds of a run in each part, and how well the model foresaw trials."""
     table = tabulate_time(trials, RMSES).set_index("scenario")
-    by_run = evaluations.groupby(["scenario", "seed"], sort=False)["evaluation_seconds"].sum()
-    seconds = by_run.groupby("scenario", sort=False).mean()
+    seconds = seconds_of_a_run(evaluations, ["evaluation"])["evaluation_seconds"]
     table.insert(3, "evaluation_seconds", seconds)
     table["total_seconds"] += seconds
     return table.reset_index()

@@ -59,7 +59,7 @@ def fragments(folder: Path) -> dict[str, str]:
     found["cartpole:targets"] = claims_table(claims[ours], "target", "actions", parts)
     times = times.set_index(times["scenario"].map(lambda name: SCENARIOS[name].label))
     columns = ["fit_seconds", "rollout_seconds", "sac_seconds", "total_seconds", "updates"]
-    header = ["mean of a run", "fits, s", "model steps, s", "updates, s", "all, s", "updates"]
+    header = ["of a run", "fits, s", "model steps, s", "updates, s", "all, s", "updates"]
     found["cartpole:time"] = numbers(times[columns], header, "{:.0f}")
     errors = ("x, m", "theta, rad", "x', m/s", "theta', rad/s")
     found["cartpole:model"] = model_table(times, RMSES, errors)

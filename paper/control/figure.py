@@ -135,7 +135,7 @@ def draw_time(table: pd.DataFrame, labels: Mapping[str, str], path: Path) -> Non
     """Draw what the seconds of a run are spent on.
 
     Args:
-        table: A row for each scenario, with the mean seconds of each part.
+        table: A row for each scenario, with the median seconds of each part.
         labels: The names of the scenarios.
         path: The file.
     """
@@ -157,6 +157,6 @@ def draw_time(table: pd.DataFrame, labels: Mapping[str, str], path: Path) -> Non
         left += seconds
     ax.invert_yaxis()
     ax.set_xlim(left=0)
-    ax.set_xlabel("seconds of a run of all trials, mean")
+    ax.set_xlabel("seconds of a run of all trials, median of the runs")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=len(parts))
     save(figure, path)

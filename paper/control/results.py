@@ -92,17 +92,29 @@ def iqm(scores: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, np.n
     )
 
 
-def tabulate_time(trials: pd.DataFrame, rmses: Sequence[str]) -> pd.DataFrame:
-    """Mean seconds of a run in each part, its updates, and how well the model foresaw trials.
+def seconds_of_a_run(rows: pd.DataFrame, parts: Sequence[str]) -> pd.DataFrame:
+    """Medians over the runs of the seconds in each part that there is: a row for each scenario.
 
-    ``cpu_seconds`` are of the whole run on its core, the others of wall time. Scores are over the
-    trials from the second, which is the first that a learnt model foresees.
+    Args:
+        rows: Those of the runs, with a column ``..._seconds`` for each part.
+        parts: Their names.
+    """
+    columns = [f"{part}_seconds" for part in parts if f"{part}_seconds" in rows]
+    by_run = rows.groupby(["scenario", "seed"], sort=False)[columns].sum()
+    return by_run.groupby("scenario", sort=False).median()
+
+
+def tabulate_time(trials: pd.DataFrame, rmses: Sequence[str]) -> pd.DataFrame:
+    """Seconds of a run in each part, its updates, and how well the model foresaw trials.
+
+    ``cpu_seconds`` are of the whole run on its core, the others of wall time; they are medians over
+    the runs, as a run may have been suspended. Scores are over the trials from the second, which is
+    the first that a learnt model foresees.
     """
     trials = trials.assign(total_seconds=sum(trials[f"{part}_seconds"] for part in PARTS))
-    sums = [*(f"{part}_seconds" for part in PARTS), "total_seconds", "updates", "left_bounds"]
-    sums += [name for name in ["cpu_seconds"] if name in trials]
-    by_run = trials.groupby(["scenario", "seed"], sort=False)[sums].sum()
-    table = by_run.groupby("scenario", sort=False).mean()
+    table = seconds_of_a_run(trials, (*PARTS, "total", "cpu"))
+    by_run = trials.groupby(["scenario", "seed"], sort=False)[["updates", "left_bounds"]].sum()
+    table[["updates", "left_bounds"]] = by_run.groupby("scenario", sort=False).mean()
     scores = trials[trials["trial"] > 1].groupby("scenario", sort=False)
     table["nlpd_median"] = scores["nlpd"].median()
     table["coverage"] = scores["coverage"].mean()

@@ -43,7 +43,7 @@ class Summary:
             print(rows.to_string(index=False, float_format=form, na_rep="-"))
             for claim in self.claims[self.claims[self.part] == name].itertuples():
                 print(f"  {claim.id} {claim.verdict}: {claim.claim} ({claim.measured})")
-        print("\nMean of a run:")
+        print("\nOf a run:")
         print(self.time.to_string(index=False, float_format="%.4g", na_rep="-"))
 
 

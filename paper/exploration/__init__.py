@@ -26,7 +26,7 @@ def summarise(out: Path) -> None:
         rows = table[table["measure"] == measure].drop(columns="measure")
         print(f"\nMean {label}, after trials:")
         print(rows.to_string(index=False, float_format="%.3f", na_rep="-"))
-    print("\nMean seconds of a run:")
+    print("\nMedian seconds of a run:")
     print(seconds.to_string(index=False, float_format="%.4g", na_rep="-"))
     draw_curves(trials, out / "curves.png")
     print(f"\nFigure: {out / 'curves.png'}")

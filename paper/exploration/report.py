@@ -26,7 +26,7 @@ def fragments(folder: Path) -> dict[str, str]:
     for measure, part in table.groupby("measure"):
         found[f"exploration:{measure}"] = _means(part, _DIGITS[str(measure)])
     seconds = seconds.set_index(seconds.pop("scenario").map(lambda name: SCENARIOS[name].label))
-    header = ["mean of a run", "plans, s", "fits, s", "model steps, s", "updates, s", "CPU, s"]
+    header = ["of a run", "plans, s", "fits, s", "model steps, s", "updates, s", "CPU, s"]
     found["exploration:seconds"] = numbers(seconds, header, "{:.0f}")
     return found
 

@@ -9,7 +9,7 @@ import pandas as pd
 
 from paper.cartpole.results import RMSES
 from paper.control.curves import Curves
-from paper.control.results import load_trials
+from paper.control.results import load_trials, seconds_of_a_run
 from paper.exploration.scenarios import REFERENCE, SCENARIOS, model_of
 
 MEASURES = {
@@ -53,7 +53,5 @@ def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def tabulate_seconds(trials: pd.DataFrame) -> pd.DataFrame:
-    """Mean seconds of a run: plans, fits, model steps and updates of wall time, ``cpu`` of all."""
-    columns = [f"{part}_seconds" for part in _PARTS]
-    by_run = trials.groupby(["scenario", "seed"], sort=False)[columns].sum()
-    return by_run.groupby("scenario", sort=False).mean().reset_index()
+    """Median seconds of a run in plans, fits, model steps and updates; ``cpu`` of one core's."""
+    return seconds_of_a_run(trials, _PARTS).reset_index()

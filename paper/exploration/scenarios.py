@@ -12,7 +12,9 @@ from paper.cartpole import scenarios as cartpole
 from paper.cartpole.scenarios import CartPoleScenario
 
 NUM_TRIALS = 15
-SETTINGS = replace(cartpole.SETTINGS, num_trials=NUM_TRIALS, model_until=NUM_TRIALS)
+SETTINGS = replace(
+    cartpole.SETTINGS, num_trials=NUM_TRIALS, model_until=NUM_TRIALS, model_updates=1
+)
 FEW = 3  # trials after the first
 RANDOM = InformativeTrials(num_random=1, num_policy=0, num_functions=1, rounds=0)
 INFORMATIVE = InformativeTrials()

@@ -224,7 +224,7 @@ class TestResults:
     def test_verdicts(self, cka, verdict, measured):
         runs = frame(gp=[[3.0, 2.0, 1.5, 1.0]] * 2, cka=cka)
         (claim,) = verdicts(runs).to_dict("records")
-        assert (claim["id"], claim["verdict"]) == ("A1", verdict)
+        assert (claim["id"], claim["verdict"]) == ("M1", verdict)
         assert measured in claim["measured"]
 
     def test_no_results(self, tmp_path):
@@ -247,7 +247,7 @@ def test_command_writes_tables_and_a_figure(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "errors.png").stat().st_size > 10_000
     table = pd.read_csv(tmp_path / "table.csv")
     assert len(table) == 6
-    assert list(pd.read_csv(tmp_path / "claims.csv")["id"]) == ["A1", "A4"]
+    assert list(pd.read_csv(tmp_path / "claims.csv")["id"]) == ["M1", "M4"]
     first = capsys.readouterr().out
     assert "cartpole:" in first
     command(monkeypatch, tmp_path, "--only-tables", "--learners", "sobol")
