@@ -44,6 +44,21 @@ def as_points(X: Any, num_inputs: int, name: str = "X") -> Tensor:
     return X
 
 
+def as_points_within(X: Any, bounds: Tensor, name: str) -> Tensor:
+    """Return points within bounds ``2 x d`` as ``n x d``, float64.
+
+    Raises:
+        ValueError: As :func:`as_points`, or if one is out of bounds.
+    """
+    X = as_points(X, bounds.shape[-1], name)
+    outside = (X.clamp(bounds[0], bounds[1]) != X).any(-1)
+    if outside.any():
+        raise ValueError(
+            f"Expected {name} within the bounds {bounds.tolist()}, got {X[outside][0].tolist()}."
+        )
+    return X
+
+
 def as_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
     """Return measured values as ``n x m``, float64; they may be NaN or infinite.
 

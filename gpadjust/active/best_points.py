@@ -11,7 +11,8 @@ from botorch.optim import optimize_acqf
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-_NEAR = 0.01  # of the bounds' widths: closer than this is the same point again
+from gpadjust.active.design import NEAR, distances
+
 _OTHERS = 256  # points among which the best is taken in its place
 
 
@@ -57,8 +58,7 @@ def best_points(
 
 def _near(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
     """Whether each of ``n x d`` points is near one of the others, ``n``."""
-    distance = (points.unsqueeze(-2) - others).abs() / (bounds[1] - bounds[0])
-    return (distance < _NEAR).all(-1).any(-1)
+    return (distances(points, others, bounds) < NEAR).any(-1)
 
 
 def _elsewhere(

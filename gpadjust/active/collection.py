@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
 
-from gpadjust.active.arguments import as_bounds, as_outcomes, as_points
+from gpadjust.active.arguments import as_bounds, as_outcomes, as_points, as_points_within
 from gpadjust.active.best_points import best_points
 from gpadjust.active.design import among, sobol_points
 from gpadjust.active.measurement_log import MeasurementLog, Record
@@ -107,7 +108,7 @@ class Collection(Measurements):
         initial = 2 * (d + 1) if initial is None else initial
         self._first_points = self.bounds[:0]
         if isinstance(initial, Tensor):
-            self._first_points, initial = as_points(initial, d, "initial"), 2
+            self._first_points, initial = as_points_within(initial, self.bounds, "initial"), 2
         if not isinstance(initial, int) or initial < 2:
             raise ValueError(
                 f"Expected initial to be a number of points >= 2, or the points, got {initial!r}."
@@ -116,7 +117,7 @@ class Collection(Measurements):
         self._options = optimizer_options or {}
         if num_outputs is not None:
             check_number(num_outputs, "num_outputs")
-        super().__init__(d, num_outputs, data)
+        super().__init__(self.bounds, num_outputs, data)
         self._model: Any = None
         self._last_model: tuple[Any, int] = (None, 0)
         self.log = None if log is None else MeasurementLog(log)
@@ -174,8 +175,10 @@ class Collection(Measurements):
         """Take measurements, of points asked for or of others.
 
         Args:
-            X: The points, ``n x d``.
-            Y: What was measured, ``n x m`` or ``n``. A row with NaN or infinity has failed.
+            X: The points, ``n x d``, as they were measured: one that is within a hundredth of the
+                bounds' widths of a pending one counts as that.
+            Y: What was measured, ``n x m`` or ``n``. A row with NaN or infinity has failed as a
+                whole; what it has of other outputs stays in the log.
 
         Raises:
             TypeError: If they are no numbers.
@@ -188,8 +191,9 @@ class Collection(Measurements):
         Y = as_outcomes(Y, len(X), self.num_outputs)
         records = []
         for x, y in zip(X.tolist(), Y.tolist(), strict=True):
-            finite = torch.tensor(y).isfinite().all()
-            records.append({"x": x, "y": y} if finite else {"x": x, "failed": f"measured {y}"})
+            values = [value if math.isfinite(value) else None for value in y]
+            record: Record = {"x": x, "y": values}
+            records.append(record | ({"failed": f"measured {y}"} if None in values else {}))
         self._enter(records)
         self._warn(records)
 
@@ -219,7 +223,7 @@ class Collection(Measurements):
 
     def _design(self, q: int) -> Tensor | None:
         """The next points that need no model, ``q x d``, or None if a model is to choose."""
-        known = torch.cat([self.X, self.failed_X, self.pending])
+        known = torch.cat([self.X, self.failed_X, self._asked])
         first = self._first_points[~among(self._first_points, known)]
         if not len(first) and len(self.X) >= self._initial:
             return None

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+NEAR = 0.01  # of the bounds' widths: closer than this is the same point
+
 
 def sobol_points(bounds: Tensor, q: int, known: Tensor, seed: int) -> Tensor:
     """The next points of a scrambled Sobol sequence that are not known yet.
@@ -28,3 +30,12 @@ def sobol_points(bounds: Tensor, q: int, known: Tensor, seed: int) -> Tensor:
 def among(points: Tensor, others: Tensor) -> Tensor:
     """Whether each of ``n x d`` points is one of the others, ``n``."""
     return (points.unsqueeze(-2) == others).all(-1).any(-1)
+
+
+def distances(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
+    """Distances of ``n x d`` points from others, the largest over the inputs: ``n x k``.
+
+    They are in units of the bounds' widths.
+    """
+    gaps = (points.unsqueeze(-2) - others).abs() / (bounds[1] - bounds[0])
+    return gaps.amax(-1)

@@ -54,7 +54,8 @@ def collect(
 
     A measurement that fails (the oracle raises an exception or returns NaN, infinity or a wrong
     shape) is logged with its message and skipped, with a warning. It counts against the budget, and
-    nothing so near is asked for again. An exception fails the whole batch.
+    no point within a hundredth of the bounds' widths of it is asked for again. An exception fails
+    the whole batch.
 
     Args:
         model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64.

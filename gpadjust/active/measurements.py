@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.active.arguments import as_outcomes, as_points
+from gpadjust.active.design import NEAR, among, distances
 from gpadjust.active.measurement_log import Record
 
 
@@ -17,11 +18,15 @@ class Measurements:
     - ``{"asked": [x, ...], "parameters": {...}}``: points that are to be measured, and the
       parameters of the model that chose them, if one did;
     - ``{"x": x, "y": y}``: a measurement;
-    - ``{"x": x, "failed": message}``: one that failed;
+    - ``{"x": x, "failed": message}``: one that failed; with ``"y"``, too, if values came out, of
+      which some are null;
     - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more.
 
+    A measurement is of the pending point that it is nearest to, if that is within a hundredth of
+    the bounds' widths: what a laboratory sets is seldom what was asked for to the last digit.
+
     Args:
-        num_inputs: Number ``d`` of inputs.
+        bounds: Bounds of the inputs, ``2 x d``.
         num_outputs: Number ``m`` of outputs, or None for that of the first measurement.
         data: ``(X, Y)`` measured before, or None.
 
@@ -35,17 +40,17 @@ class Measurements:
     """
 
     def __init__(
-        self, num_inputs: int, num_outputs: int | None, data: tuple[Tensor, Tensor] | None
+        self, bounds: Tensor, num_outputs: int | None, data: tuple[Tensor, Tensor] | None
     ) -> None:
-        none = torch.zeros(0, num_inputs, dtype=torch.float64)
-        self.X = self.failed_X = self.pending = none
+        self.bounds = bounds
+        self.X = self.failed_X = self.pending = self._asked = bounds[:0]
         self.Y = torch.zeros(0, num_outputs or 0, dtype=torch.float64)
         self.num_measured = 0
         self.num_outputs = num_outputs
         self._num_asks = 0
         self._last_fit: tuple[int, Record] | None = None  # of how many points, and its result
         if data is not None:
-            X = as_points(data[0], num_inputs, "the X of data")
+            X = as_points(data[0], bounds.shape[-1], "the X of data")
             Y = as_outcomes(data[1], len(X), num_outputs)
             if not Y.isfinite().all():
                 raise ValueError("Expected the Y of data to be finite; leave failed points out.")
@@ -54,13 +59,16 @@ class Measurements:
     def _take(self, record: Record) -> None:
         """Take in one record."""
         if "asked" in record:
-            self.pending = torch.cat([self.pending, self._points(record["asked"])])
+            asked = self._points(record["asked"])
+            self.pending = torch.cat([self.pending, asked])
+            self._asked = torch.cat([self._asked, asked])
             self._num_asks += 1
             if record.get("parameters"):
                 self._last_fit = (len(self.X), record["parameters"])
         elif "withdrawn" in record:
             for x in self._points(record["withdrawn"]):
-                self._no_longer_pending(x)
+                point = self._no_longer_pending(x)
+                self._asked = self._asked[~among(self._asked, point)]
         else:
             self._take_measurement(record)
 
@@ -76,12 +84,19 @@ class Measurements:
         self._no_longer_pending(x[0])
         self.num_measured += 1
 
-    def _no_longer_pending(self, x: Tensor) -> None:
-        """Remove one point from those that are pending, if it is one."""
-        here = (self.pending == x).all(-1).nonzero()
-        if len(here):
-            i = int(here[0])
-            self.pending = torch.cat([self.pending[:i], self.pending[i + 1 :]])
+    def _no_longer_pending(self, x: Tensor) -> Tensor:
+        """Remove the point that ``x`` is of those that are pending, and return it, ``1 x d``.
+
+        If it is none, nothing is removed, and ``0 x d`` returned.
+        """
+        if not len(self.pending):
+            return self.pending
+        distance, i = distances(x, self.pending, self.bounds).min(-1)
+        if distance > NEAR:
+            return self.pending[:0]
+        point = self.pending[i : i + 1]
+        self.pending = torch.cat([self.pending[:i], self.pending[i + 1 :]])
+        return point
 
     def _points(self, rows: list[list[float]]) -> Tensor:
         """The points of a record, ``n x d``."""

@@ -43,6 +43,7 @@ _WITHOUT_PHYSICS = ("zero mean",)
 # Without physics these are the zero mean; the others have a kernel or a constant of their own.
 _COMPARABLE = ("physics mean", "CKA", "CKA centred", "CKA centred, learnt rho mean")
 _WITHOUT_ADJUSTMENT = ("zero mean", "physics mean")
+_ENOUGH = 3  # observations for each hyper-parameter; with fewer, point fits are found too sure
 _SURE = 2.0  # standard errors that a difference takes to be real
 
 
@@ -253,7 +254,7 @@ def _advice(rows: list[Candidate], densities: dict[str, Tensor]) -> list[str]:
     order = [row.structure for row in rows]
     best = next(row for row in rows if row.structure == _best(order))
     sentences = [f"Best: {best.structure}."]
-    if len(densities[best.structure]) < 2 * best.num_parameters:
+    if len(densities[best.structure]) < _ENOUGH * best.num_parameters:
         sentences.append(
             f"{len(densities[best.structure])} observations are few for {best.num_parameters} "
             "hyper-parameters: the ranking is uncertain, and the intervals of a point fit are too "

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from paper.arm.results import MEASURES, RMSES, SHOWN, THRESHOLDS, WINDOWS
+from paper.arm.results import LAST_TRIAL, MEASURES, RMSES, SHOWN, THRESHOLDS, WINDOWS
 from paper.arm.runs import ARM
 from paper.arm.scenarios import SCENARIOS
 from paper.control.report import (
@@ -32,7 +32,9 @@ NAMES = (
     "targets",
     "time",
     "model",
+    "short",
 )
+SHORT = ("mf-best", "phy", "gp", "cka", "rra", "cka-memory")  # the learners of the main README
 
 
 def fragments(folder: Path) -> dict[str, str]:
@@ -50,6 +52,7 @@ def fragments(folder: Path) -> dict[str, str]:
         found[f"arm:{name}"] = f"![{caption}](results/arm/{figure}.png)"
     for name, steps in zip(("all", "last"), MEASURES.values(), strict=True):
         found[f"arm:{name}"] = _errors(table[table["steps"] == steps])
+    found["arm:short"] = _short(table[table["steps"] == MEASURES["all_steps"]])
     ours = claims["id"].str.startswith("T")
     parts = {steps: steps for steps in MEASURES.values()}
     found["arm:claims"] = claims_table(claims[~ours], "claim", "steps", parts)
@@ -91,6 +94,22 @@ def _errors(table: pd.DataFrame) -> str:
                 "" if pd.isna(row["hundred"]) else f"{row['hundred']:.1f}",
                 *(paired(row, f"more_{trials}", 1) for trials in ("3_9", "24_30")),
                 *("never" if pd.isna(first) else f"{first:.0f}" for first in firsts),
+            ]
+        )
+    return markdown(header, rows)
+
+
+def _short(table: pd.DataFrame) -> str:
+    trials, (_, level) = (3, 6, 12, LAST_TRIAL), THRESHOLDS
+    header = ["hand's error, cm", *(f"at {trial}" for trial in trials), f"first at {level} cm"]
+    rows = []
+    for row in table[table["scenario"].isin(SHORT)].to_dict("records"):
+        first = row[f"first_{level}"]
+        rows.append(
+            [
+                f"{SCENARIOS[row['scenario']].label} ({row['runs']})",
+                *("" if pd.isna(row[f"at_{t}"]) else f"{row[f'at_{t}']:.1f}" for t in trials),
+                "never" if pd.isna(first) else f"trial {first:.0f}",
             ]
         )
     return markdown(header, rows)

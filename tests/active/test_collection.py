@@ -1,5 +1,7 @@
 """Asking and telling in any order."""
 
+import json
+
 import pytest
 import torch
 
@@ -69,6 +71,46 @@ def test_told_again_is_a_repeated_measurement(make):
     collection.tell(X, truth(X))
     collection.tell(X, truth(X) + 0.1)
     assert torch.equal(collection.X, X.repeat(2, 1))
+
+
+@pytest.mark.parametrize("initial", [4, torch.tensor([[0.123456, 0.5], [1.9, -0.654321]])])
+def test_what_was_set_need_not_be_what_was_asked_for(make, initial):
+    collection = make(initial=initial)
+    X = collection.ask(4)
+    for x in ((1000 * X[:2]).round() / 1000, X[2:].float()):
+        collection.tell(x, truth(x.double()))
+    assert len(collection.pending) == 0
+    assert torch.equal(collection.X[2:], X[2:].float().double())  # as it was told
+    later = torch.cat([collection.ask() for _ in range(2)])
+    assert (later[:, None] - X).abs().amax(-1).min() > 1e-3, "a point of the design came again"
+
+
+def test_it_is_the_nearest_of_the_pending_points(make):
+    close = torch.tensor([[1.0, 0.0], [1.01, 0.0], [1.02, 0.0]])
+    collection = make(initial=close)
+    X = collection.ask(3)
+    collection.withdraw(torch.tensor([[1.013, 0.0]]))
+    assert torch.equal(collection.pending, X[[0, 2]])
+    collection.tell(torch.tensor([[1.5, 0.0]]), torch.ones(1))
+    assert torch.equal(collection.pending, X[[0, 2]]), "another point"
+
+
+def test_values_beside_a_missing_one_stay_in_the_log(make, tmp_path):
+    path = tmp_path / "log.jsonl"
+    collection = make(log=path, num_outputs=2)
+    X = collection.ask()
+    with pytest.warns(MeasurementWarning, match=r"measured \[50.0, nan\]"):
+        collection.tell(X, torch.tensor([[50.0, float("nan")]]))
+    record = json.loads(path.read_text().splitlines()[-1])
+    assert record["y"] == [50.0, None]
+    again = make(log=path, num_outputs=2)
+    assert torch.equal(again.failed_X, X)
+    assert len(again.X) == 0
+
+
+def test_first_points_out_of_bounds(make):
+    with pytest.raises(ValueError, match=r"initial within the bounds .* got \[5.0, 0.0\]"):
+        make(initial=torch.tensor([[1.0, 0.0], [5.0, 0.0]]))
 
 
 def test_failing_and_withdrawing(make):

@@ -1,7 +1,7 @@
 """Figures: what is drawn is what was predicted."""
 
 import matplotlib as mpl
-import matplotlib.pyplot
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -41,7 +41,7 @@ def plane(data, build):
 def _leave_pyplot_alone():
     settings = dict(mpl.rcParams)
     yield
-    assert mpl.pyplot.get_fignums() == []
+    plt.close("all")
     assert dict(mpl.rcParams) == settings
 
 
@@ -185,3 +185,14 @@ def test_an_input_that_never_changed():
     model = CKA(X, X[:, :1].exp(), physics=lambda X: X[:, :1])
     axes = plot_adjustment(model)
     assert axes.shape == (2, 2)
+
+
+def test_default_axes_are_of_a_figure_that_pyplot_knows(line):
+    ax = plot_prediction(line, torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1))
+    assert plt.gcf() is ax.figure
+
+
+def test_calibration_names_the_output_if_there_are_several():
+    assert plot_calibration(torch.rand(20, 2), output=1).get_title() == "output 1"
+    assert plot_pit(torch.rand(20, 2)).get_title() == "output 0"
+    assert plot_calibration(torch.rand(20)).get_title() == ""

@@ -34,7 +34,9 @@ def plot_calibration(
         'observed coverage'
     """
     pit = _pit(prediction, output)
-    ax = new_axes(1, 1, size=3.6)[0, 0] if ax is None else ax
+    if ax is None:
+        ax = new_axes(1, 1, size=3.6)[0, 0]
+        ax.set_title(_title(prediction, output))
     levels = np.linspace(0, 1, 201)
     n = len(pit)
     low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
@@ -80,7 +82,9 @@ def plot_pit(
     if bins < 1:
         raise ValueError(f"Expected bins >= 1, got {bins}.")
     pit = _pit(prediction, output)
-    ax = new_axes(1, 1)[0, 0] if ax is None else ax
+    if ax is None:
+        ax = new_axes(1, 1)[0, 0]
+        ax.set_title(_title(prediction, output))
     n = len(pit)
     low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
     ax.hist(pit.numpy(), bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
@@ -92,6 +96,12 @@ def plot_pit(
     ax.set_ylim(top=1.25 * max(high, ax.get_ylim()[1]))  # room for the legend
     legend(ax)
     return ax
+
+
+def _title(prediction: Tensor | LeaveOneOut | Scores, output: int) -> str:
+    """Which output is drawn, if there are others."""
+    pit = prediction if isinstance(prediction, Tensor) else prediction.pit
+    return f"output {output}" if pit.dim() > 1 and pit.shape[-1] > 1 else ""
 
 
 def _pit(prediction: Tensor | LeaveOneOut | Scores, output: int) -> Tensor:
