@@ -125,7 +125,7 @@ class InformativeTrials:
             ValueError: If ``state`` or ``action_bounds`` have another shape, or bounds are not
                 finite.
             RuntimeError: If the dynamics have learnt nothing yet.
-            PhysicsError: If the physics fails everywhere.
+            PhysicsError: If the physics fails at ``state``, whatever the action.
         """
         spec = dynamics.spec
         if state.shape != (spec.state_dim,):

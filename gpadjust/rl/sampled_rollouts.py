@@ -93,7 +93,9 @@ class SampledRollouts:
         visited, made = [], []
         for t in range(num_steps):
             actions = choose(t, states)
-            following, ended, left = self._step(states, actions)
+            # Where the trials start the physics has to work; later, all may have come to where it
+            # does not.
+            following, ended, left = self._step(states, actions, some_must_succeed=t == 0)
             visited.append(states)
             taken.append(actions)
             made.append(running & ~left)
@@ -104,7 +106,9 @@ class SampledRollouts:
         )
         return _without_failures(steps)
 
-    def _step(self, states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _step(
+        self, states: Tensor, actions: Tensor, *, some_must_succeed: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Next states, which of them end a trial, and who would have left the bounds."""
         blocks = states.shape[:2]
 
@@ -114,7 +118,9 @@ class SampledRollouts:
             )
 
         rows = states.flatten(0, 1)
-        following = sound_steps(move, rows, actions.flatten(0, 1))
+        following = sound_steps(
+            move, rows, actions.flatten(0, 1), some_must_succeed=some_must_succeed
+        )
         left = ~following.isfinite().all(-1)
         if self.state_bounds is not None:
             low, high = self.state_bounds

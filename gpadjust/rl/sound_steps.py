@@ -11,7 +11,11 @@ from gpadjust.physics import PhysicsError
 
 
 def sound_steps(
-    move: Callable[[Tensor, Tensor], Tensor], states: Tensor, actions: Tensor
+    move: Callable[[Tensor, Tensor], Tensor],
+    states: Tensor,
+    actions: Tensor,
+    *,
+    some_must_succeed: bool = False,
 ) -> Tensor:
     """The next states ``N x state_dim``; not finite where the physics fails.
 
@@ -19,9 +23,11 @@ def sound_steps(
         move: A model, from states and actions to next states.
         states: ``N x state_dim``.
         actions: ``N x action_dim``.
+        some_must_succeed: Whether it is an error that the physics fails for all of them.
 
     Raises:
-        PhysicsError: If the physics fails everywhere, or does not say where.
+        PhysicsError: If the physics does not say where it fails; or fails everywhere, though it
+            must not.
     """
     states, actions = states.clone(), actions.clone()
     failed = torch.zeros(len(states), dtype=torch.bool)
@@ -30,8 +36,10 @@ def sound_steps(
             following = move(states, actions)
         except PhysicsError as error:
             failed[list(error.rows)] = True
-            if not error.rows or failed.all():
+            if not error.rows or (failed.all() and some_must_succeed):
                 raise
+            if failed.all():
+                return torch.full_like(states, torch.nan)
             # They are evaluated with the others, at a place where the physics does not fail.
             sound = int((~failed).nonzero()[0])
             states[failed], actions[failed] = states[sound], actions[sound]

@@ -22,6 +22,7 @@ BACKDROP = "mf"  # in every panel, for comparison
 _COLUMNS = 4
 _LABELS = ARM.labels
 _WORST = 30.0  # cm, the end of the colours
+_WIDEST = 10  # cm, the end of the sizes
 
 
 def draw_curves(evaluations: pd.DataFrame, path: Path) -> None:
@@ -57,7 +58,7 @@ def draw_map(maps: pd.DataFrame, path: Path) -> None:
             targets[:, 0],
             targets[:, 1],
             c=mean,
-            s=6 + 6 * sd,
+            s=6 + 6 * sd.clip(max=_WIDEST),
             cmap="viridis_r",
             vmin=0,
             vmax=_WORST,
@@ -69,8 +70,8 @@ def draw_map(maps: pd.DataFrame, path: Path) -> None:
     label = f"RMSE after trial {MAP_TRIAL}, cm"
     figure.colorbar(dots, ax=[*axes.values()], label=label, shrink=0.9, extend="max")
     sizes = [
-        ax.scatter([], [], s=6 + 6 * sd, color="0.4", label=f"sd of runs {sd} cm")
-        for sd in (0, 5, 10)
+        ax.scatter([], [], s=6 + 6 * sd, color="0.4", label=f"sd of runs {sd} cm{more}")
+        for sd, more in ((0, ""), (5, ""), (_WIDEST, " or more"))
     ]
     figure.legend(handles=sizes, loc="outside upper center", ncols=3)
     save(figure, path)

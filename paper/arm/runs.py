@@ -42,9 +42,9 @@ class ArmRecorder(Recorder):
         return {}
 
     def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
         if not evaluation_log(self.model)["evaluations"]:
             evaluate(self.model, self.scenario, self.settings, 0)
-        super()._on_rollout_start()
 
 
 def details(agent: DynaSAC, seed: int) -> dict[str, Any]:

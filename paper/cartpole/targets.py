@@ -10,7 +10,7 @@ from gpadjust.envs.cart_pole import TIME_STEP
 from paper.cartpole.scenarios import SCENARIOS, SETTINGS
 from paper.control.claims import Claim, Finding, met, reached
 from paper.control.curves import Curves
-from paper.control.results import PARTS
+from paper.control.results import PARTS, seconds_of_a_run
 
 _SECONDS = SETTINGS.trial_length * TIME_STEP
 _LATE = SETTINGS.model_until - 4  # the first of the last five trials in which the model serves
@@ -105,12 +105,11 @@ def _stays_from(curves: Curves, name: str) -> int | None:
 def _seconds(
     curves: Curves, name: str, first: int = 1, last: int = SETTINGS.num_trials
 ) -> list[float]:
-    """Mean seconds of a run in fits, model steps and updates."""
+    """Median seconds of a run in fits, model steps and updates."""
     chosen = curves.records[
         (curves.records["scenario"] == name) & curves.records["trial"].between(first, last)
     ]
-    by_run = chosen.groupby("seed")[[f"{part}_seconds" for part in PARTS]].sum()
-    return [float(seconds) for seconds in by_run.mean()]
+    return [float(seconds) for seconds in seconds_of_a_run(chosen, PARTS).loc[name]]
 
 
 def _late(curves: Curves, name: str) -> float:

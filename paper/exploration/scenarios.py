@@ -50,8 +50,3 @@ SCENARIOS = {
 def model_of(name: str) -> str:
     """The model of a scenario."""
     return name.partition("-")[0]
-
-
-def explorer_of(name: str) -> str:
-    """Who chooses the real trials of a scenario."""
-    return name.partition("-")[2]

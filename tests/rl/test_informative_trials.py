@@ -120,6 +120,14 @@ def test_trials_end_where_the_physics_fails(origin):
     assert steps.states.max() <= 0.9
 
 
+def test_all_trials_may_end_at_once_but_not_at_the_start(origin):
+    sequences = torch.ones(2, 5, 1).double()
+    steps = SampledRollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
+    assert steps.made.tolist() == [[[True, True, False, False, False]] * 2] * 2
+    with pytest.raises(PhysicsError, match="too far"):
+        SampledRollouts(half_steps(fails_beyond=-1), 2).follow(origin, sequences)
+
+
 def test_the_policy_proposes(origin):
     rollouts = SampledRollouts(half_steps(), 2)
     sequences = rollouts.propose(origin, 4, lambda states: 1 + states, 3)

@@ -217,6 +217,10 @@ def test_particles_at_which_the_physics_fails_are_truncated(
     assert dones.tolist() == [False, True, False]
     assert infos[1]["left_bounds"]
     assert obs[:, 0].tolist() == pytest.approx([1.4, 1.0, 1.0])
+    env.reset()
+    _, _, dones, infos = env.step(np.full((3, 1), 2.0, dtype=np.float32))
+    assert dones.all()
+    assert all(info["left_bounds"] for info in infos)
 
 
 def test_bounds_give_way_to_the_starts(point_particles, rise):
