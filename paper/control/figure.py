@@ -122,11 +122,11 @@ def draw_iqm(
             )  # fmt: skip
         ax.axvline(line[0], color="tab:green", lw=1, ls="--", label=line[1])
         ax.set_title(title, loc="left")
-        ax.set_xlabel(f"IQM of the {unit}, 95 % interval")
         ax.grid(axis="y", alpha=0.3)
     runs = trials.groupby("scenario")["seed"].nunique()
     axes[0].set_yticks(range(len(names)), [f"{labels[name]} ({runs[name]})" for name in names])
     axes[0].invert_yaxis()
+    figure.supxlabel(f"IQM of the {unit}, 95 % interval", fontsize="medium")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     save(figure, path)
 
