@@ -6,19 +6,22 @@ from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from paper.control.figure import one_legend, save
 from paper.exploration.results import MEASURES
-from paper.exploration.scenarios import EXPLORERS, MODELS
+from paper.exploration.scenarios import EXPLORERS, MODELS, model_of
 
 _COLORS = {"random": "0.55", "sac": "navy", "info": "tab:red", "info-3": "tab:orange"}
 
 
 def draw_curves(trials: pd.DataFrame, path: Path) -> None:
     """Draw each measure after each trial, mean and standard error: a row of panels for a model."""
-    figure = Figure(figsize=(11, 6), layout="constrained")
-    axes = figure.subplots(len(MODELS), len(MEASURES), sharex=True, sharey="col", squeeze=False)
-    for row, (model, (model_label, _)) in zip(axes, MODELS.items(), strict=True):
+    there_are = set(trials["scenario"].map(model_of))
+    models = {name: label for name, (label, _) in MODELS.items() if name in there_are}
+    figure = Figure(figsize=(11, 2.6 * len(models) + 0.8), layout="constrained")
+    axes = figure.subplots(len(models), len(MEASURES), sharex=True, sharey="col", squeeze=False)
+    for row, (model, model_label) in zip(axes, models.items(), strict=True):
         for ax, (measure, label) in zip(row, MEASURES.items(), strict=True):
             for explorer, (explorer_label, *_) in EXPLORERS.items():
                 own = trials[trials["scenario"] == f"{model}-{explorer}"]
@@ -32,6 +35,7 @@ def draw_curves(trials: pd.DataFrame, path: Path) -> None:
                 ax.plot(mean.index, mean, color=color, lw=1.4, label=explorer_label)
             if measure != "evaluation":
                 ax.set_yscale("log")
+            ax.xaxis.set_major_locator(MaxNLocator(integer=True))
             ax.set_title(f"{model_label}: {label}", loc="left", fontsize=10)
     figure.supxlabel("real trials")
     one_legend(figure, axes.flatten())
