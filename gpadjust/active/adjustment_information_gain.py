@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 from botorch.acquisition import AcquisitionFunction
 from botorch.utils.transforms import (
@@ -12,10 +12,8 @@ from botorch.utils.transforms import (
 )
 from torch import Tensor
 
-from gpadjust.models import RRA, AdjustmentGP
-from gpadjust.models.adjustment_gp import Component
-from gpadjust.models.conditional_covariance import ConditionalCovariance
-from gpadjust.models.information import information_gain
+from gpadjust.models import AdjustedGP, PaperRRA
+from gpadjust.models.information import UnknownCovariance, information_gain
 
 About = Literal["rho", "delta", "both"]
 
@@ -52,7 +50,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     it tells what delta was at measured points nearby.
 
     It needs no samples, is differentiable as far as f_p is, and counts independent outputs
-    together. An unknown constant mean (``learn_rho_mean``) is a part of its function. Of a model
+    together. An unknown constant mean (``rho_mean="learn"``) is a part of its function. Of a model
     that holds samples of its hyper-parameters, the information is averaged over them. New
     observations are as noisy as the model thinks; with known noise (``train_Yvar``), as noisy as
     the old ones on average.
@@ -66,9 +64,9 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         learning for classification and preference learning*, arXiv:1112.5745, 2011.
 
     Args:
-        model: A :class:`~gpadjust.CKA`, :class:`~gpadjust.RRA` (with ``prior="physics"``),
-            :class:`~gpadjust.ScaleGP`, :class:`~gpadjust.PhysicsMeanGP` or
-            :class:`~gpadjust.BiasGP`.
+        model: A :class:`~gpadjust.CKA`, :class:`~gpadjust.RRA`,
+            :class:`~gpadjust.ScaleGP` or
+            :class:`~gpadjust.PhysicsMeanGP`.
         about: ``"rho"``, ``"delta"``, or ``"both"``: all that the model does not know. Of a model
             with one of them only, ``"both"`` is about that one.
         X_pending: Points that are being measured, ``k x d``.
@@ -92,7 +90,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     """
 
     def __init__(
-        self, model: AdjustmentGP, about: About = "both", X_pending: Tensor | None = None
+        self, model: AdjustedGP, about: About = "both", X_pending: Tensor | None = None
     ) -> None:
         _check(model, about)
         super().__init__(model=model)
@@ -119,8 +117,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
 
     def _rests(self) -> _Rest:
         """What is unknown given the data; made anew after the model is given other data."""
-        self.model._remember_training_data()
-        if self._rest is None or self._rest.source is not self.model.prediction_strategy:
+        if self._rest is None or self._rest.source is not self.model.strategy():
             self._rest = _Rest(self.model, self.about)
         return self._rest
 
@@ -133,11 +130,12 @@ class _Rest:
         about: The adjustment in question.
     """
 
-    def __init__(self, model: AdjustmentGP, about: About) -> None:
-        self.source = model.prediction_strategy
-        self.whole = ConditionalCovariance(model, model.covar_module)
-        other = {"rho": model._kernel("delta"), "delta": model._kernel("rho"), "both": None}[about]
-        self.remaining = None if other is None else ConditionalCovariance(model, other)
+    def __init__(self, model: AdjustedGP, about: About) -> None:
+        self.source = model.strategy()
+        self.whole = UnknownCovariance(model)
+        others = {"rho": model.other_names, "delta": model.rho_names, "both": ()}[about]
+        others = tuple(name for name in others if name in model.term_names)
+        self.remaining = UnknownCovariance(model, others) if others else None
 
 
 def _check(model: Any, about: str) -> None:
@@ -145,22 +143,22 @@ def _check(model: Any, about: str) -> None:
     if about not in get_args(About):
         raise ValueError(f"Unknown {about=}; expected 'rho', 'delta' or 'both'.")
     name = type(model).__name__
-    if not isinstance(model, AdjustmentGP):
+    if not isinstance(model, AdjustedGP) or "f" in model.term_names:
         raise TypeError(
             f"Expected a model with rho or delta (CKA, RRA, ScaleGP, PhysicsMeanGP, BiasGP), got "
             f"{name}; for a model without them, take BoTorch's qNegIntegratedPosteriorVariance."
         )
-    if isinstance(model, RRA) and model.prior == "paper":
+    if isinstance(model, PaperRRA):
         raise TypeError(
-            "RRA(prior='paper') has a covariance that is not a posterior's, so that there is no "
-            "information to speak of; take prior='physics'."
+            "PaperRRA has a covariance that is not a posterior's, so that there is no information "
+            "to speak of; take RRA."
         )
     if about == "both":
         return
-    if model._kernel(cast(Component, about)) is None:
+    if not set(model.rho_names if about == "rho" else ("delta",)) & set(model.term_names):
         other = "delta" if about == "rho" else "rho"
         raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
-    if about == "delta" and model._kernel("rho") is not None and model._column.offset.any():
+    if about == "delta" and len(model._term_weights("delta")) > 1:
         raise ValueError(
             "With `center`, delta is not independent of rho a priori, and its information has no "
             "closed form: ask about 'rho' or 'both', or build the model with center=0."

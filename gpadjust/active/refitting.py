@@ -11,7 +11,7 @@ from botorch.exceptions.warnings import OptimizationWarning
 
 from gpadjust.inference import fit as fit_model
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models.multi_output_gp import MultiOutputGP
+from gpadjust.models import ExactGPBase
 
 
 def refit(model: Any, previous: Any, fit: Callable[[Any], Any] | None) -> None:
@@ -39,14 +39,14 @@ def refit(model: Any, previous: Any, fit: Callable[[Any], Any] | None) -> None:
 
 def parameter_values(model: Any) -> dict[str, Any]:
     """All parameters of a model as lists; none of one that no fit can begin from."""
-    if not isinstance(model, MultiOutputGP) or model.num_samples is not None:
+    if not isinstance(model, ExactGPBase) or model.num_samples is not None:
         return {}
     return {name: parameter.tolist() for name, parameter in model.named_parameters()}
 
 
 def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
     """Give a model parameters, unless it has others; tell whether it was done."""
-    if not isinstance(model, MultiOutputGP):
+    if not isinstance(model, ExactGPBase):
         return False
     named = dict(model.named_parameters())
     tensors = {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()}
@@ -61,7 +61,7 @@ def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
 
 def _alike(model: Any, previous: Any) -> bool:
     """Whether a warm start of one model from another makes sense."""
-    if type(model) is not type(previous) or not isinstance(model, MultiOutputGP):
+    if type(model) is not type(previous) or not isinstance(model, ExactGPBase):
         return False
     if model.num_samples is not None or previous.num_samples is not None:
         return False

@@ -11,8 +11,16 @@ from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transition_physics import Target, TransitionPhysics
 from gpadjust.inference.fitting import FitOptions
-from gpadjust.models import CKA, RRA, AdjustmentGP, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
-from gpadjust.models.multi_output_gp import MultiOutputGP
+from gpadjust.models import (
+    CKA,
+    RRA,
+    AdjustedGP,
+    ExactGPBase,
+    PaperRRA,
+    PhysicsMeanGP,
+    ScaleGP,
+    ZeroMeanGP,
+)
 from gpadjust.physics import Physics
 
 
@@ -46,7 +54,7 @@ class GPDynamics(LearnedDynamics):
         train_Y: Tensor,
         physics: TransitionPhysics | None,
         **options: Any,
-    ) -> MultiOutputGP:
+    ) -> ExactGPBase:
         return ZeroMeanGP(train_X, train_Y, **options)
 
 
@@ -67,7 +75,7 @@ class CKADynamics(LearnedDynamics):
             absolute position or angle depends on where its origin is; one of a change does not.
         encode_angles: Whether the model reads the sine and cosine of angles; the physics always
             reads the angles.
-        model_options: Further arguments of the model, such as ``center`` or ``learn_rho_mean``. A
+        model_options: Further arguments of the model, such as ``center`` or ``rho_mean``. A
             kernel may be a function of the number of inputs and the batch shape that makes it;
             one that is a module is copied for each fit.
         fit_options: Options of the search that :func:`gpadjust.fit` makes at the first fit.
@@ -84,7 +92,7 @@ class CKADynamics(LearnedDynamics):
         True
     """
 
-    _model_class: ClassVar[type[AdjustmentGP]] = CKA
+    _model_class: ClassVar[type[AdjustedGP]] = CKA
 
     def __init__(
         self,
@@ -111,7 +119,7 @@ class CKADynamics(LearnedDynamics):
         train_Y: Tensor,
         physics: TransitionPhysics | None,
         **options: Any,
-    ) -> MultiOutputGP:
+    ) -> ExactGPBase:
         assert physics is not None, "there is one"
         return self._model_class(train_X, train_Y, physics=physics, **options)
 
@@ -131,7 +139,7 @@ class BiasDynamics(CKADynamics):
     The arguments are those of :class:`CKADynamics`.
     """
 
-    _model_class = BiasGP
+    _model_class = PhysicsMeanGP
 
 
 class ScaleDynamics(CKADynamics):
@@ -151,7 +159,7 @@ class RRADynamics(CKADynamics):
         spec: As in :class:`CKADynamics`.
         physics: As in :class:`CKADynamics`.
         prior: ``"physics"``, or ``"paper"`` for the closed form as printed in the paper, which
-            falls to zero far from the data; see :class:`~gpadjust.RRA`.
+            falls to zero far from the data; see :class:`~gpadjust.models.PaperRRA`.
         num_features: Number of features of each of rho and delta.
         target: As in :class:`CKADynamics`.
         encode_angles: As in :class:`CKADynamics`.
@@ -173,15 +181,29 @@ class RRADynamics(CKADynamics):
         model_options: Mapping[str, Any] | None = None,
         fit_options: FitOptions | None = None,
     ) -> None:
+        if prior not in ("physics", "paper"):
+            raise ValueError(f"Unknown prior {prior!r}; expected 'physics' or 'paper'.")
         super().__init__(
             spec,
             physics,
             target=target,
             encode_angles=encode_angles,
-            model_options={
-                "prior": prior,
-                "num_features": num_features,
-                **(model_options or {}),
-            },
+            model_options={"num_features": num_features, **(model_options or {})},
             fit_options=fit_options,
         )
+        self.prior = prior
+
+    def describe(self) -> dict[str, str]:
+        """As the base class, with the prior."""
+        return {**super().describe(), "prior": self.prior}
+
+    def _make_model(
+        self,
+        train_X: Tensor,
+        train_Y: Tensor,
+        physics: TransitionPhysics | None,
+        **options: Any,
+    ) -> ExactGPBase:
+        assert physics is not None, "there is one"
+        model_class = PaperRRA if self.prior == "paper" else RRA
+        return model_class(train_X, train_Y, physics=physics, **options)

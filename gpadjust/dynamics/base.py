@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.models.prediction import Prediction
+from gpadjust.models import Prediction
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""

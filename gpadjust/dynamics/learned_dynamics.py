@@ -23,7 +23,7 @@ from gpadjust.dynamics.transitions import Transitions
 from gpadjust.gp import AngleInput
 from gpadjust.inference import FitResult, fit
 from gpadjust.inference.fitting import FitOptions
-from gpadjust.models.multi_output_gp import MultiOutputGP
+from gpadjust.models import ExactGPBase
 from gpadjust.physics import Physics
 
 
@@ -67,11 +67,11 @@ class LearnedDynamics(ModelDynamics):
         train_Y: Tensor,
         physics: TransitionPhysics | None,
         **options: Any,
-    ) -> MultiOutputGP:
+    ) -> ExactGPBase:
         """Build the model, from its options and an input transform."""
 
     def _forget_data(self) -> None:
-        self._model: MultiOutputGP | None = None
+        self._model: ExactGPBase | None = None
         self._data: Transitions | None = None
         self._known: Tensor | None = None  # f_p at the data
         self._chunks: list[int] = []  # numbers of points: fitted, then conditioned on
@@ -83,7 +83,7 @@ class LearnedDynamics(ModelDynamics):
         return self._model is not None
 
     @property
-    def model(self) -> MultiOutputGP:
+    def model(self) -> ExactGPBase:
         """The model, whose targets are what ``target`` says of the predicted states."""
         if self._model is None:
             raise RuntimeError(
@@ -213,7 +213,7 @@ class LearnedDynamics(ModelDynamics):
             start += size
 
     def _learn(
-        self, data: Transitions, known: Tensor | None, previous: MultiOutputGP | None
+        self, data: Transitions, known: Tensor | None, previous: ExactGPBase | None
     ) -> None:
         n = len(data.states)
         if n < 2:
@@ -244,7 +244,7 @@ class LearnedDynamics(ModelDynamics):
         warn_of_differences(self.physics.name, self.spec, data, self.spec.predicted, change)
         self._compared = True
 
-    def _build(self, data: Transitions, quiet: bool) -> MultiOutputGP:
+    def _build(self, data: Transitions, quiet: bool) -> ExactGPBase:
         """The model of some transitions; quiet where the first one has given its warnings."""
         options = {
             name: deepcopy(value) if isinstance(value, Module) else value
@@ -264,7 +264,7 @@ class LearnedDynamics(ModelDynamics):
                 **options,
             )
 
-    def _condition(self, model: MultiOutputGP, data: Transitions) -> MultiOutputGP:
+    def _condition(self, model: ExactGPBase, data: Transitions) -> ExactGPBase:
         with torch.no_grad():
             return model.condition_on_observations(
                 self.targets.inputs(data.states, data.actions),

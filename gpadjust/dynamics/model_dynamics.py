@@ -13,8 +13,7 @@ from gpadjust.dynamics.state_spec import StateSpec, check_columns
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transition_scores import TransitionScores, score_transitions
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.models.multi_output_gp import MultiOutputGP
-from gpadjust.models.prediction import Prediction
+from gpadjust.models import ExactGPBase, Prediction
 
 
 class ModelDynamics(Dynamics):
@@ -34,7 +33,7 @@ class ModelDynamics(Dynamics):
 
     @property
     @abstractmethod
-    def model(self) -> MultiOutputGP:
+    def model(self) -> ExactGPBase:
         """The model, whose targets are what ``target`` says of the predicted states."""
 
     def predict(

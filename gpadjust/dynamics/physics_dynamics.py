@@ -12,7 +12,7 @@ from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.identity import check_identity, identity
 from gpadjust.dynamics.next_state_physics import check_physics, next_values, warn_of_differences
 from gpadjust.dynamics.state_spec import StateSpec, check_columns
-from gpadjust.models.prediction import Prediction
+from gpadjust.models import Prediction
 from gpadjust.physics import Physics
 
 

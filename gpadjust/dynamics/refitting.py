@@ -12,7 +12,7 @@ from gpadjust.inference import FitResult, fit
 from gpadjust.inference.fitting import FitOptions
 from gpadjust.inference.objective import Objective
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models.multi_output_gp import MultiOutputGP
+from gpadjust.models import ExactGPBase
 
 _SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
 _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
@@ -28,7 +28,7 @@ def search_rows(num_points: int) -> Tensor | None:
 
 
 def refit(
-    model: MultiOutputGP, previous: MultiOutputGP, searches: bool, part: MultiOutputGP | None
+    model: ExactGPBase, previous: ExactGPBase, searches: bool, part: ExactGPBase | None
 ) -> FitResult:
     """Fit a model from where an earlier one was, and from a new search if there is one.
 
@@ -47,7 +47,7 @@ def refit(
         return fit(model, "map", **_REFIT)
 
 
-def _search(model: MultiOutputGP, part: MultiOutputGP | None) -> None:
+def _search(model: ExactGPBase, part: ExactGPBase | None) -> None:
     """Give a model the best hyper-parameters of its own and those of a new search."""
     if part is None:
         fit(model, "map", **_SEARCH)
@@ -55,8 +55,8 @@ def _search(model: MultiOutputGP, part: MultiOutputGP | None) -> None:
     warm_start(part, model)
     fit(part, "map", **_SEARCH)
     objective = Objective(model)
-    before = objective.current()
+    before = objective.parameters.current()
     warm_start(model, part)
-    after = objective.current()
+    after = objective.parameters.current()
     better = objective(after) < objective(before)
     objective.assign(torch.where(better.unsqueeze(-1), after, before)[0])

@@ -9,8 +9,7 @@ from gpadjust.dynamics.adjusted_dynamics import RRADynamics
 from gpadjust.dynamics.base import Dynamics
 from gpadjust.dynamics.model_dynamics import ModelDynamics
 from gpadjust.dynamics.state_spec import check_columns
-from gpadjust.models.conditional_covariance import ConditionalCovariance
-from gpadjust.models.information import information_gain
+from gpadjust.models.information import UnknownCovariance, information_gain
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
 
@@ -62,9 +61,8 @@ class TrajectoryInformation:
         self.spec = dynamics.spec
         self.targets = dynamics.targets
         self.model = dynamics.model.eval()
-        self.model._remember_training_data()
         with torch.no_grad():
-            self.unknown = ConditionalCovariance(self.model, self.model.covar_module)
+            self.unknown = UnknownCovariance(self.model)
 
     @torch.no_grad()
     def __call__(self, states: Tensor, actions: Tensor, counted: Tensor | None = None) -> Tensor:
@@ -117,7 +115,7 @@ def check_informative(dynamics: Dynamics | None) -> None:
             f"to tell what transitions would teach; found {type(dynamics).__name__}, which say "
             "nothing of their own errors."
         )
-    if isinstance(dynamics, RRADynamics) and dynamics.model_options["prior"] == "paper":
+    if isinstance(dynamics, RRADynamics) and dynamics.prior == "paper":
         raise TypeError(
             "RRADynamics(prior='paper') has a covariance that is not a posterior's, so that there "
             "is no information to speak of; take prior='physics'."

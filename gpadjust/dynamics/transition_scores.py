@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.models.prediction import Prediction
+from gpadjust.models import Prediction
 from gpadjust.validation import coverage, nlpd, rmse
 
 

@@ -1,13 +1,11 @@
-"""An outcome transform whose scale is given, not estimated from the targets."""
+"""An outcome transform whose shift and scale are given, not estimated from the targets."""
 
 from __future__ import annotations
 
 from typing import Self
 
 import torch
-from botorch.models.transforms.outcome import Standardize
-from botorch.posteriors import GPyTorchPosterior, Posterior, TransformedPosterior
-from gpytorch.settings import min_variance
+from botorch.models.transforms.outcome import OutcomeTransform, Standardize
 from torch import Tensor
 
 
@@ -20,7 +18,7 @@ class FixedStandardize(Standardize):
     """
 
     @classmethod
-    def of(cls, means: Tensor, stdvs: Tensor) -> FixedStandardize:
+    def from_moments(cls, means: Tensor, stdvs: Tensor) -> FixedStandardize:
         """Make the transform from ``batch_shape x 1 x m`` shifts and (positive) scales."""
         transform = cls(m=means.shape[-1], batch_shape=means.shape[:-2])
         transform.means = means
@@ -29,41 +27,45 @@ class FixedStandardize(Standardize):
         transform._is_trained = torch.tensor(True)
         return transform.eval()
 
+    @classmethod
+    def from_residual(cls, train_Y: Tensor, mean: Tensor) -> FixedStandardize:
+        """Divide by the root mean square of ``train_Y - mean``.
+
+        Args:
+            train_Y: Targets, ``batch_shape x n x m``, NaN where there is none.
+            mean: The prior mean at the training inputs, of the same shape. Where it meets the
+                targets exactly, the scale is a millionth of theirs (or 1 if they are zero).
+        """
+
+        def rms(values: Tensor) -> Tensor:
+            return values.square().nanmean(-2, keepdim=True).sqrt()
+
+        scale, size = rms(train_Y - mean), rms(train_Y)
+        tiny = 1e-6 * size.where(size > 0, torch.full_like(size, 1e6))
+        return cls.from_moments(torch.zeros_like(scale), scale.where(scale > 0, tiny))
+
+    @classmethod
+    def from_transform(
+        cls, transform: OutcomeTransform | None, train_Y: Tensor, X: Tensor
+    ) -> FixedStandardize | None:
+        """Take over the shift and scale that BoTorch's ``Standardize`` puts on the targets.
+
+        Raises:
+            ValueError: If the transform is not a shift and scale of each output.
+        """
+        if transform is None or type(transform) is FixedStandardize:
+            return transform
+        if type(transform) is not Standardize:
+            raise ValueError(
+                f"The outcome transform {type(transform).__name__} is not supported: f_p lives in "
+                "the units of the targets, so the transform must be one shift and scale per "
+                "output. Use Standardize, None, or the default, which divides by the residual's "
+                "scale; to model log(y), say, take the logarithm of both train_Y and the physics."
+            )
+        transform.train()
+        transform(train_Y, X=X)
+        return cls.from_moments(transform.means, transform.stdvs)
+
     def train(self, mode: bool = True) -> Self:
         """Stay in eval mode: there is nothing to estimate."""
         return super().train(False)
-
-    def untransform_posterior(
-        self, posterior: Posterior, X: Tensor | None = None
-    ) -> GPyTorchPosterior | TransformedPosterior:
-        """Bring a posterior back to the user's units; its variance is right however small."""
-        untransformed = super().untransform_posterior(posterior, X=X)
-        if type(untransformed) is GPyTorchPosterior:
-            return RescaledPosterior(untransformed.distribution, posterior, self._stdvs_sq)
-        return untransformed
-
-
-class RescaledPosterior(GPyTorchPosterior):
-    """A posterior in the user's units whose variance is computed in the model's.
-
-    GPyTorch raises every variance to an absolute minimum (1e-10), which small units and noise-free
-    data would fall below. ``.variance`` is free of that; what is computed from ``.distribution``,
-    by a posterior transform, say, is not: bring targets far below 1e-4 to larger units.
-
-    Args:
-        distribution: The distribution in the user's units.
-        scaled: The posterior in the model's units.
-        factor: What its variance is to be multiplied by, ``batch_shape x 1 x m``.
-    """
-
-    def __init__(self, distribution: object, scaled: GPyTorchPosterior, factor: Tensor) -> None:
-        super().__init__(distribution)
-        self._scaled = scaled
-        self._factor = factor
-
-    @property
-    def variance(self) -> Tensor:
-        """The posterior variance, ``batch_shape x q x m``."""
-        with min_variance(double_value=0.0):
-            variance: Tensor = self._scaled.variance * self._factor
-        return variance

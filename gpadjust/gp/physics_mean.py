@@ -7,8 +7,8 @@ from collections.abc import Callable
 from gpytorch.means import Mean
 from torch import Tensor
 
-from gpadjust.gp.readers import PhysicsColumn, as_reader
-from gpadjust.physics import Physics
+from gpadjust.gp.physics_columns import CalledPhysics
+from gpadjust.physics import Physics, as_physics
 
 
 class PhysicsMean(Mean):
@@ -32,12 +32,10 @@ class PhysicsMean(Mean):
     """
 
     def __init__(
-        self,
-        physics: Physics | Callable[[Tensor], Tensor] | PhysicsColumn,
-        output: int | None = None,
+        self, physics: Physics | Callable[[Tensor], Tensor], output: int | None = None
     ) -> None:
         super().__init__()
-        self.physics = as_reader(physics, output)
+        self.physics = CalledPhysics(as_physics(physics), output)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return f_p at ``x`` (``... x n x d``) as ``... x n``."""

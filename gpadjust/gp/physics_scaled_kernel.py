@@ -10,10 +10,10 @@ import torch
 from gpytorch.kernels import Kernel
 from linear_operator import to_dense
 from linear_operator.operators import LinearOperator
-from torch import Size, Tensor
+from torch import Tensor
 
-from gpadjust.gp.readers import PhysicsColumn, as_reader
-from gpadjust.physics import Physics
+from gpadjust.gp.physics_columns import CalledPhysics
+from gpadjust.physics import Physics, as_physics
 
 
 class PhysicsScaledKernel(Kernel):
@@ -45,14 +45,14 @@ class PhysicsScaledKernel(Kernel):
     def __init__(
         self,
         base_kernel: Kernel,
-        physics: Physics | Callable[[Tensor], Tensor] | PhysicsColumn,
+        physics: Physics | Callable[[Tensor], Tensor],
         output: int | None = None,
         active_dims: tuple[int, ...] | None = None,
     ) -> None:
         # No batch shape of its own: the base kernel carries it, so that indexing can shrink it.
         super().__init__(active_dims=active_dims)
         self.base_kernel = base_kernel
-        self.physics = as_reader(physics, output)
+        self.physics = CalledPhysics(as_physics(physics), output)
 
     @property
     def is_stationary(self) -> bool:
@@ -80,15 +80,13 @@ class PhysicsScaledKernel(Kernel):
 
     def __getitem__(self, index: Any) -> PhysicsScaledKernel:
         """The kernel of a part of the batch."""
-        return self._with(self.base_kernel[index], self.physics[index])
+        return self._with(self.base_kernel[index])
 
     def expand_batch(self, *sizes: Any) -> PhysicsScaledKernel:
         """The kernel with its batch expanded to ``sizes``."""
-        shape = Size(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else Size(sizes)
-        return self._with(self.base_kernel.expand_batch(shape), self.physics.expand_batch(shape))
+        return self._with(self.base_kernel.expand_batch(*sizes))
 
-    def _with(self, base_kernel: Kernel, physics: Any) -> PhysicsScaledKernel:
+    def _with(self, base_kernel: Kernel) -> PhysicsScaledKernel:
         new = deepcopy(self)
         new.base_kernel = base_kernel
-        new.physics = physics
         return new

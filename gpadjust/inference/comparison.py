@@ -5,44 +5,68 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from botorch.models.transforms.input import InputTransform
+from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 from tqdm import tqdm
 
-from gpadjust.inference.maximisation import FitResult, maximise
+from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.inference.objective import Objective
-from gpadjust.models import CKA, RRA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.models.multi_output_gp import MultiOutputGP
-from gpadjust.physics import Physics, as_physics
+from gpadjust.models import CKA, RRA, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.models.training_data import ArrayLike, training_data
+from gpadjust.physics import JoinedPhysics, Physics, as_physics
+from gpadjust.threads import threads_for
 from gpadjust.validation import leave_one_out
 
 Criterion = Literal["leave-one-out", "evidence"]
 
-_STRUCTURES: dict[str, Callable[..., MultiOutputGP]] = {
-    "zero mean": lambda *data, physics, **options: ZeroMeanGP(*data, **options),
-    "physics mean": PhysicsMeanGP,
-    "constant rho": lambda *data, **options: PhysicsMeanGP(
-        *data, learn_rho_mean=True, learn_delta_mean=True, **options
+class Structure(NamedTuple):
+    """A way to adjust a physics, one of those that :func:`compare` fits.
+
+    Attributes:
+        name: Its name.
+        build: Makes the model of ``train_X, train_Y, train_Yvar`` with the keyword arguments
+            ``physics`` and ``input_transform``.
+        unknowns: How many constant means are unknown, for one physics.
+        uses_physics: Whether it reads the physics at all.
+        adjusts: Whether it does more than to take the physics as a mean.
+        joins: Whether it takes several physics at once.
+    """
+
+    name: str
+    build: Callable[..., ExactGPBase]
+    unknowns: int = 0
+    uses_physics: bool = True
+    adjusts: bool = True
+    joins: bool = True
+
+
+def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> ExactGPBase:
+    return ZeroMeanGP(*data, **options)
+
+
+STRUCTURES = (
+    Structure("zero mean", _zero_mean, uses_physics=False, adjusts=False, joins=False),
+    Structure("physics mean", PhysicsMeanGP, adjusts=False),
+    Structure(
+        "constant rho", partial(PhysicsMeanGP, rho_mean="learn", delta_mean="learn"), unknowns=2
     ),
-    "CKA": CKA,
-    "CKA centred": lambda *data, **options: CKA(*data, center="mean", **options),
-    "CKA centred, learnt rho mean": lambda *data, **options: CKA(
-        *data, center="mean", learn_rho_mean=True, **options
+    Structure("CKA", CKA),
+    Structure("CKA centred", partial(CKA, center="mean")),
+    Structure(
+        "CKA centred, learnt rho mean", partial(CKA, center="mean", rho_mean="learn"), unknowns=1
     ),
-    "RRA": RRA,
-}
-STRUCTURES = tuple(_STRUCTURES)
-"""The names of the structures that :func:`compare` knows."""
-_UNKNOWNS = {"constant rho": 2, "CKA centred, learnt rho mean": 1}  # constant means
-_WITHOUT_PHYSICS = ("zero mean",)
-# Without physics these are the zero mean; the others have a kernel or a constant of their own.
-_COMPARABLE = ("physics mean", "CKA", "CKA centred", "CKA centred, learnt rho mean")
-_WITHOUT_ADJUSTMENT = ("zero mean", "physics mean")
+    Structure("RRA", RRA),
+)
+"""The structures that :func:`compare` knows; add your own to them."""
 _ENOUGH = 3  # observations for each hyper-parameter; with fewer, point fits are found too sure
 _SURE = 2.0  # standard errors that a difference takes to be real
 
@@ -84,7 +108,7 @@ class Comparison:
         advice: What the comparison says about the physics, in sentences.
     """
 
-    models: dict[str, MultiOutputGP]
+    models: dict[str, ExactGPBase]
     table: list[Candidate]
     criterion: Criterion
     advice: list[str]
@@ -98,7 +122,7 @@ class Comparison:
         return _best([row.structure for row in self.table])
 
     @property
-    def best(self) -> MultiOutputGP:
+    def best(self) -> ExactGPBase:
         """The fitted model of the best structure."""
         return self.models[self.chosen]
 
@@ -116,13 +140,13 @@ class Comparison:
 
 
 def compare(
-    train_X: Tensor,
-    train_Y: Tensor,
-    physics: Physics | Callable[[Tensor], Tensor],
-    train_Yvar: Tensor | None = None,
+    train_X: ArrayLike,
+    train_Y: ArrayLike,
+    physics: PhysicsLike,
+    train_Yvar: ArrayLike = None,
     *,
     input_transform: InputTransform | None = None,
-    structures: Sequence[str] = STRUCTURES,
+    structures: Sequence[str | Structure] = STRUCTURES,
     criterion: Criterion = "leave-one-out",
     num_starts: int | None = None,
     num_screened: int | None = None,
@@ -141,6 +165,10 @@ def compare(
     ``"RRA"``                           on random features, :class:`~gpadjust.RRA`
     ==================================  ===========================================================
 
+    Of several physics each structure is fitted to each of them alone, ``"CKA of coarse"`` and so
+    on, and to all at once, ``"CKA of all"``; the advice says which physics the data prefer, and
+    where (by the mean size of each rho in the halves of each input's range).
+
     Two numbers tell how good a structure is: its *evidence*, the marginal likelihood at the best
     hyper-parameters, and the *leave-one-out* log predictive density, which judges predictions and
     minds neither the number of hyper-parameters nor how vague their priors are. Where they
@@ -148,12 +176,13 @@ def compare(
     approximates, is chosen in its place.
 
     Args:
-        train_X: Inputs, ``n x d``, float64.
-        train_Y: Targets, ``n x m``, float64; one structure is chosen for all outputs.
-        physics: The physics f_p, as in :class:`~gpadjust.CKA`.
-        train_Yvar: Known observation variances, ``n x m``, or None to learn the noise.
-        input_transform: As in :class:`~gpadjust.CKA`.
-        structures: Which to fit.
+        train_X: Inputs, ``n x d``, as in :class:`~gpadjust.CKA`.
+        train_Y: Targets, ``n x m``; one structure is chosen for all outputs.
+        physics: The physics f_p, or several, as in :class:`~gpadjust.CKA`. Each model has a copy of
+            its own, where it has parameters.
+        train_Yvar: Known observation variances, as in :class:`~gpadjust.CKA`.
+        input_transform: As in :class:`~gpadjust.CKA`; each model has a copy of its own.
+        structures: Which to fit: names, or a :class:`Structure` of your own.
         criterion: ``"leave-one-out"`` or ``"evidence"``, what to rank them by.
         num_starts: As in :func:`~gpadjust.fit`.
         num_screened: As in :func:`~gpadjust.fit`.
@@ -182,63 +211,132 @@ def compare(
         'CKA'
         >>> mean, variance = comparison.best.predict(X)
     """
-    if isinstance(structures, str):
-        structures = [structures]
-    structures = list(dict.fromkeys(structures))
-    unknown = [name for name in structures if name not in _STRUCTURES]
-    if unknown or not structures:
-        raise ValueError(
-            f"Unknown structures {unknown}; expected some of {', '.join(map(repr, STRUCTURES))}."
-        )
+    chosen = _known(structures)
     if criterion not in ("leave-one-out", "evidence"):
         raise ValueError(
             f"Unknown criterion {criterion!r}; expected 'leave-one-out' or 'evidence'."
         )
-    if isinstance(train_X, Tensor) and train_X.dim() > 2:
+    data = training_data(train_X, train_Y, train_Yvar)
+    if data.X.dim() > 2:
         raise ValueError(
-            f"Expected one data set, train_X of n x d, got shape {tuple(train_X.shape)}; compare "
+            f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
             "the data sets of a batch one by one."
         )
-    physics = as_physics(physics)
-    models: dict[str, MultiOutputGP] = {}
+    candidates = _candidates(chosen, as_physics(physics))
+    models: dict[str, ExactGPBase] = {}
     rows: list[Candidate] = []
     densities: dict[str, Tensor] = {}
-    for name in tqdm(structures, disable=not progress, unit="structure"):
-        if name in _UNKNOWNS and train_X.shape[-2] < 2 + _UNKNOWNS[name] and len(structures) > 1:
+    for structure, part in tqdm(candidates, disable=not progress, unit="structure"):
+        parts = len(part.parts) if isinstance(part, JoinedPhysics) else 1
+        unknowns = structure.unknowns + (parts - 1 if parts > 1 else 0)
+        if unknowns and len(data.X) < 2 + unknowns and len(candidates) > 1:
             continue  # too few points for its unknown constants
-        model = _STRUCTURES[name](
-            train_X, train_Y, train_Yvar, physics=physics, input_transform=input_transform
+        model = structure.build(
+            train_X,
+            train_Y,
+            train_Yvar,
+            physics=deepcopy(part),
+            input_transform=deepcopy(input_transform),
         )
-        with warnings.catch_warnings():
+        search = Search(num_starts, num_screened, seed=seed)
+        with warnings.catch_warnings(), threads_for(len(data.X)):
             warnings.simplefilter("ignore", OptimizationWarning)
-            result = maximise(Objective(model), num_starts, num_screened, 500, seed)
-        models[name] = model
-        row, densities[name] = _judge(name, model, result)
+            result = maximise(Objective(model), search)
+            row, densities[structure.name] = _judge(structure, model, result)
+        models[structure.name] = model
         rows.append(row)
     key = "evidence" if criterion == "evidence" else "log_predictive"
     rows.sort(key=lambda row: _or_worst(getattr(row, key)), reverse=True)
-    return Comparison(models, rows, criterion, _advice(rows, densities))
+    by_name = {structure.name: structure for structure, _ in candidates}
+    advice = _advice(rows, densities, by_name)
+    best = models[_best([row.structure for row in rows])]
+    if isinstance(as_physics(physics), JoinedPhysics):
+        advice.extend(_preferred(best, data.X))
+    return Comparison(models, rows, criterion, advice)
+
+
+def _known(structures: Sequence[str | Structure]) -> list[Structure]:
+    """The structures that are asked for, each once."""
+    names = {structure.name: structure for structure in STRUCTURES}
+    given = [structures] if isinstance(structures, str | Structure) else [*structures]
+    unknown = [s for s in given if not isinstance(s, Structure) and s not in names]
+    if unknown or not given:
+        raise ValueError(
+            f"Unknown structures {unknown}; expected some of {', '.join(map(repr, names))}, or a "
+            "Structure of your own."
+        )
+    found = [s if isinstance(s, Structure) else names[s] for s in given]
+    return list({structure.name: structure for structure in found}.values())
+
+
+def _candidates(
+    structures: list[Structure], physics: Physics
+) -> list[tuple[Structure, Physics]]:
+    """What is to be fitted: structures of one physics, or of each of several and of all."""
+    if not isinstance(physics, JoinedPhysics):
+        return [(structure, physics) for structure in structures]
+    candidates: list[tuple[Structure, Physics]] = []
+    for structure in structures:
+        if not structure.uses_physics:
+            candidates.append((structure, physics))
+            continue
+        of = [*zip(physics.names, physics.parts, strict=True)]
+        of += [("all", physics)] if structure.joins else []
+        for name, part in of:
+            named = structure._replace(name=f"{structure.name} of {name}")
+            candidates.append((named, part))
+    return candidates
+
+
+def _preferred(model: ExactGPBase, X: Tensor) -> list[str]:
+    """Which physics a model of several relies on, and where."""
+    names = getattr(model, "rho_names", ())
+    if len(names) < 2:
+        return []
+    with torch.no_grad():
+        if set(names) <= set(model.term_names):
+            sizes = torch.stack([model.term(n, X).mean.abs().mean(-1) for n in names])  # k x n
+        else:
+            sizes = torch.tensor([abs(model.term_mean(n)) for n in names]).unsqueeze(-1)
+            sizes = sizes.expand(-1, len(X)).to(X)
+    labels = [name.removeprefix("rho_") for name in names]
+    overall = sizes.mean(-1)
+    shares = ", ".join(f"{n} {w:.2g}" for n, w in zip(labels, overall.tolist(), strict=True))
+    sentences = [f"Mean size of rho at the data: {shares}."]
+    for i in range(X.shape[-1]):
+        low = X[:, i] <= X[:, i].median()
+        if low.all():
+            continue
+        first, second = sizes[:, low].mean(-1), sizes[:, ~low].mean(-1)
+        a, b = int(first.argmax()), int(second.argmax())
+        if a != b:
+            sentences.append(
+                f"Below the median of {model.input_names[i]} the data prefer {labels[a]}, above it "
+                f"{labels[b]}."
+            )
+    return sentences
 
 
 def _best(order: list[str]) -> str:
     """The first of an order, but CKA itself rather than its approximation."""
-    return next((name for name in order if name != "RRA" or "CKA" not in order), order[0])
+    return next((n for n in order if "RRA" not in n or n.replace("RRA", "CKA") not in order), order[0])
 
 
-def _judge(name: str, model: MultiOutputGP, result: FitResult) -> tuple[Candidate, Tensor]:
+def _judge(structure: Structure, model: ExactGPBase, result: FitResult) -> tuple[Candidate, Tensor]:
     """The row of a fitted model, and the leave-one-out log densities of all observations."""
     loo = leave_one_out(model)
-    normal = torch.distributions.Normal(loo.mean, loo.variance.sqrt())
-    densities = normal.log_prob(loo.Y).flatten()
+    observed = ~loo.Y.isnan()
+    normal = torch.distributions.Normal(loo.mean, loo.variance.sqrt(), validate_args=False)
+    densities = normal.log_prob(loo.Y)[observed]
     # Likelihoods are in the units of the model's targets, which differ between structures.
     scale: Any = getattr(model, "outcome_transform", None)
-    units = 0.0 if scale is None else len(loo.Y) * scale.stdvs.log().sum().item()
-    spread = loo.Y.std(-2)
+    units = 0.0 if scale is None else (observed * scale.stdvs.log()).sum().item()
+    spread = nanstd(loo.Y, dim=-2)
     relative = loo.rmse / spread.where(spread > 0, torch.ones_like(spread))
     learnt = sum(p.numel() for p in model.parameters() if p.requires_grad)
-    learnt += len(model.constant_means) * model.num_outputs
+    learnt += sum(term.learns_mean for term in model.terms) * model.num_outputs
     row = Candidate(
-        name,
+        structure.name,
         result.log_likelihood.sum().item() - units,
         densities.sum().item(),
         relative.mean().item(),
@@ -249,7 +347,9 @@ def _judge(name: str, model: MultiOutputGP, result: FitResult) -> tuple[Candidat
     return row, densities
 
 
-def _advice(rows: list[Candidate], densities: dict[str, Tensor]) -> list[str]:
+def _advice(
+    rows: list[Candidate], densities: dict[str, Tensor], structures: dict[str, Structure]
+) -> list[str]:
     """What the ranking says about the physics."""
     order = [row.structure for row in rows]
     best = next(row for row in rows if row.structure == _best(order))
@@ -270,8 +370,11 @@ def _advice(rows: list[Candidate], densities: dict[str, Tensor]) -> list[str]:
     def first(names: Callable[[str], bool]) -> str | None:
         return next((name for name in order if names(name)), None)
 
-    with_physics = first(lambda name: name in _COMPARABLE)
-    without = first(lambda name: name in _WITHOUT_PHYSICS)
+    # RRA without physics would be another model than the zero mean.
+    with_physics = first(
+        lambda name: structures[name].uses_physics and not name.startswith(("RRA", "constant"))
+    )
+    without = first(lambda name: not structures[name].uses_physics)
     if with_physics and without:
         value, error = gain(with_physics, without)
         if value <= _SURE * error:
@@ -281,9 +384,10 @@ def _advice(rows: list[Candidate], densities: dict[str, Tensor]) -> list[str]:
                 f"{error:.1f} nats). Check its units and inputs, or leave it out."
             )
             return sentences
-    adjusted = first(lambda name: name not in _WITHOUT_ADJUSTMENT)
-    if adjusted and "physics mean" in order:
-        value, error = gain(adjusted, "physics mean")
+    adjusted = first(lambda name: structures[name].adjusts)
+    plain = first(lambda name: name.startswith("physics mean"))
+    if adjusted and plain:
+        value, error = gain(adjusted, plain)
         if value <= _SURE * error:
             sentences.append(
                 f"As far as these data tell, scaling the physics ({adjusted}) is no better than "

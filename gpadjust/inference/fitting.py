@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict, Unpack, get_args, overload
+from typing import Any, Literal, TypedDict, Unpack, overload
 
 from botorch.models import ModelListGP
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from botorch.utils.transforms import is_fully_bayesian
 
-from gpadjust.inference.maximisation import FitResult, maximise
+from gpadjust.inference.full_bayes import SampleResult, sample
+from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.inference.objective import Objective
-from gpadjust.inference.sampling import Sampler, SampleResult, sample
+from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES
+from gpadjust.threads import threads_for
 
-_WARMUP = {"hmc": 40, "nuts": 200}
+Method = Literal["map", "hmc"]
+
+# Least values of the options of each method.
+_SEARCH = {"num_starts": 1, "num_screened": 0, "max_iterations": 1, "seed": 0}
+_OPTIONS: dict[str, dict[str, int]] = {
+    "map": _SEARCH,
+    "hmc": {**_SEARCH, "num_samples": 1, "num_warmup": 8, "progress": 0},
+}
 
 
 class FitOptions(TypedDict, total=False):
@@ -21,9 +30,9 @@ class FitOptions(TypedDict, total=False):
     num_starts: int | None
     num_screened: int | None
     max_iterations: int
-    num_samples: int
-    num_warmup: int | None
     seed: int
+    num_samples: int
+    num_warmup: int
     progress: bool
 
 
@@ -37,65 +46,55 @@ def fit(
 
 @overload
 def fit(
-    model: BatchedMultiOutputGPyTorchModel, method: Sampler, **options: Unpack[FitOptions]
+    model: BatchedMultiOutputGPyTorchModel, method: Literal["hmc"], **options: Unpack[FitOptions]
 ) -> SampleResult: ...
 
 
 @overload
 def fit(
-    model: ModelListGP,
-    method: Literal["map"] | Sampler = ...,
-    **options: Unpack[FitOptions],
+    model: ModelListGP, method: Method = ..., **options: Unpack[FitOptions]
 ) -> list[FitResult | SampleResult]: ...
 
 
 def fit(
     model: BatchedMultiOutputGPyTorchModel | ModelListGP,
-    method: Literal["map"] | Sampler = "map",
-    *,
-    num_starts: int | None = None,
-    num_screened: int | None = None,
-    max_iterations: int = 500,
-    num_samples: int = 64,
-    num_warmup: int | None = None,
-    seed: int = 0,
-    progress: bool = False,
+    method: Method = "map",
+    **options: Unpack[FitOptions],
 ) -> FitResult | SampleResult | list[FitResult | SampleResult]:
     """Fit a model's hyper-parameters, in place: to their most likely values, or by sampling them.
 
     ``"map"``: Random starts are screened in one batch beside the model's current parameters;
     L-BFGS then runs from the best of them, for all outputs in lockstep, on a likelihood whose
     overall scale (and constant means, where they are unknown) is at its optimum in closed form.
-    Starts and bounds follow the data's scales, so that units of inputs, targets and physics make
-    no difference. The result is never less likely than the parameters that the model came with.
-    Priors registered on the model are honoured (maximum a posteriori, otherwise maximum
-    likelihood); parameters with ``requires_grad=False`` stay.
+    With more than some 150 points the search is made on 128 of them, and its best optima are
+    refined on all. Starts and bounds follow the data's scales, so that units of inputs, targets
+    and physics make no difference. The result is never less likely than the parameters that the
+    model came with. Priors registered on the model are honoured (maximum a posteriori, otherwise
+    maximum likelihood); parameters with ``requires_grad=False`` stay.
 
-    ``"hmc"`` and ``"nuts"``: Full Bayes. With few data (about five points per input, say) the
-    intervals of a point estimate are too narrow; those of a mixture over the hyper-parameters'
-    posterior are far closer to what they say. ``"hmc"`` runs 16 chains of Hamiltonian Monte Carlo
-    in one batch, and takes about five times as long as ``"map"``; ``"nuts"`` is Pyro's sampler, two
-    chains one after the other, of the same posterior: far slower, and slow to mix under vague
-    priors. Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`. The
-    model then is a fully Bayesian model as BoTorch has them: its posterior is a
-    ``GaussianMixturePosterior``, and acquisition functions
-    average over the samples.
+    ``"hmc"``: Full Bayes. With few data (about five points per input, say) the intervals of a point
+    estimate are too narrow; those of a mixture over the hyper-parameters' posterior are far closer
+    to what they say. 16 chains of Hamiltonian Monte Carlo run in one batch, which takes about five
+    times as long as ``"map"``. Parameters without a prior get that of
+    :func:`~gpadjust.inference.register_priors`. The model then is a fully Bayesian model as BoTorch
+    has them: its posterior is a ``GaussianMixturePosterior``, and acquisition functions average
+    over the samples.
+
+    Small problems are computed with one thread; the user's setting is restored after.
 
     Args:
         model: Any model of this library, any BoTorch model with batched outputs such as
             ``SingleTaskGP`` (for ``"map"``), or a ``ModelListGP`` of them.
-        method: ``"map"``, ``"hmc"`` or ``"nuts"``.
-        num_starts: Number of starts that L-BFGS is run from, for each output. Default: 16; 8 if the
-            physics learns, which is evaluated at one setting after the other.
-        num_screened: Number of random starts that are screened; 0 fits from the current
-            parameters alone (a warm start). Default: 256, fewer for more than 100 points; 32 if
-            the physics learns.
-        max_iterations: Limit of L-BFGS iterations from each start.
-        num_samples: Number of samples that the model is to hold; sampling only.
-        num_warmup: Number of iterations that adapt the sampler; sampling only. Default: 40 for
-            ``"hmc"``, 200 for ``"nuts"``.
-        seed: Seed of the random starts and the sampler. The global random state is left alone.
-        progress: Whether to show a progress bar of the sampler.
+        method: ``"map"`` or ``"hmc"``.
+        options: ``num_starts``, the number of starts that L-BFGS is run from, for each output
+            (default: 16; 8 if the physics learns, which is evaluated at one vector after the
+            other). ``num_screened``, the number of random starts that are screened; 0 fits from
+            the current parameters alone, a warm start (default: 256, fewer for more than 100
+            points; 32 if the physics learns). ``max_iterations``, the limit of L-BFGS iterations
+            from each start (500). ``seed`` of random starts and sampler (0); the global random
+            state is left alone. Of ``"hmc"`` only: ``num_samples`` that the model is to hold (64),
+            ``num_warmup`` iterations that adapt the sampler (40), and ``progress``, whether to show
+            a bar (False).
 
     Returns:
         For ``"map"`` the likelihood reached and whether the optimiser converged, otherwise the
@@ -103,9 +102,9 @@ def fit(
         eval mode.
 
     Raises:
-        TypeError: If the model is of another kind.
-        ValueError: If an option is out of range, no parameter is learnable, or a model whose
-            outputs share parameters is to be sampled.
+        TypeError: If the model is of another kind, or an option is no whole number.
+        ValueError: If an option is out of range or not one of the method, no parameter is
+            learnable, or a model whose outputs share parameters is to be sampled.
         RuntimeError: If the likelihood cannot be evaluated anywhere (the model is left unchanged),
             or the model holds samples already.
 
@@ -113,31 +112,11 @@ def fit(
         OptimizationWarning: If the optimiser did not converge.
         SamplingWarning: If the chains did not mix.
     """
-    if method not in ("map", *get_args(Sampler)):
-        raise ValueError(f"Unknown method {method!r}; expected 'map', 'hmc' or 'nuts'.")
-    for name, value, least in (
-        ("num_starts", num_starts, 1),
-        ("num_screened", num_screened, 0),
-        ("max_iterations", max_iterations, 1),
-        ("num_samples", num_samples, 1),
-        ("num_warmup", num_warmup, 8),
-    ):
-        if value is not None and value < least:
-            raise ValueError(f"Expected {name} >= {least}, got {value}.")
+    _check(method, dict(options))
     if isinstance(model, ModelListGP):
         results: list[FitResult | SampleResult] = []
         for part in model.models:
-            result = fit(
-                part,
-                method,
-                num_starts=num_starts,
-                num_screened=num_screened,
-                max_iterations=max_iterations,
-                num_samples=num_samples,
-                num_warmup=num_warmup,
-                seed=seed,
-                progress=progress,
-            )
+            result = fit(part, method, **options)
             results.extend(result if isinstance(result, list) else [result])
         return results
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
@@ -146,19 +125,33 @@ def fit(
             f"ModelListGP of them, got {type(model).__name__}."
         )
     if is_fully_bayesian(model):
-        raise RuntimeError(
-            "The model holds samples of its hyper-parameters already; build it anew to fit it."
+        raise RuntimeError(HOLDS_SAMPLES)
+    search = Search(**{name: value for name, value in options.items() if name in _SEARCH})
+    with threads_for(model.train_targets.shape[-1]):
+        if method == "map":
+            return maximise(Objective(model), search)
+        return sample(
+            model,
+            search,
+            options.get("num_samples", 64),
+            options.get("num_warmup", 40),
+            options.get("progress", False),
         )
-    if method == "map":
-        return maximise(Objective(model), num_starts, num_screened, max_iterations, seed)
-    if num_warmup is None:
-        num_warmup = _WARMUP[method]
-    return sample(
-        model,
-        method,
-        lambda target: maximise(target, num_starts, num_screened, max_iterations, seed),
-        num_samples,
-        num_warmup,
-        seed,
-        progress,
-    )
+
+
+def _check(method: str, options: dict[str, Any]) -> None:
+    """Raise what :func:`fit` raises of its options."""
+    if method not in _OPTIONS:
+        raise ValueError(f"Unknown method {method!r}; expected 'map' or 'hmc'.")
+    known = _OPTIONS[method]
+    for name, value in options.items():
+        if name not in known:
+            others = [other for other, names in _OPTIONS.items() if name in names]
+            hint = f"it is one of method {others[0]!r}" if others else f"expected {', '.join(known)}"
+            raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
+        if value is None and name in ("num_starts", "num_screened"):
+            continue
+        if not isinstance(value, int):
+            raise TypeError(f"Expected {name} to be a whole number, got {value!r}.")
+        if value < known[name]:
+            raise ValueError(f"Expected {name} >= {known[name]}, got {value}.")

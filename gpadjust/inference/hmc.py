@@ -101,7 +101,7 @@ def hmc(
             f, g = potential(x)
             v = v - (0.5 if inner == num_steps - 1 else 1.0) * _transposed(stretch, g)
         change = energy - f - 0.5 * v.square().sum(-1)
-        rate = change.nan_to_num(-math.inf, -math.inf, -math.inf).clamp_max(0).exp()
+        rate = _rate(change, value)
         position, value, gradient = move(uniform() < rate, (x, f, g))
         if mean is not None:
             # A step to anywhere under the Gaussian, which may lead to another mode.
@@ -112,7 +112,7 @@ def hmc(
                 root, (position - mean).unsqueeze(-1), upper=False
             ).squeeze(-1)
             log_ratio = value - f + 0.5 * ((white.square() - here.square()).sum(-1) / _INFLATION**2)
-            position, value, gradient = move(uniform().log() < log_ratio, (x, f, g))
+            position, value, gradient = move(uniform() < _rate(log_ratio, value), (x, f, g))
         if warm:
             history.append(position)
             step.update(rate.mean(0))
@@ -125,6 +125,17 @@ def hmc(
             accepted += rate.mean(0) / num_iterations
         progress()
     return Draws(torch.stack(kept), accepted)
+
+
+def _rate(log_ratio: Tensor, value: Tensor) -> Tensor:
+    """Acceptance rates from their logarithms, which are NaN or infinite where a potential is.
+
+    From where the potential is infinite any step is taken to where it is not, or a chain that
+    starts there would stand still.
+    """
+    escapes = value.isinf() & (log_ratio == math.inf)
+    rate = log_ratio.nan_to_num(-math.inf, -math.inf, -math.inf).clamp_max(0).exp()
+    return rate.masked_fill(escapes, 1.0)
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

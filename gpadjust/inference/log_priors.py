@@ -3,89 +3,78 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.priors import LogNormalPrior, NormalPrior
-from torch import Size, Tensor
+from torch import Tensor
 from torch.func import functional_call
 from torch.nn import Module
 
-from gpadjust.inference.parameters import LogScale, Parameters
+from gpadjust.inference.log_parameters import LogParameters
 
 
 class LogPriors:
-    """The sum of the log densities of the priors registered on a model, at settings of it.
+    """The sum of the log densities of the priors registered on a model, at vectors of it.
 
-    They are densities of the hyper-parameters themselves, as GPyTorch has it, or of the settings,
+    They are densities of the hyper-parameters themselves, as GPyTorch has it, or of the vectors,
     their logarithms: the log determinant between the two is the sum of the latter. Where all of
     them are log-normal (or normal, of a parameter that is not taken as its logarithm) they are
     computed and differentiated by hand.
 
     Args:
         model: The model.
-        names: The parameters that settings consist of.
-        batch_shape: The shape whose elements are the problems, or empty for one problem.
-        unflatten: Unpacks settings ``k x B x p`` into parameters.
-        flatten: Packs one tensor for each parameter, with a leading dimension, into ``k x B x p``.
-        of_settings: Whether densities are those of the settings.
+        parameters: Its learnable parameters.
+        of_logs: Whether densities are those of the vectors' elements.
     """
 
     def __init__(
         self,
         model: BatchedMultiOutputGPyTorchModel,
-        names: list[str],
-        batch_shape: Size,
-        unflatten: Callable[[Tensor], Parameters],
-        flatten: Callable[[Parameters], Tensor],
-        of_settings: bool = False,
+        parameters: LogParameters,
+        of_logs: bool = False,
     ) -> None:
-        self._scale = LogScale(model)
+        self._parameters = parameters
         self._priors = _Priors(model)
-        self._batch_shape = batch_shape
-        self._unflatten = unflatten
-        has_priors = next(iter(model.named_priors()), None) is not None
-        self.any = has_priors or of_settings
-        # What the density of the settings has in addition, by each of them.
-        like = {name: self._scale.current(name).unsqueeze(0) for name in names}
-        self._slope = flatten(
-            {n: torch.full_like(v, of_settings and self._scale.covers(n)) for n, v in like.items()}
+        # What the density of the logarithms has in addition, by each of them.
+        values = {name: parameters.value(name).unsqueeze(0) for name in parameters.names}
+        self._slope = parameters.flatten(
+            {n: torch.full_like(v, of_logs and parameters.is_log(n)) for n, v in values.items()}
         )[0]
         self._normal: _Normal | None = None
-        if has_priors:
-            found = _normals(model, self._scale, names)
+        if has_priors(model):
+            found = _normals(model, parameters)
             if found is not None:
                 fields = ({n: f[i] for n, f in found.items()} for i in range(len(_Normal._fields)))
-                self._normal = _Normal(*(flatten(field)[0] for field in fields))
+                self._normal = _Normal(*(parameters.flatten(field)[0] for field in fields))
 
-    def __call__(self, settings: Tensor) -> Tensor:
-        """Return the log density at ``settings`` (``k x B x p``) as ``k x B``."""
-        between = (self._slope * settings).sum(-1)
+    def __call__(self, vectors: Tensor) -> Tensor:
+        """Return the log density at ``vectors`` (``k x B x p``) as ``k x B``."""
+        between = (self._slope * vectors).sum(-1)
         if self._normal is not None:
-            return self._normal.log_density(settings) + between
-        raw = self._scale.to_raw(self._unflatten(settings))
+            return self._normal.log_density(vectors) + between
+        raw = self._parameters.to_raw(self._parameters.unflatten(vectors))
         named = {f"model.{name}": value for name, value in raw.items()}
         densities: list[Tensor] = functional_call(self._priors, named, ())
-        batch = (len(settings), *self._batch_shape)
-        total = settings.new_zeros(batch)
+        batch = (len(vectors), *self._parameters.batch_shape)
+        total = vectors.new_zeros(batch)
         for density in densities:
-            # That of a parameter which is not learnt has no dimension of settings.
+            # That of a parameter which is not learnt has no dimension of vectors.
             shape = batch if density.dim() >= len(batch) else batch[1:]
             shape = shape if density.dim() >= len(shape) else ()
             total = total + density.reshape(*shape, -1).sum(-1)
-        return total.reshape(len(settings), -1) + between
+        return total.reshape(len(vectors), -1) + between
 
-    def with_gradient(self, settings: Tensor) -> tuple[Tensor, Tensor]:
+    def with_gradient(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Return the log density and its gradient, ``k x B`` and ``k x B x p``."""
         if self._normal is not None:
-            return self(settings), self._normal.gradient(settings) + self._slope
-        leaf = settings.detach().requires_grad_()
+            return self(vectors), self._normal.gradient(vectors) + self._slope
+        leaf = vectors.detach().requires_grad_()
         with torch.enable_grad():
             total = self(leaf)
         if not total.requires_grad:
-            return total, torch.zeros_like(settings)
+            return total, torch.zeros_like(vectors)
         return total.detach(), torch.autograd.grad(total.sum(), leaf)[0]
 
 
@@ -127,26 +116,31 @@ class _Priors(Module):
         ]
 
 
+def has_priors(model: BatchedMultiOutputGPyTorchModel) -> bool:
+    """Whether any prior is registered on a model."""
+    return next(iter(model.named_priors()), None) is not None
+
+
 def _normals(
-    model: BatchedMultiOutputGPyTorchModel, scale: LogScale, names: list[str]
+    model: BatchedMultiOutputGPyTorchModel, parameters: LogParameters
 ) -> dict[str, tuple[Tensor, Tensor, Tensor]] | None:
     """Location, precision and kind of the priors of all learnt parameters.
 
     None if a prior is of another form, or of a parameter that is not learnt.
     """
-    zero = {n: torch.zeros_like(scale.current(n)).unsqueeze(0) for n in names}
-    found = {name: (zero[name], zero[name], zero[name]) for name in names}
+    zero = {n: torch.zeros_like(parameters.value(n)).unsqueeze(0) for n in parameters.names}
+    found = {name: (zero[name], zero[name], zero[name]) for name in parameters.names}
     for full_name, module, prior, closure, _ in model.named_priors():
         path, _, leaf = full_name.removesuffix("_prior").rpartition(".")
         name = f"{path}.raw_{leaf}" if f"{path}.raw_{leaf}" in zero else f"{path}.{leaf}"
         of_log = type(prior) is LogNormalPrior
         if name not in zero or type(prior) not in (LogNormalPrior, NormalPrior):
             return None
-        value = scale.current(name)
+        value = parameters.value(name)
         expected = value.exp() if of_log else value
         read = closure(module).detach()
         if (
-            scale.covers(name) != of_log
+            parameters.is_log(name) != of_log
             or read.shape != value.shape
             or not torch.allclose(read, expected)
             or torch.broadcast_shapes(prior.loc.shape, value.shape) != value.shape

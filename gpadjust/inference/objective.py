@@ -1,26 +1,30 @@
-"""The negative log marginal likelihood of many hyper-parameter settings at once."""
+"""The negative log marginal likelihood of many hyper-parameter vectors at once."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
-from torch import Size, Tensor
+from torch import Tensor
 
-from gpadjust.gp import DataInterval
-from gpadjust.inference.gaussian_likelihood import (
-    Likelihood,
+from gpadjust.gp import SumOfTerms
+from gpadjust.gp.gaussian import (
+    LikelihoodValue,
+    cholesky,
     least_squares,
     negative_log_likelihood,
-    safe_cholesky,
+    nugget,
 )
-from gpadjust.inference.log_priors import LogPriors
-from gpadjust.inference.parameters import LogScale, Parameters
-from gpadjust.inference.prior_moments import ModuleMoments, Moments
-from gpadjust.inference.stationary_moments import StationaryMoments
-from gpadjust.models.multi_output_gp import MultiOutputGP
-from gpadjust.models.parameter_scales import kind
+from gpadjust.inference.closed_form import ClosedForm
+from gpadjust.inference.log_parameters import LogParameters, Parameters
+from gpadjust.inference.log_priors import LogPriors, has_priors
+from gpadjust.inference.target_distribution import (
+    ModuleDistribution,
+    TargetDistribution,
+    known_noise_of,
+)
 from gpadjust.physics import PhysicsError
 
 _VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
@@ -28,257 +32,253 @@ _AT_ONCE = 2**20  # numbers in the covariances of a batch; larger ones make memo
 
 
 class Objective:
-    r"""Negative log marginal likelihood, less the log priors, of settings of a model.
+    r"""Negative log marginal likelihood, less the log priors, of a model's hyper-parameters.
 
     .. math:: \tfrac12 (y - m)^T K^{-1} (y - m) + \tfrac12 \log|K| + \tfrac n2 \log 2\pi
 
-    A model's outputs (and batches) have their own hyper-parameters each, and are ``B`` problems
-    apart; the model is evaluated at ``k`` settings of all of them in one batch. Where parameters
-    are shared, by several outputs or with the input transform (a physics that learns), the outputs
-    make up one problem, ``B = 1``, and the settings are evaluated one after the other.
+    It is evaluated at ``k`` vectors of all ``B`` problems in one batch
+    (:class:`~gpadjust.inference.log_parameters.LogParameters`); where outputs share parameters,
+    one vector after the other.
 
     Where all variances are learnt without priors, their overall scale is *concentrated* out: it is
-    at its optimum, in closed form, and the objective does not depend on that of a setting. Unknown
-    constant means are at their generalised least squares estimate.
-
-    Attributes:
-        names: The names of the model's learnable parameters.
-        scale: What the settings are in: logarithms of lengthscales and variances.
-        num_problems: Number ``B`` of problems.
-        num_parameters: Number ``p`` of parameters of each.
-        batch_shape: The shape whose elements are the problems.
-        variances: 1 for a free variance, 0 for another parameter, ``B x p``.
-        concentrated: Whether the overall scale is concentrated out.
+    at its optimum, in closed form, as far as the noise keeps to its least value. Unknown constant
+    means are at their generalised least squares estimate.
 
     Args:
         model: The model; it is put in train mode.
         marginal: Take the model as it is, at its own scale and with unknown constant means
             integrated over their priors.
-        of_settings: Take priors as densities of the settings, that is of the logarithms of
-            lengthscales and variances, instead of densities of these: what is to be sampled.
+        of_logs: Take priors as densities of the logarithms of lengthscales and variances, instead
+            of densities of these: what is to be sampled.
         autograd: Differentiate the kernel by autograd even where there is a closed form.
+        rows: The observations that count, numbers of rows. Default: all.
+
+    Attributes:
+        parameters: The vectors and their bounds.
+        concentrated: Whether the overall scale is concentrated out.
     """
 
     def __init__(
         self,
         model: BatchedMultiOutputGPyTorchModel,
         marginal: bool = False,
-        of_settings: bool = False,
+        of_logs: bool = False,
         autograd: bool = False,
+        rows: Tensor | None = None,
     ) -> None:
         model.train()
         self.model = model
-        parameters = {n: p for n, p in model.named_parameters() if p.requires_grad}
-        if not parameters:
-            raise ValueError(
-                "The model has no learnable parameter: all have `requires_grad=False`."
-            )
-        outputs = model._aug_batch_shape
-        learns_inputs = any(name.startswith("input_transform.") for name in parameters)
-        own = all(p.shape[: len(outputs)] == outputs for p in parameters.values())
-        self.is_batched = own and not learns_inputs
-        self.batch_shape = outputs if self.is_batched else Size()
-        self.num_problems = self.batch_shape.numel()
-        self.names = list(parameters)
-        self.scale = LogScale(model)
-        self.shapes = [p.shape[len(self.batch_shape) :] for p in parameters.values()]
-        self.num_parameters = sum(shape.numel() for shape in self.shapes)
-        inputs = model.train_inputs[0]
+        self.parameters = LogParameters(model)
+        learns_inputs = any(name.startswith("input_transform.") for name in self.parameters.names)
+        raw, noise = model.train_inputs[0], known_noise_of(model)
         with torch.no_grad():
-            transformed = model.transform_inputs(inputs)
-        means = model.constant_means if isinstance(model, MultiOutputGP) and not marginal else {}
-        self._basis = (
-            torch.stack([read(transformed) for read in means.values()], dim=-1) if means else None
+            inputs = model.transform_inputs(raw)
+        self.targets = model.train_targets
+        if rows is not None:
+            raw, inputs, self.targets = raw[..., rows, :], inputs[..., rows, :], self.targets[..., rows]
+            noise = None if noise is None else noise[..., rows]
+        self._basis = None if marginal else _basis_of_constants(model, inputs)
+        closed: TargetDistribution | None = None
+        if self.parameters.is_batched and not autograd:
+            closed = ClosedForm.of(model, inputs, self.parameters, noise, marginal)
+        self._distribution = closed or ModuleDistribution(
+            model, raw if learns_inputs else inputs, self.parameters, noise, marginal
         )
-        if means:
-            # Those that the residuals are computed with.
-            self._constants = model.constant_mean_values.detach().clone()
-        by_hand = None
-        if self.is_batched and not autograd:
-            by_hand = StationaryMoments.of(model, transformed, self.names, [*means])
-        inputs = inputs if learns_inputs else transformed
-        self._moments: Moments = by_hand or ModuleMoments(model, inputs, [*means], learns_inputs)
-        self._log_priors = LogPriors(
-            model, self.names, self.batch_shape, self.unflatten, self.flatten, of_settings
-        )
-        self.variances = self.flatten(
-            {
-                name: torch.full_like(p, float(self._is_free_variance(name))).unsqueeze(0)
-                for name, p in parameters.items()
-            }
-        )[0]
+        self._log_priors: LogPriors | None = None
+        if of_logs or has_priors(model):
+            self._log_priors = LogPriors(model, self.parameters, of_logs)
         # Targets that are met exactly would have no variance at all: their rounding errors have.
-        square = model.train_targets.square().mean(-1)
-        self._rounding = torch.finfo(square.dtype).eps ** 2 * square.where(
-            square > 0, torch.ones_like(square)
-        )
-        self.concentrated = False
+        square = self.targets.square().nanmean(-1)
+        square = square.where(square > 0, torch.ones_like(square))
+        self._rounding = torch.finfo(square.dtype).eps ** 2 * square
         self.concentrated = not marginal and self._is_homogeneous()
 
-    def flatten(self, values: Parameters) -> Tensor:
-        """Pack one tensor per parameter name, ``k x`` its shape, into ``k x B x p``."""
-        parts = [
-            values[name].detach().reshape(-1, self.num_problems, shape.numel())
-            for name, shape in zip(self.names, self.shapes, strict=True)
-        ]
-        return torch.cat(parts, dim=-1)
+    @property
+    def num_points(self) -> int:
+        """Number ``n`` of observations of each problem."""
+        return self.targets.shape[-1]
 
-    def unflatten(self, settings: Tensor) -> Parameters:
-        """The reverse of :meth:`flatten`."""
-        sizes = [shape.numel() for shape in self.shapes]
-        parts = settings.split(sizes, dim=-1)
-        return {
-            name: part.reshape(-1, *self.batch_shape, *shape)
-            for name, part, shape in zip(self.names, parts, self.shapes, strict=True)
-        }
-
-    def current(self) -> Tensor:
-        """The model's own setting, ``1 x B x p``."""
-        return self.flatten({name: self.scale.current(name).unsqueeze(0) for name in self.names})
-
-    def assign(self, setting: Tensor) -> None:
-        """Give the model a setting, ``B x p``, at its best scale, and its constant means."""
+    def assign(self, vector: Tensor) -> None:
+        """Give the model a vector, ``B x p``, at its best scale, and its constant means."""
         if self.concentrated:
-            shift = self.best_scale(setting.unsqueeze(0))[0].log()
-            setting = setting + self.variances * shift.unsqueeze(-1)
-        parameters = self._single(self.unflatten(setting.unsqueeze(0)))
-        self.scale.assign(parameters)
+            shift = self.best_scale(vector.unsqueeze(0))[0].log()
+            vector = vector + self.parameters.variances * shift.unsqueeze(-1)
+            # The least noise is met but for rounding errors.
+            vector = torch.where(
+                self.parameters.noise > 0, vector.maximum(self.parameters.lower), vector
+            )
+        self.parameters.assign(vector)
         if self._basis is not None:
             with torch.no_grad():
-                mean, covariance = self._moments(parameters)
-                chol, _ = safe_cholesky(covariance)
-                basis = self._basis.expand(*covariance.shape[:-1], -1)
-                shift, variance = least_squares(chol, self.model.train_targets - mean, basis)
-                vague = _VAGUE * variance.diagonal(dim1=-1, dim2=-2)
-                # A wider prior would drown the smallest pivot in rounding errors.
-                pivot = chol.diagonal(dim1=-1, dim2=-2).amin(-1, keepdim=True).square()
-                rounding = 10 * chol.shape[-1] ** 2 * torch.finfo(chol.dtype).eps
-                size = basis.square().amax(-2).clamp_min(torch.finfo(chol.dtype).tiny)
-                vague = vague.minimum(pivot / (rounding * size))
-                self.model.set_constant_means(self._constants + shift, vague)
+                self._assign_constants(vector)
 
-    @torch.no_grad()
-    def __call__(self, settings: Tensor) -> Tensor:
-        """Return the objective at ``settings`` (``k x B x p``) as ``k x B``.
+    def __call__(self, vectors: Tensor) -> Tensor:
+        """Return the objective at ``vectors`` (``k x B x p``) as ``k x B``.
 
         It is infinite where the covariance has no Cholesky factor.
         """
-        if not self.is_batched:
-            value = torch.stack([self._together(each)[0] for each in settings])
-            return _finite(value - self._log_priors(settings) if self._log_priors.any else value)
-        likelihood = self._likelihood(*self._moments(self.unflatten(settings)))
-        value = likelihood.value.reshape(-1, self.num_problems)
-        return _finite(value - self._log_priors(settings) if self._log_priors.any else value)
+        return self._in_chunks(lambda part: (self._evaluate(part, derivatives=False)[0],), vectors)[0]
 
-    def value_and_gradient(self, settings: Tensor) -> tuple[Tensor, Tensor]:
+    def value_and_gradient(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Return the objective and its gradient, ``k x B`` and ``k x B x p``.
 
         The gradient is zero where the objective is infinite.
         """
-        settings = settings.detach()
-        n = self.model.train_targets.shape[-1]
-        at_once = max(1, _AT_ONCE // (self.num_problems * n**2))
-        if len(settings) > at_once:
-            parts = [self.value_and_gradient(part) for part in settings.split(at_once)]
-            values, gradients = zip(*parts, strict=True)
-            return torch.cat(values), torch.cat(gradients)
-        if self.is_batched:
-            with torch.no_grad():
-                mean, covariance, pull_back = self._moments.with_pull_back(self.unflatten(settings))
-                likelihood = self._likelihood(mean, covariance, derivatives=True)
-                gradient = self.flatten(pull_back(*likelihood.gradient))
-            value = likelihood.value.reshape(-1, self.num_problems)
-        else:
-            pairs = [self._together(each, derivatives=True) for each in settings]
-            value = torch.stack([pair[0] for pair in pairs])
-            gradient = torch.stack([pair[1] for pair in pairs])
-        if self._log_priors.any:
-            log_prior, by_prior = self._log_priors.with_gradient(settings)
-            value, gradient = value - log_prior, gradient - by_prior
-        value = _finite(value)
-        good = (value.isfinite() & gradient.isfinite().all(-1)).unsqueeze(-1)
-        return value, torch.where(good, gradient, torch.zeros_like(gradient))
+        value, gradient = self._in_chunks(
+            lambda part: self._evaluate(part, derivatives=True), vectors.detach()
+        )
+        return value, gradient
 
     @torch.no_grad()
-    def best_scale(self, settings: Tensor) -> Tensor:
+    def best_scale(self, vectors: Tensor) -> Tensor:
         r"""The factor of all variances that maximises the likelihood, ``k x B``.
 
         With :math:`c K` in place of :math:`K` it is :math:`(y - m)^T K^{-1} (y - m) / n`.
         """
-        if not self.is_batched:
-            return torch.ones_like(settings[..., 0])
-        likelihood = self._likelihood(*self._moments(self.unflatten(settings)))
-        return likelihood.scale.reshape(-1, self.num_problems)
+        if not self.parameters.is_batched:
+            return torch.ones_like(vectors[..., 0])
 
-    def _likelihood(
-        self, mean: Tensor, covariance: Tensor, derivatives: bool = False
-    ) -> Likelihood:
-        residual = (self.model.train_targets - mean).expand(covariance.shape[:-1])
-        return negative_log_likelihood(
-            residual, covariance, self._basis, self.concentrated, derivatives, self._rounding
-        )
+        def scale(part: Tensor) -> tuple[Tensor]:
+            mean, covariance = self._distribution(self.parameters.unflatten(part))
+            likelihood = negative_log_likelihood(
+                self._residual(mean, covariance), covariance, self._basis, self._least_scale(part)
+            )
+            return (likelihood.scale.reshape(len(part), -1),)
 
-    def _together(self, setting: Tensor, derivatives: bool = False) -> tuple[Tensor, Tensor]:
-        """Negative log likelihood and its gradient (if asked for) of one setting, ``1``, ``1 x p``.
+        return self._in_chunks(scale, vectors)[0]
+
+    def _in_chunks(
+        self, function: Callable[[Tensor], tuple[Tensor, ...]], vectors: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Evaluate a function of vectors in parts that fit in memory."""
+        at_once = max(1, _AT_ONCE // (self.parameters.num_problems * self.num_points**2))
+        parts = [function(part) for part in vectors.split(at_once)]
+        return tuple(torch.cat(part) for part in zip(*parts, strict=True))
+
+    def _evaluate(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
+        if self.parameters.is_batched:
+            value, gradient = self._apart(vectors, derivatives)
+        else:
+            pairs = [self._together(each, derivatives) for each in vectors]
+            value = torch.stack([pair[0] for pair in pairs])
+            gradient = torch.stack([pair[1] for pair in pairs])
+        if self._log_priors is not None:
+            if derivatives:
+                log_prior, by_prior = self._log_priors.with_gradient(vectors)
+                gradient = gradient - by_prior
+            else:
+                with torch.no_grad():
+                    log_prior = self._log_priors(vectors)
+            value = value - log_prior
+        # NaN and minus infinity are what only failures give.
+        value = value.nan_to_num(math.inf, math.inf, math.inf)
+        good = (value.isfinite() & gradient.isfinite().all(-1)).unsqueeze(-1)
+        return value, torch.where(good, gradient, torch.zeros_like(gradient))
+
+    @torch.no_grad()
+    def _apart(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
+        """The likelihood of problems of their own, and its gradient (zero if not asked for)."""
+        values = self.parameters.unflatten(vectors)
+        least = self._least_scale(vectors) if self.concentrated else None
+        if not derivatives:
+            mean, covariance = self._distribution(values)
+            likelihood = self._likelihood(mean, covariance, least)
+            return likelihood.value.reshape(len(vectors), -1), torch.zeros_like(vectors)
+        mean, covariance, pull_back = self._distribution.with_pull_back(values)
+        likelihood = self._likelihood(mean, covariance, least, derivatives=True)
+        assert likelihood.by_mean is not None and likelihood.by_covariance is not None
+        found = pull_back(likelihood.by_mean, likelihood.by_covariance)
+        gradient = self.parameters.flatten(found)
+        value = likelihood.value.reshape(len(vectors), -1)
+        if likelihood.by_least_scale is not None:
+            # The least scale is that of the least noise, in inverse proportion to the noise.
+            by_least = likelihood.by_least_scale.reshape(value.shape)
+            gradient = gradient - self.parameters.noise * by_least.unsqueeze(-1)
+        return value, gradient
+
+    def _together(self, vector: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
+        """Negative log likelihood and its gradient of one vector, ``1`` and ``1 x p``.
 
         Its outputs are independent given the parameters that they share.
         """
-        parameters = self._single(self.unflatten(setting.unsqueeze(0)))
-        gradient = torch.zeros_like(setting)
+        values = {n: v[0] for n, v in self.parameters.unflatten(vector.unsqueeze(0)).items()}
+        gradient = torch.zeros_like(vector)
         try:
             if not derivatives:
-                value = self._likelihood(*self._moments(parameters)).value
-                return value.sum().reshape(1), gradient
-            mean, covariance, pull_back = self._moments.with_pull_back(parameters)
+                with torch.no_grad():
+                    likelihood = self._likelihood(*self._distribution(values), None)
+                return likelihood.value.sum().reshape(1), gradient
+            mean, covariance, pull_back = self._distribution.with_pull_back(values)
         except PhysicsError:
-            # Parameters that the physics cannot run with are a bad setting, not the end of a fit.
-            return setting.new_full((1,), math.inf), gradient
-        likelihood = self._likelihood(mean, covariance, derivatives=True)
-        found = pull_back(*likelihood.gradient)
-        gradient = self.flatten({name: v.unsqueeze(0) for name, v in found.items()})[0]
+            # Parameters that the physics cannot run with are a bad vector, not the end of a fit.
+            return vector.new_full((1,), math.inf), gradient
+        likelihood = self._likelihood(mean, covariance, None, derivatives=True)
+        assert likelihood.by_mean is not None and likelihood.by_covariance is not None
+        found = pull_back(likelihood.by_mean, likelihood.by_covariance)
+        gradient = self.parameters.flatten({name: v.unsqueeze(0) for name, v in found.items()})[0]
         return likelihood.value.sum().reshape(1), gradient
 
-    def _single(self, parameters: Parameters) -> Parameters:
-        return {name: value[0] for name, value in parameters.items()}
+    def _likelihood(
+        self, mean: Tensor, covariance: Tensor, least: Tensor | None, derivatives: bool = False
+    ) -> LikelihoodValue:
+        residual = self._residual(mean, covariance)
+        return negative_log_likelihood(residual, covariance, self._basis, least, derivatives)
 
-    def is_free(self, name: str) -> bool:
-        """Whether nothing but the data bounds a lengthscale or variance."""
-        if not self.scale.covers(name):
-            return False
-        constraint = self.scale.constraint(name)
-        unbounded = bool((constraint.lower_bound <= 0).all()) and bool(
-            constraint.upper_bound.isinf().all()
-        )
-        return unbounded or isinstance(constraint, DataInterval)
+    def _residual(self, mean: Tensor, covariance: Tensor) -> Tensor:
+        return (self.targets - mean).expand(covariance.shape[:-1])
 
-    @property
-    def has_one_noise(self) -> bool:
-        """Whether a problem has one noise at most, not one for each level as AR1 has."""
-        noises = [
-            shape.numel()
-            for name, shape in zip(self.names, self.shapes, strict=True)
-            if kind(name) == "noise"
-        ]
-        return sum(noises) <= 1
+    def _least_scale(self, vectors: Tensor) -> Tensor:
+        """The factor of all variances that brings the noise to its bound, ``k x batch_shape``."""
+        least = ((self.parameters.lower - vectors).exp() * self.parameters.noise).sum(-1)
+        least = least.maximum(self._rounding.reshape(-1))
+        return least.reshape(len(vectors), *self.parameters.batch_shape)
 
-    def _is_free_variance(self, name: str) -> bool:
-        return kind(name) in ("outputscale", "noise") and self.is_free(name)
+    def _assign_constants(self, vector: Tensor) -> None:
+        values: Parameters = self.parameters.unflatten(vector.unsqueeze(0))
+        mean, covariance = self._distribution({name: value[0] for name, value in values.items()})
+        residual = self.targets - mean
+        observed = ~residual.isnan()
+        chol, _ = cholesky(covariance, None if observed.all() else observed)
+        basis = self._basis * observed.unsqueeze(-1)
+        basis = basis.expand(*chol.shape[:-1], -1)
+        shift, variance = least_squares(chol, residual.nan_to_num(nan=0.0), basis)
+        vague = _VAGUE * variance.diagonal(dim1=-1, dim2=-2)
+        # A wider prior would drown the smallest pivot in rounding errors.
+        pivot = chol.diagonal(dim1=-1, dim2=-2).amin(-1, keepdim=True).square()
+        size = basis.square().amax(-2).clamp_min(torch.finfo(chol.dtype).tiny)
+        vague = vague.minimum(pivot / (nugget(chol.shape[-1]) * size))
+        learnt = [term for term in self.model.covar_module.terms if term.learns_mean]
+        for i, term in enumerate(learnt):
+            term.mean += shift[..., i : i + 1]
+            term.mean_variance.copy_(vague[..., i : i + 1])
 
     def _is_homogeneous(self) -> bool:
         """Whether a factor of all variances is one of the covariance, and no prior minds."""
-        if not self.is_batched or self._log_priors.any or not self.has_one_noise:
+        parameters = self.parameters
+        one_noise = bool((parameters.noise.sum(-1) <= 1).all())
+        if not parameters.is_batched or self._log_priors is not None or not one_noise:
             return False
-        setting = self.current()
+        vector = parameters.current()
         with torch.no_grad():
-            mean, covariance = self._moments(self.unflatten(setting))
-            doubled = setting + self.variances * math.log(2)
-            mean2, covariance2 = self._moments(self.unflatten(doubled))
+            mean, covariance = self._distribution(parameters.unflatten(vector))
+            doubled = vector + parameters.variances * math.log(2)
+            mean2, covariance2 = self._distribution(parameters.unflatten(doubled))
             off = (covariance2 - 2 * covariance).abs().amax((-1, -2))
         return bool((off <= 1e-9 * covariance.abs().amax((-1, -2))).all()) and bool(
             (mean2 == mean).all()
         )
 
 
-def _finite(value: Tensor) -> Tensor:
-    """Infinity in place of NaN and minus infinity, which only failures give."""
-    return value.nan_to_num(math.inf, math.inf, math.inf)
+def _basis_of_constants(
+    model: BatchedMultiOutputGPyTorchModel, inputs: Tensor
+) -> Tensor | None:
+    """The bases of the unknown constant means, ``... x n x q``, or None."""
+    if not isinstance(model.covar_module, SumOfTerms):
+        return None
+    with torch.no_grad():
+        columns = [
+            torch.ones_like(inputs[..., 0]) if term.basis is None else term.basis(inputs)
+            for term in model.covar_module.terms
+            if term.learns_mean
+        ]
+    return torch.stack(columns, dim=-1) if columns else None

@@ -11,15 +11,15 @@ from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.priors import LogNormalPrior, NormalPrior
 from torch import Tensor
 
-from gpadjust.gp import PhysicsScaledKernel
-from gpadjust.models.ar1 import AR1Kernel
-from gpadjust.models.parameter_scales import kind, parameter_scales
-
-_LENGTHSCALE = math.sqrt(3)  # standard deviations of the logarithms
-_OUTPUTSCALE = {"rho": 1.5, "delta": 5.0}
-_NOISE = 4.0
-_RHO = 0.25  # the typical variance of rho
-_NUGGET = 1e-4  # the typical noise, of the mean square of the residual
+from gpadjust.models.ar1 import Level
+from gpadjust.models.hyperparameters import (
+    KINDS,
+    RHO_VARIANCE,
+    is_rho,
+    kernels_of,
+    kind_of,
+    typical_sizes,
+)
 
 
 def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
@@ -58,31 +58,19 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         ... }
         True
     """
-    of_rho = {
-        f"covar_module.{name}."
-        for name, module in model.covar_module.named_modules()
-        if isinstance(module, PhysicsScaledKernel)
-    }
-    if isinstance(model.covar_module, PhysicsScaledKernel):
-        of_rho = {"covar_module."}
-    for name, size in parameter_scales(model).items():
-        module = model.get_submodule(name.rpartition(".")[0])
-        which = kind(name)
-        if which == "lengthscale":
-            d = size.shape[-1]
-            shift = math.sqrt(2) + 0.5 * math.log(d) - 1
-            _register(module, which, size.log() + shift, _LENGTHSCALE)
-        elif which == "outputscale":
-            if any(name.startswith(prefix) for prefix in of_rho):
-                _register(module, which, torch.full_like(size, _RHO).log(), _OUTPUTSCALE["rho"])
-            else:
-                _register(module, which, size.log(), _OUTPUTSCALE["delta"])
-        elif which == "noise":
-            _register(module, which, size.log() + math.log(_NUGGET), _NOISE)
-    kernel = model.covar_module
-    if isinstance(kernel, AR1Kernel) and "rho_prior" not in kernel._priors:
-        one = torch.ones_like(kernel.rho)
-        kernel.register_prior("rho_prior", NormalPrior(one, one), "rho")
+    of_rho = [path for path, _, _, basis in kernels_of(model) if is_rho(basis)]
+    for name, size in typical_sizes(model).items():
+        module, kind = model.get_submodule(name.rpartition(".")[0]), kind_of(name)
+        median, spread = KINDS[kind].prior
+        if kind == "lengthscale":
+            median *= math.sqrt(size.shape[-1])
+        elif kind == "outputscale" and any(name.startswith(f"{path}.") for path in of_rho):
+            size, (median, spread) = torch.ones_like(size), RHO_VARIANCE.prior
+        _register(module, kind, size.log() + math.log(median), spread)
+    for module in model.covar_module.modules():
+        if isinstance(module, Level) and module.rho is not None and not module._priors:
+            one = torch.ones_like(module.rho)
+            module.register_prior("rho_prior", NormalPrior(one, one), "rho")
 
 
 def _register(module: Any, name: str, location: Tensor, scale: float) -> None:

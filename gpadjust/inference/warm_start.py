@@ -1,17 +1,16 @@
-"""Going on from the hyper-parameters of an earlier fit."""
+"""Hyper-parameters of a model that another one of the same structure starts from."""
 
 from __future__ import annotations
 
-from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+import torch
 from torch import Tensor
 
-from gpadjust.gp import PhysicsScaledKernel
-from gpadjust.inference.parameters import LogScale
-from gpadjust.models.parameter_scales import kind
+from gpadjust.models import ExactGPBase
+from gpadjust.models.hyperparameters import constraint_of, is_rho, kernels_of, kind_of
 
 
 def warm_start(
-    model: BatchedMultiOutputGPyTorchModel, previous: BatchedMultiOutputGPyTorchModel
+    model: ExactGPBase, previous: ExactGPBase
 ) -> None:
     """Give a model the hyper-parameters of an earlier one of the same structure.
 
@@ -23,29 +22,17 @@ def warm_start(
         model: The model to start, changed in place.
         previous: The model with the hyper-parameters, of other data.
     """
-    ratio = 2 * (_log_scale(previous) - _log_scale(model))  # shape: (m)
-    unitless = {
-        f"{path}.{name}"
-        for path, module in model.named_modules()
-        if isinstance(module, PhysicsScaledKernel)
-        for name, _ in module.named_parameters()
-    }
-    source, target = LogScale(previous), LogScale(model)
-    values = {}
-    for name, parameter in model.named_parameters():
-        if not parameter.requires_grad:
-            continue
-        value = source.current(name)
-        if kind(name) in ("outputscale", "noise") and name not in unitless and target.covers(name):
-            value = value + ratio[(..., *[None] * (value.dim() - ratio.dim()))]
-        values[name] = value
-    target.assign(values)
-
-
-def _log_scale(model: BatchedMultiOutputGPyTorchModel) -> Tensor:
-    """The logarithm of each output's unit, of the model's batch shape."""
-    transform = getattr(model, "outcome_transform", None)
-    if transform is None:
-        return model.train_targets.new_zeros(model._aug_batch_shape)
-    stdvs: Tensor = transform.stdvs.squeeze(-2)
-    return (stdvs if model.num_outputs > 1 else stdvs.squeeze(-1)).log()
+    ratio = 2 * (previous._units()[1] / model._units()[1]).log().squeeze(-1)  # ... x (m)
+    unitless = [path for path, _, _, basis in kernels_of(model) if is_rho(basis)]
+    source = dict(previous.named_parameters())
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if not parameter.requires_grad:
+                continue
+            value: Tensor = source[name]
+            constraint = constraint_of(model, name)
+            follows = kind_of(name) in ("outputscale", "noise") and constraint is not None
+            if follows and not any(name.startswith(f"{path}.") for path in unitless):
+                factor = ratio[(..., *[None] * (value.dim() - ratio.dim()))].exp()
+                value = constraint.inverse_transform(constraint.transform(value) * factor)
+            parameter.copy_(value)

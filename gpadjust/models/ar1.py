@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any, Self
 
+import gpytorch
 import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
-from botorch.posteriors import Posterior
 from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.constraints import Interval
-from gpytorch.distributions import MultivariateNormal
-from gpytorch.kernels import Kernel
-from gpytorch.likelihoods import FixedNoiseGaussianLikelihood
 from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.likelihoods.noise_models import MultitaskHomoskedasticNoise
-from gpytorch.means import ZeroMean
-from linear_operator import to_dense
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
-from gpadjust.gp import DataInterval, FixedStandardize, InputsKernel
-from gpadjust.models.defaults import make_kernel, scaled_rbf
-from gpadjust.models.multi_output_gp import MultiOutputGP
-from gpadjust.models.parameter_scales import set_initial_values
-from gpadjust.models.prediction import Prediction
-from gpadjust.models.training_data import check_training_data
-from gpadjust.physics import Physics, as_physics
+from gpadjust.gp import FixedStandardize, Term
+from gpadjust.gp.physics_columns import check_one_to_one
+from gpadjust.models.adjusted_gp import KernelLike, PhysicsLike, make_kernel
+from gpadjust.models.exact_gp_base import ExactGPBase
+from gpadjust.models.hyperparameters import default_constraint, scaled_rbf
+from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
+from gpadjust.physics import as_physics
 
 
 class LevelInput(InputTransform):
@@ -46,11 +42,7 @@ class LevelInput(InputTransform):
 
     def __init__(self, num_inputs: int, base: InputTransform | None = None) -> None:
         super().__init__()
-        if base is not None and base.is_one_to_many:
-            raise ValueError(
-                f"The input transform {type(base).__name__} makes several points of one, which "
-                "AR1 does not support; use a one-to-one transform."
-            )
+        check_one_to_one(base)
         self.num_inputs = num_inputs
         self.base = base
 
@@ -72,44 +64,37 @@ class LevelInput(InputTransform):
             f"got shape {tuple(X.shape)}."
         )
 
+    def untransform(self, X: Tensor) -> Tensor:
+        """Map ``... x n x (d' + 1)`` back to raw ``... x n x d``."""
+        return X[..., :-1] if self.base is None else self.base.untransform(X[..., :-1])
 
-class AR1Kernel(Kernel):
-    r"""The joint covariance of two levels, :math:`f_2 = \rho f_1 + \delta`, :math:`\rho` constant:
 
-    .. math:: k((x, l), (x', l')) = \rho^{[l=1] + [l'=1]} k_1(x, x') + [l = l' = 1] k_\delta(x, x'),
+class Level(gpytorch.Module):
+    r"""The basis of a term of two levels: :math:`\rho^{[l=1]}`, or :math:`[l=1]`.
 
-    where the last column of the inputs is 0 for the low level and 1 for the high one
-    (Kennedy and O'Hagan 2000).
+    The last column of the inputs is 0 for the low level and 1 for the high one.
 
     Args:
-        low_kernel: The covariance :math:`k_1` of the low level.
-        delta_kernel: The covariance :math:`k_\delta` of the bias.
-        batch_shape: Batch shape of the constant :math:`\rho`.
+        batch_shape: Batch shape of the constant :math:`\rho`, or None for the basis without.
     """
 
-    def __init__(
-        self,
-        low_kernel: Kernel,
-        delta_kernel: Kernel,
-        batch_shape: Size = Size(),  # noqa: B008
-    ) -> None:
-        super().__init__(batch_shape=batch_shape)
-        self.low_kernel = low_kernel
-        self.delta_kernel = delta_kernel
-        self.register_parameter("rho", torch.nn.Parameter(torch.ones(*batch_shape, 1)))
+    def __init__(self, batch_shape: Size | None = None) -> None:
+        super().__init__()
+        one = None if batch_shape is None else torch.ones(*batch_shape, 1, dtype=torch.float64)
+        self.register_parameter("rho", None if one is None else torch.nn.Parameter(one))
 
-    def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: Any) -> Tensor:
-        """Return ``... x n x n'``, or its diagonal ``... x n``."""
-        high1, high2 = x1[..., -1], x2[..., -1]
-        scale1, scale2 = (1 + high * (self.rho - 1) for high in (high1, high2))
-        low = to_dense(self.low_kernel(x1, x2, diag=diag, **params))
-        bias = to_dense(self.delta_kernel(x1, x2, diag=diag, **params))
-        if diag:
-            return scale1 * scale2 * low + high1 * high2 * bias
-        return (
-            scale1.unsqueeze(-1) * scale2.unsqueeze(-2) * low
-            + high1.unsqueeze(-1) * high2.unsqueeze(-2) * bias
-        )
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the basis at ``x`` (``... x n x (d + 1)``) as ``... x n``."""
+        level = x[..., -1]
+        rho: Tensor | None = self.rho
+        return level if rho is None else 1 + level * (rho - 1)
+
+    def map_batches(self, change: Callable[[Tensor], Tensor]) -> Level:
+        """A copy whose constant is changed along its batch dimensions."""
+        new = deepcopy(self)
+        if self.rho is not None:
+            new.rho = torch.nn.Parameter(change(self.rho.detach()))
+        return new
 
 
 class LevelLikelihood(_GaussianLikelihoodBase):
@@ -149,7 +134,7 @@ class LevelLikelihood(_GaussianLikelihoodBase):
         return DiagLinearOperator(noise.expand(shape))
 
 
-class AR1(MultiOutputGP):
+class AR1(ExactGPBase):
     r"""Auto-regressive co-kriging, :math:`f_2(x) = \rho f_1(x) + \delta(x)` with a constant rho.
 
     The classic of multi-fidelity modelling (Kennedy and O'Hagan 2000; Wannawas and Faisal 2023,
@@ -184,26 +169,26 @@ class AR1(MultiOutputGP):
 
     def __init__(
         self,
-        train_X: Tensor,
-        train_Y: Tensor,
-        train_Yvar: Tensor | None = None,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike = None,
         *,
-        physics: Physics | Callable[[Tensor], Tensor] | None = None,
+        physics: PhysicsLike | None = None,
         bounds: Tensor | None = None,
         num_low: int = 40,
-        low_X: Tensor | None = None,
-        low_Y: Tensor | None = None,
-        low_covar_module: Kernel | None = None,
-        delta_covar_module: Kernel | None = None,
+        low_X: ArrayLike = None,
+        low_Y: ArrayLike = None,
+        low_covar_module: KernelLike | None = None,
+        delta_covar_module: KernelLike | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
         seed: int = 0,
     ) -> None:
-        check_training_data(train_X, train_Y, train_Yvar)
+        high = training_data(train_X, train_Y, train_Yvar)
         if low_X is None and low_Y is not None:
             raise ValueError("Got `low_Y` without `low_X`, the inputs that it belongs to.")
         if low_X is None:
-            low_X = _samples(train_X, bounds, num_low, seed)
+            low_X = _samples(high.X, bounds, num_low, seed)
         if low_Y is None:
             if physics is None:
                 raise ValueError(
@@ -212,106 +197,86 @@ class AR1(MultiOutputGP):
                 )
             with torch.no_grad():
                 low_Y = as_physics(physics)(low_X)
-        check_training_data(low_X, low_Y, prefix="low")
-        if low_X.shape[-1] != train_X.shape[-1] or low_Y.shape[-1] != train_Y.shape[-1]:
+        low = training_data(low_X, low_Y, prefix="low")
+        if low.X.shape[-1] != high.X.shape[-1] or low.Y.shape[-1] != high.Y.shape[-1]:
             raise ValueError(
-                f"Expected the low level with {train_X.shape[-1]} inputs and {train_Y.shape[-1]} "
-                f"outputs as the high one has, got {low_X.shape[-1]} and {low_Y.shape[-1]}."
+                f"Expected the low level with {high.X.shape[-1]} inputs and {high.Y.shape[-1]} "
+                f"outputs as the high one has, got {low.X.shape[-1]} and {low.Y.shape[-1]}."
             )
-        batch_shape = self.get_batch_dimensions(train_X, train_Y)[1]
-        transform = LevelInput(train_X.shape[-1], input_transform)
-        low_level = torch.cat([low_X, torch.zeros_like(low_X[..., :1])], dim=-1)
-        X = torch.cat([low_level, transform.with_level(train_X)], dim=-2)
-        Y = torch.cat([low_Y, train_Y], dim=-2)
-        if isinstance(outcome_transform, _DefaultType):
-            spread = low_Y.std(-2, keepdim=True)
-            outcome_transform = FixedStandardize.of(
-                low_Y.mean(-2, keepdim=True),
-                spread.where(spread > 0, torch.ones_like(spread)),
-            )
-        d = transform(X).shape[-1] - 1
-        low_kernel = make_kernel(low_covar_module or scaled_rbf, "low_covar_module", d, batch_shape)
-        delta_kernel = make_kernel(
-            delta_covar_module or scaled_rbf, "delta_covar_module", d, batch_shape
+        batch_shape = self.get_batch_dimensions(high.X, high.Y)[1]
+        transform = LevelInput(high.X.shape[-1], input_transform)
+        X = torch.cat(
+            [torch.nn.functional.pad(low.X, (0, 1)), transform.with_level(high.X)], dim=-2
         )
-        Yvar = likelihood = None
-        if train_Yvar is None:
-            likelihood = LevelLikelihood(DataInterval(), batch_shape)
+        Y = torch.cat([low.Y, high.Y], dim=-2)
+        if isinstance(outcome_transform, _DefaultType):
+            spread = low.Y.std(-2, keepdim=True)
+            outcome_transform = FixedStandardize.from_moments(
+                low.Y.mean(-2, keepdim=True), spread.where(spread > 0, torch.ones_like(spread))
+            )
+        likelihood: _GaussianLikelihoodBase | None = None
+        Yvar: Tensor | None = None
+        if high.Yvar is None:
+            likelihood = LevelLikelihood(default_constraint(), batch_shape)
         else:
             # f_p is known without error, but GPyTorch wants at least 1e-6 for fixed noise.
-            low_Yvar = 1e-5 * low_Y.var(-2, keepdim=True)
+            low_Yvar = 1e-5 * low.Y.var(-2, keepdim=True)
             low_Yvar = low_Yvar.clamp_min(1e-6) if outcome_transform is None else low_Yvar
-            Yvar = torch.cat([low_Yvar.expand_as(low_Y), train_Yvar], dim=-2)
+            Yvar = torch.cat([low_Yvar.expand_as(low.Y), high.Yvar], dim=-2)
+        d = transform(X).shape[-1] - 1
+        zero = torch.zeros(*batch_shape, 1, dtype=torch.float64)
+        kernels = [
+            make_kernel(kernel or scaled_rbf, f"the kernel of {name}", d, batch_shape)
+            for name, kernel in (("low", low_covar_module), ("delta", delta_covar_module))
+        ]
         super().__init__(
-            X,
-            Y,
-            Yvar,
-            likelihood=likelihood,
-            covar_module=AR1Kernel(
-                InputsKernel(low_kernel, d), InputsKernel(delta_kernel, d), batch_shape
-            ),
-            mean_module=ZeroMean(),
-            outcome_transform=outcome_transform,
-            input_transform=transform,
+            TrainingData(X, Y, Yvar, high.input_names, high.output_names),
+            [
+                Term("low", kernels[0], d, Level(batch_shape), zero),
+                Term("delta", kernels[1], d, Level(), zero),
+            ],
+            likelihood,
+            FixedStandardize.from_transform(outcome_transform, Y, X),
+            transform,
+            (low_covar_module, delta_covar_module),
         )
-        set_initial_values(self, low_covar_module, delta_covar_module)
 
     @classmethod
-    def construct_inputs(
-        cls,
-        training_data: SupervisedDataset,
-        **options: Any,
-    ) -> dict[str, Any]:
+    def construct_inputs(cls, training_data: SupervisedDataset, **options: Any) -> dict[str, Any]:
         """Construct keyword arguments of the model from a dataset.
 
         Args:
             training_data: The data of the high level.
-            options: The low level: ``physics`` with ``bounds``, or ``low_X`` with ``low_Y``.
+            options: Further arguments of the model; among them the low level, ``physics`` with
+                ``bounds``, or ``low_X`` with ``low_Y``.
         """
         return {**super().construct_inputs(training_data), **options}
 
     @property
     def rho_constant(self) -> Tensor:
         r"""The constant :math:`\rho` of each output, ``batch_shape x (m)``."""
-        return self.covar_module.rho.squeeze(-1)
+        basis: Any = self.terms[0].basis
+        return basis.rho.squeeze(-1)
 
-    def _measured(self, inputs: Tensor) -> tuple[Tensor, slice]:
-        """For leave-one-out: inputs without their level, and the rows of the high level."""
-        num_low = int((inputs[..., -1] == 0).sum(-1).max())
-        return inputs[..., :-1], slice(num_low, None)
+    def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
+        """Inputs without their level, and the rows of the high level."""
+        return inputs[..., :-1], slice(int((inputs[..., -1] == 0).sum(-1).max()), None)
 
-    def _apply_noise(
-        self, X: Tensor, mvn: MultivariateNormal, observation_noise: bool | Tensor = False
-    ) -> MultivariateNormal:
-        """BoTorch's hook for observation noise; known noise is that of the high level."""
-        if observation_noise is True and isinstance(self.likelihood, FixedNoiseGaussianLikelihood):
-            high = self.train_inputs[0][..., -1]
-            noise = (self.likelihood.noise * high).sum(-1, keepdim=True) / high.sum(
-                -1, keepdim=True
-            )
-            shape = torch.broadcast_shapes(mvn.batch_shape + mvn.event_shape, noise.shape)
-            return self.likelihood(mvn, X, noise=noise.expand(shape))
-        return super()._apply_noise(X, mvn, observation_noise)
+    def _typical_noise(self) -> Tensor:
+        high = self.train_inputs[0][..., -1] * ~self.train_targets.isnan()
+        noise = self.likelihood.noise * high
+        return noise.sum(-1, keepdim=True) / high.sum(-1, keepdim=True)
 
-    def posterior(self, X: Tensor, *args: Any, **kwargs: Any) -> Posterior:
-        """The posterior of the high level at raw ``X`` (``... x q x d``); see BoTorch."""
-        self._check_columns(X)
-        return super().posterior(X, *args, **kwargs)
-
-    def predict(self, X: Tensor, observation_noise: bool | Tensor = False) -> Prediction:
-        """Predict the high level at each point of raw ``X`` (``... x q x d``) by itself."""
-        self._check_columns(X)
-        return super().predict(X, observation_noise)
-
-    def _check_columns(self, X: Tensor) -> None:
-        """Refuse the level, which training inputs may bring."""
-        if X.shape[-1] != self.input_transform.num_inputs:
+    def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
+        """As the base class; the level, which training inputs may bring, is refused."""
+        if isinstance(X, Tensor) and X.shape[-1] != self.input_transform.num_inputs:
             raise ValueError(
                 f"Expected X with {self.input_transform.num_inputs} columns, the inputs that the "
                 f"model was built on, got shape {tuple(X.shape)}."
             )
+        return super().model_inputs(X, with_basis)
 
-    def condition_on_observations(self, X: Tensor, Y: Tensor, **kwargs: Any) -> Self:
+    def condition_on_observations(self, X: ArrayLike, Y: ArrayLike, **kwargs: Any) -> Self:
         """Condition on observations of the high level; see BoTorch."""
         return super().condition_on_observations(self.input_transform.with_level(X), Y, **kwargs)
 

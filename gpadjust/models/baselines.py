@@ -3,32 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from typing import Literal
 
-import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
-from botorch.posteriors import GPyTorchPosterior
 from botorch.utils.types import DEFAULT, _DefaultType
-from gpytorch.kernels import Kernel
 from gpytorch.likelihoods import Likelihood
-from gpytorch.means import ZeroMean
-from torch import Tensor
 
-from gpadjust.models.adjustment_gp import AdjustmentGP
-from gpadjust.models.defaults import (
-    default_likelihood,
-    make_kernel,
-    scaled_rbf,
-)
-from gpadjust.models.multi_output_gp import MultiOutputGP
-from gpadjust.models.parameter_scales import set_initial_values
-from gpadjust.models.target_units import residual_scale
-from gpadjust.models.training_data import check_training_data
-from gpadjust.physics import Physics
+from gpadjust.models.adjusted_gp import AdjustedGP, Adjustment, KernelLike, Means, PhysicsLike
+from gpadjust.models.hyperparameters import scaled_rbf
+from gpadjust.models.training_data import ArrayLike, to_tensor
 
 
-class ZeroMeanGP(MultiOutputGP):
+class ZeroMeanGP(AdjustedGP):
     r"""A Gaussian process without physics, :math:`f \sim GP(0, k)`.
 
     Args:
@@ -49,35 +36,34 @@ class ZeroMeanGP(MultiOutputGP):
 
     def __init__(
         self,
-        train_X: Tensor,
-        train_Y: Tensor,
-        train_Yvar: Tensor | None = None,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike = None,
         *,
-        covar_module: Kernel | None = None,
+        covar_module: KernelLike | None = None,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
     ) -> None:
-        check_training_data(train_X, train_Y, train_Yvar)
-        batch_shape = self.get_batch_dimensions(train_X, train_Y)[1]
-        if isinstance(outcome_transform, _DefaultType):
-            outcome_transform = residual_scale(train_Y, torch.zeros_like(train_Y))
-        d = self.transform_inputs(train_X, input_transform).shape[-1]
         super().__init__(
             train_X,
             train_Y,
             train_Yvar,
-            likelihood=likelihood or default_likelihood(train_Yvar, batch_shape),
-            covar_module=make_kernel(covar_module or scaled_rbf, "covar_module", d, batch_shape),
-            mean_module=ZeroMean(),
+            physics=None,
+            rho=None,
+            delta=Adjustment(covar_module or scaled_rbf, 0.0),
+            likelihood=likelihood,
             outcome_transform=outcome_transform,
             input_transform=input_transform,
         )
-        set_initial_values(self, covar_module, likelihood)
 
 
-class PhysicsMeanGP(AdjustmentGP):
+class PhysicsMeanGP(AdjustedGP):
     r"""A Gaussian process with the physics as its mean, :math:`f \sim GP(f_p, k)`.
+
+    Seen as an adjustment it is a bias alone, :math:`f_a = f_p + \delta`,
+    :math:`\delta \sim GP(0, k)`, and ``delta(X)`` the posterior of the bias: the paper's GP-bias,
+    :data:`~gpadjust.BiasGP`, is this model.
 
     Args:
         train_X: Inputs, ``batch_shape x n x d``, float64.
@@ -85,8 +71,9 @@ class PhysicsMeanGP(AdjustmentGP):
         train_Yvar: Known observation variances, or None to learn one per output.
         physics: The physics f_p, as in :class:`~gpadjust.CKA`.
         covar_module: The kernel. Default: RBF with a lengthscale per input.
-        learn_rho_mean: Scale the physics by an unknown constant, :math:`f \sim GP(\rho f_p, k)`.
-        learn_delta_mean: Add an unknown constant to the mean.
+        rho_mean: As in :class:`~gpadjust.CKA`: ``"learn"`` scales the physics by an unknown
+            constant, :math:`f \sim GP(\rho f_p, k)`.
+        delta_mean: As in :class:`~gpadjust.CKA`.
         likelihood: As in :class:`~gpadjust.CKA`.
         outcome_transform: As in :class:`~gpadjust.CKA`.
         input_transform: As in :class:`~gpadjust.CKA`.
@@ -99,14 +86,14 @@ class PhysicsMeanGP(AdjustmentGP):
 
     def __init__(
         self,
-        train_X: Tensor,
-        train_Y: Tensor,
-        train_Yvar: Tensor | None = None,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike = None,
         *,
-        physics: Physics | Callable[[Tensor], Tensor],
-        covar_module: Kernel | None = None,
-        learn_rho_mean: bool = False,
-        learn_delta_mean: bool = False,
+        physics: PhysicsLike,
+        covar_module: KernelLike | None = None,
+        rho_mean: Means | None = None,
+        delta_mean: float | Literal["learn"] = 0.0,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
@@ -115,30 +102,20 @@ class PhysicsMeanGP(AdjustmentGP):
             train_X,
             train_Y,
             train_Yvar,
-            physics=physics,
-            rho_covar_module=None,
-            delta_covar_module=covar_module or scaled_rbf,
-            learn_rho_mean=learn_rho_mean,
-            learn_delta_mean=learn_delta_mean,
+            physics,
+            rho=Adjustment(None, rho_mean),
+            delta=Adjustment(covar_module or scaled_rbf, delta_mean),
             likelihood=likelihood,
             outcome_transform=outcome_transform,
             input_transform=input_transform,
         )
 
 
-class BiasGP(PhysicsMeanGP):
-    r"""An adjustment by a bias alone, :math:`f_a = f_p + \delta`, :math:`\delta \sim GP(0, k)`.
-
-    The same prior as :class:`~gpadjust.PhysicsMeanGP`, seen as an adjustment: ``delta(X)`` is the
-    posterior of the bias. It takes the same arguments.
-    """
-
-    def delta(self, X: Tensor) -> GPyTorchPosterior:
-        r"""The posterior of :math:`\delta` at raw ``X`` (``... x q x d``), in y's units."""
-        return self._adjustment(X, "delta")
+BiasGP = PhysicsMeanGP
+"""The paper's name of the same model, :math:`f_a = f_p + \\delta`, seen as an adjustment."""
 
 
-class ScaleGP(AdjustmentGP):
+class ScaleGP(AdjustedGP):
     r"""An adjustment by a scaling alone, :math:`f_a = \rho f_p`, :math:`\rho \sim GP(1, k)`.
 
     It cannot adjust where f_p is zero, and explodes near there: a warning says so when f_p nearly
@@ -150,6 +127,7 @@ class ScaleGP(AdjustmentGP):
         train_Yvar: Known observation variances, or None to learn one per output.
         physics: The physics f_p, as in :class:`~gpadjust.CKA`.
         covar_module: The kernel of rho. Default: RBF with a lengthscale per input.
+        rho_mean: As in :class:`~gpadjust.CKA`.
         likelihood: As in :class:`~gpadjust.CKA`.
         outcome_transform: As in :class:`~gpadjust.CKA`.
         input_transform: As in :class:`~gpadjust.CKA`.
@@ -162,12 +140,13 @@ class ScaleGP(AdjustmentGP):
 
     def __init__(
         self,
-        train_X: Tensor,
-        train_Y: Tensor,
-        train_Yvar: Tensor | None = None,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike = None,
         *,
-        physics: Physics | Callable[[Tensor], Tensor],
-        covar_module: Kernel | None = None,
+        physics: PhysicsLike,
+        covar_module: KernelLike | None = None,
+        rho_mean: Means | None = None,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
@@ -176,14 +155,14 @@ class ScaleGP(AdjustmentGP):
             train_X,
             train_Y,
             train_Yvar,
-            physics=physics,
-            rho_covar_module=covar_module or scaled_rbf,
-            delta_covar_module=None,
+            physics,
+            rho=Adjustment(covar_module or scaled_rbf, rho_mean),
+            delta=Adjustment(None, 0.0),
             likelihood=likelihood,
             outcome_transform=outcome_transform,
             input_transform=input_transform,
         )
-        size = self.physics(train_X).detach().abs()
+        size = self.physics(to_tensor(train_X, "train_X")).detach().abs()
         typical = size.square().mean(-2, keepdim=True).sqrt()
         if (typical == 0).any():
             raise ValueError(
@@ -197,7 +176,3 @@ class ScaleGP(AdjustmentGP):
                 "where ScaleGP cannot adjust it and may explode; CKA can.",
                 stacklevel=2,
             )
-
-    def rho(self, X: Tensor) -> GPyTorchPosterior:
-        r"""The posterior of :math:`\rho` at raw ``X`` (``... x q x d``), without units."""
-        return self._adjustment(X, "rho")

@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from gpytorch.distributions import MultivariateNormal
-from gpytorch.kernels import Kernel
 from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.models.exact_prediction_strategies import DefaultPredictionStrategy
-from gpytorch.settings import (
-    detach_test_caches,
-    lazily_evaluate_kernels,
-    skip_posterior_variances,
-)
+from gpytorch.settings import detach_test_caches, skip_posterior_variances
 from linear_operator import to_dense, to_linear_operator
-from linear_operator.operators import (
-    DiagLinearOperator,
-    LinearOperator,
-    MatmulLinearOperator,
-    ZeroLinearOperator,
-)
-from linear_operator.utils.cholesky import psd_safe_cholesky
+from linear_operator.operators import LinearOperator, ZeroLinearOperator
+from linear_operator.utils.errors import NotPSDError
 from torch import Tensor
+
+from gpadjust.gp import SumOfTerms, Term
+from gpadjust.gp.gaussian import cholesky, noise_variances
+
+Weights = list[tuple[Term, Tensor | None]]
+"""Terms and what each is multiplied by, ``... x n``, or None for 1."""
 
 
 class Factors(NamedTuple):
     r"""The inverse Cholesky factor of ``n`` points by its blocks of rows, and the weights.
 
     Args:
-        base: The first ``n_0`` rows without their zeros, ``... x n_0 x n_0``.
+        base: The first ``n_0`` rows without their zeros, ``... x n_0 x n_0``. Rows and columns of
+            missing observations are zero, so that covariances with these do not count.
         rows: The other rows, ``... x (n - n_0) x n``; one base serves a batch of them.
         alpha: The weights :math:`K^{-1} (y - m)`, ``... x n``.
     """
@@ -47,21 +45,62 @@ class Factors(NamedTuple):
         shape = torch.broadcast_shapes(first.shape[:-1], rest.shape[:-1])
         return torch.cat([first.expand(*shape, -1), rest.expand(*shape, -1)], dim=-1)
 
+    @classmethod
+    def of(cls, covariance: Tensor, residual: Tensor) -> Factors:
+        """Factorise.
+
+        Args:
+            covariance: The covariance of the targets, noise included, ``... x n x n``; it is
+                overwritten.
+            residual: Targets less their prior mean, ``... x n``; NaN where one is missing.
+        """
+        observed = ~residual.isnan()
+        chol, failed = cholesky(covariance, None if observed.all() else observed)
+        if failed.any():
+            raise NotPSDError(
+                "The covariance of the training targets has no Cholesky factor, with any nugget: "
+                "some hyper-parameter is not finite."
+            )
+        identity = torch.diag_embed(observed.to(chol))
+        inverse = torch.linalg.solve_triangular(chol, identity.expand_as(chol), upper=False)
+        whitened = inverse @ residual.nan_to_num(nan=0.0).unsqueeze(-1)
+        return cls(inverse, inverse[..., :0, :], (inverse.mT @ whitened).squeeze(-1))
+
+    def solve(self, residual: Tensor) -> Tensor:
+        """Return :math:`K^{-1} r` for r, ``... x n``."""
+        white = self.whiten(residual.unsqueeze(-2))
+        n_0 = self.base.shape[-1]
+        first = pad(white[..., :n_0] @ self.base, residual.shape[-1] - n_0)
+        return (first + white[..., n_0:] @ self.rows).squeeze(-2)
+
+    def squared_columns(self) -> Tensor:
+        """The diagonal of the inverse covariance, ``... x n``; zero for missing observations."""
+        first = self.base.square().sum(-2)
+        return pad(first, self.rows.shape[-2]) + self.rows.square().sum(-2)
+
     def append(self, cross: Tensor, corner: Tensor, residual: Tensor) -> Factors:
         """Return the factors with ``k`` more points.
 
         Args:
             cross: Covariances of the new points with the old ones, ``... x k x n``.
             corner: Covariance of the new targets, noise included, ``... x k x k``.
-            residual: New targets less their prediction by the old ones, ``... x k``.
+            residual: New targets less their prediction by the old ones, ``... x k``; NaN where one
+                is missing.
         """
         n_0, n, k = self.base.shape[-1], *cross.shape[-1:], cross.shape[-2]
+        observed = ~residual.isnan()
+        residual = residual.nan_to_num(nan=0.0)
+        if not observed.all():
+            cross = cross * observed.unsqueeze(-1)
         border = self.whiten(cross)
-        chol = psd_safe_cholesky(corner - border @ border.mT)
+        chol, _ = cholesky(
+            corner - border @ border.mT, None if observed.all() else observed, n + k
+        )
         row = pad(batched_product(border[..., :n_0], self.base), n - n_0)
         if self.rows.shape[-2]:
             row = row + border[..., n_0:] @ self.rows
-        identity = torch.eye(k, dtype=chol.dtype, device=chol.device).expand_as(chol)
+        identity = torch.diag_embed(observed.to(chol)).expand(*row.shape[:-2], k, k)
+        chol = chol.expand(*row.shape[:-2], k, k)
         row = torch.linalg.solve_triangular(chol, torch.cat([-row, identity], -1), upper=False)
         rows = torch.cat([pad(self.rows, k).expand(*row.shape[:-2], -1, -1), row], dim=-2)
         whitened = row[..., n:] @ residual.unsqueeze(-1)
@@ -114,14 +153,18 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         train_prior_dist: MultivariateNormal,
         train_labels: Tensor,
         likelihood: _GaussianLikelihoodBase,
+        kernel: SumOfTerms,
     ) -> None:
         # GPyTorch's own makes lazy covariances that are not needed here.
         self.train_inputs = train_inputs
         self.train_prior_dist = train_prior_dist
         self.train_labels = train_labels
         self.likelihood = likelihood
+        self.kernel = kernel
         self._train_shape = train_prior_dist.event_shape
         self._factors: Factors | None = None
+        self.kept: dict[str, Any] = {}  # what else a model makes of the same data
+        self._prepared: dict[str, tuple[Callable[[Tensor], Tensor], Tensor | None]] | None = None
 
     def factors(self) -> Factors:
         """Return the factors, computed at the first call."""
@@ -132,25 +175,52 @@ class CholeskyStrategy(DefaultPredictionStrategy):
     def _factorise(self) -> Factors:
         with torch.set_grad_enabled(torch.is_grad_enabled() and detach_test_caches.off()):
             # Not from the lazy covariances at hand, which would keep a matrix each.
-            prior_mean, kernel = self.train_prior_dist.mean, self._kernel
-            with lazily_evaluate_kernels(False):
-                prior = MultivariateNormal(prior_mean, kernel(self.train_inputs[0]))
-            noisy = self.likelihood(prior, self.train_inputs).lazy_covariance_matrix
-            chol = psd_safe_cholesky(to_dense(noisy))
-            identity = torch.eye(chol.shape[-1], dtype=chol.dtype, device=chol.device)
-            inverse = torch.linalg.solve_triangular(chol, identity, upper=False)
-            residual = self.train_labels - prior_mean
-            whitened = inverse @ residual.unsqueeze(-1)
-            alpha = (inverse.mT @ whitened).squeeze(-1)
-        for factor in (inverse, alpha):
+            covariance = self.noisy_covariance(self.kernel)
+            factors = Factors.of(covariance, self.train_labels - self.train_prior_dist.mean)
+        for factor in (factors.base, factors.alpha):
             if factor.grad_fn is not None:
                 # A backward pass frees the graph that a later prediction would need.
                 factor.grad_fn.register_hook(self._forget)
-        return Factors(inverse, inverse[..., :0, :], alpha)
+        return factors
 
-    @property
-    def _kernel(self) -> Kernel:
-        return self.train_prior_dist.lazy_covariance_matrix.kernel
+    def noisy_covariance(self, kernel: SumOfTerms) -> Tensor:
+        """The covariance of the training targets under a kernel, noise included, ``... x n x n``."""
+        (train,) = self.train_inputs
+        return kernel.forward(train, train) + self.noise_covariance()
+
+    def noise_covariance(self) -> Tensor:
+        """The covariance of the training targets' noise, ``... x n x n``."""
+        return torch.diag_embed(noise_variances(self.likelihood, self.train_inputs[0]))
+
+    def cross_covariance(self, inputs: Tensor, weights: Weights) -> Tensor:
+        """The covariance of a weighted sum of terms with the targets.
+
+        Args:
+            inputs: Transformed inputs, ``... x q x d``.
+            weights: The terms and their weights at the inputs.
+
+        Returns:
+            ``... x q x n``.
+        """
+        if self._prepared is None:
+            (train,) = self.train_inputs
+            self._prepared = {
+                term.name: (term.covariance_with(train), term.weights(train))
+                for term in self.kernel.terms
+                if not term.is_known
+            }
+        total: Tensor | None = None
+        for term, weight in weights:
+            if term.name not in self._prepared:
+                continue
+            covariance, basis = self._prepared[term.name]
+            part = covariance(inputs)
+            part = part if basis is None else part * basis.unsqueeze(-2)
+            part = part if weight is None else part * weight.unsqueeze(-1)
+            total = part if total is None else total + part
+        if total is None:
+            total = inputs.new_zeros(*inputs.shape[:-1], self.num_train)
+        return total
 
     @property
     def mean_cache(self) -> Tensor:
@@ -177,15 +247,15 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         """Return the posterior covariance, ``... x q x q``."""
         if skip_posterior_variances.on():
             return ZeroLinearOperator(*test_test_covar.shape)
+        prior = to_dense(test_test_covar)
         root = self.factors().whiten(to_dense(test_train_covar))
-        prior_variance = test_test_covar.diagonal(dim1=-1, dim2=-2)
-        variance = (prior_variance - root.square().sum(-1)).detach()
+        prior_variance = prior.diagonal(dim1=-1, dim2=-2)
+        covariance = prior - root @ root.mT
+        variance = covariance.diagonal(dim1=-1, dim2=-2).detach()
         excess = (self._least_variance(prior_variance) - variance).clamp_min(0)
-        if isinstance(test_test_covar, Tensor):
-            covariance = to_linear_operator(test_test_covar - root @ root.mT)
-        else:
-            covariance = test_test_covar + MatmulLinearOperator(root, -root.mT)
-        return covariance + DiagLinearOperator(excess) if excess.any() else covariance
+        if excess.any():
+            covariance = covariance + torch.diag_embed(excess)
+        return to_linear_operator(covariance)
 
     def marginals(
         self, prior_mean: Tensor, prior_variance: Tensor, covariance: Tensor
@@ -230,18 +300,18 @@ class CholeskyStrategy(DefaultPredictionStrategy):
             kwargs: ``noise``, the known variances of the new observations, ``... x k``.
         """
         n = self.num_train
-        kernel = self._kernel
+        kernel = self.kernel
         train, new = full_inputs[0][..., :n, :], full_inputs[0][..., n:, :]
-        with lazily_evaluate_kernels(False):
-            cross, corner = to_dense(kernel(new, train)), kernel(new, new)
         likelihood = self.likelihood.get_fantasy_likelihood(**kwargs)
-        prior = MultivariateNormal(full_output.mean[..., n:], corner)
-        corner = likelihood(prior, inputs, **kwargs).covariance_matrix
+        cross = kernel.forward(new, train)
+        noise = noise_variances(likelihood, new, **kwargs)
+        corner = kernel.forward(new, new) + torch.diag_embed(noise)
+        mean = full_output.mean[..., n:]
 
-        residual = targets - self.exact_predictive_mean(prior.mean, cross)
+        residual = targets - self.exact_predictive_mean(mean, cross)
         factors = self.factors().append(cross, corner, residual)
         if detach_test_caches.on():
             factors = Factors(*(factor.detach() for factor in factors))
-        strategy = type(self)(full_inputs, full_output, full_targets, likelihood)
+        strategy = type(self)(full_inputs, full_output, full_targets, likelihood, kernel)
         strategy._factors = factors
         return strategy

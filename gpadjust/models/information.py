@@ -1,23 +1,86 @@
-"""What observations would tell of what a model does not know."""
+"""What the data leave unknown of a model, and what observations would tell of it."""
 
 from __future__ import annotations
 
 import torch
-from gpytorch.distributions import MultivariateNormal
-from gpytorch.settings import min_variance
-from linear_operator.operators import DiagLinearOperator
-from linear_operator.utils.cholesky import psd_safe_cholesky
 from torch import Tensor
 
-from gpadjust.models.conditional_covariance import ConditionalCovariance
-from gpadjust.models.multi_output_gp import MultiOutputGP
+from gpadjust.gp import SumOfTerms
+from gpadjust.gp.gaussian import cholesky
+from gpadjust.models.cholesky_strategy import Factors
+from gpadjust.models.exact_gp_base import ExactGPBase
+
+
+class UnknownCovariance:
+    r"""What the data leave unknown of a sum of terms, as if they were of these and noise alone.
+
+    With the terms' covariance K of the data, noise included, and U of new points with the data,
+
+    .. math:: k(X, X) - U K^{-1} U^T.
+
+    Where constant means with the bases H and the prior variances :math:`\kappa` are unknown, K is
+    that without them, and :math:`R (\mathrm{diag}(\kappa)^{-1} + H^T K^{-1} H)^{-1} R^T` with
+    :math:`R = H_X - U K^{-1} H` is added (Rasmussen and Williams 2006, eq. 2.42), so that vague
+    priors cost no digits.
+
+    Args:
+        model: The model, in eval mode.
+        names: The names of the terms. Default: all.
+    """
+
+    def __init__(self, model: ExactGPBase, names: tuple[str, ...] | None = None) -> None:
+        strategy = model.strategy()
+        (self.train,) = model.train_inputs
+        self.terms = [t for t in model.terms if names is None or t.name in names]
+        self.constants = [term for term in self.terms if term.learns_mean]
+        self.kernel = SumOfTerms(self.terms, known_means=True)
+        self.has_kernel = any(term.kernel is not None for term in self.terms)
+        if names is None and not self.constants:
+            self.factors = strategy.factors()
+            return
+        if self.has_kernel:
+            covariance = strategy.noisy_covariance(self.kernel)
+        else:
+            covariance = strategy.noise_covariance()
+        self.factors = Factors.of(covariance, model.train_targets)
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """Return ``... x q x q`` without noise, at transformed inputs ``... x q x d``."""
+        q, n = inputs.shape[-2], self.train.shape[-2]
+        batch = torch.broadcast_shapes(inputs.shape[:-2], self.train.shape[:-2])
+        train = self.train.expand(*batch, *self.train.shape[-2:])
+        if self.has_kernel:
+            prior, cross = self.kernel.forward(inputs, inputs), self.kernel.forward(inputs, train)
+        else:
+            prior, cross = inputs.new_zeros(*batch, q, q), inputs.new_zeros(*batch, q, n)
+        white = self.factors.whiten(cross)
+        covariance: Tensor = prior - white @ white.mT
+        least = 4 * n * torch.finfo(prior.dtype).eps * prior.diagonal(dim1=-1, dim2=-2).detach()
+        excess = (least - covariance.detach().diagonal(dim1=-1, dim2=-2)).clamp_min(0)
+        covariance = covariance + torch.diag_embed(excess)
+        if not self.constants:
+            return covariance
+        # In units of the constants' prior, where the matrix to invert is at least the identity.
+        known = self.factors.whiten(self._columns(self.train).mT)
+        rest = self._columns(inputs) - white @ known.mT
+        identity = torch.eye(known.shape[-2], dtype=known.dtype, device=known.device)
+        chol = torch.linalg.cholesky(identity + known @ known.mT)
+        root = torch.linalg.solve_triangular(chol, rest.mT, upper=False)
+        return covariance + root.mT @ root
+
+    def _columns(self, inputs: Tensor) -> Tensor:
+        """The constants' bases, for a prior variance of one, ``... x q x k``."""
+        one = torch.ones_like(inputs[..., 0])
+        columns = [(one if t.basis is None else t.basis(inputs)) for t in self.constants]
+        roots = [term.mean_variance.sqrt() for term in self.constants]
+        return torch.stack([c * root for c, root in zip(columns, roots, strict=True)], dim=-1)
 
 
 def information_gain(
-    model: MultiOutputGP,
+    model: ExactGPBase,
     X: Tensor,
-    unknown: ConditionalCovariance,
-    remaining: ConditionalCovariance | None = None,
+    unknown: UnknownCovariance,
+    remaining: UnknownCovariance | None = None,
     counted: Tensor | None = None,
 ) -> Tensor:
     r"""The information of noisy observations at a batch of points, in nats.
@@ -37,11 +100,10 @@ def information_gain(
         The information, ``batch_shape``; of a model that holds samples of its hyper-parameters, of
         each of these, ``batch_shape x S``.
     """
-    inputs = model.transform_inputs(model._for_samples(X))
-    inputs = inputs.unsqueeze(-3) if model.num_outputs > 1 else inputs
+    inputs = model.model_inputs(X)
     batch_shape = torch.broadcast_shapes(inputs.shape[:-2], model.train_inputs[0].shape[:-2])
     inputs = inputs.expand(*batch_shape, *inputs.shape[-2:])
-    noise = _noise(model, inputs)
+    noise = model.observation_noise(inputs).expand(inputs.shape[:-1])
     if counted is not None:
         for _ in range(noise.dim() - counted.dim()):
             counted = counted.unsqueeze(-2)
@@ -52,19 +114,11 @@ def information_gain(
     return information.sum(-1) if model.num_outputs > 1 else information
 
 
-def _noise(model: MultiOutputGP, inputs: Tensor) -> Tensor:
-    """The noise variances of observations at transformed inputs, ``... x q``."""
-    nothing = torch.zeros_like(inputs[..., 0])
-    silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
-    with min_variance(double_value=0.0):
-        noise: Tensor = model._apply_noise(inputs, silent, True).variance
-    return noise
-
-
 def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
     """Half the log-determinant of noisy observations' covariance, in units of their noise."""
     sd = noise.sqrt()
     scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
-    chol = psd_safe_cholesky(scaled + torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device))
+    identity = torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device)
+    chol, _ = cholesky(scaled + identity)
     log_sds: Tensor = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
     return log_sds

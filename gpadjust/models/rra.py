@@ -1,65 +1,60 @@
-"""Ridge regression adjustment."""
+"""Ridge regression adjustment: Bayesian linear regression on random features."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import pyro
 import pyro.distributions as dist
 import torch
-from botorch.acquisition.objective import PosteriorTransform
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
-from botorch.posteriors import GPyTorchPosterior, Posterior
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.distributions import MultivariateNormal
-from gpytorch.kernels import ScaleKernel
+from gpytorch.kernels import RFFKernel, ScaleKernel
 from gpytorch.likelihoods import Likelihood
-from gpytorch.means import ZeroMean
-from linear_operator import to_linear_operator
 from linear_operator.operators import RootLinearOperator
 from torch import Size, Tensor
 
-from gpadjust.gp import DataInterval, FourierFeatures, FourierKernel
-from gpadjust.models.adjusted_functions import AdjustedFunctions, AdjustmentFeatures
-from gpadjust.models.adjustment_gp import AdjustmentGP, Component
-from gpadjust.physics import Physics
+from gpadjust.gp.gaussian import noise_variances
+from gpadjust.models.adjusted_gp import AdjustedGP, Adjustment, Means, PhysicsLike
+from gpadjust.models.cholesky_strategy import Weights
+from gpadjust.models.hyperparameters import default_constraint
+from gpadjust.models.sampled_functions import SampledFunctions, TermFeatures
+from gpadjust.models.training_data import ArrayLike
 
 
-class RRA(AdjustmentGP):
+class RRA(AdjustedGP):
     r"""Ridge regression adjustment (Wannawas and Faisal 2023, section 2.2), a Bayesian linear model
 
     .. math:: f_a(x) = f_p(x) + [f_p(x)\, \varphi_\rho(x)^T, \; \varphi_\delta(x)^T]\, \beta, \quad
         \beta_\rho \sim N(0, s_\rho^2 I), \; \beta_\delta \sim N(0, s_\delta^2 I)
 
-    on random Fourier features: :class:`~gpadjust.CKA` with RBF kernels, seen through finitely many
-    weights. It is a Gaussian process with the kernel of the features, so that the marginal
-    likelihood, that is the evidence of the regression, chooses lengthscales, prior scales and
-    noise, and the posterior of the weights is exact. The weights make whole *functions* that can
-    be evaluated anywhere (:meth:`sample_functions`), and a Pyro model (:meth:`pyro_model`).
+    on random Fourier features, pairs of sines and cosines (Rahimi and Recht 2007):
+    :class:`~gpadjust.CKA` with RBF kernels, seen through finitely many weights. Far from the data
+    it falls back to rho = 1 and delta = 0. It is a Gaussian process with the kernel of the
+    features, so that the marginal likelihood, that is the evidence of the regression, chooses
+    lengthscales, prior scales and noise; all predictions are those of the weights' exact posterior,
+    which lose no digits where there is no noise. The weights make whole *functions* that can be
+    evaluated anywhere (:meth:`sample_functions`), and a Pyro model (:meth:`pyro_model`).
 
     Args:
-        train_X: Inputs, ``batch_shape x n x d``, float64.
-        train_Y: Targets, ``batch_shape x n x m``, float64.
-        train_Yvar: Known observation variances, or None to learn one per output.
-        physics: The physics f_p, as in :class:`~gpadjust.CKA`.
-        num_features: Number ``D`` of features of each of rho and delta.
-        prior: ``"physics"``: rho = 1 and delta = 0 far from the data. ``"paper"``: the closed form
-            as printed there, which regresses y itself, so that the model falls to zero far from
-            the data: weights of prior variance 1 in the user's units, the noise variance as the
-            ridge :math:`\lambda`, :math:`\hat\beta = (\Phi^T\Phi + \lambda I)^{-1}\Phi^T y` and
-            covariance :math:`(\Phi^T\Phi + I)^{-1}`. It is here for comparison: its covariance is
-            not that of the conjugate posterior unless :math:`\lambda = 1`.
-        center: As in :class:`~gpadjust.CKA`.
-        likelihood: As in :class:`~gpadjust.CKA`.
-        outcome_transform: As in :class:`~gpadjust.CKA`; with ``prior="paper"`` the default is None.
-        input_transform: As in :class:`~gpadjust.CKA`.
+        train_X: As in :class:`~gpadjust.CKA`, like all that are not listed here.
+        train_Y: See there.
+        train_Yvar: See there.
+        physics: See there.
+        num_features: Number ``D`` of features of each of rho and delta, an even one.
+        rho_mean: See there.
+        delta_mean: See there.
+        center: See there.
+        likelihood: See there.
+        outcome_transform: See there.
+        input_transform: See there.
         seed: Seed of the features.
 
     Raises:
         TypeError: As :class:`~gpadjust.CKA`.
-        ValueError: As :class:`~gpadjust.CKA`, and for an unknown ``prior``.
+        ValueError: As :class:`~gpadjust.CKA`.
         PhysicsError: As :class:`~gpadjust.CKA`.
 
     Example:
@@ -76,103 +71,62 @@ class RRA(AdjustmentGP):
 
     def __init__(
         self,
-        train_X: Tensor,
-        train_Y: Tensor,
-        train_Yvar: Tensor | None = None,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike = None,
         *,
-        physics: Physics | Callable[[Tensor], Tensor],
+        physics: PhysicsLike,
         num_features: int = 128,
-        prior: Literal["physics", "paper"] = "physics",
+        rho_mean: Means | None = None,
+        delta_mean: float | Literal["learn"] = 0.0,
         center: float | Tensor | Literal["mean"] = 0.0,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
         seed: int = 0,
     ) -> None:
-        if prior not in ("physics", "paper"):
-            raise ValueError(f"Unknown prior {prior!r}; expected 'physics' or 'paper'.")
-        if not isinstance(num_features, int) or num_features < 1:
+        if not isinstance(num_features, int) or num_features < 2 or num_features % 2:
             raise ValueError(
-                f"Expected num_features to be a whole number >= 1, got {num_features}."
+                "Expected num_features to be an even whole number >= 2 (sines and cosines), got "
+                f"{num_features!r}."
             )
-        if prior == "paper" and isinstance(outcome_transform, _DefaultType):
-            outcome_transform = None
+        generator = torch.Generator().manual_seed(seed)
 
-        def kernel(num_inputs: int, batch_shape: Size, seed: int) -> ScaleKernel:
-            base = FourierKernel(
-                FourierFeatures(num_features, num_inputs, seed),
-                ard_num_dims=num_inputs,
-                batch_shape=batch_shape,
-                lengthscale_constraint=DataInterval(),
-            )
-            return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=DataInterval())
+        def kernel(num_inputs: int, batch_shape: Size) -> ScaleKernel:
+            return fourier_kernel(num_inputs, batch_shape, num_features, generator)
 
         super().__init__(
             train_X,
             train_Y,
             train_Yvar,
-            physics=physics,
-            rho_covar_module=lambda d, batch_shape: kernel(d, batch_shape, 2 * seed),
-            delta_covar_module=lambda d, batch_shape: kernel(d, batch_shape, 2 * seed + 1),
+            physics,
+            rho=Adjustment(kernel, rho_mean),
+            delta=Adjustment(kernel, delta_mean),
             center=center,
             likelihood=likelihood,
             outcome_transform=outcome_transform,
             input_transform=input_transform,
         )
         self.num_features = num_features
-        self.prior = prior
-        if prior == "paper":
-            if outcome_transform is not None:
-                raise ValueError("prior='paper' is in the user's units: outcome_transform=None.")
-            self.mean_module = ZeroMean()
-            self._rho_mean = 0.0
-            for kernel_ in (self.rho_covar_module, self.delta_covar_module):
-                kernel_.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
-
-    def check_can_hold_samples(self) -> None:
-        """As the base class; the paper's closed form has no likelihood to sample from."""
-        if self.prior == "paper":
-            raise ValueError(
-                "RRA(prior='paper') cannot be fully Bayesian: its covariance is not that of a "
-                "posterior. Take prior='physics'."
-            )
-        super().check_can_hold_samples()
-
-    def rho(self, X: Tensor) -> GPyTorchPosterior:
-        r"""The posterior of :math:`\rho` at raw ``X`` (``... x q x d``), without units."""
-        return self._adjustment(X, "rho")
-
-    def delta(self, X: Tensor) -> GPyTorchPosterior:
-        r"""The posterior of :math:`\delta` at raw ``X`` (``... x q x d``), in y's units."""
-        return self._adjustment(X, "delta")
 
     def weights(self) -> MultivariateNormal:
         r"""The posterior of the weights :math:`\beta = [\beta_\rho, \beta_\delta]`.
 
-        With ``prior="physics"`` it is the conjugate one, of precision
+        It is the conjugate one, of precision
         :math:`\Phi^T \Phi / \sigma^2 + \text{diag}(s^2)^{-1}`.
 
         Returns:
-            A normal distribution over ``batch_shape x (m) x 2D`` weights in the user's units:
-            those of rho without units, those of delta in the units of the targets.
+            A normal distribution over ``batch_shape x (m) x 2D`` weights in the user's units (of
+            several physics, ``D`` for each of them): those of rho without units, those of delta in
+            the units of the targets. An unknown mean (``rho_mean="learn"``) is a weight more,
+            after those of its function.
         """
         self.eval()
-        inputs = self.train_inputs[0]
-        scale, prior_sd = self._column.scale, self._prior_sd()
-        # In the units of the targets, and for weights of prior variance 1.
-        design = AdjustmentFeatures(self)(inputs) * (prior_sd / scale).unsqueeze(-2)
-        residual = (self.train_targets - self.mean_module(inputs)).unsqueeze(-1)
-        noise = self.likelihood.noise.unsqueeze(-1)
-        identity = torch.eye(design.shape[-1], dtype=design.dtype, device=design.device)
-        chol = torch.linalg.cholesky(design.mT @ (design / noise) + identity)
-        mean = torch.cholesky_solve(design.mT @ (residual / noise), chol).squeeze(-1)
-        if self.prior == "paper":
-            chol = torch.linalg.cholesky(design.mT @ design + identity)
-        root = torch.linalg.solve_triangular(chol, identity, upper=False).mT
-        covariance = RootLinearOperator(prior_sd.unsqueeze(-1) * root)
-        return MultivariateNormal(prior_sd * mean, covariance)
+        mean, root = self._weights_posterior()
+        sd = self._prior_sd()
+        return MultivariateNormal(sd * mean, RootLinearOperator(sd.unsqueeze(-1) * root))
 
-    def functions(self, weights: Tensor) -> AdjustedFunctions:
+    def functions(self, weights: Tensor) -> SampledFunctions:
         r"""The functions :math:`f_i` that given weights make, to be called anywhere.
 
         Args:
@@ -186,9 +140,18 @@ class RRA(AdjustmentGP):
         Raises:
             ValueError: If the weights have another shape.
         """
-        return AdjustedFunctions(self, weights)
+        sd = self._prior_sd()
+        if weights.dim() != sd.dim() + 1 or weights.shape[1:] != sd.shape:
+            raise ValueError(
+                f"Expected weights of shape k x {' x '.join(map(str, sd.shape))}, got "
+                f"{tuple(weights.shape)}."
+            )
+        self.eval()
+        features = [TermFeatures(term, 2) for term in self.terms]
+        sizes = [each.num_features for each in features]
+        return SampledFunctions(self, features, (weights / sd).detach().split(sizes, dim=-1))
 
-    def _draw_functions(self, num_functions: int) -> AdjustedFunctions:
+    def _draw_functions(self, num_functions: int, num_features: int) -> SampledFunctions:
         """As the base class, but exactly; see :meth:`functions`."""
         with torch.no_grad():
             return self.functions(self.weights().sample(Size([num_functions])))
@@ -218,86 +181,195 @@ class RRA(AdjustmentGP):
                 f"{tuple(self._input_batch_shape)}."
             )
         self.eval()
-        features = AdjustmentFeatures(self)
+        shift, scale = self._units()
         with torch.no_grad():
-            noise = self.likelihood.noise
             if X is None:
-                inputs = self.train_inputs[0]
-                obs: Tensor | None = features.user_units(self.train_targets)
+                inputs, obs = self.train_inputs[0], self.train_targets * scale + shift
+                noise = noise_variances(self.likelihood, inputs)
             else:
-                noise = noise.mean(-1, keepdim=True)  # known noise is that of the training points
-                inputs = self.transform_inputs(X)
-                inputs = inputs.expand(*self._aug_batch_shape, *inputs.shape[-2:])
-                obs = Y
-                if Y is not None:
-                    obs = Y.mT if self.num_outputs > 1 else Y.squeeze(-1)
+                inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)
+                noise = self._noise(inputs, True)
+                obs = None if Y is None else Y.mT if self.num_outputs > 1 else Y.squeeze(-1)
+            weights = [(term, term.weights(inputs)) for term in self.terms]
             prior_sd = self._prior_sd()
-            design, mean = features(inputs), features.prior_mean(inputs)
-            noise_sd = noise.sqrt() * self._column.scale
-        weights = pyro.sample(
+            design = self._design(inputs, weights) * scale.unsqueeze(-1) / prior_sd.unsqueeze(-2)
+            mean = self._prior_mean(inputs, weights) * scale + shift
+            noise_sd = noise.sqrt() * scale
+        beta = pyro.sample(
             "weights", dist.Normal(torch.zeros_like(prior_sd), prior_sd).to_event(prior_sd.dim())
         )
-        values: Tensor = mean + (design @ weights.unsqueeze(-1)).squeeze(-1)
+        values: Tensor = mean + (design @ beta.unsqueeze(-1)).squeeze(-1)
         pyro.sample("Y", dist.Normal(values, noise_sd).to_event(values.dim()), obs=obs)
         return values
 
-    def posterior(
-        self,
-        X: Tensor,
-        output_indices: list[int] | None = None,
-        observation_noise: bool | Tensor = False,
-        posterior_transform: PosteriorTransform | None = None,
-    ) -> Posterior:
-        """The posterior at raw ``X`` (``... x q x d``); see BoTorch."""
-        everything = output_indices is None or [*output_indices] == [*range(self.num_outputs)]
-        if self.prior != "paper" or not everything:
-            return super().posterior(X, output_indices, observation_noise, posterior_transform)
-        self.eval()
-        inputs, output_dim = self._with_output_dim(self.transform_inputs(X))
-        mvn = self._push_forward(AdjustmentFeatures(self)(inputs))
-        mvn = self._apply_noise(inputs, mvn, observation_noise)
-        posterior = self._as_posterior(mvn, output_dim)
-        return posterior if posterior_transform is None else posterior_transform(posterior)
+    def _joint(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
+        mean, root = self._push_forward(inputs, weights)
+        return mean, root @ root.mT
 
-    def _adjustment(self, X: Tensor, component: Component) -> GPyTorchPosterior:
-        """As the base class; the covariance of ``prior="paper"`` is not a Gaussian process's."""
-        if self.prior != "paper":
-            return super()._adjustment(X, component)
-        self.eval()
-        inputs, output_dim = self._with_output_dim(self.input_transform.without_physics(X))
-        features = AdjustmentFeatures(self)
-        x = inputs[..., : self._column.num_inputs]
-        rho, delta = features.rho.feature_map(x), features.delta.feature_map(x)
-        if component == "rho":
-            blocks = [rho, torch.zeros_like(delta)]
-        else:
-            blocks = [-self._column.offset.unsqueeze(-1) * rho, delta]
-        return self._as_posterior(self._push_forward(torch.cat(blocks, dim=-1)), output_dim)
+    def _marginals(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
+        mean, root = self._push_forward(inputs, weights)
+        return mean, root.square().sum(-1)
 
-    def _marginals(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """As the base class; the posterior of ``prior="paper"`` is that of its weights."""
-        if self.prior != "paper":
-            return super()._marginals(inputs)
-        features, weights = AdjustmentFeatures(self)(inputs), self.weights()
-        mean = (features @ weights.mean.unsqueeze(-1)).squeeze(-1)
-        root = weights.lazy_covariance_matrix.root.to_dense()
-        return mean, (features @ root).square().sum(-1)
+    def _push_forward(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
+        """Mean ``... x q`` and a root ``... x q x 2D`` of the covariance of a sum of terms."""
+        beta, root = self._weights_posterior()
+        design = self._design(inputs, weights)
+        mean = self._prior_mean(inputs, weights) + (design @ beta.unsqueeze(-1)).squeeze(-1)
+        return mean, design @ root
 
-    def _push_forward(self, features: Tensor) -> MultivariateNormal:
-        """The distribution of ``features @ weights``, for features ``... x q x 2D``."""
-        weights = self.weights()
-        mean = (features @ weights.mean.unsqueeze(-1)).squeeze(-1)
-        root = features @ weights.lazy_covariance_matrix.root.to_dense()
-        return MultivariateNormal(mean, to_linear_operator(root @ root.mT))
+    def _weights_posterior(self) -> tuple[Tensor, Tensor]:
+        """Mean and a root of the covariance of the weights, in their prior's units."""
+        strategy = self.strategy()
+        if "weights" not in strategy.kept:
+            with torch.set_grad_enabled(self.train_inputs[0].requires_grad):
+                strategy.kept["weights"] = self._regress()
+        return strategy.kept["weights"]
 
-    @property
-    def _covariance_noise(self) -> float | None:
-        """For leave-one-out: the noise variance in the covariance, if not that in the mean."""
-        return 1.0 if self.prior == "paper" else None
+    def _regress(self) -> tuple[Tensor, Tensor]:
+        (inputs,) = self.train_inputs
+        weights = [(term, term.weights(inputs)) for term in self.terms]
+        residual = self.train_targets - self._prior_mean(inputs, weights)
+        return regression(
+            self._design(inputs, weights), residual, noise_variances(self.likelihood, inputs)
+        )
+
+    def _design(self, inputs: Tensor, weights: Weights) -> Tensor:
+        """Weighted features, of all terms of the model, for weights N(0, I): ``... x q x 2D``."""
+        by_name = {term.name: weight for term, weight in weights}
+        parts = []
+        for term in self.terms:
+            phi = TermFeatures(term, 2)(inputs)
+            if term.name not in by_name:
+                phi = torch.zeros_like(phi)
+            elif by_name[term.name] is not None:
+                phi = phi * by_name[term.name].unsqueeze(-1)
+            parts.append(phi)
+        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
 
     def _prior_sd(self) -> Tensor:
         """Prior standard deviations of the weights in the user's units, ``... x 2D``."""
-        shape = (*self._aug_batch_shape, self.num_features)
-        rho = self.rho_covar_module.outputscale.sqrt().unsqueeze(-1).expand(shape)
-        delta = self.delta_covar_module.outputscale.sqrt().unsqueeze(-1) * self._column.scale
-        return torch.cat([rho, delta.expand(shape)], dim=-1)
+        parts = []
+        with torch.no_grad():
+            for term in self.terms:
+                _, scale = self._term_units(term.name)
+                kernel: Any = term.kernel
+                sd = kernel.outputscale.sqrt().unsqueeze(-1) * scale
+                parts.append(sd.expand(*sd.shape[:-1], self.num_features))
+                if term.learns_mean:
+                    parts.append(term.mean_variance.sqrt() * scale)
+        return torch.cat(parts, dim=-1)
+
+
+class PaperRRA(RRA):
+    r"""The ridge regression adjustment as printed in the paper, for comparison.
+
+    It regresses y itself, so that it falls to zero far from the data; weights have the prior
+    variance 1 in the user's units, the noise variance is the ridge :math:`\lambda`:
+
+    .. math:: \hat\beta = (\Phi^T\Phi + \lambda I)^{-1}\Phi^T y, \quad
+        \mathrm{Cov}(\beta) = (\Phi^T\Phi + I)^{-1},
+
+    which is not the covariance of the conjugate posterior unless :math:`\lambda = 1`. It cannot be
+    fully Bayesian, nor tell the information of an observation. The arguments are those of
+    :class:`RRA`, without prior means, and always in the user's units.
+    """
+
+    def __init__(
+        self,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike = None,
+        *,
+        physics: PhysicsLike,
+        num_features: int = 128,
+        center: float | Tensor | Literal["mean"] = 0.0,
+        likelihood: Likelihood | None = None,
+        input_transform: InputTransform | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(
+            train_X,
+            train_Y,
+            train_Yvar,
+            physics=physics,
+            num_features=num_features,
+            rho_mean=0.0,
+            center=center,
+            likelihood=likelihood,
+            outcome_transform=None,
+            input_transform=input_transform,
+            seed=seed,
+        )
+        for term in self.terms:
+            kernel: Any = term.kernel
+            kernel.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
+
+    def check_can_hold_samples(self) -> None:
+        """Refuse: the paper's closed form has no likelihood to sample from."""
+        raise ValueError(
+            "PaperRRA cannot be fully Bayesian: its covariance is not that of a posterior. Take "
+            "RRA."
+        )
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        """As the base class, with the variance of the paper's covariance."""
+        mean, _ = super().left_out()
+        (inputs,) = self.train_inputs
+        with torch.no_grad():
+            design = self._design(inputs, [(term, term.weights(inputs)) for term in self.terms])
+            identity = torch.eye(design.shape[-2], dtype=design.dtype, device=design.device)
+            precision = torch.linalg.inv(design @ design.mT + identity)
+            latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
+            return mean, latent + noise_variances(self.likelihood, inputs)
+
+    def _regress(self) -> tuple[Tensor, Tensor]:
+        mean, _ = super()._regress()
+        (inputs,) = self.train_inputs
+        design = self._design(inputs, [(term, term.weights(inputs)) for term in self.terms])
+        one = torch.ones_like(design[..., 0])
+        return mean, regression(design, self.train_targets, one)[1]
+
+
+def fourier_kernel(
+    num_inputs: int, batch_shape: Size, num_features: int, generator: torch.Generator
+) -> ScaleKernel:
+    """A scaled ``RFFKernel`` with a lengthscale per input; the outputs share its frequencies."""
+    base = RFFKernel(
+        num_samples=num_features // 2,
+        ard_num_dims=num_inputs,
+        batch_shape=batch_shape,
+        lengthscale_constraint=default_constraint(),
+    )
+    shape = (num_inputs, num_features // 2)
+    frequencies = torch.randn(shape, generator=generator, dtype=torch.float64)
+    base._init_weights(randn_weights=frequencies.expand(*batch_shape, *shape).clone())
+    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=default_constraint())
+
+
+def regression(design: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Bayesian linear regression with weights N(0, I), by an orthogonal factorisation.
+
+    With :math:`\begin{bmatrix} \Phi / \sigma \\ I \end{bmatrix} = Q R` the posterior of the weights
+    is :math:`N(R^{-1} Q^T [r / \sigma; 0], \; R^{-1} R^{-T})`: no digits cancel, however small the
+    noise.
+
+    Args:
+        design: :math:`\Phi`, ``... x n x p``.
+        residual: Targets less their prior mean, ``... x n``; NaN where one is missing.
+        noise: Noise variances, ``... x n``.
+
+    Returns:
+        The mean ``... x p``, and the root :math:`R^{-1}` of the covariance, ``... x p x p``.
+    """
+    weight = noise.rsqrt().masked_fill(residual.isnan(), 0.0)
+    p = design.shape[-1]
+    scaled = design * weight.unsqueeze(-1)
+    identity = torch.eye(p, dtype=design.dtype, device=design.device)
+    identity = identity.expand(*scaled.shape[:-2], p, p)
+    q, r = torch.linalg.qr(torch.cat([scaled, identity], dim=-2))
+    root = torch.linalg.solve_triangular(r, identity, upper=True)
+    target = (residual.nan_to_num(nan=0.0) * weight).unsqueeze(-1)
+    n = design.shape[-2]
+    mean = root @ (q[..., :n, :].mT @ target)
+    return mean.squeeze(-1), root

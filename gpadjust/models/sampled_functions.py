@@ -1,63 +1,89 @@
-"""Functions drawn from the posterior of a Gaussian process."""
+"""Functions drawn from the posterior of a sum of terms, to be called anywhere."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from copy import deepcopy
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from botorch.sampling.pathwise import draw_kernel_feature_paths, draw_matheron_paths
-from botorch.sampling.pathwise.features import FeatureMap, gen_kernel_features
+from botorch.sampling.pathwise.features import gen_kernel_features
+from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, RFFKernel, ScaleKernel
 from torch import Size, Tensor
-from torch.nn import Module
+from torch.nn import Module, ModuleList
 
-if TYPE_CHECKING:
-    from gpadjust.models.multi_output_gp import MultiOutputGP
+from gpadjust.gp import Term
+from gpadjust.gp.gaussian import noise_variances
+from gpadjust.models.hyperparameter_samples import take_samples
 
 
 class SampledFunctions(Module):
-    """Deterministic functions from a posterior, by Matheron's rule (Wilson et al. 2020).
+    r"""Deterministic functions from a posterior, by Matheron's rule (Wilson et al. 2020).
 
-    Each is a function from the prior, on random Fourier features, plus the exact update that makes
-    it meet the data. They can be called anywhere, so that particles that follow one of them stay
-    consistent along a trajectory; gradients flow to the inputs as far as f_p allows.
+    Each is a function from the prior, on random Fourier features :math:`\varphi_t` of the terms,
+    plus the exact update that makes it meet the data,
+
+    .. math:: f(x) = \sum_t b_t(x) \left[ \bar g_t + \varphi_t(x)^T w_t
+        + k_t(x, X) B_t v \right], \quad v = K^{-1} (y - f_{prior}(X) - \varepsilon).
+
+    They can be called anywhere, so that particles that follow one of them stay consistent along a
+    trajectory; gradients flow to the inputs as far as f_p allows, which is evaluated once a call.
 
     Args:
         model: The model; later changes of it have no effect here.
-        num_functions: Number ``k`` of functions.
-        num_features: Number of random features of each stationary kernel.
+        features: The features of each term.
+        weights: The weights w of each term, ``k x batch_shape x (m) x D_t``.
+        updates: :math:`B_t v` of each term, ``k x batch_shape x (m) x n``; none for functions that
+            the weights say all about.
     """
 
-    def __init__(self, model: MultiOutputGP, num_functions: int, num_features: int) -> None:
+    def __init__(
+        self,
+        model: Any,
+        features: Sequence[TermFeatures],
+        weights: Sequence[Tensor],
+        updates: Sequence[Tensor] = (),
+    ) -> None:
         super().__init__()
-        model = deepcopy(model).requires_grad_(False).eval()
-        draw = partial(
-            draw_kernel_feature_paths,
-            num_features=num_features,
-            weight_generator=_normal,
-            map_generator=partial(_features, model.train_inputs[0].shape[-1]),
-        )
-        with torch.no_grad():
-            self.paths = draw_matheron_paths(model, Size([num_functions]), prior_sampler=draw)
-        self.batch_shape = model.batch_shape
+        (train,) = model.train_inputs
+        self.input_transform = deepcopy(getattr(model, "input_transform", None))
         self.has_outputs = model.num_outputs > 1
+        self.batch_shape: Size = model.batch_shape
+        # Together, as the features read the kernels of the terms.
+        copies = deepcopy([(term, each) for term, each in zip(model.terms, features, strict=True)])
+        self.terms = ModuleList(term for term, _ in copies)
+        self.features = ModuleList(each for _, each in copies)
+        for name, tensor in zip(("shift", "scale"), model._units(), strict=True):
+            self.register_buffer(name, tensor)
+        self.weights, self.updates = [*weights], [*updates]
+        self.requires_grad_(False).eval()
+        self.cross = [term.covariance_with(train.detach()) for term in self.terms]
+
+    @classmethod
+    def by_matheron(cls, model: Any, num_functions: int, num_features: int) -> SampledFunctions:
+        """Draw ``k`` functions of each batch of a model from its posterior."""
+        strategy, (train,) = model.strategy(), model.train_inputs
+        with torch.no_grad():
+            features = [TermFeatures(term, num_features) for term in model.terms]
+            shape = (num_functions, *model._aug_batch_shape)
+            weights = [
+                torch.randn(*shape, each.num_features, dtype=torch.float64).to(train)
+                for each in features
+            ]
+            noise = noise_variances(model.likelihood, train).sqrt()
+            noise = noise * torch.randn(num_functions, *train.shape[:-1]).to(train)
+            prior = cls(model, features, weights)._values(train)
+            residual = (model.train_targets - prior - noise).nan_to_num(nan=0.0)
+            update, bases = strategy.factors().solve(residual), [t.weights(train) for t in model.terms]
+            return cls(model, features, weights, [update if b is None else b * update for b in bases])
 
     def forward(self, X: Tensor) -> Tensor:
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
-        batch = self.batch_shape
-        lead = torch.broadcast_shapes(X.shape[:-2], batch)
-        extra = len(lead) - len(batch)
-        # BoTorch's paths take one list of points per batch.
-        count = lead[:extra].numel()
-        points = X.expand(*lead, *X.shape[-2:]).reshape(count, *batch, *X.shape[-2:])
-        points = points.movedim(0, -3).flatten(-3, -2)
-        values = self.paths(points.unsqueeze(-3) if self.has_outputs else points)
-        values = values.mT if self.has_outputs else values.unsqueeze(-1)
-        values = values.unflatten(-2, (count, X.shape[-2])).movedim(-3, 1)
-        return values.reshape(values.shape[0], *lead[:extra], *values.shape[2:])
+        lead = torch.broadcast_shapes(X.shape[:-2], self.batch_shape)
+        extra = len(lead) - len(self.batch_shape)
+        inputs = self._inputs(X.expand(*lead, *X.shape[-2:]))
+        return self._to_user(self._values(inputs, extra))
 
     def each(self, X: Tensor) -> Tensor:
         """Evaluate each function at points of its own.
@@ -68,18 +94,111 @@ class SampledFunctions(Module):
         Returns:
             ``k x q x m``: the i-th function at the i-th block of points.
         """
-        values: Tensor = self.paths(X.unsqueeze(-3) if self.has_outputs else X)
+        return self._to_user(self._values(self._inputs(X)))
+
+    def _inputs(self, X: Tensor) -> Tensor:
+        inputs = X if self.input_transform is None else self.input_transform(X)
+        return inputs.unsqueeze(-3) if self.has_outputs else inputs
+
+    def _to_user(self, values: Tensor) -> Tensor:
+        values = values * self.scale + self.shift
         return values.mT if self.has_outputs else values.unsqueeze(-1)
+
+    def _values(self, inputs: Tensor, extra: int = 0) -> Tensor:
+        """The functions in model units, ``k x ... x (m) x q``.
+
+        Args:
+            inputs: Transformed inputs, ``... x (m) x q x d``.
+            extra: How many dimensions of them lead those of the model.
+        """
+        total = inputs.new_zeros(())
+        for i, (term, features) in enumerate(zip(self.terms, self.features, strict=True)):
+            phi = features(inputs)
+            part = term.mean + _product(phi, self.weights[i], extra)
+            if self.updates and not term.is_known:
+                part = part + _product(self.cross[i](inputs), self.updates[i], extra)
+            basis = term.weights(inputs)
+            part = part if basis is None else part * basis
+            total = total + part
+        return total
+
+
+def _product(matrix: Tensor, vectors: Tensor, extra: int) -> Tensor:
+    """Matrices ``extra x ... x q x n`` times vectors ``k x ... x n``: ``k x extra x ... x q``."""
+    vectors = vectors.reshape(vectors.shape[0], *[1] * extra, *vectors.shape[1:])
+    return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
+
+
+class TermFeatures(Module):
+    r"""Random features of a term's Gaussian process, of covariance :math:`\varphi(x)^T\varphi(x')`.
+
+    Args:
+        term: The term.
+        num_features: Number of features of each stationary kernel.
+    """
+
+    def __init__(self, term: Term, num_features: int) -> None:
+        super().__init__()
+        self.num_inputs = term.num_inputs
+        self.maps = ModuleList(_feature_maps(term.kernel, term.num_inputs, num_features))
+        self.mean_variance = term.mean_variance if term.learns_mean else None
+        with torch.no_grad():
+            self.num_features = self(term.mean.new_zeros(1, term.num_inputs)).shape[-1]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return ``... x n x D`` at ``x``, ``... x n x (d + k)``."""
+        parts = [each(x[..., : self.num_inputs]) for each in self.maps]
+        if self.mean_variance is not None:
+            root = self.mean_variance.sqrt().unsqueeze(-1)
+            parts.append(root.expand(*root.shape[:-2], x.shape[-2], 1))
+        if not parts:
+            return x.new_zeros(*x.shape[:-1], 0)
+        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
+
+
+class KernelFeatures(Module):
+    """The features that an ``RFFKernel`` is made of, or those of a ``ConstantKernel``."""
+
+    def __init__(self, kernel: Kernel, scale: ScaleKernel | None) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.scale = scale
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return ``... x n x D``."""
+        if isinstance(self.kernel, ConstantKernel):
+            root: Tensor = self.kernel.constant.sqrt().unsqueeze(-1)
+            features = root.expand(*root.shape[:-2], x.shape[-2], 1)
+        else:
+            features = self.kernel._featurize(x, normalize=True)
+        if self.scale is not None:
+            features = features * self.scale.outputscale.sqrt()[..., None, None]
+        return features
+
+
+def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> list[Module]:
+    """The feature maps of a kernel, whose features side by side are those of the kernel."""
+    if kernel is None:
+        return []
+    if isinstance(kernel, AdditiveKernel) and kernel.active_dims is None:
+        return [m for part in kernel.kernels for m in _feature_maps(part, num_inputs, num_features)]
+    scale = kernel if isinstance(kernel, ScaleKernel) else None
+    base = kernel if scale is None else scale.base_kernel
+    exact = isinstance(base, RFFKernel | ConstantKernel)
+    if exact and base.active_dims is None and kernel.active_dims is None:
+        return [KernelFeatures(base, scale)]
+    return [gen_kernel_features(kernel, num_inputs=num_inputs, num_outputs=num_features)]
 
 
 class FunctionPerBatch(Module):
     """One function of each batch of a model, seen as so many functions of the same inputs.
 
     Args:
-        functions: Maps ``... x k x q x d`` to ``1 x ... x k x q x m`` in ``k`` batches.
+        functions: Functions of a model with ``k`` batches, one of each.
     """
 
-    def __init__(self, functions: Module) -> None:
+    def __init__(self, functions: SampledFunctions) -> None:
         super().__init__()
         self.functions = functions
 
@@ -88,14 +207,26 @@ class FunctionPerBatch(Module):
         values: Tensor = self.functions(X.unsqueeze(-3))
         return values.squeeze(0).movedim(-3, 0)
 
+    def each(self, X: Tensor) -> Tensor:
+        """Evaluate each function at points of its own, ``k x q x d``: ``k x q x m``."""
+        values: Tensor = self.functions(X)
+        return values.squeeze(0)
 
-def _features(num_transformed: int, *, num_inputs: int, **options: Any) -> FeatureMap:
-    """A kernel's features; BoTorch counts the inputs before their transform."""
-    return gen_kernel_features(num_inputs=num_transformed, **options)
 
-
-def _normal(shape: Size) -> Tensor:
-    return torch.randn(shape, dtype=torch.float64)
+def draw_functions(model: Any, num_functions: int, seed: int | None, num_features: int) -> Module:
+    """Draw functions from a model's posterior; see :meth:`~gpadjust.CKA.sample_functions`."""
+    check_number(num_functions, "num_functions")
+    check_number(num_features, "num_features")
+    if num_features % 2:
+        raise ValueError(
+            f"Expected num_features to be even (sines and cosines), got {num_features}."
+        )
+    with seeded(seed):
+        if model.num_samples is None:
+            return model._draw_functions(num_functions, num_features)
+        order = torch.randperm(model.num_samples)
+        each = take_samples(model, order[torch.arange(num_functions) % model.num_samples])
+        return FunctionPerBatch(each._draw_functions(1, num_features))
 
 
 @contextmanager

@@ -1,81 +1,170 @@
-"""Checks of the data that a model is built on."""
+"""The data that a model is built on: tensors, arrays or frames, and what is checked of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
 import torch
 from torch import Tensor
 
+ArrayLike = Any
+"""A float64 tensor, or a NumPy array or pandas DataFrame of numbers."""
 
-def check_training_data(
-    train_X: Tensor, train_Y: Tensor, train_Yvar: Tensor | None = None, prefix: str = "train"
-) -> None:
-    """Check inputs, targets and observation variances of a model.
+
+class TrainingData(NamedTuple):
+    """Inputs, targets and observation variances of a model.
+
+    Attributes:
+        X: ``batch_shape x n x d``.
+        Y: ``batch_shape x n x m``; NaN where an output was not observed.
+        Yvar: Known observation variances of the shape of ``Y``, or None.
+        input_names: The names of the columns of ``X``.
+        output_names: Those of ``Y``.
+    """
+
+    X: Tensor
+    Y: Tensor
+    Yvar: Tensor | None
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+
+
+def training_data(
+    train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, prefix: str = "train"
+) -> TrainingData:
+    """Bring the data of a model into the form of tensors, and check them.
 
     Args:
-        train_X: Expected ``batch_shape x n x d``, ``n >= 2``, float64, finite.
-        train_Y: Expected ``batch_shape x n x m``, float64, finite.
-        train_Yvar: Expected of the shape of ``train_Y``, float64, not negative, or None.
+        train_X: Expected ``batch_shape x n x d``, ``n >= 2``, finite.
+        train_Y: Expected ``batch_shape x n x m``; NaN where an output was not observed, but not in
+            a whole row.
+        train_Yvar: Expected of the shape of ``train_Y``, or one number, or one for each output;
+            not negative; or None.
         prefix: What the names of the three begin with in errors.
 
     Raises:
-        TypeError: If one of them is not a float64 tensor.
+        TypeError: If one of them is neither a float64 tensor nor an array or frame of numbers.
         ValueError: If shapes disagree, there are fewer than 2 points, or values are not finite.
     """
-    named = {f"{prefix}_X": train_X, f"{prefix}_Y": train_Y}
-    if train_Yvar is not None:
-        named[f"{prefix}_Yvar"] = train_Yvar
-    for name, tensor in named.items():
-        if not isinstance(tensor, Tensor):
-            raise TypeError(
-                f"Expected {name} to be a torch tensor, got {type(tensor).__name__}; convert it "
-                f"with `torch.as_tensor({name}, dtype=torch.float64)`."
-            )
-        if tensor.dtype != torch.float64:
-            raise TypeError(
-                f"Expected {name} in float64, got {tensor.dtype}: Cholesky factors of these "
-                f"kernels fail in lower precision. Convert it with `{name}.double()`."
-            )
+    input_names, output_names = column_names(train_X, "x"), column_names(train_Y, "y")
+    X, Y = to_tensor(train_X, f"{prefix}_X"), to_tensor(train_Y, f"{prefix}_Y")
+    for name, tensor in ((f"{prefix}_X", X), (f"{prefix}_Y", Y)):
         if tensor.dim() < 2:
             raise ValueError(
                 f"Expected {name} with at least 2 dimensions (points x columns), got shape "
-                f"{tuple(tensor.shape)}; add a column with `{name}.unsqueeze(-1)`."
+                f"{tuple(tensor.shape)}; add a column with `{name}.reshape(-1, 1)`."
             )
-    if train_X.shape[:-1] != train_Y.shape[:-1]:
+    if X.shape[:-1] != Y.shape[:-1]:
         raise ValueError(
             f"Expected {prefix}_X (batch_shape x n x d) and {prefix}_Y (batch_shape x n x m) to "
-            f"agree in all but the last dimension, got {tuple(train_X.shape)} and "
-            f"{tuple(train_Y.shape)}."
+            f"agree in all but the last dimension, got {tuple(X.shape)} and {tuple(Y.shape)}."
         )
-    if train_Yvar is not None and train_Yvar.shape != train_Y.shape:
-        raise ValueError(
-            f"Expected {prefix}_Yvar of {prefix}_Y's shape {tuple(train_Y.shape)}, got "
-            f"{tuple(train_Yvar.shape)}."
-        )
-    if train_X.shape[-1] < 1 or train_Y.shape[-1] < 1:
+    if X.shape[-1] < 1 or Y.shape[-1] < 1:
         raise ValueError(
             f"Expected at least one input column and one output column, got {prefix}_X of shape "
-            f"{tuple(train_X.shape)} and {prefix}_Y of shape {tuple(train_Y.shape)}."
+            f"{tuple(X.shape)} and {prefix}_Y of shape {tuple(Y.shape)}."
         )
-    if train_X.shape[-2] < 2:
+    if X.shape[-2] < 2:
         raise ValueError(
-            f"Expected at least 2 points in {prefix}_X, got {train_X.shape[-2]}: with fewer there "
+            f"Expected at least 2 points in {prefix}_X, got {X.shape[-2]}: with fewer there "
             "is nothing to learn a scale from. Use the physics alone until there are two."
         )
-    for name, tensor in named.items():
-        check_finite(tensor, name)
-    if train_Yvar is not None and (train_Yvar < 0).any():
+    check_finite(X, f"{prefix}_X")
+    check_observed(Y, f"{prefix}_Y")
+    seldom = (~Y.isnan()).sum(-2) < 2
+    if seldom.any():
+        where = sorted({int(index[-1]) for index in seldom.nonzero()})
         raise ValueError(
-            f"Expected {prefix}_Yvar (variances) not to be negative, got {train_Yvar.min():.3g}."
+            f"Expected at least 2 observations of each output, but {prefix}_Y has fewer in "
+            f"column(s) {where}; leave these out."
         )
+    Yvar = None if train_Yvar is None else _variances(train_Yvar, Y, f"{prefix}_Yvar")
+    names = input_names or default_names("x", X.shape[-1])
+    return TrainingData(X, Y, Yvar, names, output_names or default_names("y", Y.shape[-1]))
+
+
+def to_tensor(values: ArrayLike, name: str) -> Tensor:
+    """Take a float64 tensor as it is, and make one of a NumPy array or a DataFrame.
+
+    Raises:
+        TypeError: If it is something else, or holds something else than numbers.
+    """
+    if isinstance(values, Tensor):
+        if values.dtype != torch.float64:
+            raise TypeError(
+                f"Expected {name} in float64, got {values.dtype}: Cholesky factors of these "
+                f"kernels fail in lower precision. Convert it with `{name}.double()`."
+            )
+        return values
+    if isinstance(values, np.ndarray) or hasattr(values, "to_numpy"):
+        array = values if isinstance(values, np.ndarray) else values.to_numpy()
+        try:
+            return torch.as_tensor(np.array(array, dtype=np.float64))
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                f"Expected {name} to hold numbers only, but {error}. Select the numeric columns, "
+                "and encode or drop the others."
+            ) from error
+    raise TypeError(
+        f"Expected {name} to be a torch tensor, a NumPy array or a DataFrame, got "
+        f"{type(values).__name__}; convert it with `torch.tensor({name}, dtype=torch.float64)`."
+    )
+
+
+def column_names(values: ArrayLike, letter: str) -> tuple[str, ...] | None:
+    """The names of a DataFrame's (or Series') columns, or None."""
+    columns = getattr(values, "columns", None)
+    if columns is not None:
+        return tuple(map(str, columns))
+    name = getattr(values, "name", None)
+    return None if name is None or isinstance(values, Tensor) else (str(name),)
+
+
+def default_names(letter: str, number: int) -> tuple[str, ...]:
+    """``x``, or ``x1`` and so on."""
+    return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
 
 
 def check_finite(tensor: Tensor, name: str) -> None:
     """Raise a ValueError that names the rows of ``tensor`` (``... x n x k``) with NaN or inf."""
-    bad = ~tensor.isfinite().all(-1)
+    _check_rows(~tensor.isfinite().all(-1), name, "to be finite, found NaN or infinity")
+
+
+def check_observed(Y: Tensor, name: str) -> None:
+    """As :func:`check_finite`, but NaN is a missing value; a row of them is an error."""
+    _check_rows(Y.isinf().any(-1), name, "to be finite, found infinity")
+    _check_rows(
+        Y.isnan().all(-1), name, "to hold an observation in each row, found nothing but NaN"
+    )
+
+
+def _check_rows(bad: Tensor, name: str, expected: str) -> None:
     if bad.any():
         rows = sorted({int(index[-1]) for index in bad.nonzero()})
         shown = ", ".join(str(row) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
         raise ValueError(
-            f"Expected {name} to be finite, found NaN or infinity in {len(rows)} of "
-            f"{tensor.shape[-2]} rows (row {shown}); remove these points."
+            f"Expected {name} {expected} in {len(rows)} of {bad.shape[-1]} rows (row {shown}); "
+            "remove these points."
         )
+
+
+def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Tensor:
+    """Known variances of the shape of ``Y``; 1 where there is no observation."""
+    given = values
+    if isinstance(given, int | float | list | tuple):
+        given = torch.tensor(given, dtype=torch.float64)
+    given = to_tensor(given, name)
+    if given.shape != Y.shape and given.shape not in ((), (1,), Y.shape[-1:]):
+        raise ValueError(
+            f"Expected {name} (known variances) as one number, {Y.shape[-1]} numbers (one for each "
+            f"output), or of the targets' shape {tuple(Y.shape)}, got {tuple(given.shape)}."
+        )
+    variances = given.expand(Y.shape).where(~Y.isnan(), torch.ones_like(Y))
+    check_finite(variances, name)
+    if (variances < 0).any():
+        raise ValueError(
+            f"Expected {name} (variances) not to be negative, got {variances.min():.3g}."
+        )
+    return variances

@@ -3,12 +3,14 @@
 from gpadjust.physics.base import Physics
 from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError
-from gpadjust.physics.function import FunctionPhysics, as_physics
+from gpadjust.physics.function import FunctionPhysics
+from gpadjust.physics.joined import JoinedPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
 
 __all__ = [
     "BlackBoxPhysics",
     "FunctionPhysics",
+    "JoinedPhysics",
     "ODEPhysics",
     "Physics",
     "PhysicsError",

@@ -6,14 +6,15 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import deepcopy
-from operator import index
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
+from gpadjust.physics.carrier import pack, unpack
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.memo import RowMemo
+from gpadjust.physics.settings import column_numbers, whole_number
 
 
 class Physics(torch.nn.Module, ABC):
@@ -26,7 +27,8 @@ class Physics(torch.nn.Module, ABC):
       once: fitting a GP asks for the same rows at every step. The memo is dropped when a parameter
       or buffer of the physics changes. It cannot see other changes, such as a plain attribute:
       call ``forget()`` after those. A physics must therefore be deterministic. Looking a row up
-      costs about half a microsecond; switch the memo off for a function that is cheaper.
+      costs about a quarter of a microsecond; switch the memo off for a function that is cheaper.
+      Threads may share a physics if what it calls allows that.
     - *Gradients.* A result that needs a gradient, in X or in a parameter, is evaluated anew.
     - *Copies.* A deep copy of a physics without parameters and buffers is the physics itself, so
       that a simulator's handle outlives the copies that GP libraries make of their models.
@@ -41,7 +43,7 @@ class Physics(torch.nn.Module, ABC):
         num_outputs: ``m``; None until the first call if it is not known before.
 
     Raises:
-        TypeError: If ``inputs`` holds something else than whole numbers.
+        TypeError: If ``inputs`` holds something else than whole numbers, or ``memo`` is none.
         ValueError: If ``inputs`` is empty or ``memo`` is negative.
 
     Example:
@@ -54,6 +56,9 @@ class Physics(torch.nn.Module, ABC):
                 [-2.0000]])
     """
 
+    # The attributes that hold the user's callables, and whether a pickle may go without them.
+    _callables: ClassVar[tuple[str, ...]] = ()
+    _callables_may_be_lost: ClassVar[bool] = False
     _shape_hint = "For a constant return X.new_full((X.shape[0],), value)."
 
     def __init__(
@@ -64,13 +69,12 @@ class Physics(torch.nn.Module, ABC):
         name: str | None = None,
     ) -> None:
         super().__init__()
-        if memo < 0:
+        if whole_number("memo", memo) < 0:
             raise ValueError(f"memo must be a number of rows, 0 for no memo; found {memo}.")
-        self.inputs = None if inputs is None else _column_numbers(inputs)
+        self.inputs = None if inputs is None else column_numbers(inputs)
         self.name = type(self).__name__ if name is None else name
         self.num_outputs: int | None = None
         self._memo = RowMemo(memo)
-        self._memo_state: list[Tensor] = []
         self._warned: set[str] = set()
 
     @abstractmethod
@@ -102,7 +106,7 @@ class Physics(torch.nn.Module, ABC):
         """
         self._check_input(X)
         once = _without_copies(X)
-        columns = once if self.inputs is None else once[..., list(self.inputs)]
+        columns = self._columns(once)
         rows = columns.reshape(-1, columns.shape[-1])
         try:
             Y = self._evaluate_rows(rows)
@@ -118,7 +122,8 @@ class Physics(torch.nn.Module, ABC):
 
     def forget(self) -> None:
         """Empties the memo; call it after a change that the physics cannot see."""
-        self._memo.clear()
+        # A new memo: what other threads are evaluating right now ends in the old one.
+        self._memo = RowMemo(self._memo.capacity)
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""
@@ -126,6 +131,12 @@ class Physics(torch.nn.Module, ABC):
             f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}, "
             f"memo={self._memo.capacity}"
         )
+
+    def __copy__(self) -> Self:
+        """A shallow copy, which is no pickle: it keeps a function that cannot be pickled."""
+        copy = type(self).__new__(type(self))
+        copy.__dict__.update(self.__dict__)
+        return copy
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """The physics itself if it has no parameters and buffers, else a copy, its memo empty."""
@@ -135,6 +146,20 @@ class Physics(torch.nn.Module, ABC):
         memo[id(self)] = copy
         copy.__dict__.update(deepcopy(self.__dict__, memo))
         return copy
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for a pickle; callables without a name travel with cloudpickle only."""
+        lost = self._callables_may_be_lost
+        return {
+            name: pack(value, self.name, name, may_be_lost=lost)
+            if name in self._callables
+            else value
+            for name, value in self.__dict__.items()
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Takes the state of a pickle."""
+        super().__setstate__({name: unpack(value) for name, value in state.items()})
 
     def _state(self) -> list[Tensor]:
         """What the outputs depend on besides X, as far as torch knows."""
@@ -161,6 +186,9 @@ class Physics(torch.nn.Module, ABC):
                 "all its columns, or correct inputs."
             )
 
+    def _columns(self, X: Tensor) -> Tensor:
+        return X if self.inputs is None else X[..., list(self.inputs)]
+
     def _evaluate_rows(self, rows: Tensor) -> Tensor:
         if len(rows) == 0:
             if self.num_outputs is None:
@@ -181,16 +209,17 @@ class Physics(torch.nn.Module, ABC):
 
     def _recall(self, rows: Tensor) -> Tensor:
         """``N x m`` outputs without a graph, from the memo as far as it knows them."""
-        self._forget_if_stale(rows)
-        return self._memo.recall(rows, self._call_without_graph)
+        return self._current_memo(rows).recall(rows, self._call_without_graph)
 
-    def _forget_if_stale(self, rows: Tensor) -> None:
+    def _current_memo(self, rows: Tensor) -> RowMemo:
         # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
         # The empty tensor stands for the dtype and device of what is remembered.
         state = [*self._state(), rows.new_empty(0)]
-        if len(state) != len(self._memo_state) or not all(map(_same, state, self._memo_state)):
-            self._memo.clear()
-            self._memo_state = [tensor.detach().clone() for tensor in state]
+        memo = self._memo
+        if len(state) != len(memo.state) or not all(map(_same, state, memo.state)):
+            # A new one: a thread that still evaluates in the old state keeps the old memo.
+            memo = self._memo = RowMemo(memo.capacity, state)
+        return memo
 
     def _call_without_graph(self, rows: Tensor) -> Tensor:
         Y = self._call(rows)
@@ -217,7 +246,9 @@ class Physics(torch.nn.Module, ABC):
                 range(len(rows)),
             ) from error
         Y = self._check_shape(Y, len(rows)).to(rows)
-        bad = (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
+        # A finite sum has finite terms only, and is the faster look.
+        finite = Y.detach().sum().isfinite()
+        bad = [] if finite else (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
         if bad:
             raise PhysicsError(
                 f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} row(s), "
@@ -238,12 +269,13 @@ class Physics(torch.nn.Module, ABC):
                 f"{self._shape_hint}"
             )
         Y = Y.unsqueeze(-1) if Y.dim() == 1 else Y
-        if self.num_outputs not in (None, Y.shape[1]):
+        if self.num_outputs is None:
+            self.num_outputs = Y.shape[1]
+        if self.num_outputs != Y.shape[1]:
             raise PhysicsError(
                 f"Physics {self.name!r} returned {Y.shape[1]} output(s), expected "
                 f"{self.num_outputs} as before; the number must not depend on the rows."
             )
-        self.num_outputs = Y.shape[1]
         return Y
 
     def _warn_once(self, message: str) -> None:
@@ -260,18 +292,6 @@ def _without_copies(X: Tensor) -> Tensor:
         if X.shape[dim] > 1 and X.stride(dim) == 0:
             X = X.narrow(dim, 0, 1)
     return X
-
-
-def _column_numbers(inputs: Sequence[int]) -> tuple[int, ...]:
-    try:
-        columns = tuple(index(i) for i in inputs)
-    except TypeError:
-        raise TypeError(
-            f"inputs must be a sequence of column numbers, such as [0, 2]; found {inputs!r}."
-        ) from None
-    if not columns:
-        raise ValueError("inputs is empty; name at least one column of X, or None for all.")
-    return columns
 
 
 def _same(a: Tensor, b: Tensor) -> bool:

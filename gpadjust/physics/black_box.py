@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Self
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,8 +14,7 @@ from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.external_call import ExternalCall
 from gpadjust.physics.finite_difference import central_difference
-from gpadjust.physics.lost_callable import LostCallable, can_pickle
-from gpadjust.physics.row_calls import call_rows
+from gpadjust.physics.row_calls import call_rows, real_array
 
 NumpyFunction = Callable[[NDArray[np.float64]], ArrayLike]
 
@@ -31,9 +30,9 @@ class BlackBoxPhysics(Physics):
     or any other backend of joblib, a cluster's included. Rows that succeed are remembered even
     when others fail.
 
-    A pickle holds the function if it can be pickled. If not, as with a handle of a running
-    simulator, the loaded physics still answers the rows in its memo; for new ones set
-    ``physics.function`` again.
+    A pickle holds the function if it can be pickled; cloudpickle takes lambdas, too. If not, as
+    with a handle of a running simulator, the loaded physics still answers the rows in its memo; for
+    new ones set ``physics.function`` again.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
@@ -61,6 +60,8 @@ class BlackBoxPhysics(Physics):
         tensor([[2.0000, 0.0000]], dtype=torch.float64)
     """
 
+    _callables = ("function", "gradient")
+    _callables_may_be_lost = True
     _shape_hint = "For a function of a single row pass batched=False."
 
     def __init__(
@@ -104,7 +105,7 @@ class BlackBoxPhysics(Physics):
             PhysicsError: If single rows fail. It carries the outputs of the others.
         """
         rows = _to_numpy(X)
-        Y = np.array(self.function(rows), dtype=np.float64) if self.batched else self._stack(rows)
+        Y = real_array(self.function(rows)) if self.batched else self._stack(rows)
         return torch.from_numpy(Y).to(X.device)
 
     def _stack(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -171,7 +172,7 @@ class BlackBoxPhysics(Physics):
 
     def _user_jacobian(self, gradient: NumpyFunction, rows: Tensor) -> Tensor:
         try:
-            J = np.array(gradient(_to_numpy(rows)), dtype=np.float64)
+            J = real_array(gradient(_to_numpy(rows)))
         except PhysicsError:
             raise
         except Exception as error:
@@ -185,20 +186,6 @@ class BlackBoxPhysics(Physics):
                 f"expected shape N x m x d = {expected} and finite numbers."
             )
         return torch.from_numpy(J).to(rows)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The state for a pickle, without callables that cannot be pickled."""
-        state = self.__dict__.copy()
-        for attribute in ("function", "gradient"):
-            if not can_pickle(state[attribute]):
-                state[attribute] = LostCallable(self.name, attribute)
-        return state
-
-    def __copy__(self) -> Self:
-        """A shallow copy, which is no pickle: it keeps the function."""
-        copy = type(self).__new__(type(self))
-        copy.__dict__.update(self.__dict__)
-        return copy
 
 
 def _to_numpy(X: Tensor) -> NDArray[np.float64]:

@@ -33,6 +33,8 @@ class FunctionPhysics(Physics):
                 [690.]], dtype=torch.float64)
     """
 
+    _callables = ("function",)
+
     def __init__(
         self,
         function: Callable[[Tensor], Tensor],
@@ -82,27 +84,3 @@ class FunctionPhysics(Physics):
                 "ignore this if the outputs do not depend on X."
             )
         return Y
-
-
-def as_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
-    """Takes a physics as it is, and wraps any other callable as a ``FunctionPhysics``.
-
-    Raises:
-        TypeError: If ``physics`` is neither, or a class instead of an instance of it.
-
-    Example:
-        >>> import torch
-        >>> as_physics(torch.sin)
-        FunctionPhysics(name='sin', inputs=None, num_outputs=None, memo=100000)
-    """
-    if isinstance(physics, Physics):
-        return physics
-    if not callable(physics) or isinstance(physics, type):
-        is_class = isinstance(physics, type)
-        found = f"the class {physics.__name__}" if is_class else f"a {type(physics).__name__}"
-        raise TypeError(
-            f"physics must be a Physics or a callable; found {found}. Pass a torch function of "
-            "rows N x d, ODEPhysics(rhs, step, state_dim) for an equation of motion, or "
-            "BlackBoxPhysics(function) for NumPy code and simulators."
-        )
-    return FunctionPhysics(physics)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any, NoReturn
 
 from gpadjust.physics.error import PhysicsError
@@ -31,17 +30,3 @@ class LostCallable:
             f"The {self.attribute} of physics {self.owner!r} could not be pickled, so this loaded "
             f"copy only knows the rows in its memo; set physics.{self.attribute} = ... again."
         )
-
-
-def can_pickle(value: object) -> bool:
-    """Whether ``pickle.dumps`` takes a value.
-
-    Example:
-        >>> can_pickle(len), can_pickle(lambda: 0)
-        (True, False)
-    """
-    try:
-        pickle.dumps(value)
-    except Exception:
-        return False
-    return True

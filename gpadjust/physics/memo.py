@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import repeat
+from threading import RLock
 from typing import Any, cast
 
 import numpy as np
@@ -37,10 +38,12 @@ class RowMemo:
     """Remembers the output rows of a function, keyed by its input rows (see ``row_keys``).
 
     When a new batch does not fit, it forgets everything and starts again with that batch. A deep
-    copy is empty: what is copied is about to go its own way.
+    copy is empty: what is copied is about to go its own way. Threads can share it; rows that two of
+    them ask for at the same moment may be evaluated by both.
 
     Args:
         capacity: The most rows it holds; 0 for none.
+        state: What the values depend on besides the rows. It is copied, and kept for the owner.
 
     Example:
         >>> memo = RowMemo(capacity=100)
@@ -55,8 +58,10 @@ class RowMemo:
         tensor([[4.]])
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, state: Sequence[Tensor] = ()) -> None:
         self.capacity = capacity
+        self.state = [tensor.detach().clone() for tensor in state]
+        self._lock = RLock()
         self.clear()
 
     def __len__(self) -> int:
@@ -65,8 +70,9 @@ class RowMemo:
 
     def clear(self) -> None:
         """Forgets every row."""
-        self._slots: dict[bytes, int] = {}
-        self._values: Tensor | None = None
+        with self._lock:
+            self._slots: dict[bytes, int] = {}
+            self._values: Tensor | None = None
 
     def recall(self, rows: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
         """The values of some rows, of which a function is asked for those not remembered.
@@ -84,34 +90,47 @@ class RowMemo:
         """
         if self.capacity == 0:
             return evaluate(rows)
-        numbers: dict[bytes, int] = {}
-        inverse = torch.tensor([numbers.setdefault(k, len(numbers)) for k in row_keys(rows)])
-        keys = list(numbers)
-        slots = self.lookup(keys)
-        known = slots >= 0
-        if known.all():
-            return self.gather(slots[inverse])
+        keys = row_keys(rows)
+        if self._slots.keys().isdisjoint(keys) and len(set(keys)) == len(keys):
+            # All new and distinct: the usual case of cheap physics, kept free of index tables.
+            return self._learn(keys, rows, evaluate).clone()
+        with self._lock:
+            slots = self.lookup(keys)
+            known = slots >= 0
+            recalled = self.gather(slots[known]) if known.any() else None
+        if recalled is not None and len(recalled) == len(keys):
+            return recalled
 
-        first = torch.from_numpy(np.unique(inverse.numpy(), return_index=True)[1])
-        new = (~known).nonzero().flatten()
+        new = (~known).nonzero().flatten().tolist()
+        asked = sorted({keys[i]: i for i in reversed(new)}.values())
+        numbers = {keys[i]: number for number, i in enumerate(asked)}
+        origin = torch.tensor([numbers.get(key, -1) for key in keys])
         try:
-            values = evaluate(rows[first[new]])
+            values = self._learn(list(numbers), rows[asked], evaluate)
+        except PhysicsError as error:
+            if error.inputs is None:
+                error.relocate(origin)
+            raise
+        result = values.new_empty(len(keys), values.shape[1])
+        result[new] = values[origin[new]]
+        if recalled is not None:
+            result[known] = recalled
+        return result
+
+    def _learn(
+        self, keys: list[bytes], rows: Tensor, evaluate: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """Evaluates and remembers some rows, outside of the lock: a simulator may take hours."""
+        try:
+            values = evaluate(rows)
         except PhysicsError as error:
             if error.partial is not None:
                 partial, error.partial = error.partial, None
                 good = partial.isfinite().all(-1)
-                self.store([keys[i] for i in new[good.cpu()].tolist()], partial[good])
-            if error.inputs is None:
-                order = torch.full_like(slots, -1)
-                order[new] = torch.arange(len(new))
-                error.relocate(order[inverse])
+                self.store([keys[i] for i in good.nonzero().flatten().tolist()], partial[good])
             raise
-        distinct = values.new_empty(len(keys), values.shape[1])
-        distinct[new] = values
-        if known.any():
-            distinct[known] = self.gather(slots[known])
-        self.store([keys[i] for i in new.tolist()], values)
-        return distinct[inverse]
+        self.store(keys, values)
+        return values
 
     def lookup(self, keys: Sequence[bytes]) -> Tensor:
         """Finds where the values of some rows are kept.
@@ -142,15 +161,18 @@ class RowMemo:
         """Remembers new rows, and no more than ``capacity`` of them.
 
         Args:
-            keys: ``N`` keys, distinct and unknown so far.
+            keys: ``N`` distinct keys. Those that it knows already keep their values.
             values: ``N x m``, without an autograd graph.
         """
-        if len(self) + len(keys) > self.capacity:
-            self.clear()
-            keys, values = keys[: self.capacity], values[: self.capacity]
-        start, end = len(self), len(self) + len(keys)
         # The table outlives inference mode, whose tensors could not be written to afterwards.
-        with torch.inference_mode(False):
+        with self._lock, torch.inference_mode(False):
+            if not self._slots.keys().isdisjoint(keys):  # another thread was faster
+                new = (self.lookup(keys) < 0).nonzero().flatten().tolist()
+                keys, values = [keys[i] for i in new], values[new]
+            if len(self) + len(keys) > self.capacity:
+                self.clear()
+                keys, values = keys[: self.capacity], values[: self.capacity]
+            start, end = len(self), len(self) + len(keys)
             if self._values is None:
                 self._values = values.clone()
             elif end > self._values.shape[0]:
@@ -158,12 +180,20 @@ class RowMemo:
                 room = values.new_empty(max(start, len(keys)), values.shape[1])
                 self._values = torch.cat([self._values[:start], room])
             self._values[start:end] = values
-        self._slots.update(zip(keys, range(start, end), strict=True))
+            self._slots.update(zip(keys, range(start, end), strict=True))
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for a pickle, without the table's spare rows."""
-        values = None if self._values is None else self._values[: len(self)].clone()
-        return {**self.__dict__, "_values": values}
+        """The state for a pickle, without the lock and the table's spare rows."""
+        with self._lock:
+            values = None if self._values is None else self._values[: len(self)].clone()
+            state = {**self.__dict__, "_values": values, "_slots": self._slots.copy()}
+        del state["_lock"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Takes the state of a pickle, with a lock of its own."""
+        self.__dict__.update(state)
+        self._lock = RLock()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RowMemo:
         """An empty memo of the same capacity."""

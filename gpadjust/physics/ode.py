@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torchdiffeq import odeint
 
 from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.settings import is_finite, whole_number
 
 FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
 ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
@@ -37,15 +38,17 @@ class ODEPhysics(Physics):
             the rows it is evaluated with; hence the default.
         rtol: Relative tolerance of the adaptive methods.
         atol: Absolute tolerance of the adaptive methods, in the unit of the state.
+        max_steps: The most steps that an adaptive method tries within ``step``.
         difference: Whether the output is the change of the state instead of the new state.
         inputs: The columns of X that hold state and action, in this order. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: that of ``rhs``.
 
     Raises:
-        TypeError: If ``rhs`` is not callable.
-        ValueError: If ``step``, ``substeps`` or ``state_dim`` is not positive, or ``method`` is
-            unknown.
+        TypeError: If ``rhs`` is not callable, or a setting is no number, or none that is whole
+            where it counts something.
+        ValueError: If ``step``, ``substeps``, ``state_dim`` or ``max_steps`` is not positive, a
+            tolerance is negative, or ``method`` is unknown.
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
@@ -53,6 +56,8 @@ class ODEPhysics(Physics):
         tensor([[0.3679],
                 [1.0000]], dtype=torch.float64)
     """
+
+    _callables = ("rhs",)
 
     def __init__(
         self,
@@ -64,6 +69,7 @@ class ODEPhysics(Physics):
         method: str = "rk4",
         rtol: float = 1e-7,
         atol: float = 1e-9,
+        max_steps: int = 10_000,
         difference: bool = False,
         inputs: Sequence[int] | None = None,
         memo: int = 100_000,
@@ -71,12 +77,15 @@ class ODEPhysics(Physics):
     ) -> None:
         if not callable(rhs):
             raise TypeError(f"rhs must be callable; found {type(rhs).__name__}.")
-        if not (math.isfinite(step) and step > 0):
+        if not (is_finite("step", step) and step > 0):
             raise ValueError(f"step must be a positive duration; found {step}.")
-        if state_dim < 1:
-            raise ValueError(f"state_dim must be at least 1; found {state_dim}.")
-        if substeps < 1:
-            raise ValueError(f"substeps must be at least 1; found {substeps}.")
+        for setting, tolerance in (("rtol", rtol), ("atol", atol)):
+            if not (is_finite(setting, tolerance) and tolerance >= 0):
+                raise ValueError(f"{setting} must be a tolerance of 0 or more; found {tolerance}.")
+        counts = {"state_dim": state_dim, "substeps": substeps, "max_steps": max_steps}
+        for setting, count in counts.items():
+            if whole_number(setting, count) < 1:
+                raise ValueError(f"{setting} must be at least 1; found {count}.")
         if method not in FIXED_STEP + ADAPTIVE_STEP:
             raise ValueError(
                 f"Unknown method {method!r}; use one with a fixed step, {', '.join(FIXED_STEP)}, "
@@ -91,6 +100,7 @@ class ODEPhysics(Physics):
         self.method = method
         self.rtol = rtol
         self.atol = atol
+        self.max_steps = max_steps
         self.difference = difference
         self.num_outputs = state_dim
 
@@ -104,8 +114,8 @@ class ODEPhysics(Physics):
             ``N x state_dim``.
 
         Raises:
-            PhysicsError: If X has fewer than ``state_dim`` columns, or ``rhs`` returns something
-                else than one time derivative per state.
+            PhysicsError: If X has fewer than ``state_dim`` columns, ``rhs`` returns something else
+                than one time derivative per state, or an adaptive method does not arrive.
         """
         if X.shape[1] < self.state_dim:
             raise PhysicsError(
@@ -116,27 +126,40 @@ class ODEPhysics(Physics):
 
         def derivative(t: Tensor, state: Tensor) -> Tensor:
             rate = self.rhs(state, action)
-            if not torch.is_tensor(rate) or rate.shape != state.shape:
-                found = tuple(rate.shape) if torch.is_tensor(rate) else type(rate).__name__
+            if not torch.is_tensor(rate) or rate.shape != state.shape or rate.is_complex():
+                found: object = type(rate).__name__
+                if torch.is_tensor(rate):
+                    found = rate.dtype if rate.is_complex() else tuple(rate.shape)
                 raise PhysicsError(
-                    f"The rhs of physics {self.name!r} returned {found}, expected a tensor of the "
-                    f"state's shape {tuple(state.shape)}: one time derivative per state variable."
+                    f"The rhs of physics {self.name!r} returned {found}, expected a real tensor of "
+                    f"shape {tuple(state.shape)}, as the state: a time derivative of each variable."
                 )
             return rate
 
-        options = {}
+        options: dict[str, Any] = {"max_num_steps": self.max_steps}
         if self.method in FIXED_STEP:
             # A grid of our own: torchdiffeq's step_size rounds up to one substep too many.
-            options["grid_constructor"] = lambda *_: self._times(self.substeps, X)
-        path: Tensor = odeint(
-            derivative,
-            state,
-            self._times(1, X),
-            rtol=self.rtol,
-            atol=self.atol,
-            method=self.method,
-            options=options,
-        )
+            options = {"grid_constructor": lambda *_: self._times(self.substeps, X)}
+        try:
+            path: Tensor = odeint(
+                derivative,
+                state,
+                self._times(1, X),
+                rtol=self.rtol,
+                atol=self.atol,
+                method=self.method,
+                options=options,
+            )
+        except AssertionError as error:
+            if not str(error).startswith(("max_num_steps exceeded", "underflow in dt")):
+                raise
+            raise PhysicsError(
+                f"The method {self.method!r} of physics {self.name!r} did not reach the end of the "
+                f"time step ({error}); expected it to within max_steps={self.max_steps}. The rhs "
+                "may be stiff, have jumps, or blow up: use a method with a fixed step, such as "
+                "'rk4' with many substeps, or larger rtol and atol, or more max_steps.",
+                range(len(X)),
+            ) from error
         return path[-1] - state if self.difference else path[-1]
 
     def extra_repr(self) -> str:

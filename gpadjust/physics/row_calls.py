@@ -37,9 +37,33 @@ def call_rows(
     return results
 
 
+def real_array(values: ArrayLike) -> NDArray[np.float64]:
+    """A copy of real numbers as a float64 array.
+
+    Raises:
+        TypeError: If they are anything else. NumPy would drop the imaginary part of complex
+            numbers, and take None for NaN and text for numbers.
+
+    Example:
+        >>> real_array([1, 2])
+        array([1., 2.])
+        >>> real_array([1j])
+        Traceback (most recent call last):
+        TypeError: expected real numbers, found complex128
+    """
+    array = np.array(values)
+    # Objects may be numbers, such as fractions.
+    if array.dtype.kind not in "biufO" or (
+        array.dtype.kind == "O" and None in array.ravel().tolist()
+    ):
+        found = "None" if array.dtype.kind == "O" else array.dtype
+        raise TypeError(f"expected real numbers, found {found}")
+    return array.astype(np.float64, copy=False)
+
+
 def _call_row(function: RowFunction, x: NDArray[np.float64]) -> NDArray[np.float64] | Exception:
     try:
-        y = np.array(function(x), dtype=np.float64, ndmin=1)
+        y = np.atleast_1d(real_array(function(x)))
         if y.ndim > 1:
             raise ValueError(f"expected a scalar or outputs of shape (m,), found {y.shape}")
         return y

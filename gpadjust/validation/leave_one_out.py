@@ -13,11 +13,12 @@ from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from botorch.models.transforms.outcome import Standardize
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.utils.transforms import is_fully_bayesian
-from gpytorch.distributions import MultivariateNormal
-from linear_operator import to_dense, to_linear_operator
-from linear_operator.utils.cholesky import psd_safe_cholesky
+from linear_operator import to_dense
 from torch import Tensor
 
+from gpadjust.gp.gaussian import noise_variances
+from gpadjust.models import ExactGPBase
+from gpadjust.models.cholesky_strategy import Factors
 from gpadjust.validation import scores
 
 
@@ -27,15 +28,17 @@ class LeaveOneOut:
 
     Attributes:
         X: Raw inputs, ``batch_shape x n x d``.
-        Y: Observations, ``batch_shape x n x m``.
+        Y: Observations, ``batch_shape x n x m``; NaN where there is none.
         mean: Their predictions, of the same shape.
         variance: The variances of the predictions, observation noise included.
+        output_names: The names of the outputs; empty if the model has none.
     """
 
     X: Tensor
     Y: Tensor
     mean: Tensor
     variance: Tensor
+    output_names: tuple[str, ...] = ()
 
     @property
     def residuals(self) -> Tensor:
@@ -79,8 +82,8 @@ def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> Leave
         \sigma^2_{-i} = 1 / [K^{-1}]_{ii}
 
     (Rasmussen and Williams 2006, eqs. 5.10-5.12; Sundararajan and Keerthi 2001). Of an
-    :class:`~gpadjust.AR1` only points of the high level are left out. The covariance of an
-    :class:`~gpadjust.RRA` with ``prior="paper"`` is that of the paper.
+    :class:`~gpadjust.AR1` only points of the high level are left out. The covariance of a
+    :class:`~gpadjust.models.PaperRRA` is that of the paper.
 
     Of a model that holds samples of its hyper-parameters, these *are* without the left-out
     observation: a sample has the weight :math:`1 / p(y_i | y_{-i}, \theta)`, at most
@@ -122,10 +125,13 @@ def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> Leave
         )
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
-        mean, variance = _targets(model)
+        mean, variance = model.left_out() if isinstance(model, ExactGPBase) else _targets(model)
         Y, mean, variance = (
             _outputs_last(model, t)[..., rows, :] for t in (model.train_targets, mean, variance)
         )
+        # A missing observation is predicted from all that there are, but not compared.
+        missing = Y.isnan()
+        mean, variance = mean.masked_fill(missing, 0.0), variance.masked_fill(missing, 1.0)
         if transform is not None:
             Y, mean = transform.untransform(Y)[0], transform.untransform(mean)[0]
             variance = variance * transform.stdvs.square()
@@ -133,12 +139,12 @@ def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> Leave
             X, Y = X.select(MCMC_DIM, 0), Y.select(MCMC_DIM, 0)
             mean, variance = _mixture(Y, mean, variance)
     X, Y = X[..., rows, :].expand(*mean.shape[:-1], X.shape[-1]), Y.expand(mean.shape)
-    return LeaveOneOut(X.clone(), Y.clone(), mean, variance)
+    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, getattr(model, "output_names", ()))
 
 
 def _mixture(Y: Tensor, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance ``... x n x m`` of mixtures of predictions ``... x S x n x m``."""
-    error = (Y.unsqueeze(MCMC_DIM) - mean).square()
+    error = (Y.unsqueeze(MCMC_DIM) - mean).square().nan_to_num(nan=0.0)
     weight = (0.5 * (error / variance + variance.log())).softmax(MCMC_DIM)
     weight = weight.clamp_max(weight.shape[MCMC_DIM] ** -0.5)
     weight = weight / weight.sum(MCMC_DIM, keepdim=True)
@@ -165,29 +171,14 @@ def training_data(model: Any) -> tuple[Tensor, Tensor]:
 
 
 def _targets(model: Any) -> tuple[Tensor, Tensor]:
-    """Leave-one-out means and variances of the targets, ``... x (m) x n`` in their units."""
+    """As :meth:`~gpadjust.models.ExactGPBase.left_out`, for models of other libraries."""
     inputs, y = model.train_inputs[0], model.train_targets
     covariance = to_dense(model.covar_module(inputs))
-    mean = model.mean_module(inputs).expand(covariance.shape[:-1])
-    prior = MultivariateNormal(mean, to_linear_operator(covariance))
-    noisy = to_dense(model.likelihood(prior, inputs).lazy_covariance_matrix)
-    chol = psd_safe_cholesky(noisy)
-    alpha = torch.cholesky_solve((y - prior.mean).unsqueeze(-1), chol).squeeze(-1)
-    variance = _left_out_variance(chol)
-    mean = y - alpha * variance
-    ridge = getattr(model, "_covariance_noise", None)
-    if ridge is not None:
-        # The model's covariance is that of another noise than its mean.
-        identity = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
-        noise = (noisy - covariance).diagonal(dim1=-1, dim2=-2)
-        latent = _left_out_variance(psd_safe_cholesky(covariance + ridge * identity)) - ridge
-        variance = latent + noise
-    return mean, variance
-
-
-def _left_out_variance(chol: Tensor) -> Tensor:
-    """The variances of observations given all others, from the factor of their covariance."""
-    return torch.cholesky_inverse(chol).diagonal(dim1=-1, dim2=-2).reciprocal()
+    residual = y - model.mean_module(inputs).expand(covariance.shape[:-1])
+    noise = noise_variances(model.likelihood, inputs)
+    factors = Factors.of(covariance + torch.diag_embed(noise.expand(residual.shape)), residual)
+    variance = factors.squared_columns().reciprocal()
+    return y - factors.alpha * variance, variance
 
 
 def _measurements(model: Any) -> tuple[Tensor, slice]:
@@ -197,8 +188,7 @@ def _measurements(model: Any) -> tuple[Tensor, slice]:
     inputs = inputs if raw is None else raw
     if model.num_outputs > 1:
         inputs = inputs[..., 0, :, :]
-    select = getattr(model, "_measured", None)
-    return (inputs, slice(None)) if select is None else select(inputs)
+    return model.measured_rows(inputs) if isinstance(model, ExactGPBase) else (inputs, slice(None))
 
 
 def _outputs_last(model: Any, values: Tensor) -> Tensor:
@@ -231,4 +221,5 @@ def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
         torch.cat([getattr(part, name) for part in parts], dim=-1)
         for name in ("Y", "mean", "variance")
     )
-    return LeaveOneOut(X, Y, mean, variance)
+    names = tuple(name for part in parts for name in part.output_names)
+    return LeaveOneOut(X, Y, mean, variance, names)

@@ -1,9 +1,14 @@
-"""Scores of Gaussian predictions, and of equally weighted mixtures of them."""
+"""Scores of Gaussian predictions, and of equally weighted mixtures of them.
+
+A true value may be NaN where it was not observed. Scores are over the observed points only, and NaN
+for an output that has none.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 import torch
 from botorch.posteriors import Posterior
@@ -17,7 +22,7 @@ def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
 
     Args:
         mean: Predicted means, ``... x n x m``; of a mixture, those of its components.
-        y: True values, ``... x n x m``.
+        y: True values, ``... x n x m``, NaN where not observed.
         mixture_dim: The dimension of ``mean`` along which the components of an equally weighted
             mixture lie: -3 for ``... x S x n x m``, as in BoTorch's fully Bayesian posteriors.
 
@@ -25,15 +30,16 @@ def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
         ``... x m``, in the units of ``y``.
 
     Raises:
-        ValueError: If the shapes disagree.
+        TypeError: If ``mean`` or ``y`` are no tensors of numbers.
+        ValueError: If the shapes disagree, or ``mean`` has NaN.
 
     Example:
         >>> import torch
         >>> rmse(torch.tensor([[1.0], [2.0]]), torch.tensor([[1.0], [4.0]]))
         tensor([1.4142])
     """
-    mean, _, y = _components(mean, mean, y, mixture_dim)
-    return (mean.mean(0) - y).square().mean(-2).sqrt()
+    (mean,) = _components(y, mixture_dim, mean=mean)
+    return _mean_over_observed((mean.mean(0) - _filled(y)).square(), y).sqrt()
 
 
 def nlpd(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -42,14 +48,16 @@ def nlpd(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
     Args:
         mean: Predicted means, as in :func:`rmse`.
         variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``.
+        y: True values, ``... x n x m``, NaN where not observed.
         mixture_dim: As in :func:`rmse`.
 
     Returns:
         ``... x m``, in nats.
 
     Raises:
-        ValueError: If the shapes disagree.
+        TypeError: If one of the three is no tensor of numbers.
+        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
+            negative.
 
     Example:
         >>> import torch
@@ -57,9 +65,9 @@ def nlpd(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
         >>> nlpd(zero, torch.ones(3, 1), zero)
         tensor([0.9189])
     """
-    mean, variance, y = _components(mean, variance, y, mixture_dim)
-    density = Normal(mean, _sd(variance)).log_prob(y)
-    return (math.log(len(mean)) - density.logsumexp(0)).mean(-2)
+    mean, variance = _components(y, mixture_dim, mean=mean, variance=variance)
+    density = Normal(mean, _sd(variance)).log_prob(_filled(y))
+    return _mean_over_observed(math.log(len(mean)) - density.logsumexp(0), y)
 
 
 def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -74,14 +82,16 @@ def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
     Args:
         mean: Predicted means, as in :func:`rmse`.
         variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``.
+        y: True values, ``... x n x m``, NaN where not observed.
         mixture_dim: As in :func:`rmse`.
 
     Returns:
         ``... x m``, in the units of ``y``.
 
     Raises:
-        ValueError: If the shapes disagree.
+        TypeError: If one of the three is no tensor of numbers.
+        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
+            negative.
 
     Example:
         >>> import torch
@@ -89,12 +99,12 @@ def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
         >>> crps(zero, torch.ones(3, 1), zero)
         tensor([0.2337])
     """
-    mean, variance, y = _components(mean, variance, y, mixture_dim)
-    score = _absolute_moment(y - mean, variance).mean(0)
+    mean, variance = _components(y, mixture_dim, mean=mean, variance=variance)
+    score = _absolute_moment(_filled(y) - mean, variance).mean(0)
     for mean_i, variance_i in zip(mean, variance, strict=True):  # all pairs at once are S^2 n m
         spread = _absolute_moment(mean - mean_i, variance + variance_i).mean(0)
         score = score - spread / (2 * len(mean))
-    return score.mean(-2)
+    return _mean_over_observed(score, y)
 
 
 def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -103,14 +113,17 @@ def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = 
     Args:
         mean: Predicted means, as in :func:`rmse`.
         variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``.
+        y: True values, ``... x n x m``, NaN where not observed.
         mixture_dim: As in :func:`rmse`.
 
     Returns:
-        ``... x n x m``, between 0 and 1; uniform for calibrated predictions (Dawid 1984).
+        ``... x n x m``, between 0 and 1, or NaN where not observed; uniform for calibrated
+        predictions (Dawid 1984).
 
     Raises:
-        ValueError: If the shapes disagree.
+        TypeError: If one of the three is no tensor of numbers.
+        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
+            negative.
 
     Example:
         >>> import torch
@@ -118,8 +131,8 @@ def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = 
         tensor([[0.5000],
                 [0.8413]])
     """
-    mean, variance, y = _components(mean, variance, y, mixture_dim)
-    return Normal(mean, _sd(variance)).cdf(y).mean(0)
+    mean, variance = _components(y, mixture_dim, mean=mean, variance=variance)
+    return Normal(mean, _sd(variance)).cdf(_filled(y)).mean(0).masked_fill(y.isnan(), math.nan)
 
 
 def coverage(
@@ -135,7 +148,7 @@ def coverage(
     Args:
         mean: Predicted means, as in :func:`rmse`.
         variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``.
+        y: True values, ``... x n x m``, NaN where not observed.
         level: Nominal coverage, between 0 and 1.
         mixture_dim: As in :func:`rmse`.
 
@@ -143,7 +156,8 @@ def coverage(
         ``... x m``, between 0 and 1; calibrated predictions have it near ``level``.
 
     Raises:
-        ValueError: If ``level`` is not between 0 and 1, or the shapes disagree.
+        TypeError: As :func:`nlpd`, or if ``level`` is not a number.
+        ValueError: As :func:`nlpd`, or if ``level`` is not between 0 and 1.
 
     Example:
         >>> import torch
@@ -155,21 +169,28 @@ def coverage(
 
 def central_share(pit: Tensor, level: float) -> Tensor:
     """Share of PIT values (``... x n x m``) in the central interval of a level: ``... x m``."""
+    check_level(level)
+    return _mean_over_observed(((pit - 0.5).abs() <= level / 2).to(pit.dtype), pit)
+
+
+def check_level(level: float) -> None:
+    """Raise a TypeError or a ValueError unless ``level`` is a number between 0 and 1."""
+    if not isinstance(level, Real):
+        raise TypeError(f"Expected level to be a number such as 0.95, got {level!r}.")
     if not 0 < level < 1:
-        raise ValueError(f"Expected level between 0 and 1, got {level}.")
-    return ((pit - 0.5).abs() <= level / 2).to(pit.dtype).mean(-2)
+        raise ValueError(f"Expected level between 0 and 1, got {level}; 95 % is 0.95.")
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How good a prediction was.
+    """How good a prediction was, at the points that were observed.
 
     Attributes:
         rmse: Root mean square error, ``... x m``, in y's units.
         nlpd: Mean negative log predictive density, ``... x m``, in nats.
         crps: Mean continuous ranked probability score, ``... x m``, in y's units.
         coverage: Share of the points in the central interval, ``... x m``.
-        pit: Probability integral transform of each point, ``... x n x m``.
+        pit: Probability integral transform of each point, ``... x n x m``, NaN where not observed.
     """
 
     rmse: Tensor
@@ -188,10 +209,12 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
     Args:
         posterior: Any BoTorch posterior that is Gaussian at each point; that of a fully Bayesian
             model (``GaussianMixturePosterior``) is judged as the mixture that it is.
-        Y: Observations, ``... x n x m``.
+        Y: Observations, ``... x n x m``, NaN where there is none.
         level: Nominal coverage, between 0 and 1.
 
     Raises:
+        TypeError: If ``posterior`` has no mean and variance, ``Y`` is no tensor, or ``level`` no
+            number.
         ValueError: If ``Y`` does not have the posterior's shape, or ``level`` is not between 0
             and 1.
 
@@ -207,7 +230,12 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
         (torch.Size([1]), torch.Size([20, 1]))
     """
     dim = MCMC_DIM if isinstance(posterior, GaussianMixturePosterior) else None
-    mean, variance = posterior.mean, posterior.variance
+    mean, variance = getattr(posterior, "mean", None), getattr(posterior, "variance", None)
+    if not (isinstance(mean, Tensor) and isinstance(variance, Tensor)):
+        raise TypeError(
+            f"Expected a posterior, with a mean and a variance, got {type(posterior).__name__}; "
+            "that of a model is `model.posterior(X, observation_noise=True)`."
+        )
     values = pit(mean, variance, Y, mixture_dim=dim)
     return Scores(
         rmse=rmse(mean, Y, mixture_dim=dim),
@@ -218,26 +246,74 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
     )
 
 
-def _components(
-    mean: Tensor, variance: Tensor, y: Tensor, mixture_dim: int | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Bring the components to the front: two ``S x ... x n x m``, and ``y`` as it is."""
+def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list[Tensor]:
+    """Check all, and bring the components of what was predicted to the front.
+
+    Args:
+        y: True values, ``... x n x m``.
+        mixture_dim: Where the components are, if any.
+        predicted: ``mean`` and, if need be, ``variance``.
+
+    Returns:
+        What was predicted, ``S x ... x n x m`` each.
+    """
+    for name, values in (*predicted.items(), ("y", y)):
+        if not isinstance(values, Tensor):
+            raise TypeError(
+                f"Expected {name} to be a torch tensor, got {type(values).__name__}; convert it "
+                f"with `torch.as_tensor({name}, dtype=torch.float64)`."
+            )
+        if name != "y" and not values.is_floating_point():
+            raise TypeError(
+                f"Expected {name} in floating point, got {values.dtype}; convert it with "
+                f"`{name}.double()`."
+            )
+    if y.dim() < 2:
+        raise ValueError(
+            f"Expected y of shape ... x n x m, n points of m outputs, got {tuple(y.shape)}; give "
+            "one output its column with `.unsqueeze(-1)`, of all that is passed."
+        )
+    shape = list(predicted["mean"].shape)
+    if mixture_dim is not None:
+        if mixture_dim not in range(-len(shape), len(shape)):
+            raise ValueError(
+                f"There is no dimension {mixture_dim} in means of shape {tuple(shape)}; pass "
+                "mixture_dim=None for a prediction that is not a mixture."
+            )
+        del shape[mixture_dim]
+    shapes = [tuple(values.shape) for values in predicted.values()]
+    if shape != list(y.shape) or shapes[0] != shapes[-1]:
+        raise ValueError(
+            f"Expected {' and '.join(predicted)} of y's shape {tuple(y.shape)} (and the "
+            "components' dimension `mixture_dim`, if any), got "
+            f"{' and '.join(map(str, shapes))} with mixture_dim={mixture_dim}."
+        )
+    for name, values in predicted.items():
+        if values.isnan().any():
+            raise ValueError(
+                f"Expected {name} without NaN, found {int(values.isnan().sum())} of "
+                f"{values.numel()}; only y may be NaN, where it was not observed. Remove these "
+                "points."
+            )
+        if name == "variance" and (values < 0).any():
+            raise ValueError(
+                f"Expected variances of at least 0, got {values.min().item():.3g}; if they are "
+                "negative by rounding, pass `variance.clamp_min(0)`."
+            )
     if mixture_dim is None:
-        components = (mean.unsqueeze(0), variance.unsqueeze(0))
-    elif -mean.dim() <= mixture_dim < mean.dim():
-        components = (mean.movedim(mixture_dim, 0), variance.movedim(mixture_dim, 0))
-    else:
-        raise ValueError(
-            f"There is no dimension {mixture_dim} in means of shape {tuple(mean.shape)}; pass "
-            "mixture_dim=None for a prediction that is not a mixture."
-        )
-    if components[0].shape[1:] != y.shape or mean.shape != variance.shape:
-        raise ValueError(
-            f"Expected means and variances of y's shape {tuple(y.shape)} (and the components' "
-            f"dimension `mixture_dim`, if any), got {tuple(mean.shape)} and "
-            f"{tuple(variance.shape)} with mixture_dim={mixture_dim}."
-        )
-    return (*components, y)
+        return [values.unsqueeze(0) for values in predicted.values()]
+    return [values.movedim(mixture_dim, 0) for values in predicted.values()]
+
+
+def _filled(y: Tensor) -> Tensor:
+    """True values with a number where they are NaN, which is left out later."""
+    return y.masked_fill(y.isnan(), 0)
+
+
+def _mean_over_observed(values: Tensor, y: Tensor) -> Tensor:
+    """The mean over the points at which ``y`` is not NaN, ``... x n x m`` to ``... x m``."""
+    missing = y.isnan()
+    return values.masked_fill(missing, 0).sum(-2) / (~missing).sum(-2)
 
 
 def _absolute_moment(mean: Tensor, variance: Tensor) -> Tensor:

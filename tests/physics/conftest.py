@@ -1,6 +1,8 @@
 """Settings and fixtures shared by the tests of the physics."""
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -55,3 +57,17 @@ def points() -> Callable[..., Tensor]:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     return draw
+
+
+@pytest.fixture
+def in_threads() -> Iterator[Callable[[Callable[[int], None]], None]]:
+    """Calls a function with 0, ..., 7, each in a thread, and switches between these often."""
+
+    def run(function: Callable[[int], None]) -> None:
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(function, range(8)))
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield run
+    sys.setswitchinterval(interval)

@@ -6,8 +6,10 @@ import pickle
 import threading
 import warnings
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
+import cloudpickle
 import joblib
 import numpy as np
 import pytest
@@ -50,6 +52,13 @@ class Handle:
     def __call__(self, X: np.ndarray) -> np.ndarray:
         with self.lock:
             return waves(X)
+
+
+class NumpyModule(torch.nn.Module):
+    """A module that computes with NumPy."""
+
+    def forward(self, X: np.ndarray) -> np.ndarray:
+        return waves(X)
 
 
 class TestValues:
@@ -192,6 +201,7 @@ class TestGradients:
             (lambda X: np.zeros((3, 2)), r"shape \(3, 2\), expected shape.*\(3, 2, 2\)"),
             (lambda X: np.full((3, 2, 2), np.nan), "finite numbers"),
             (lambda X: 1 / 0, "raised ZeroDivisionError"),
+            (lambda X: np.full((3, 2, 2), 1j), "expected real numbers, found complex128"),
         ],
     )
     def test_wrong_jacobian(
@@ -275,6 +285,20 @@ class TestFailures:
         with pytest.raises(PhysicsError, match=r"a scalar or outputs.*found \(2, 2\)"):
             physics(points(1, 2))
 
+    @pytest.mark.parametrize("batched", [True, False])
+    @pytest.mark.parametrize(
+        ("result", "found"), [(1j, "complex128"), (None, "None"), ("1", "<U1"), ([None], "None")]
+    )
+    def test_result_that_is_not_real(self, result: Any, found: str, batched: bool) -> None:
+        physics = BlackBoxPhysics(lambda x: result, batched=batched, name="mill")
+        message = rf"Physics 'mill' raised TypeError: expected real numbers, found {found}"
+        with pytest.raises(PhysicsError, match=message):
+            physics(torch.ones(1, 1))
+
+    def test_exact_numbers_are_numbers(self) -> None:
+        physics = BlackBoxPhysics(lambda x: Fraction(1, 4), batched=False)
+        assert physics(torch.ones(1, 1)).item() == 0.25
+
     def test_failed_rows_do_not_hide_a_new_number_of_outputs(self) -> None:
         def fragile(x: np.ndarray) -> np.ndarray:
             return np.zeros(int(x[0])) if x[0] else np.array([1 // 0])
@@ -350,6 +374,30 @@ class TestCopies:
         loaded.function = waves
         assert torch.allclose(loaded(X + 1), torch_waves(X + 1))
         assert isinstance(physics.function, Handle)
+
+    def test_cloudpickle_keeps_lambdas(self, points: Points) -> None:
+        scale = 3.0
+        physics = BlackBoxPhysics(
+            lambda X: scale * waves(X), gradient=lambda X: scale * waves_jacobian(X)
+        )
+        loaded = pickle.loads(cloudpickle.dumps(physics))
+        X = points(3, 2).requires_grad_()
+        Y = loaded(X)
+        assert torch.allclose(Y, 3.0 * torch_waves(X))
+        (found,) = torch.autograd.grad(Y.sum(), X)
+        (expected,) = torch.autograd.grad(3.0 * torch_waves(X).sum(), X)
+        assert torch.allclose(found, expected)
+
+    @pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
+    def test_a_handle_never_hinders_a_pickle(self, dumps: Any, points: Points) -> None:
+        physics = BlackBoxPhysics(Handle())
+        Y = physics(points(3, 2))
+        assert torch.equal(pickle.loads(dumps(physics))(points(3, 2)), Y)
+
+    def test_a_pickled_module_is_no_attribute(self, points: Points) -> None:
+        physics = BlackBoxPhysics(NumpyModule())
+        X = points(3, 2)
+        assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
     def test_lost_gradient_is_not_taken_for_none(self, points: Points) -> None:
         physics = BlackBoxPhysics(waves, gradient=lambda X: waves_jacobian(X))

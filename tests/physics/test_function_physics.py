@@ -1,9 +1,11 @@
 """Torch functions as physics, and `as_physics`."""
 
+import pickle
 import warnings
 from collections.abc import Callable
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -82,6 +84,60 @@ def test_no_warning_where_a_gradient_flows(points: Points) -> None:
         physics(points(3, 2))
 
 
+def double(X: Tensor) -> Tensor:
+    return 2 * X
+
+
+class Owner:
+    """Something that holds a physics made of its own method."""
+
+    def __init__(self) -> None:
+        self.physics = FunctionPhysics(self.formula)
+
+    def formula(self, X: Tensor) -> Tensor:
+        return X + 1
+
+
+def test_pickle_of_a_function_with_a_name(points: Points) -> None:
+    models = torch.nn.ModuleList([FunctionPhysics(double)])
+    assert torch.equal(pickle.loads(pickle.dumps(models))[0](points(3, 2)), 2 * points(3, 2))
+
+
+@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("dumps", [pickle.dumps, pickle._dumps])  # type: ignore[attr-defined]
+def test_pickle_of_a_lambda_says_what_to_do(dumps: Any, protocol: int) -> None:
+    models = torch.nn.ModuleList([FunctionPhysics(lambda X: X, name="ghost")])
+    message = r"function of physics 'ghost' cannot be pickled.*<lambda>.*top level.*cloudpickle"
+    with pytest.raises(pickle.PicklingError, match=message):
+        dumps(models, protocol)
+
+
+def test_cloudpickle_keeps_a_lambda_and_what_it_shares(points: Points) -> None:
+    shift = [1.0]
+    physics = FunctionPhysics(lambda X: X + shift[0])
+    physics(points(3, 2))
+    loaded, kept = pickle.loads(cloudpickle.dumps((physics, shift)))
+    kept[0] = 2.0
+    loaded.forget()
+    assert torch.equal(loaded(points(3, 2)), points(3, 2) + 2.0)
+
+
+def test_pickle_of_a_lambda_that_holds_its_physics(points: Points) -> None:
+    physics = FunctionPhysics(lambda X: X * len(physics.name))
+    loaded = pickle.loads(cloudpickle.dumps(physics))
+    assert torch.equal(loaded(points(3, 2)), 8.0 * points(3, 2))
+    with pytest.raises(pickle.PicklingError, match="cannot be pickled"):
+        pickle.dumps(physics)
+
+
+@pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
+def test_pickle_of_a_method_that_holds_its_physics(dumps: Any, points: Points) -> None:
+    loaded = pickle.loads(dumps(Owner()))
+    assert torch.equal(loaded.physics(points(3, 2)), points(3, 2) + 1)
+    loaded = pickle.loads(dumps(Owner().physics))
+    assert torch.equal(loaded(points(3, 2)), points(3, 2) + 1)
+
+
 def test_as_physics_wraps_callables(points: Points) -> None:
     X = points(3, 2)
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
@@ -92,6 +148,16 @@ def test_as_physics_wraps_callables(points: Points) -> None:
 def test_as_physics_takes_a_physics_as_it_is() -> None:
     physics = BlackBoxPhysics(np.sin)
     assert as_physics(physics) is physics
+
+
+def test_as_physics_joins_several(points: Points) -> None:
+    X = points(3, 2)
+    for several in ([torch.sin, double], (torch.sin, double), {"a": torch.sin, "b": double}):
+        assert torch.equal(as_physics(several)(X), torch.cat([X.sin(), 2 * X], -1))
+    physics = FunctionPhysics(double)
+    assert as_physics([physics]) is physics
+    with pytest.raises(ValueError, match="no physics to join"):
+        as_physics([])
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Callable
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -173,6 +174,9 @@ class TestErrors:
             ({"step": float("nan")}, "step must be a positive duration; found nan"),
             ({"state_dim": 0}, "state_dim must be at least 1; found 0"),
             ({"substeps": 0}, "substeps must be at least 1; found 0"),
+            ({"max_steps": 0}, "max_steps must be at least 1; found 0"),
+            ({"rtol": -1e-3}, "rtol must be a tolerance of 0 or more; found -0.001"),
+            ({"atol": float("nan")}, "atol must be a tolerance of 0 or more; found nan"),
             ({"method": "magic"}, "Unknown method 'magic'.*euler.*rk4.*dopri5"),
         ],
     )
@@ -180,13 +184,54 @@ class TestErrors:
         with pytest.raises(ValueError, match=message):
             ODEPhysics(decay, **{"step": 0.1, "state_dim": 1, **settings})
 
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"step": "x"}, "step must be a number; found 'x'"),
+            ({"rtol": None}, "rtol must be a number; found None"),
+            ({"state_dim": 1.5}, "state_dim must be a whole number; found 1.5"),
+            ({"substeps": 1.5}, "substeps must be a whole number; found 1.5"),
+        ],
+    )
+    def test_settings_of_another_type(self, settings: dict[str, Any], message: str) -> None:
+        with pytest.raises(TypeError, match=message):
+            ODEPhysics(decay, **{"step": 0.1, "state_dim": 1, **settings})
+
+    @pytest.mark.parametrize("method", ADAPTIVE_STEP)
+    def test_adaptive_method_gives_up_on_a_stiff_rhs(self, method: str) -> None:
+        physics = ODEPhysics(
+            lambda s, a: -1e9 * (s - s.cos()), 1.0, 1, method=method, max_steps=50, name="clamp"
+        )
+        message = rf"'{method}' of physics 'clamp' did not reach.*max_steps=50.*'rk4'"
+        with pytest.raises(PhysicsError, match=message) as caught:
+            physics(torch.ones(2, 1, dtype=torch.float64))
+        assert caught.value.rows == (0, 1)
+
+    def test_adaptive_method_gives_up_on_a_blow_up(self) -> None:
+        physics = ODEPhysics(lambda s, a: s**2, 2.0, 1, method="dopri5")
+        with pytest.raises(PhysicsError, match="did not reach the end of the time step"):
+            physics(torch.ones(1, 1, dtype=torch.float64))
+
+    def test_other_assertions_are_the_user_s(self) -> None:
+        def rhs(state: Tensor, action: Tensor) -> Tensor:
+            raise AssertionError("negative mass")
+
+        with pytest.raises(PhysicsError, match="raised AssertionError: negative mass"):
+            ODEPhysics(rhs, 0.1, 1, method="dopri5")(torch.ones(1, 1))
+
     def test_rhs_is_not_callable(self) -> None:
         with pytest.raises(TypeError, match="rhs must be callable; found str"):
             ODEPhysics("decay", 0.1, 1)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize(
         ("rate", "found"),
-        [(torch.zeros(3), r"\(3,\)"), (torch.zeros(3, 1), r"\(3, 1\)"), (0, "int")],
+        [
+            (torch.zeros(3), r"\(3,\)"),
+            (torch.zeros(3, 1), r"\(3, 1\)"),
+            (torch.zeros(3, 2) * 1j, "torch.complex64"),
+            (0, "int"),
+            (None, "NoneType"),
+        ],
     )
     def test_rhs_of_another_shape(self, rate: Any, found: str, points: Points) -> None:
         physics = ODEPhysics(lambda s, a: rate, 0.1, 2, name="tank")
@@ -221,6 +266,13 @@ class TestCopies:
         physics = ODEPhysics(Spring(), 0.1, 2, difference=True)
         X = points(3, 3)
         assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
+
+    def test_pickle_of_a_local_rhs(self, points: Points) -> None:
+        physics = ODEPhysics(lambda s, a: -s, 0.1, 2, name="tank")
+        with pytest.raises(pickle.PicklingError, match=r"rhs of physics 'tank' cannot be pickled"):
+            pickle.dumps(physics)
+        X = points(3, 2)
+        assert torch.equal(pickle.loads(cloudpickle.dumps(physics))(X), physics(X))
 
     def test_repr(self) -> None:
         text = repr(ODEPhysics(decay, 0.1, 2))

@@ -3,7 +3,9 @@
 import copy
 import pickle
 import re
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -106,7 +108,7 @@ class TestColumns:
         with pytest.raises(ValueError, match="inputs is empty"):
             FunctionPhysics(square, inputs=[])
 
-    @pytest.mark.parametrize("inputs", [[0.5], 1, "a"])
+    @pytest.mark.parametrize("inputs", [[0.5], 1, 0.5, "a"])
     def test_columns_that_are_not_whole_numbers(self, inputs: Any) -> None:
         with pytest.raises(TypeError, match=re.escape(f"such as [0, 2]; found {inputs!r}")):
             FunctionPhysics(square, inputs=inputs)
@@ -137,12 +139,30 @@ class TestMemo:
         with pytest.raises(ValueError, match=r"memo must be a number of rows.*found -1"):
             FunctionPhysics(square, memo=-1)
 
+    def test_no_whole_number(self) -> None:
+        with pytest.raises(TypeError, match=r"memo must be a whole number; found 1\.5"):
+            FunctionPhysics(square, memo=1.5)  # type: ignore[arg-type]
+
     def test_more_rows_than_it_can_hold(self, counter: Any, points: Points) -> None:
         physics = FunctionPhysics(counter, memo=3)
         X = points(10, 2)
         physics(X[:2])
         assert torch.equal(physics(X), counter.formula(X))
         assert torch.equal(physics(X), counter.formula(X))
+
+    def test_result_is_not_the_function_s_own_tensor(self, points: Points) -> None:
+        X = points(3, 2)
+        kept = X.clone()
+        FunctionPhysics(lambda X: X)(X).zero_()
+        assert torch.equal(X, kept)
+
+    def test_rows_that_are_known_new_and_repeated(self, counter: Any, points: Points) -> None:
+        physics = FunctionPhysics(counter)
+        X = points(5, 2)
+        physics(X[[3, 1]])
+        mixed = X[[0, 3, 0, 4, 1, 4, 2]]
+        assert torch.equal(physics(mixed), counter.formula(mixed))
+        assert counter.rows == [tuple(row) for row in X[[3, 1, 0, 4, 2]].tolist()]
 
     def test_forget(self, counter: Any, points: Points) -> None:
         physics = FunctionPhysics(counter)
@@ -394,6 +414,44 @@ class TestCopies:
     def test_repr(self) -> None:
         text = repr(FunctionPhysics(square, inputs=[2], memo=5))
         assert text == "FunctionPhysics(name='square', inputs=(2,), num_outputs=None, memo=5)"
+
+
+class TestThreads:
+    def test_dtypes_and_states_are_kept_apart(self, in_threads: Any, points: Points) -> None:
+        scale = Scale()
+        physics = FunctionPhysics(scale, memo=50)
+        X = points(40, 1)
+
+        def ask(number: int) -> None:
+            generator = torch.Generator().manual_seed(number)
+            dtype = torch.float32 if number % 2 else torch.float64
+            for _ in range(100):
+                rows = X[torch.randint(40, (10,), generator=generator)].to(dtype)
+                with torch.no_grad():
+                    Y = physics(rows)
+                if number == 0:
+                    physics.forget()
+                assert Y.dtype == dtype
+                assert torch.equal(Y, (2.0 * rows.double()).to(dtype))
+
+        in_threads(ask)
+
+    def test_forget_holds_for_rows_under_evaluation(self, points: Points) -> None:
+        inside, go = threading.Event(), threading.Event()
+
+        def slow(X: Tensor) -> Tensor:
+            inside.set()
+            assert go.wait(10)
+            return X
+
+        physics = FunctionPhysics(slow)
+        with ThreadPoolExecutor() as pool:
+            result = pool.submit(physics, points(3, 1))
+            assert inside.wait(10)
+            physics.forget()
+            go.set()
+            assert torch.equal(result.result(), points(3, 1))
+        assert len(physics._memo) == 0
 
 
 class TestSubclass:

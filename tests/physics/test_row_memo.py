@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from typing import Any
 
 import pytest
 import torch
@@ -97,6 +98,29 @@ def test_pickle_holds_the_rows_without_spare_room() -> None:
     loaded = pickle.loads(pickle.dumps(memo))
     assert torch.equal(loaded.gather(loaded.lookup(row_keys(X))), X)
     assert loaded._values.untyped_storage().nbytes() == 1025 * 8
+
+
+def test_threads_share_a_memo_that_overflows(in_threads: Any) -> None:
+    memo = RowMemo(capacity=20)
+    X = torch.arange(60, dtype=torch.float64).unsqueeze(-1)
+
+    def ask(number: int) -> None:
+        generator = torch.Generator().manual_seed(number)
+        for _ in range(300):
+            rows = X[torch.randint(60, (12,), generator=generator)]
+            assert torch.equal(memo.recall(rows, torch.square), rows**2)
+            assert len(memo) <= 20
+
+    in_threads(ask)
+
+
+def test_store_keeps_what_it_knows() -> None:
+    memo = RowMemo(capacity=10)
+    X = torch.tensor([[1.0], [2.0], [3.0]])
+    memo.store(row_keys(X[:2]), X[:2])
+    memo.store(row_keys(X), X)
+    assert len(memo) == 3
+    assert torch.equal(memo.gather(memo.lookup(row_keys(X))), X)
 
 
 def test_deep_copy_is_empty_with_the_same_capacity() -> None:

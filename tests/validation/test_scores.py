@@ -79,6 +79,12 @@ def test_bad_level(prediction, level):
         coverage(*prediction, level=level)
 
 
+@pytest.mark.parametrize("level", ["0.9", None, [0.9]])
+def test_a_level_that_is_no_number(prediction, level):
+    with pytest.raises(TypeError, match=r"Expected level to be a number such as 0\.95, got"):
+        coverage(*prediction, level=level)
+
+
 @pytest.fixture
 def mixture(uniform):
     """Means and variances of 4 components at 7 points of 3 outputs, in a batch of 2; targets."""
@@ -189,3 +195,96 @@ def test_predictions_without_variance_have_their_limits():
     torch.testing.assert_close(crps(mean, variance, y), torch.tensor([0.25]).double())
     assert nlpd(mean, variance, y) > 1e10
     assert coverage(mean, variance, y) == 0.5
+
+
+GAUSSIAN = [nlpd, crps, pit, coverage]
+
+
+@pytest.mark.parametrize("one", GAUSSIAN)
+def test_numpy_arrays_are_refused(prediction, one):
+    mean, variance, y = prediction
+    with pytest.raises(TypeError, match=r"got ndarray; convert it with `torch.as_tensor\(mean, "):
+        rmse(mean.numpy(), y.numpy())
+    with pytest.raises(TypeError, match="Expected variance to be a torch tensor, got ndarray"):
+        one(mean, variance.numpy(), y)
+    with pytest.raises(TypeError, match="Expected y to be a torch tensor, got list"):
+        one(mean, variance, y.tolist())
+    with pytest.raises(TypeError, match=r"got torch.int64; convert it with `mean.double\(\)`"):
+        rmse(mean.long(), y)
+
+
+@pytest.mark.parametrize("one", GAUSSIAN)
+def test_variances_that_are_none(prediction, one):
+    mean, variance, y = (t.clone() for t in prediction)
+    variance[0, 1, 2] = -0.5
+    with pytest.raises(ValueError, match=r"at least 0, got -0.5; if .* `variance.clamp_min\(0\)`"):
+        one(mean, variance, y)
+    variance[0, 1, 2] = torch.nan
+    with pytest.raises(ValueError, match="Expected variance without NaN, found 1 of 42"):
+        one(mean, variance, y)
+
+
+def test_means_of_nan(prediction):
+    mean, variance, y = (t.clone() for t in prediction)
+    mean[0, 1, 2] = y[0, 1, 2] = torch.nan
+    for call in (lambda: rmse(mean, y), lambda: pit(mean, variance, y)):
+        with pytest.raises(ValueError, match="Expected mean without NaN, found 1 of 42"):
+            call()
+
+
+@pytest.mark.parametrize("one", GAUSSIAN)
+def test_columns_are_needed(prediction, one):
+    mean, variance, y = (t[0, :, 0] for t in prediction)
+    with pytest.raises(ValueError, match=r"Expected y of shape ... x n x m.*unsqueeze\(-1\)"):
+        rmse(mean, y)
+    with pytest.raises(ValueError, match=r"Expected y of shape ... x n x m.*unsqueeze\(-1\)"):
+        one(mean, variance, y)
+    with pytest.raises(ValueError, match=r"\(7, 1\) and \(7, 2\)"):
+        one(mean.unsqueeze(-1), variance.unsqueeze(-1).expand(7, 2), y.unsqueeze(-1))
+
+
+def test_what_is_no_posterior_is_not_scored(data, build):
+    X, Y = data()
+    with pytest.raises(TypeError, match=r"got CKA; that of a model is `model.posterior\(X, "):
+        score(build("CKA", X, Y), Y)
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_points_that_were_not_observed_are_left_out(prediction, mixture, mixed):
+    mean, variance, y = mixture if mixed else prediction
+    options = {"mixture_dim": -3} if mixed else {}
+    partial = y.clone()
+    partial[:, [0, 3], 0] = torch.nan
+    partial[:, :, 2] = torch.nan
+    rest = [1, 2, 4, 5, 6]
+    for one in (rmse, nlpd, crps, coverage):
+        some = {True: (mean,), False: (mean, variance)}[one is rmse]
+        found, whole = one(*some, partial, **options), one(*some, y, **options)
+        part = one(*(t[..., rest, :] for t in some), y[:, rest], **options)
+        torch.testing.assert_close(found[:, 0], part[:, 0])
+        torch.testing.assert_close(found[:, 1], whole[:, 1])
+        assert found[:, 2].isnan().all()
+    expected = pit(mean, variance, y, **options).masked_fill(partial.isnan(), torch.nan)
+    found = pit(mean, variance, partial, **options)
+    torch.testing.assert_close(found, expected, equal_nan=True)
+
+
+def test_gradients_of_scores_skip_what_was_not_observed(prediction):
+    mean, variance, y = (t.clone() for t in prediction)
+    y[0, 1, 2] = torch.nan
+    mean.requires_grad_()
+    for value in (rmse(mean, y), nlpd(mean, variance, y), crps(mean, variance, y)):
+        (gradient,) = torch.autograd.grad(value.sum(), mean)
+        assert gradient.isfinite().all()
+        assert gradient[0, 1, 2] == 0
+
+
+def test_the_score_of_a_posterior_of_partial_outputs(data, build):
+    X, Y = data(num_outputs=2)
+    posterior = build("CKA", X, Y).posterior(X, observation_noise=True)
+    partial = Y.clone()
+    partial[2:, 1] = torch.nan
+    scores = score(posterior, partial)
+    torch.testing.assert_close(scores.rmse[1], rmse(posterior.mean[:2], Y[:2])[1])
+    assert scores.pit.isnan().sum() == len(Y) - 2
+    assert not scores.coverage.isnan().any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import index
 from typing import Any
 
 import torch
@@ -12,14 +13,15 @@ from gpadjust.validation.plots.drawing import (
     GREY,
     RED,
     band,
+    column,
     given_axes,
+    labels,
     mean_and_half_width,
     new_axes,
+    quantile,
     tidy,
+    whole,
 )
-
-_SYMBOLS = {"rho": r"$\rho$", "delta": r"$\delta$"}
-_UNADJUSTED = {"rho": 1.0, "delta": 0.0}
 
 
 def plot_adjustment(
@@ -34,14 +36,17 @@ def plot_adjustment(
 ) -> Any:
     r"""Draw :math:`\rho` and :math:`\delta` with their intervals: where is the physics wrong?
 
-    One row for each that the model has, one column for each input, along which the others stay at
-    a base point. The dashed line is the physics as it is, :math:`\rho = 1` and
-    :math:`\delta = 0`; ticks at the bottom are the training inputs.
+    One row for each that the model has (a rho for each of several physics), one column for each
+    input, along which the others stay at a base point. The dashed line is what the model falls
+    back to far from data, such as the physics as it is, :math:`\rho = 1` and
+    :math:`\delta = 0`; ticks at the bottom are the training inputs at which the output was
+    observed.
 
     Args:
         model: A model with ``rho`` or ``delta``.
-        bounds: Range of the inputs, ``2 x d``. Default: that of the training inputs.
-        base: The base point, ``d``. Default: the median of the training inputs.
+        bounds: Range of the inputs, ``2 x d``, a tensor or lists. Default: that of the training
+            inputs.
+        base: The base point, ``d``, a tensor or a list. Default: the median of the training inputs.
         output: Which output to draw.
         level: Nominal coverage of the intervals.
         num_points: Number of points of each curve.
@@ -51,8 +56,10 @@ def plot_adjustment(
         An array of axes, ``rows x d``.
 
     Raises:
-        TypeError: If the model has neither rho nor delta.
-        ValueError: If ``bounds`` or ``base`` have the wrong shape, or there is no such output.
+        TypeError: If the model has neither rho nor delta, or ``bounds``, ``base`` or ``level`` are
+            no numbers.
+        ValueError: If ``bounds``, ``base`` or ``axes`` have the wrong shape, there is no such
+            output, ``level`` is not between 0 and 1, or ``num_points`` is below 2.
 
     Example:
         >>> import torch
@@ -63,29 +70,31 @@ def plot_adjustment(
         (2, 1)
     """
     names = _adjustments(model)
-    train_X, bounds, base = _domain(model, bounds, base)
+    num_points = whole(num_points, "num_points", 2)
+    quantile(level)  # refused before there is a figure
+    train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     d = train_X.shape[-1]
     shape = (len(names), d)
     axes = new_axes(*shape, size=2.6) if axes is None else given_axes(axes, shape)
-    for i in range(d):
-        x = torch.linspace(bounds[0, i].item(), bounds[1, i].item(), num_points).to(base)
+    for i, label in enumerate(labels(model, "input", d)):
+        x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
         X = base.repeat(num_points, 1)
         X[:, i] = x
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
-                mean, half = mean_and_half_width(getattr(model, name)(X), output, level)
-            ax.axhline(_UNADJUSTED[name], color=GREY, lw=1, ls="--")
+                mean, half = mean_and_half_width(_term(model, name, X), output, level)
+            ax.axhline(_unadjusted(model, name, output), color=GREY, lw=1, ls="--")
             band(ax, x, mean, half, level)
             bottom = ax.get_xaxis_transform()
             ax.plot(train_X[:, i], torch.zeros(len(train_X)), "|", color=RED, transform=bottom)
-            ax.set_xlim(bounds[0, i].item(), bounds[1, i].item())
+            ax.set_xlim(*bounds[:, i].tolist())
             tidy(ax)
-        axes[-1, i].set_xlabel("x" if d == 1 else f"$x_{{{i + 1}}}$")
+        axes[-1, i].set_xlabel(label)
     for row, name in zip(axes, names, strict=True):
         low, high = zip(*(ax.get_ylim() for ax in row), strict=True)
         for ax in row:  # slices of one function are compared by eye
             ax.set_ylim(min(low), max(high))
-        row[0].set_ylabel(_SYMBOLS[name])
+        row[0].set_ylabel(_symbol(name) + suffix)
     axes[0, 0].legend(frameon=False)
     return axes
 
@@ -115,7 +124,7 @@ def plot_adjustment_pair(
         An array of axes, ``rows x 2``: mean and sd.
 
     Raises:
-        TypeError: If the model has neither rho nor delta.
+        TypeError: As :func:`plot_adjustment`.
         ValueError: As :func:`plot_adjustment`, and if ``inputs`` are not two of the model's.
 
     Example:
@@ -127,34 +136,37 @@ def plot_adjustment_pair(
         (2, 2)
     """
     names = _adjustments(model)
-    train_X, bounds, base = _domain(model, bounds, base)
-    d = train_X.shape[-1]
-    i, j = inputs
-    if i == j or not (0 <= i < d and 0 <= j < d):
-        raise ValueError(f"Expected two different inputs from 0 to {d - 1}, got {inputs}.")
+    num_points = whole(num_points, "num_points", 2)
+    train_X, bounds, base, suffix = _domain(model, bounds, base, output)
+    i, j = _two_inputs(inputs, train_X.shape[-1])
     shape = (len(names), 2)
     axes = new_axes(*shape) if axes is None else given_axes(axes, shape)
-    lines = [torch.linspace(bounds[0, k].item(), bounds[1, k].item(), num_points) for k in (i, j)]
-    grid = torch.meshgrid(*(line.to(base) for line in lines), indexing="xy")
+    lines = [
+        torch.linspace(bounds[0, k], bounds[1, k], num_points, dtype=base.dtype) for k in (i, j)
+    ]
+    grid = torch.meshgrid(*lines, indexing="xy")
     X = base.repeat(num_points**2, 1)
     X[:, i], X[:, j] = grid[0].flatten(), grid[1].flatten()
+    label = labels(model, "input", train_X.shape[-1])
     for row, name in zip(axes, names, strict=True):
         with torch.no_grad():
             one_sd = 0.6826894921370859
-            mean, sd = mean_and_half_width(getattr(model, name)(X), output, one_sd)
+            mean, sd = mean_and_half_width(_term(model, name, X), output, one_sd)
         for ax, values, title, colors in zip(
             row, (mean, sd), ("mean", "sd"), ("viridis", "cividis"), strict=True
         ):
             contour = ax.contourf(*grid, values.reshape(grid[0].shape), levels=12, cmap=colors)
             ax.figure.colorbar(contour, ax=ax)
             ax.plot(train_X[:, i], train_X[:, j], "o", color=RED, ms=4, mec="white", mew=0.6)
-            ax.set(title=f"{title} of {_SYMBOLS[name]}", xlabel=f"$x_{{{i + 1}}}$")
-            ax.set(ylabel=f"$x_{{{j + 1}}}$", xlim=bounds[:, i], ylim=bounds[:, j])
+            ax.set(title=f"{title} of {_symbol(name)}{suffix}", xlabel=label[i], ylabel=label[j])
+            ax.set(xlim=bounds[:, i], ylim=bounds[:, j])
     return axes
 
 
 def _adjustments(model: Any) -> list[str]:
-    names = [name for name in _SYMBOLS if callable(getattr(model, name, None))]
+    """The names of the rhos and deltas of a model."""
+    own = [name for name in ("rho", "delta") if callable(getattr(model, name, None))]
+    names = [name for name in getattr(model, "term_names", own) if name != "f"]
     if not names:
         raise TypeError(
             f"{type(model).__name__} has neither rho nor delta to draw; CKA, RRA, ScaleGP and "
@@ -163,23 +175,63 @@ def _adjustments(model: Any) -> list[str]:
     return names
 
 
-def _domain(
-    model: Any, bounds: Tensor | None, base: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Training inputs, the range to draw, and the base point."""
-    train_X, _ = training_data(model)
-    d = train_X.shape[-1]
+def _term(model: Any, name: str, X: Tensor) -> Any:
+    """The posterior of a rho or a delta at raw ``n x d``."""
+    return model.term(name, X) if hasattr(model, "term") else getattr(model, name)(X)
+
+
+def _unadjusted(model: Any, name: str, output: int) -> float:
+    """What the model takes a rho or a delta to be where no data say otherwise."""
+    if hasattr(model, "term_mean"):
+        return float(model.term_mean(name, output))
+    return 1.0 if name.startswith("rho") else 0.0
+
+
+def _symbol(name: str) -> str:
+    """How ``rho``, ``rho_coarse`` and ``delta`` are written."""
+    symbol, _, physics = name.partition("_")
+    if symbol not in ("rho", "delta"):
+        return name
+    return rf"$\{symbol}$" + (f" of {physics}" if physics else "")
+
+
+def _two_inputs(inputs: tuple[int, int], d: int) -> tuple[int, int]:
+    try:
+        i, j = (index(k) for k in inputs)
+    except (TypeError, ValueError):
+        i = j = 0  # not two whole numbers: refused below
+    if i == j or not (0 <= i < d and 0 <= j < d):
+        hint = "; draw a model of one input with `plot_adjustment`" if d == 1 else ""
+        raise ValueError(f"Expected two different inputs from 0 to {d - 1}, got {inputs!r}{hint}.")
+    return i, j
+
+
+def _domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Tensor, Tensor, str]:
+    """Inputs at which the output was observed, the range, the base point, and whose they are."""
+    X, Y = training_data(model)
+    d, num_outputs = X.shape[-1], Y.shape[-1]
+    seen = ~column(Y, output).isnan()
     if bounds is None:
-        lower, upper = train_X.min(0).values, train_X.max(0).values
+        lower, upper = X.min(0).values, X.max(0).values
         # An input that never changed is drawn around its value.
         pad = torch.where(lower == upper, 0.5 * lower.abs().clamp_min(1.0), torch.zeros_like(lower))
         bounds = torch.stack([lower - pad, upper + pad])
-    if base is None:
-        base = train_X.median(0).values
-    if bounds.shape != (2, d) or not (bounds[0] < bounds[1]).all():
+    bounds = _numbers(bounds, "bounds", X)
+    if bounds.shape != (2, d) or not (bounds[0] < bounds[1]).all() or bounds.isinf().any():
         raise ValueError(
-            f"Expected bounds of shape (2, {d}), lower below upper, got {bounds.tolist()}."
+            f"Expected bounds of shape (2, {d}), finite, lower below upper, got {bounds.tolist()}."
         )
-    if base.shape != (d,):
-        raise ValueError(f"Expected a base point of {d} inputs, got shape {tuple(base.shape)}.")
-    return train_X, bounds, base.to(train_X)
+    base = X.median(0).values if base is None else _numbers(base, "base", X)
+    if base.shape != (d,) or not base.isfinite().all():
+        raise ValueError(f"Expected a base point of {d} inputs, finite, got {base.tolist()}.")
+    suffix = f"\nfor {labels(model, 'output', num_outputs)[output]}" if num_outputs > 1 else ""
+    return X[seen], bounds, base, suffix
+
+
+def _numbers(values: Any, name: str, like: Tensor) -> Tensor:
+    try:
+        return torch.as_tensor(values, dtype=like.dtype, device=like.device).detach()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(
+            f"Expected {name} as a tensor or lists of numbers, got {values!r}."
+        ) from error

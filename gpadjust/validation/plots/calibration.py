@@ -8,7 +8,18 @@ from scipy.stats import binom
 from torch import Tensor
 
 from gpadjust.validation.leave_one_out import LeaveOneOut
-from gpadjust.validation.plots.drawing import BLUE, GREY, column, legend, new_axes, tidy
+from gpadjust.validation.plots.drawing import (
+    BLUE,
+    GREY,
+    column,
+    given_axes,
+    labels,
+    legend,
+    new_axes,
+    observed,
+    tidy,
+    whole,
+)
 from gpadjust.validation.scores import Scores
 
 
@@ -21,11 +32,13 @@ def plot_calibration(
     observed coverages of a calibrated prediction with as many points, at each level.
 
     Args:
-        prediction: PIT values, ``n`` or ``n x m``, or what has them.
+        prediction: PIT values, ``n`` or ``n x m``, or what has them. Those that are NaN, where
+            nothing was observed, are left out.
         output: Which output to draw.
         ax: Where to draw. Default: a new figure.
 
     Raises:
+        TypeError: If there are no PIT values in what was given, as in a model.
         ValueError: If PIT values are not between 0 and 1, or there is no such output.
 
     Example:
@@ -33,10 +46,11 @@ def plot_calibration(
         >>> plot_calibration(torch.rand(50)).get_ylabel()
         'observed coverage'
     """
-    pit = _pit(prediction, output)
+    pit, title = _pit_and_title(prediction, output)
     if ax is None:
         ax = new_axes(1, 1, size=3.6)[0, 0]
-        ax.set_title(_title(prediction, output))
+        ax.set_title(title)
+    ax = given_axes(ax, (1,))[0]
     levels = np.linspace(0, 1, 201)
     n = len(pit)
     low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
@@ -66,25 +80,27 @@ def plot_pit(
     The band holds 95 % of the counts of a bin if calibrated.
 
     Args:
-        prediction: PIT values, ``n`` or ``n x m``, or what has them.
+        prediction: PIT values, ``n`` or ``n x m``, or what has them. Those that are NaN, where
+            nothing was observed, are left out.
         output: Which output to draw.
         bins: Number of bins.
         ax: Where to draw. Default: a new figure.
 
     Raises:
-        ValueError: If PIT values are not between 0 and 1, or there is no such output or bin.
+        TypeError: As :func:`plot_calibration`.
+        ValueError: As :func:`plot_calibration`, or if ``bins`` is not a positive whole number.
 
     Example:
         >>> import torch
         >>> len(plot_pit(torch.rand(50), bins=5).patches)
         5
     """
-    if bins < 1:
-        raise ValueError(f"Expected bins >= 1, got {bins}.")
-    pit = _pit(prediction, output)
+    bins = whole(bins, "bins", 1)
+    pit, title = _pit_and_title(prediction, output)
     if ax is None:
         ax = new_axes(1, 1)[0, 0]
-        ax.set_title(_title(prediction, output))
+        ax.set_title(title)
+    ax = given_axes(ax, (1,))[0]
     n = len(pit)
     low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
     ax.hist(pit.numpy(), bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
@@ -98,15 +114,19 @@ def plot_pit(
     return ax
 
 
-def _title(prediction: Tensor | LeaveOneOut | Scores, output: int) -> str:
-    """Which output is drawn, if there are others."""
-    pit = prediction if isinstance(prediction, Tensor) else prediction.pit
-    return f"output {output}" if pit.dim() > 1 and pit.shape[-1] > 1 else ""
-
-
-def _pit(prediction: Tensor | LeaveOneOut | Scores, output: int) -> Tensor:
-    pit = prediction if isinstance(prediction, Tensor) else prediction.pit
-    pit = column(pit.unsqueeze(-1) if pit.dim() == 1 else pit, output)
-    if len(pit) == 0 or not ((pit >= 0) & (pit <= 1)).all():
+def _pit_and_title(prediction: Tensor | LeaveOneOut | Scores, output: int) -> tuple[Tensor, str]:
+    """The PIT values of what was observed, and which output they are of, if that is a question."""
+    pit = prediction if isinstance(prediction, Tensor) else getattr(prediction, "pit", None)
+    if not isinstance(pit, Tensor):
+        raise TypeError(
+            f"Expected what has PIT values, got {type(prediction).__name__}; pass "
+            "`leave_one_out(model)` of a model, `score(posterior, Y)` of a posterior, or the "
+            "values themselves as a torch tensor."
+        )
+    pit = pit.unsqueeze(-1) if pit.dim() == 1 else pit
+    values = column(pit, output)
+    values = values[observed(values, output)]
+    if not ((values >= 0) & (values <= 1)).all():
         raise ValueError("Expected PIT values between 0 and 1, as `gpadjust.validation.pit` makes.")
-    return pit
+    label = labels(prediction, "output", pit.shape[-1])[output]
+    return values, "" if label == "y" else label

@@ -1,8 +1,10 @@
-"""What the figures share: colours, axes, bands, and one output of a posterior."""
+"""What the figures share: colours, axes, names, bands, and one output of a posterior."""
 
 from __future__ import annotations
 
 import math
+import re
+from operator import index
 from statistics import NormalDist
 from typing import Any
 
@@ -11,6 +13,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from torch import Tensor
 
+from gpadjust.validation.scores import check_level
+
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
 BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
 DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
@@ -18,8 +22,7 @@ DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew
 
 def quantile(level: float) -> float:
     """Half the width of the central interval, in standard deviations."""
-    if not 0 < level < 1:
-        raise ValueError(f"Expected level between 0 and 1, got {level}.")
+    check_level(level)
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
@@ -38,9 +41,38 @@ def column(values: Tensor, output: int) -> Tensor:
             f"Expected n x m values to draw, got shape {tuple(values.shape)}; plot the elements of "
             "a batch one by one."
         )
-    if not 0 <= output < values.shape[-1]:
+    if whole(output, "output", 0) >= values.shape[-1]:
         raise ValueError(f"There is no output {output}; there are {values.shape[-1]}, from 0.")
     return values[:, output].detach()
+
+
+def whole(number: Any, name: str, least: int) -> int:
+    """Return a whole number of at least ``least``, or raise a ValueError that names it."""
+    try:
+        if index(number) >= least:
+            return index(number)
+    except TypeError:
+        pass  # refused below
+    raise ValueError(f"Expected {name} to be a whole number >= {least}, got {number!r}.")
+
+
+def observed(values: Tensor, output: int) -> Tensor:
+    """Where the ``n`` values of an output are not NaN, which is somewhere."""
+    seen = ~values.isnan()
+    if not seen.any():
+        raise ValueError(
+            f"Output {output} has no observed value to draw, {len(values)} points of NaN; choose "
+            "another `output`."
+        )
+    return seen
+
+
+def labels(of: Any, kind: str, number: int) -> list[str]:
+    """The names of the inputs or outputs (``kind``), or x or y with subscripts."""
+    symbol = {"input": "x", "output": "y"}[kind]
+    default = [symbol] if number == 1 else [f"{symbol}{k + 1}" for k in range(number)]
+    names = getattr(of, f"{kind}_names", None) or default
+    return [re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", name) for name in names]
 
 
 def new_axes(rows: int, columns: int, size: float = 3.2) -> Any:
@@ -53,8 +85,9 @@ def new_axes(rows: int, columns: int, size: float = 3.2) -> Any:
 def given_axes(axes: Any, shape: tuple[int, ...]) -> Any:
     """The axes that the user gave, as an array of the shape needed."""
     axes = np.asarray(axes)
-    if axes.size != math.prod(shape):
-        raise ValueError(f"Expected {' x '.join(map(str, shape))} axes, got {axes.size}.")
+    number = sum(isinstance(ax, Axes) for ax in axes.flat)
+    if not number == axes.size == math.prod(shape):
+        raise ValueError(f"Expected {' x '.join(map(str, shape))} axes, got {number}.")
     return axes.reshape(shape)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import Any
 
 import torch
@@ -19,9 +20,11 @@ from gpadjust.validation.plots.drawing import (
     band,
     column,
     given_axes,
+    labels,
     legend,
     mean_and_half_width,
     new_axes,
+    observed,
     quantile,
 )
 
@@ -44,14 +47,15 @@ def plot_prediction(
     Args:
         model: Any BoTorch model.
         X: Raw inputs, ``n x d``.
-        Y: True values there, ``n x m``; needed if ``d > 1``.
+        Y: True values there, ``n x m``; needed if ``d > 1``. Those that are NaN are left out.
         output: Which output to draw.
         level: Nominal coverage of the intervals.
         observation_noise: Whether the intervals are those of observations.
         ax: Where to draw. Default: a new figure.
 
     Raises:
-        ValueError: If shapes or ``level`` are wrong, or ``Y`` is missing.
+        TypeError: If ``X`` or ``Y`` is no tensor, or ``level`` no number.
+        ValueError: If shapes or ``level`` are wrong, there is no such output, or ``Y`` is missing.
 
     Example:
         >>> import torch
@@ -70,24 +74,35 @@ def plot_prediction(
     with torch.no_grad():
         posterior = model.posterior(X, observation_noise=observation_noise)
     mean, half = mean_and_half_width(posterior, output, level)
-    truth = None if Y is None else column(Y, output)
-    ax = new_axes(1, 1)[0, 0] if ax is None else ax
+    label = labels(model, "output", posterior.mean.shape[-1])[output]
+    if Y is not None and Y.shape[-1] != posterior.mean.shape[-1]:
+        raise ValueError(
+            f"Expected Y with the {posterior.mean.shape[-1]} outputs of the model as its columns, "
+            f"got shape {tuple(Y.shape)}."
+        )
+    if Y is not None:
+        truth = column(Y, output)
+        seen = observed(truth, output)
+    ax = (new_axes(1, 1) if ax is None else given_axes(ax, (1, 1)))[0, 0]
     if X.shape[-1] > 1:
-        assert truth is not None
-        against_truth(ax, truth, mean, half, level, "true", "predicted")
+        of = "" if label == "y" else f" {label}"
+        seen_values = (truth[seen], mean[seen], half[seen])
+        against_truth(ax, *seen_values, level, f"true{of}", f"predicted{of}")
         return ax
     order = X[:, 0].argsort()
     x = X[order, 0].detach()
     band(ax, x, mean[order], half[order], level)
-    if hasattr(model, "physics"):
+    for (name, physics), style in zip(_physics(model), cycle(("--", "-.", ":")), strict=False):
         with torch.no_grad():
-            f_p = column(model.physics(X[order]), output)
-        ax.plot(x, f_p, color=GREY, ls="--", lw=1.2, label="physics")
-    if truth is not None:
-        ax.plot(x, truth[order], color="black", lw=1, ls=":", label="truth")
+            f_p = column(physics(X[order]), output)
+        ax.plot(x, f_p, color=GREY, ls=style, lw=1.2, label=name)
+    if Y is not None:
+        order = order[seen[order]]
+        ax.plot(X[order, 0].detach(), truth[order], color="black", lw=1, ls=":", label="truth")
     train_X, train_Y = training_data(model)
-    ax.plot(train_X[:, 0], column(train_Y, output), color=RED, **DOTS, label="data")
-    ax.set(xlabel="x", ylabel="y")
+    y = column(train_Y, output)
+    ax.plot(train_X[~y.isnan(), 0], y[~y.isnan()], color=RED, **DOTS, label="data")
+    ax.set(xlabel=labels(model, "input", 1)[0], ylabel=label)
     legend(ax)
     return ax
 
@@ -96,6 +111,8 @@ def plot_leave_one_out(
     loo: LeaveOneOut, *, output: int = 0, level: float = 0.95, axes: Any = None
 ) -> Any:
     """Draw left-out predictions against the observations, and standardized residuals.
+
+    Points at which the output was not observed are left out.
 
     Args:
         loo: What :func:`~gpadjust.validation.leave_one_out` returned, without batch.
@@ -107,6 +124,7 @@ def plot_leave_one_out(
         An array of two axes.
 
     Raises:
+        TypeError: If ``loo`` is something else, as a model, or ``level`` is no number.
         ValueError: If there is a batch, no such output, or ``level`` is not between 0 and 1.
 
     Example:
@@ -118,10 +136,17 @@ def plot_leave_one_out(
         >>> plot_leave_one_out(leave_one_out(model)).shape
         (2,)
     """
+    if not isinstance(loo, LeaveOneOut):
+        raise TypeError(
+            f"Expected a LeaveOneOut, got {type(loo).__name__}; pass `leave_one_out(model)`."
+        )
     z = quantile(level)
-    Y, mean, sd = (column(t, output) for t in (loo.Y, loo.mean, loo.variance.sqrt()))
+    seen = observed(column(loo.Y, output), output)
+    Y, mean, sd = (column(t, output)[seen] for t in (loo.Y, loo.mean, loo.variance.sqrt()))
+    label = labels(loo, "output", loo.Y.shape[-1])[output]
     axes = new_axes(1, 2)[0] if axes is None else given_axes(axes, (2,))
-    against_truth(axes[0], Y, mean, z * sd, level, "observed", "predicted without it")
+    of = "" if label == "y" else f" {label}"
+    against_truth(axes[0], Y, mean, z * sd, level, f"observed{of}", "predicted without it")
     axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
     axes[1].axhline(0, color=GREY, lw=1, ls="--")
     axes[1].plot(mean, (Y - mean) / sd, color=BLUE, **DOTS)
@@ -131,9 +156,23 @@ def plot_leave_one_out(
     return axes
 
 
+def _physics(model: Any) -> list[tuple[str, Any]]:
+    """The physics of a model with their names; of one that has several, those of a mapping."""
+    physics: Any = getattr(model, "physics", None)
+    if hasattr(physics, "items"):
+        return [(f"physics {name}", one) for name, one in physics.items()]
+    return [("physics", physics)] if callable(physics) else []
+
+
 def _check_inputs(X: Tensor, Y: Tensor | None) -> None:
-    if X.dim() != 2:
-        raise ValueError(f"Expected X of shape n x d, got {tuple(X.shape)}.")
+    for name, values in (("X", X), ("Y", Y)):
+        if not isinstance(values, Tensor) and (name == "X" or values is not None):
+            raise TypeError(
+                f"Expected {name} to be a torch tensor, got {type(values).__name__}; convert it "
+                f"with `torch.as_tensor({name}, dtype=torch.float64)`."
+            )
+    if X.dim() != 2 or not X.numel():
+        raise ValueError(f"Expected X of shape n x d, one point or more, got {tuple(X.shape)}.")
     if Y is not None and (Y.dim() != 2 or len(Y) != len(X)):
         raise ValueError(
             f"Expected Y of shape {len(X)} x m, one row for each of X, got {tuple(Y.shape)}."

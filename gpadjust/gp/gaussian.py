@@ -1,0 +1,188 @@
+"""Gaussian targets: one covariance with noise, one Cholesky factor, one nugget."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from gpytorch.distributions import MultivariateNormal
+from gpytorch.likelihoods import Likelihood
+from linear_operator.operators import DiagLinearOperator
+from torch import Tensor
+
+_TRIES = 7  # each with ten times the nugget of the one before
+
+
+def nugget(n: int) -> float:
+    r"""The nugget of every factorised covariance of ``n`` points, :math:`10 n^2 \epsilon`.
+
+    It is relative to the mean of the diagonal, and always there, in fits and in predictions alike.
+    With less, rounding errors would decide what a model without noise knows: they are of the order
+    of :math:`n \epsilon` of the prior variance, and the variance of a prediction is no smaller than
+    the nugget.
+    """
+    return 10 * n**2 * torch.finfo(torch.float64).eps
+
+
+def cholesky(
+    covariance: Tensor, observed: Tensor | None = None, n: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """Factorise covariances of targets, noise included; they are overwritten.
+
+    Args:
+        covariance: ``... x n x n``.
+        observed: Which targets there are, booleans that broadcast to ``... x n``. Those that are
+            missing become independent ones of variance 1. Default: all.
+        n: The number of points that the nugget is for. Default: that of the covariance.
+
+    Returns:
+        The Cholesky factors of covariance and nugget, which is raised where it must be, and which
+        of them failed all the same, ``...``.
+    """
+    n = covariance.shape[-1] if n is None else n
+    diagonal = covariance.diagonal(dim1=-1, dim2=-2)
+    if observed is None:
+        added = nugget(n) * diagonal.mean(-1, keepdim=True)
+    else:
+        pairs = observed.unsqueeze(-1) & observed.unsqueeze(-2)
+        covariance = covariance.where(pairs, torch.zeros_like(covariance))
+        diagonal = covariance.diagonal(dim1=-1, dim2=-2)
+        count = observed.sum(-1, keepdim=True).clamp_min(1)
+        added = nugget(n) * diagonal.sum(-1, keepdim=True) / count
+        covariance = covariance + torch.diag_embed((~observed).to(covariance))
+    covariance = _add_diagonal(covariance, added)
+    chol, info = torch.linalg.cholesky_ex(covariance)
+    if not info.any():
+        return chol, info > 0
+    for _ in range(_TRIES):
+        covariance = _add_diagonal(covariance, 9 * added * (info > 0).unsqueeze(-1))
+        added = 10 * added
+        chol, info = torch.linalg.cholesky_ex(covariance)
+        if not info.any():
+            break
+    failed = info > 0
+    identity = torch.eye(covariance.shape[-1], dtype=chol.dtype, device=chol.device)
+    return torch.where(failed[..., None, None], identity, chol), failed
+
+
+def _add_diagonal(matrix: Tensor, values: Tensor) -> Tensor:
+    """Add ``... x 1`` or ``... x n`` to diagonals; in place where autograd does not look on."""
+    if matrix.requires_grad or values.requires_grad:
+        return matrix + torch.diag_embed(values.expand(matrix.shape[:-1]))
+    matrix.diagonal(dim1=-1, dim2=-2).add_(values)
+    return matrix
+
+
+def noise_variances(likelihood: Likelihood, inputs: Tensor, **kwargs: Tensor) -> Tensor:
+    """The noise of observations at transformed inputs ``... x n x d``, ``... x n``."""
+    nothing = torch.zeros_like(inputs[..., 0])
+    silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
+    noisy = likelihood(silent, [inputs], **kwargs).lazy_covariance_matrix
+    return noisy.diagonal(dim1=-1, dim2=-2)
+
+
+class LikelihoodValue(NamedTuple):
+    """Value and derivatives of a negative log likelihood; ``...`` is a batch of problems.
+
+    Attributes:
+        value: ``...``; infinite where the covariance has no Cholesky factor.
+        scale: The factor of the covariance that it is for, ``...``.
+        by_mean: Its derivatives by the mean, ``... x n``; None if not asked for.
+        by_covariance: Its derivatives by the covariance, ``... x n x n``; None likewise.
+        by_least_scale: Its derivative by the logarithm of ``least_scale``, ``...``; None likewise.
+    """
+
+    value: Tensor
+    scale: Tensor
+    by_mean: Tensor | None = None
+    by_covariance: Tensor | None = None
+    by_least_scale: Tensor | None = None
+
+
+def negative_log_likelihood(
+    residual: Tensor,
+    covariance: Tensor,
+    basis: Tensor | None = None,
+    least_scale: Tensor | None = None,
+    derivatives: bool = False,
+) -> LikelihoodValue:
+    r"""Negative log likelihood of :math:`r \sim N(H \beta, s K)`, with one Cholesky factor.
+
+    .. math:: \tfrac{1}{2s} r^T P r + \tfrac12 \log|s K| + \tfrac n2 \log 2\pi
+
+    where :math:`P = K^{-1} - K^{-1} H (H^T K^{-1} H)^{-1} H^T K^{-1}`: the coefficients
+    :math:`\beta` of the basis are at their generalised least squares estimate. With a
+    ``least_scale`` the factor s is at its optimum, :math:`s = r^T P r / n`, or at that least value
+    if the optimum is below it; without one it is 1 (Rasmussen and Williams 2006, sec. 2.7, 5.4).
+
+    The derivative by the covariance is :math:`\tfrac12 (K^{-1} - \alpha \alpha^T / s)` with
+    :math:`\alpha = P r`, one inverse from the same factor.
+
+    Args:
+        residual: Targets less their mean, ``... x n``; NaN where there is no observation.
+        covariance: The covariance K, noise included, ``... x n x n``; it is overwritten.
+        basis: The basis H, ``... x n x q``, or none.
+        least_scale: The least s, ``...``, or None for s = 1.
+        derivatives: Whether to compute the derivatives.
+    """
+    size = residual.shape[-1]
+    observed = ~residual.isnan()
+    n = observed.sum(-1).to(residual)
+    everything = bool(observed.all())
+    if not everything:
+        residual = residual.nan_to_num(nan=0.0)
+        basis = None if basis is None else basis * observed.unsqueeze(-1)
+    chol, failed = cholesky(covariance, None if everything else observed)
+    alpha = torch.cholesky_solve(residual.unsqueeze(-1), chol)
+    if basis is not None:
+        basis = basis.expand(*chol.shape[:-1], basis.shape[-1])
+        coefficients, _ = least_squares(chol, residual, basis)
+        alpha = alpha - torch.cholesky_solve(basis @ coefficients.unsqueeze(-1), chol)
+    alpha = alpha.squeeze(-1)
+    # The basis is orthogonal to P r, so that r^T P r needs no other residual.
+    square = (residual * alpha).sum(-1)
+    scale = torch.ones_like(square)
+    if least_scale is not None:
+        scale = (square / n).maximum(least_scale)
+    log_det = 2 * chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+    value = 0.5 * (square / scale + n * (scale.log() + math.log(2 * math.pi)) + log_det)
+    failed = failed | ~value.isfinite()
+    value = torch.where(failed, torch.full_like(value, math.inf), value)
+    if not derivatives:
+        return LikelihoodValue(value, scale)
+    weight = alpha / scale.unsqueeze(-1)
+    by_covariance = torch.cholesky_inverse(chol)
+    by_covariance.view(-1, size, size).baddbmm_(
+        weight.reshape(-1, size, 1), alpha.reshape(-1, 1, size), beta=0.5, alpha=-0.5
+    )
+    if not everything:
+        by_covariance = by_covariance * observed.unsqueeze(-1) * observed.unsqueeze(-2)
+    diagonal = by_covariance.diagonal(dim1=-1, dim2=-2)
+    # The nugget follows the covariance's mean diagonal.
+    share = nugget(size) * diagonal.sum(-1, keepdim=True) / n.unsqueeze(-1)
+    diagonal.add_(share * observed)
+    by_scale = None if least_scale is None else 0.5 * (n - square / scale)
+    # LAPACK's matrices are stored by columns, ours by rows: mixing them would be slow.
+    return LikelihoodValue(value, scale, -weight, by_covariance.mT, by_scale)
+
+
+def least_squares(chol: Tensor, residual: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """Generalised least squares of a residual on a basis.
+
+    Args:
+        chol: Cholesky factor of the residual's covariance, ``... x n x n``.
+        residual: ``... x n``.
+        basis: ``... x n x q``.
+
+    Returns:
+        The coefficients, ``... x q``, and their covariance, ``... x q x q``.
+    """
+    white = torch.linalg.solve_triangular(
+        chol, torch.cat([basis, residual.unsqueeze(-1)], dim=-1), upper=False
+    )
+    white_basis, white_residual = white[..., :-1], white[..., -1:]
+    # Through an orthogonal basis, for columns that are nearly collinear; the pseudo-inverse is
+    # for those that are so exactly, a physics that is constant, say.
+    inverse = torch.linalg.pinv(white_basis, rtol=1e-10)
+    return (inverse @ white_residual).squeeze(-1), inverse @ inverse.mT

@@ -1,0 +1,179 @@
+"""The physics as further input columns: a transform that appends them, a module that reads one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import torch
+from botorch.models.transforms.input import InputTransform
+from torch import Size, Tensor
+from torch.nn import Module
+
+from gpadjust.physics import Physics
+
+
+class PhysicsInput(InputTransform):
+    r"""Appends f_p to the inputs: :math:`X \mapsto [\text{base}(X), f_p(X)]`.
+
+    The physics always sees the user's raw ``X``, and is evaluated once; the user's own input
+    transform (``Normalize``, say) acts on the other columns. A mean and a kernel that read the
+    columns are then the whole prior, so that everything in BoTorch that bypasses a model's
+    ``forward`` is right as well.
+
+    Args:
+        physics: The physics f_p, ``... x n x d`` to ``... x n x k``; of several, side by side.
+        num_inputs: Number ``d`` of raw input columns.
+        base: The user's input transform, or none.
+    """
+
+    transform_on_train = True
+    transform_on_eval = True
+    transform_on_fantasize = True
+
+    def __init__(
+        self, physics: Physics, num_inputs: int, base: InputTransform | None = None
+    ) -> None:
+        super().__init__()
+        check_one_to_one(base)
+        self.physics = physics
+        self.num_inputs = num_inputs
+        self.base = base
+
+    def transform(self, X: Tensor) -> Tensor:
+        """Map raw ``X`` (``... x n x d``) to ``... x n x (d' + k)``."""
+        self._check(X)
+        return self._append(X if self.base is None else self.base(X), self.physics(X))
+
+    def without_physics(self, X: Tensor) -> Tensor:
+        """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
+        self._check(X)
+        inputs = X if self.base is None else self.base(X)
+        k = self.physics.num_outputs or 0  # it is known: f_p was evaluated at the training inputs
+        return torch.cat([inputs, inputs.new_zeros(*inputs.shape[:-1], k)], dim=-1)
+
+    def untransform(self, X: Tensor) -> Tensor:
+        """Map ``... x n x (d' + k)`` back to raw ``... x n x d``."""
+        k = self.physics.num_outputs or 0
+        inputs = X[..., : X.shape[-1] - k]
+        return inputs if self.base is None else self.base.untransform(inputs)
+
+    def preprocess_transform(self, X: Tensor) -> Tensor:
+        """As :meth:`transform`, with the base transform's own preprocessing."""
+        self._check(X)
+        inputs = X if self.base is None else self.base.preprocess_transform(X)
+        return self._append(inputs, self.physics(X))
+
+    def equals(self, other: InputTransform) -> bool:
+        """Whether ``other`` appends the same physics after an equal base transform."""
+        if not isinstance(other, PhysicsInput) or self.physics is not other.physics:
+            return False
+        if self.base is None or other.base is None:
+            return self.base is other.base
+        return self.base is other.base or self.base.equals(other.base)
+
+    @staticmethod
+    def _append(inputs: Tensor, values: Tensor) -> Tensor:
+        """Join columns; the base transform may have added a batch."""
+        return torch.cat([inputs, values.expand(*inputs.shape[:-1], values.shape[-1])], dim=-1)
+
+    def _check(self, X: Tensor) -> None:
+        if not isinstance(X, Tensor) or X.dtype != torch.float64:
+            found = X.dtype if isinstance(X, Tensor) else type(X).__name__
+            way = "X.double()" if isinstance(X, Tensor) else "torch.as_tensor(X).double()"
+            raise TypeError(f"Expected X as a float64 tensor, got {found}; use `{way}`.")
+        if X.shape[-1] != self.num_inputs:
+            raise ValueError(
+                f"Expected X with {self.num_inputs} columns, the inputs that the model was built "
+                f"on, got shape {tuple(X.shape)}. Pass raw inputs: the model appends f_p itself."
+            )
+
+
+def check_one_to_one(transform: InputTransform | None) -> None:
+    """Raise a ValueError for an input transform that makes several points of one."""
+    if transform is not None and transform.is_one_to_many:
+        raise ValueError(
+            f"The input transform {type(transform).__name__} makes several points of one, which "
+            "these models do not support; use a one-to-one transform."
+        )
+
+
+class AppendedPhysics(Module):
+    r"""Reads f_p from a column that :class:`PhysicsInput` appended: the basis of a term.
+
+    For output :math:`j` it returns :math:`(f_{p,j}(x) - \text{offset}_j) / \text{scale}_j`, in the
+    units of the model's targets.
+
+    Args:
+        num_inputs: Number ``d`` of input columns before the appended ones.
+        select: One column of ones and zeros for each output, ``batch_shape x (m) x 1 x k``: which
+            of the ``k`` appended columns is f_p of that output.
+        offset: ``batch_shape x (m) x 1``, in the user's units.
+        scale: Of the same shape.
+    """
+
+    select: Tensor
+    offset: Tensor
+    scale: Tensor
+
+    def __init__(self, num_inputs: int, select: Tensor, offset: Tensor, scale: Tensor) -> None:
+        super().__init__()
+        self.num_inputs = num_inputs
+        for name, tensor in (("select", select), ("offset", offset), ("scale", scale)):
+            self.register_buffer(name, tensor.clone())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the scaled f_p of each batch as ``... x n``, from ``x``: ``... x n x (d + k)``."""
+        if x.shape[-1] != self.num_inputs + self.select.shape[-1]:
+            raise ValueError(
+                f"Expected {self.num_inputs} input columns and {self.select.shape[-1]} columns of "
+                f"f_p, got x with shape {tuple(x.shape)}. The model's input transform appends f_p: "
+                "call `model.posterior(X)`, or `model(model.transform_inputs(X))` in eval mode."
+            )
+        values = (x[..., self.num_inputs :] * self.select).sum(-1) - self.offset
+        # Differences of rounding errors are none: a physics that is constant has no variation.
+        rounding = 8 * torch.finfo(values.dtype).eps * self.offset.abs()
+        values = torch.where(values.abs() <= rounding, values - values.detach(), values)
+        return values / self.scale
+
+    def map_batches(self, change: Callable[[Tensor], Tensor]) -> AppendedPhysics:
+        """A copy whose buffers are changed along their batch dimensions."""
+        new = deepcopy(self)
+        for name, buffer in self.named_buffers():
+            setattr(new, name, change(buffer))
+        return new
+
+
+class CalledPhysics(Module):
+    """One output of a physics, called at the inputs that a mean or a kernel is given.
+
+    Args:
+        physics: The physics f_p; a plain torch function is wrapped.
+        output: Which of its outputs to use; may be left out when it has only one.
+    """
+
+    def __init__(self, physics: Physics, output: int | None = None) -> None:
+        super().__init__()
+        self.physics = physics
+        self.output = output
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return f_p at ``x`` (``... x n x d``) as ``... x n``."""
+        values: Tensor = self.physics(x)
+        if self.output is not None:
+            return values[..., self.output]
+        if values.shape[-1] != 1:
+            raise ValueError(
+                f"The physics '{self.physics.name}' has {values.shape[-1]} outputs; say with "
+                "`output=` which one this mean or kernel is about (one model, or one batch, "
+                "per output)."
+            )
+        return values.squeeze(-1)
+
+    def extra_repr(self) -> str:
+        """The settings that ``repr`` shows."""
+        return "" if self.output is None else f"output={self.output}"
+
+
+Basis = Any  # a module that maps `... x n x (d + k)` to `... x n`, with `map_batches`

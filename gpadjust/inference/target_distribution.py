@@ -1,0 +1,127 @@
+"""Mean and covariance of a model's targets as functions of its hyper-parameters, for any model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import gpytorch
+import torch
+from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+from gpytorch.likelihoods import FixedNoiseGaussianLikelihood
+from linear_operator import to_dense
+from torch import Tensor
+from torch.func import functional_call
+from torch.nn import Module
+
+from gpadjust.gp import SumOfTerms
+from gpadjust.gp.gaussian import noise_variances
+from gpadjust.inference.log_parameters import LogParameters, Parameters
+
+# Maps derivatives by mean and covariance to those by the (logarithmic) parameters.
+PullBack = Callable[[Tensor, Tensor], Parameters]
+
+
+class TargetDistribution(Protocol):
+    """Mean and covariance of the targets, noise included, as functions of the parameters."""
+
+    def __call__(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
+        """Return mean ``... x n`` and covariance ``... x n x n``, which may be overwritten."""
+
+    def with_pull_back(self, parameters: Parameters) -> tuple[Tensor, Tensor, PullBack]:
+        """As calling it, with the function that carries derivatives back to the parameters."""
+
+
+class ModuleDistribution:
+    """The distribution by the model's own modules, differentiated by autograd.
+
+    It serves every kernel, mean and likelihood. Autograd does not see the factorisation: it starts
+    from the derivatives by mean and covariance, which are known in closed form.
+
+    Args:
+        model: The model, in train mode.
+        inputs: Its training inputs, or some rows of them; transformed, unless the input transform
+            is to be evaluated each time, as its parameters are among those that are learnt.
+        parameters: Its learnable parameters.
+        known_noise: The noise variances of these inputs, if they are known.
+        marginal: Whether the prior variances of unknown constants count.
+    """
+
+    def __init__(
+        self,
+        model: BatchedMultiOutputGPyTorchModel,
+        inputs: Tensor,
+        parameters: LogParameters,
+        known_noise: Tensor | None,
+        marginal: bool,
+    ) -> None:
+        self._noisy_prior = _NoisyPrior(model, inputs, parameters, known_noise, marginal)
+        self._parameters = parameters
+
+    def __call__(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
+        """Return mean ``... x n`` and covariance ``... x n x n``, noise included."""
+        raw = self._parameters.to_raw(parameters)
+        named = {f"model.{name}": value for name, value in raw.items()}
+        with gpytorch.settings.lazily_evaluate_kernels(False):
+            moments: tuple[Tensor, Tensor] = functional_call(self._noisy_prior, named, ())
+        return moments
+
+    def with_pull_back(self, parameters: Parameters) -> tuple[Tensor, Tensor, PullBack]:
+        """As calling it, with the function that carries derivatives back to the parameters."""
+        leaves = {name: v.detach().requires_grad_() for name, v in parameters.items()}
+        with torch.enable_grad():
+            mean, covariance = self(leaves)
+
+        def pull_back(by_mean: Tensor, by_covariance: Tensor) -> Parameters:
+            moments, derivatives = [covariance], [by_covariance]
+            if mean.requires_grad:
+                moments.append(mean)
+                derivatives.append(by_mean)
+            found = torch.autograd.grad(
+                moments, list(leaves.values()), derivatives, allow_unused=True
+            )
+            return {
+                name: torch.zeros_like(leaf) if gradient is None else gradient
+                for (name, leaf), gradient in zip(leaves.items(), found, strict=True)
+            }
+
+        return mean.detach(), covariance.detach().clone(), pull_back
+
+
+class _NoisyPrior(Module):
+    def __init__(
+        self,
+        model: BatchedMultiOutputGPyTorchModel,
+        inputs: Tensor,
+        parameters: LogParameters,
+        known_noise: Tensor | None,
+        marginal: bool,
+    ) -> None:
+        super().__init__()
+        self.model = model
+        self.inputs = inputs
+        self.known_noise = known_noise
+        self.transforms = any(name.startswith("input_transform.") for name in parameters.names)
+        kernel = model.covar_module
+        self.known_means = isinstance(kernel, SumOfTerms) and not marginal
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        model = self.model
+        inputs = model.transform_inputs(self.inputs) if self.transforms else self.inputs
+        if self.known_means:
+            covariance = model.covar_module.covariance(inputs, known_means=True)
+        else:
+            covariance = to_dense(model.covar_module(inputs))
+        noise = self.known_noise
+        noise = noise_variances(model.likelihood, inputs) if noise is None else noise
+        noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
+        mean = model.mean_module(inputs).expand(noise.shape)
+        return mean, covariance + torch.diag_embed(noise)
+
+
+def known_noise_of(model: BatchedMultiOutputGPyTorchModel) -> Tensor | None:
+    """The known noise variances of the training targets, ``... x n``, or None."""
+    likelihood = model.likelihood
+    if type(likelihood) is not FixedNoiseGaussianLikelihood:
+        return None
+    return None if likelihood.second_noise_covar is not None else likelihood.noise

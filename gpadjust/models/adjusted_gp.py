@@ -1,0 +1,398 @@
+"""The Gaussian process of an adjusted physics: what CKA and its special cases share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from botorch.models.transforms.input import InputTransform
+from botorch.models.transforms.outcome import Standardize
+from botorch.posteriors import Posterior
+from botorch.utils.datasets import SupervisedDataset
+from botorch.utils.types import DEFAULT, _DefaultType
+from gpytorch.kernels import Kernel
+from gpytorch.likelihoods import Likelihood
+from torch import Size, Tensor
+from torch.nn import Module
+
+from gpadjust.gp import AppendedPhysics, FixedStandardize, PhysicsInput, Term
+from gpadjust.gp.gaussian import least_squares
+from gpadjust.models.cholesky_strategy import Weights
+from gpadjust.models.exact_gp_base import ExactGPBase
+from gpadjust.models.training_data import ArrayLike, training_data
+from gpadjust.physics import Physics, as_physics
+
+PhysicsLike = (
+    Physics
+    | Callable[[Tensor], Tensor]
+    | Sequence[Physics | Callable[[Tensor], Tensor]]
+    | dict[str, Physics | Callable[[Tensor], Tensor]]
+)
+KernelLike = Kernel | Callable[[int, Size], Kernel]
+Means = float | Sequence[float] | Literal["learn"]
+
+
+class Adjustment(NamedTuple):
+    """What a structure says of rho or delta.
+
+    Attributes:
+        kernel: Its kernel, or a function of the number of inputs and the batch shape that makes
+            it; None for a constant. Several physics have a kernel each, made by the function, or
+            given as a sequence.
+        mean: Its prior mean: a number (one for each physics), or ``"learn"``. None: 1 for one
+            physics, ``"learn"`` for several.
+    """
+
+    kernel: KernelLike | Sequence[KernelLike] | None
+    mean: Means | None
+
+
+class AdjustedGP(ExactGPBase):
+    r"""The base of the models of :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`.
+
+    With :math:`\rho_i \sim GP(\bar\rho_i, k_i)` and :math:`\delta \sim GP(\bar\delta, k_\delta)`
+    they are sums of the terms ``rho`` (of each physics) and ``delta``; for one physics the prior is
+
+    .. math:: f_a \sim GP\left(f_p, \; F_p k_\rho F_p^T + k_\delta\right)
+
+    (Wannawas and Faisal 2023, eq. 2). A structure says what kernels and means they have, by a few
+    lines of its own: :class:`~gpadjust.CKA`, :class:`~gpadjust.PhysicsMeanGP`,
+    :class:`~gpadjust.ScaleGP` and so on. Its input transform appends all f_i to the inputs
+    (:class:`~gpadjust.gp.PhysicsInput`), once; the terms read those columns.
+
+    With a center c the basis of rho is :math:`f_p - c`. The bias that makes
+    :math:`f_a = \rho f_p + \delta` is then :math:`\delta = \delta_0 - \sum_i c_i \rho_i` for the
+    model's own term :math:`\delta_0`.
+
+    Args:
+        train_X: As in :class:`~gpadjust.CKA`, like all that are not listed here.
+        train_Y: See there.
+        train_Yvar: See there.
+        physics: See there; None for a model without physics, whose only term is ``f``.
+        rho: What the structure says of rho.
+        delta: What it says of delta.
+        more_terms: Further terms of a structure of your own, made by a function of the number of
+            inputs (after their transform), the batch shape, and the scale of the targets.
+        center: See there.
+        likelihood: See there.
+        outcome_transform: See there.
+        input_transform: See there.
+    """
+
+    def __init__(
+        self,
+        train_X: ArrayLike,
+        train_Y: ArrayLike,
+        train_Yvar: ArrayLike,
+        physics: PhysicsLike | None,
+        rho: Adjustment | None,
+        delta: Adjustment,
+        *,
+        more_terms: Callable[[int, Size, Tensor], Sequence[Term]] | None = None,
+        center: float | Tensor | Literal["mean"] = 0.0,
+        likelihood: Likelihood | None = None,
+        outcome_transform: Standardize | _DefaultType | None = DEFAULT,
+        input_transform: InputTransform | None = None,
+    ) -> None:
+        data = training_data(train_X, train_Y, train_Yvar)
+        m, batch_shape = data.Y.shape[-1], self.get_batch_dimensions(data.X, data.Y)[1]
+        transform = input_transform
+        if physics is not None:
+            transform = PhysicsInput(as_physics(physics), data.X.shape[-1], input_transform)
+        with torch.no_grad():
+            X = data.X if transform is None else transform(data.X)
+        f = _values(transform, X, m)  # k physics, ... x n x m each
+        d = X.shape[-1] - len(f) * m
+        rho_means = _means(rho, len(f))
+        start = _start(data.Y, f, rho_means)
+        if isinstance(outcome_transform, _DefaultType):
+            mean = sum((w * v for w, v in zip(start, f, strict=True)), torch.zeros_like(data.Y))
+            outcome_transform = FixedStandardize.from_residual(data.Y, mean)
+        units = FixedStandardize.from_transform(outcome_transform, data.Y, X)
+        zero = torch.zeros_like(data.X[..., :1, :1]).expand(*data.X.shape[:-2], 1, m)
+        shift, scale = (zero, zero + 1) if units is None else (units.means, units.stdvs)
+
+        def of_outputs(tensor: Tensor) -> Tensor:
+            """From ``batch_shape x 1 x m`` to ``batch_shape x (m) x 1``."""
+            return tensor.mT.clone() if m > 1 else tensor.squeeze(-1).clone()
+
+        terms: list[Term] = []
+        names, given = _names(transform, len(f)), []
+        centers = [_center(center, values) for values in f]
+        kernels = _kernels(rho, len(f), names, d, batch_shape, given)
+        for i, name in enumerate(names):
+            column = torch.zeros(m, len(f) * m, dtype=torch.float64)
+            column[range(m), range(i * m, (i + 1) * m)] = 1.0
+            select = column.unsqueeze(-2) if m > 1 else column
+            basis = AppendedPhysics(
+                d,
+                select.expand(*batch_shape, 1, len(f) * m),
+                of_outputs(centers[i] + zero),
+                of_outputs(scale + zero),
+            )
+            value = of_outputs(start[i] + zero)
+            vague = torch.ones_like(value) if rho_means[i] == "learn" else None
+            terms.append(Term(name, kernels[i], d, basis, value, vague))
+        # f = sum rho_i (f_i - c_i) + delta_0, so that delta_0 has the mean sum rho_i c_i.
+        offset = sum((c * w for c, w in zip(centers, start, strict=True)), zero)
+        known = 0.0 if delta.mean == "learn" else delta.mean
+        value = of_outputs((known + offset - shift) / scale)
+        vague = torch.ones_like(value) if delta.mean == "learn" else None
+        kernel = _kernels(delta, 1, ["delta"], d, batch_shape, given)[0]
+        terms.append(Term("f" if physics is None else "delta", kernel, d, None, value, vague))
+        if more_terms is not None:
+            terms.extend(more_terms(d, batch_shape, of_outputs(scale + zero)))
+        unknown = sum(term.learns_mean for term in terms)
+        if unknown and data.X.shape[-2] < 2 + unknown:
+            raise ValueError(
+                f"Expected at least {2 + unknown} points to learn {unknown} constant means and a "
+                f"variance, got {data.X.shape[-2]}; give the means instead: rho_mean=1.0 (a number "
+                "for each physics), delta_mean=0.0."
+            )
+        super().__init__(data, terms, likelihood, units, transform, given)
+
+    @property
+    def physics(self) -> Physics:
+        """The physics f_p; of several, all of them side by side."""
+        physics: Physics = self.input_transform.physics
+        return physics
+
+    @property
+    def rho_names(self) -> tuple[str, ...]:
+        """The names of the terms that scale a physics, one for each physics."""
+        return tuple(t.name for t in self.terms if isinstance(t.basis, AppendedPhysics))
+
+    @property
+    def other_names(self) -> tuple[str, ...]:
+        """The names of the other terms: delta, and those of a structure of your own."""
+        return tuple(t.name for t in self.terms if not isinstance(t.basis, AppendedPhysics))
+
+    def rho(self, X: ArrayLike, physics: str | int | None = None) -> Posterior:
+        r"""The posterior of the scaling :math:`\rho` at ``X``; f_p is not evaluated there.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            physics: Which of several physics, by its name or number.
+
+        Returns:
+            A posterior over ``batch_shape x q x m``, without units.
+
+        Raises:
+            ValueError: If the model has no such rho.
+        """
+        return self.term(self.rho_name(physics), X)
+
+    def delta(self, X: ArrayLike) -> Posterior:
+        r"""The posterior of the bias :math:`\delta` at ``X``; f_p is not evaluated there.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+
+        Returns:
+            A posterior over ``batch_shape x q x m``, in the units of the targets.
+
+        Raises:
+            ValueError: If the model has no delta.
+        """
+        return self.term("delta", X)
+
+    def rho_name(self, physics: str | int | None = None) -> str:
+        """The name of the term that scales a physics, which is given by name or number."""
+        names = self.rho_names
+        if physics is None and len(names) == 1:
+            return names[0]
+        if isinstance(physics, int) and -len(names) <= physics < len(names):
+            return names[physics]
+        for name in names:
+            if physics is not None and physics in (name, name.removeprefix("rho_")):
+                return name
+        raise ValueError(
+            f"Expected physics to be one of {', '.join(n.removeprefix('rho_') for n in names)}, or "
+            f"a number from 0 to {len(names) - 1}, got {physics!r}."
+        )
+
+    def term_mean(self, name: str, output: int = 0) -> float:
+        """The prior mean of a term, to which it falls back far from the data.
+
+        Of a model that holds samples of its hyper-parameters, or a batch, that of the first.
+        """
+        shift, scale = self._term_units(name)
+        weights = self._term_weights(name)
+        mean = sum((t.mean if w is None else w * t.mean for t, w in weights), torch.zeros(1))
+        mean = (mean * scale + shift).squeeze(-1)
+        values = mean.reshape(-1, self.num_outputs)[0]
+        return float(values[output])
+
+    @classmethod
+    def construct_inputs(
+        cls, training_data: SupervisedDataset, **options: Any
+    ) -> dict[str, Any]:
+        """Construct keyword arguments of the model from a dataset.
+
+        Args:
+            training_data: The data.
+            options: Further arguments of the model, ``physics`` and all others.
+        """
+        return {**super().construct_inputs(training_data), **options}
+
+    def _inputs_without_basis(self, X: Tensor) -> Tensor:
+        transform = getattr(self, "input_transform", None)
+        if isinstance(transform, PhysicsInput):
+            return transform.without_physics(X)
+        return super()._inputs_without_basis(X)
+
+    def _term_weights(self, name: str) -> Weights:
+        weights = super()._term_weights(name)
+        if name != "delta":
+            return weights
+        for term in self.terms:
+            if isinstance(term.basis, AppendedPhysics) and term.basis.offset.any():
+                weights.append((term, -term.basis.offset / term.basis.scale))
+        return weights
+
+    def _term_units(self, name: str) -> tuple[Tensor, Tensor]:
+        shift, scale = super()._term_units(name)
+        if name in self.rho_names:
+            return shift, torch.ones_like(scale)
+        if name in ("delta", "f"):
+            return self._units()  # the shift of the targets is taken from the bias
+        return shift, scale
+
+
+def _values(transform: Any, X: Tensor, m: int) -> list[Tensor]:
+    """The physics at the training inputs, ``batch_shape x n x m`` for each."""
+    if not isinstance(transform, PhysicsInput):
+        return []
+    total = transform.physics.num_outputs or 0
+    parts = len(getattr(transform.physics, "parts", [0]))
+    if total != parts * m:
+        raise ValueError(
+            f"The physics '{transform.physics.name}' returned {total // parts} columns, expected "
+            f"{m}, one for each column of train_Y."
+        )
+    return list(X[..., -total:].split(m, dim=-1))
+
+
+def _names(transform: Any, number: int) -> list[str]:
+    """The names of the rhos."""
+    if number < 2:
+        return ["rho"] * number
+    return [f"rho_{name}" for name in transform.physics.names]
+
+
+def _means(rho: Adjustment | None, number: int) -> list[float | Literal["learn"]]:
+    """The prior means of the rhos, one for each physics."""
+    mean = None if rho is None else rho.mean
+    mean = (1.0 if number == 1 else "learn") if mean is None else mean
+    if mean == "learn":
+        return ["learn"] * number
+    means = [mean] * number if isinstance(mean, int | float) else mean
+    if (
+        isinstance(means, str)
+        or len(means) != number
+        or not all(isinstance(each, int | float) for each in means)
+    ):
+        raise ValueError(
+            f"Expected rho_mean to be 'learn', a number, or {number} numbers, one for each "
+            f"physics, got {mean!r}."
+        )
+    return [float(each) for each in means]
+
+
+def _start(
+    Y: Tensor, f: list[Tensor], means: list[float | Literal["learn"]]
+) -> list[Tensor]:
+    """The means of the rhos to begin with, ``batch_shape x 1 x m`` each.
+
+    Unknown weights of several physics, whose scales may be anything, are at least squares.
+    """
+    if len(f) < 2 or "learn" not in means:
+        return [Y.new_tensor(1.0 if mean == "learn" else mean) for mean in means]
+    basis, y = torch.stack(f, dim=-1).transpose(-2, -3), Y.mT  # ... x m x n x k and ... x m x n
+    observed = ~y.isnan()
+    identity = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device).expand(*y.shape, -1)
+    weights, _ = least_squares(
+        identity, y.where(observed, torch.zeros_like(y)), basis * observed.unsqueeze(-1)
+    )
+    return [weight.unsqueeze(-2) for weight in weights.unbind(-1)]
+
+
+def _kernels(
+    adjustment: Adjustment | None,
+    number: int,
+    names: list[str],
+    num_inputs: int,
+    batch_shape: Size,
+    given: list[object],
+) -> list[Kernel | None]:
+    """The kernels of terms, made or checked; those that the user brought are added to ``given``."""
+    kernel = None if adjustment is None else adjustment.kernel
+    each = [kernel] * number if not isinstance(kernel, Sequence) else [*kernel]
+    if len(each) != number:
+        raise ValueError(
+            f"Expected {number} kernels of rho, one for each physics, got {len(each)}."
+        )
+    if number > 1 and isinstance(kernel, Module):
+        raise ValueError(
+            f"Expected a kernel for each of the {number} physics: pass a sequence of kernels, or a "
+            "function of the number of inputs and the batch shape that makes one."
+        )
+    given.extend(part for part in each if isinstance(part, Module))
+    return [
+        None if part is None else make_kernel(part, f"the kernel of {name}", num_inputs, batch_shape)
+        for part, name in zip(each, names, strict=True)
+    ]
+
+
+def make_kernel(kernel: KernelLike, name: str, num_inputs: int, batch_shape: Size) -> Kernel:
+    """Return a user's kernel, after checking that it fits, or make the one that a function makes.
+
+    Args:
+        kernel: The kernel, or a function of ``num_inputs`` and ``batch_shape`` that makes it.
+        name: What to call it in an error.
+        num_inputs: Number of inputs after their transform.
+        batch_shape: The model's batch shape, the outputs last.
+    """
+    if not isinstance(kernel, Kernel):
+        if isinstance(kernel, Module | type) or not callable(kernel):
+            raise TypeError(f"Expected {name} to be a GPyTorch kernel, got {kernel!r}.")
+        kernel = kernel(num_inputs, batch_shape)
+    if kernel.batch_shape != batch_shape:
+        raise ValueError(
+            f"Expected {name} with batch_shape {tuple(batch_shape)}, one for each output, got "
+            f"{tuple(kernel.batch_shape)}; pass `batch_shape=torch.Size({list(batch_shape)})` to "
+            "it and to the kernels inside it."
+        )
+    for part in kernel.modules():
+        if not isinstance(part, Kernel):
+            continue
+        if part.active_dims is not None and int(part.active_dims.max()) >= num_inputs:
+            raise ValueError(
+                f"Expected {name} with active_dims below {num_inputs}, the number of inputs, got "
+                f"{part.active_dims.tolist()}."
+            )
+        reads = num_inputs if part.active_dims is None else len(part.active_dims)
+        if part.has_lengthscale and part.ard_num_dims not in (None, 1, reads) and part is kernel:
+            raise ValueError(
+                f"Expected {name} with ard_num_dims={reads}, one lengthscale for each input that "
+                f"it reads, got {part.ard_num_dims}."
+            )
+    return kernel
+
+
+def _center(center: float | Tensor | str, f_p: Tensor) -> Tensor:
+    """The constant c of the basis ``f_p - c``, as ``batch_shape x 1 x m``."""
+    mean = f_p.mean(-2, keepdim=True)
+    if isinstance(center, str) and center == "mean":
+        return mean
+    try:
+        offset = torch.as_tensor(center, dtype=f_p.dtype, device=f_p.device)
+    except (TypeError, ValueError, RuntimeError):
+        offset = f_p.new_full((), torch.nan)
+    if offset.dim() > 1 or offset.numel() not in (1, f_p.shape[-1]) or not offset.isfinite().all():
+        raise ValueError(
+            "Expected center to be 'mean' (the mean of f_p at the training inputs), a finite "
+            f"number, or a tensor of {f_p.shape[-1]}, one for each output, got {center!r}."
+        )
+    return offset.expand(mean.shape).clone()

@@ -1,0 +1,535 @@
+"""An exact Gaussian process that is a sum of terms, as a SingleTaskGP."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Self
+
+import torch
+from botorch.acquisition.objective import PosteriorTransform
+from botorch.models import SingleTaskGP
+from botorch.models.transforms.input import InputTransform
+from botorch.models.utils import fantasize as fantasize_flag
+from botorch.posteriors import Posterior
+from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.settings import validate_input_scaling
+from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, Likelihood
+from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
+from linear_operator import to_dense
+from torch import Size, Tensor
+from torch.nn import Module
+
+from gpadjust.gp import FixedStandardize, SumOfTerms, Term, TermsMean
+from gpadjust.gp.gaussian import noise_variances
+from gpadjust.models.cholesky_strategy import CholeskyStrategy, Weights
+from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES, hold_samples
+from gpadjust.models.hyperparameters import learnt_noise, set_initial_values
+from gpadjust.models.posteriors import HyperparameterMixture, ScaleFreePosterior, mixture_moments
+from gpadjust.models.sampled_functions import SampledFunctions, draw_functions
+from gpadjust.models.training_data import (
+    ArrayLike,
+    TrainingData,
+    check_finite,
+    check_observed,
+    to_tensor,
+)
+
+
+class Prediction(NamedTuple):
+    """Marginal predictions, as :meth:`~gpadjust.CKA.predict` returns them.
+
+    Args:
+        mean: Posterior means, ``batch_shape x q x m``, in the units of the targets.
+        variance: Posterior variances, ``batch_shape x q x m``, in their square.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+
+class ExactGPBase(SingleTaskGP):
+    r"""The base of this library's models: a sum of terms, :math:`f(x) = \sum_t b_t(x) g_t(x)`.
+
+    A ``SingleTaskGP`` with independent outputs, with the ends tied that BoTorch leaves loose: a
+    subset of its outputs can be fitted again, whatever its kernels and transforms; it can be
+    conditioned on observations before any prediction was made, with gradients to where they are
+    made; ``output_indices`` may come in any order; an output may be missing (NaN) in some rows.
+
+    Args:
+        data: What :func:`~gpadjust.models.training_data.training_data` made of the user's data.
+        terms: The terms of the model, in the units after ``outcome_transform``.
+        likelihood: The user's likelihood, or None for the default.
+        outcome_transform: Shift and scale of the targets, or None.
+        input_transform: What makes the columns that terms read out of raw inputs.
+        given: Modules that the user brought, whose parameters stay as they are.
+    """
+
+    prediction_strategy: Any
+    num_samples: int | None = None  # of the hyper-parameters, which `fit(model, "hmc")` draws
+    covar_module: SumOfTerms
+
+    def __init__(
+        self,
+        data: TrainingData,
+        terms: Sequence[Term],
+        likelihood: Likelihood | None,
+        outcome_transform: FixedStandardize | None,
+        input_transform: InputTransform | None,
+        given: Sequence[object] = (),
+    ) -> None:
+        covar_module = SumOfTerms(terms)
+        if likelihood is None and data.Yvar is None:
+            made: Likelihood | None = learnt_noise(self.get_batch_dimensions(data.X, data.Y)[1])
+        else:
+            made = likelihood
+        with validate_input_scaling(False):  # ours is by the data's scales, and NaN is missing
+            super().__init__(
+                data.X,
+                data.Y,
+                data.Yvar,
+                likelihood=made,
+                covar_module=covar_module,
+                mean_module=TermsMean(covar_module),
+                outcome_transform=outcome_transform,
+                input_transform=input_transform,
+            )
+        self.input_names, self.output_names = data.input_names, data.output_names
+        set_initial_values(self, *given, likelihood)
+
+    @property
+    def terms(self) -> Sequence[Term]:
+        """The terms of the sum."""
+        terms: Sequence[Term] = self.covar_module.terms
+        return terms
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """The names of the terms that are unknown, for :meth:`term`."""
+        return tuple(term.name for term in self.terms if not term.is_known)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Evaluate the model at *transformed* inputs, as GPyTorch does."""
+        if not self.training and self.train_inputs is not None and args:
+            expected, found = self.train_inputs[0].shape[-1], args[0].shape
+            if found[-1] != expected:
+                raise ValueError(
+                    f"In eval mode the model itself takes transformed inputs with {expected} "
+                    f"columns, got shape {tuple(found)}. Call `model.posterior(X)` on raw inputs, "
+                    "or `model(model.transform_inputs(X))`."
+                )
+            if prior_mode.off():
+                self.strategy()
+        return super().__call__(*args, **kwargs)
+
+    def strategy(self) -> CholeskyStrategy:
+        """What is remembered of the training data to predict from; made if it is not there."""
+        strategy = self.prediction_strategy
+        if strategy is None:
+            inputs = list(self.train_inputs)
+            with lazily_evaluate_kernels():
+                prior = self._get_train_prior_distribution(inputs)
+            strategy = CholeskyStrategy(
+                inputs, prior, self.train_targets, self.likelihood, self.covar_module
+            )
+            self.prediction_strategy = strategy
+        return strategy
+
+    def posterior(
+        self,
+        X: ArrayLike,
+        output_indices: list[int] | None = None,
+        observation_noise: bool | Tensor = False,
+        posterior_transform: PosteriorTransform | None = None,
+    ) -> Posterior:
+        """The joint posterior at raw ``X`` (``... x q x d``); see BoTorch."""
+        if output_indices is not None and list(output_indices) != list(range(self.num_outputs)):
+            subset = self.subset_output(list(output_indices))
+            return subset.posterior(X, None, observation_noise, posterior_transform)
+        inputs = self.model_inputs(X)
+        mean, covariance = self._joint(inputs, [(t, t.weights(inputs)) for t in self.terms])
+        noise = self._noise(inputs, observation_noise)
+        if noise is not None:
+            covariance = covariance + torch.diag_embed(noise.expand(mean.shape))
+        posterior = self._as_posterior(mean, covariance, *self._units())
+        if posterior_transform is None:
+            return posterior
+        return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))
+
+    def term(self, name: str, X: ArrayLike) -> Posterior:
+        """The posterior of a term's Gaussian process; its basis is not evaluated.
+
+        Args:
+            name: One of ``term_names``.
+            X: Raw inputs, ``batch_shape x q x d``.
+
+        Returns:
+            A posterior over ``batch_shape x q x m``: of a rho without units, else in those of the
+            targets.
+
+        Raises:
+            ValueError: If there is no such term.
+        """
+        weights, (shift, scale) = self._term_weights(name), self._term_units(name)
+        inputs = self.model_inputs(X, with_basis=False)
+        mean, covariance = self._joint(inputs, weights)
+        return self._as_posterior(mean, covariance, shift, scale)
+
+    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
+        """Predict each point by itself, without the covariances between them.
+
+        The mean and variance of ``posterior(X)``, from factors of the training covariance that are
+        kept until the model is trained or given other data: much faster for many points, with
+        memory linear in their number. Differentiable in ``X`` as far as f_p is. Of a model that
+        holds samples of its hyper-parameters, the mean and variance of the mixture.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            observation_noise: Whether to predict observations instead of the function; or their
+                noise variances, ``batch_shape x q x m``, as in ``posterior``.
+
+        Returns:
+            The mean and the variance, ``batch_shape x q x m`` each, in the user's units.
+
+        Raises:
+            TypeError: If ``X`` is not float64.
+            ValueError: If ``X`` has not the columns that the model was built on.
+            PhysicsError: If the physics fails at ``X``.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import CKA
+            >>> train_X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = CKA(train_X, train_X.sin(), physics=lambda X: X)
+            >>> mean, variance = model.predict(torch.rand(1000, 1, dtype=torch.float64))
+            >>> mean.shape
+            torch.Size([1000, 1])
+        """
+        inputs = self.model_inputs(X)
+        mean, variance = self._marginals(inputs, [(t, t.weights(inputs)) for t in self.terms])
+        noise = self._noise(inputs, observation_noise)
+        variance = variance if noise is None else variance + noise
+        shift, scale = self._units()
+        mean, variance = mean * scale + shift, variance * scale.square()
+        mean, variance = (
+            t.mT if self._num_outputs > 1 else t.unsqueeze(-1) for t in (mean, variance)
+        )
+        if self.num_samples is not None:
+            mean, variance = mixture_moments(mean, variance)
+        return Prediction(mean, variance)
+
+    def sample_functions(
+        self, num_functions: int, seed: int | None = None, num_features: int = 1024
+    ) -> Module:
+        """Draw functions from the posterior, to be called anywhere.
+
+        Of a model that holds samples of its hyper-parameters, the functions are spread over these.
+
+        Args:
+            num_functions: Number ``k`` of functions.
+            seed: Seed of the draw. Default: go on with PyTorch's generator.
+            num_features: Number of random features that stand for each kernel, an even one. The
+                more, the nearer is the functions' spread to the posterior's standard deviation;
+                the time of a call is linear in it.
+
+        Returns:
+            A module that maps raw ``... x q x d`` to ``k x ... x q x m`` in the user's units.
+            Later fits of the model leave it as it is.
+
+        Raises:
+            ValueError: If a number is not a positive whole one.
+            NotImplementedError: If BoTorch knows no features of a kernel of yours.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import CKA
+            >>> train_X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = CKA(train_X, train_X.sin(), physics=lambda X: X)
+            >>> functions = model.sample_functions(3, seed=0)
+            >>> functions(torch.rand(5, 1, dtype=torch.float64)).shape
+            torch.Size([3, 5, 1])
+        """
+        return draw_functions(self, num_functions, seed, num_features)
+
+    def _draw_functions(self, num_functions: int, num_features: int) -> Module:
+        """The functions of :meth:`sample_functions`, for each batch of the model."""
+        return SampledFunctions.by_matheron(self, num_functions, num_features)
+
+    def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
+        """What the terms read: transformed inputs with a dimension for samples and for outputs.
+
+        Args:
+            X: Raw inputs, ``... x q x d``.
+            with_basis: Whether the physics is evaluated; otherwise its columns are zero.
+
+        Returns:
+            ``... x (S) x (1) x q x (d + k)``.
+        """
+        if self.training:
+            self.eval()
+        X = to_tensor(X, "X")
+        if X.dim() < 2:
+            raise ValueError(
+                f"Expected X with at least 2 dimensions (points x inputs), got {tuple(X.shape)}."
+            )
+        X = X if self.num_samples is None else X.unsqueeze(MCMC_DIM)
+        inputs = self.transform_inputs(X) if with_basis else self._inputs_without_basis(X)
+        if inputs.shape[-1] != self.train_inputs[0].shape[-1]:
+            raise ValueError(
+                f"Expected X with the {len(self.input_names)} columns that the model was built on, "
+                f"got shape {tuple(X.shape)}."
+            )
+        return inputs.unsqueeze(-3) if self._num_outputs > 1 else inputs
+
+    def _inputs_without_basis(self, X: Tensor) -> Tensor:
+        return self.transform_inputs(X)
+
+    def _term_weights(self, name: str) -> Weights:
+        """A user's term as a weighted sum of the model's."""
+        found = [term for term in self.terms if term.name == name and not term.is_known]
+        if not found:
+            raise ValueError(
+                f"{type(self).__name__} has no unknown term {name!r}; it has "
+                f"{', '.join(map(repr, self.term_names))}."
+            )
+        return [(found[0], None)]
+
+    def _term_units(self, name: str) -> tuple[Tensor, Tensor]:
+        """Shift and scale from the model's units of a term to the user's."""
+        shift, scale = self._units()
+        return torch.zeros_like(shift), scale
+
+    def _joint(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
+        """Mean ``... x (m) x q`` and covariance of a weighted sum of terms, in model units."""
+        strategy = self.strategy()
+        prior: Tensor = inputs.new_zeros(())
+        for term, weight in weights:
+            if not term.is_known:
+                part = term.covariance(inputs, inputs)
+                if weight is not None:
+                    part = part * weight.unsqueeze(-1) * weight.unsqueeze(-2)
+                prior = prior + part
+        cross = strategy.cross_covariance(inputs, weights)
+        mean = strategy.exact_predictive_mean(self._prior_mean(inputs, weights), cross)
+        covariance = to_dense(strategy.exact_predictive_covar(prior, cross))
+        return mean, covariance.expand(*mean.shape, mean.shape[-1])
+
+    def _marginals(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
+        """As :meth:`_joint`, with the variances only."""
+        strategy = self.strategy()
+        prior: Tensor = inputs.new_zeros(())
+        for term, weight in weights:
+            if not term.is_known:
+                part = term.covariance(inputs, inputs, diag=True)
+                prior = prior + (part if weight is None else part * weight.square())
+        cross = strategy.cross_covariance(inputs, weights)
+        return strategy.marginals(self._prior_mean(inputs, weights), prior, cross)
+
+    @staticmethod
+    def _prior_mean(inputs: Tensor, weights: Weights) -> Tensor:
+        """The prior mean of a weighted sum of terms, ``... x (m) x q``."""
+        total = torch.zeros_like(inputs[..., 0])
+        for term, weight in weights:
+            total = total + (term.mean if weight is None else weight * term.mean)
+        return total
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        r"""Each training target predicted from all others, means and variances ``... x (m) x n``.
+
+        With :math:`\alpha = K^{-1} (y - m)` they are :math:`y_i - \alpha_i / [K^{-1}]_{ii}` and
+        :math:`1 / [K^{-1}]_{ii}` (Rasmussen and Williams 2006, eqs. 5.10-5.12), in model units;
+        NaN where there is no observation.
+        """
+        if self.training:
+            self.eval()
+        factors = self.strategy().factors()
+        precision = factors.squared_columns()
+        variance = precision.where(precision > 0, torch.full_like(precision, torch.nan)).reciprocal()
+        return self.train_targets - factors.alpha * variance, variance
+
+    def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
+        """Raw training inputs without what the model added to them, and the user's rows of them."""
+        return inputs, slice(None)
+
+    def observation_noise(self, inputs: Tensor) -> Tensor:
+        """The noise variances of observations at transformed inputs, ``... x (m) x q`` or 1."""
+        if isinstance(self.likelihood, FixedNoiseGaussianLikelihood):
+            return self._typical_noise()
+        return noise_variances(self.likelihood, inputs)
+
+    def _noise(self, inputs: Tensor, observation_noise: bool | Tensor) -> Tensor | None:
+        """Noise variances ``... x (m) x q`` of observations, in model units, or None for none."""
+        if observation_noise is False:
+            return None
+        if isinstance(observation_noise, Tensor):
+            given = observation_noise
+            given = given if self.num_samples is None else given.unsqueeze(MCMC_DIM)
+            expected = (inputs.shape[-2], self.num_outputs)
+            if given.dim() < 2 or any(
+                have not in (1, want) for have, want in zip(given.shape[-2:], expected, strict=True)
+            ):
+                raise ValueError(
+                    "Expected observation_noise as True, False, or variances of shape ... x "
+                    f"{expected[0]} x {expected[1]}, got shape {tuple(observation_noise.shape)}."
+                )
+            return given.mT if self._num_outputs > 1 else given.squeeze(-1)
+        if observation_noise is not True:
+            raise TypeError(
+                "Expected observation_noise as True, False, or a tensor of variances, got "
+                f"{observation_noise!r}; known noise belongs to the model (train_Yvar)."
+            )
+        return self.observation_noise(inputs)
+
+    def _typical_noise(self) -> Tensor:
+        """The mean of the known noise of the observations, ``... x (m) x 1``."""
+        observed = ~self.train_targets.isnan()
+        noise = self.likelihood.noise * observed
+        return noise.sum(-1, keepdim=True) / observed.sum(-1, keepdim=True)
+
+    def _units(self) -> tuple[Tensor, Tensor]:
+        """Shift and scale from model units to the user's, ``... x (m) x 1``."""
+        transform = getattr(self, "outcome_transform", None)
+        if transform is None:
+            zero = self.train_targets.new_zeros(*self._aug_batch_shape, 1)
+            return zero, torch.ones_like(zero)
+        if self._num_outputs > 1:
+            return transform.means.mT, transform.stdvs.mT
+        return transform.means.squeeze(-1), transform.stdvs.squeeze(-1)
+
+    def _as_posterior(
+        self, mean: Tensor, covariance: Tensor, shift: Tensor, scale: Tensor
+    ) -> Posterior:
+        """The posterior of independent outputs in the user's units."""
+        posterior = ScaleFreePosterior.of_outputs(
+            mean * scale + shift,
+            covariance * scale.square().unsqueeze(-1),
+            self._num_outputs > 1,
+        )
+        return posterior if self.num_samples is None else HyperparameterMixture(posterior)
+
+    def hold_samples(self, samples: dict[str, Tensor]) -> None:
+        """Make the model fully Bayesian: a batch of itself, one for each hyper-parameter sample.
+
+        Its posterior then is a Gaussian mixture, as that of BoTorch's fully Bayesian models.
+        :func:`gpadjust.fit` calls this.
+
+        Args:
+            samples: Raw parameters by their names, ``S x`` the parameter's shape.
+
+        Raises:
+            RuntimeError: If the model holds samples already.
+            ValueError: If the model is of a batch of data sets.
+        """
+        self.check_can_hold_samples()
+        hold_samples(self, samples)
+
+    def check_can_hold_samples(self) -> None:
+        """Raise what :meth:`hold_samples` raises."""
+        if self.num_samples is not None:
+            raise RuntimeError(HOLDS_SAMPLES)
+        if self._input_batch_shape:
+            raise ValueError(
+                "Expected a model of one data set to hold samples, got one with batch_shape "
+                f"{tuple(self._input_batch_shape)}; sample the data sets of a batch one by one."
+            )
+
+    @property
+    def num_mcmc_samples(self) -> int | None:
+        """``num_samples``, under BoTorch's name."""
+        return self.num_samples
+
+    def train(self, mode: bool = True) -> Self:
+        """Put the model in train mode, or eval mode; one that holds samples is not trained."""
+        if mode and self.num_samples is not None:
+            raise RuntimeError(HOLDS_SAMPLES)
+        return super().train(mode)
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
+    ) -> Any:
+        """Load parameters; with those of a model that holds samples, this one holds them too."""
+        samples = {
+            name: state_dict[name]
+            for name, parameter in self.named_parameters()
+            if name in state_dict and state_dict[name].dim() > parameter.dim()
+        }
+        if samples:
+            self.hold_samples(samples)
+        return super().load_state_dict(state_dict, strict, *args, **kwargs)
+
+    @property
+    def _subset_batch_dict(self) -> dict[str, int]:
+        """Where in each batched parameter and buffer the outputs lie, for ``subset_output``."""
+        outputs: Size = self._aug_batch_shape
+        if self.num_outputs == 1:
+            return {}
+        dimensions = {}
+        for part in ("covar_module", "likelihood"):
+            module = getattr(self, part)
+            for name, tensor in [*module.named_parameters(), *module.named_buffers()]:
+                if tensor.shape[: len(outputs)] == outputs:
+                    dimensions[f"{part}.{name}"] = len(outputs) - 1 - tensor.dim()
+        return dimensions
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Subset the model along the outputs; see BoTorch. Negative ones count from the end."""
+        m = self.num_outputs
+        if not idcs or any(not isinstance(i, int) or not -m <= i < m for i in idcs):
+            raise ValueError(
+                f"Expected numbers of outputs from 0 to {m - 1} (one at least), got {idcs}."
+            )
+        idcs = [i % m for i in idcs]
+        subset = super().subset_output(idcs)
+        original = subset._original_train_inputs
+        if original is not None and m > 1 and idcs != list(range(m)):
+            # BoTorch subsets the transformed inputs only, and a later fit starts from these.
+            subset._original_train_inputs = original[..., idcs if len(idcs) > 1 else idcs[0], :, :]
+        subset.output_names = tuple(self.output_names[i] for i in idcs)
+        return subset
+
+    def condition_on_observations(self, X: ArrayLike, Y: ArrayLike, **kwargs: Any) -> Self:
+        """Condition on new observations; see BoTorch. No posterior has to be called before.
+
+        The hyper-parameters stay, and with them the factors of the training covariance, to which
+        ``k`` new points among ``n`` are appended in O(n^2 k).
+
+        Args:
+            X: Raw inputs, ``batch_shape x k x d``.
+            Y: Observations, ``(f) x batch_shape x k x m``, in the user's units; NaN where an
+                output was not observed.
+            kwargs: ``noise``, the variances of the new observations, if they are known.
+
+        Raises:
+            ValueError: If ``X`` is not finite, ``Y`` is missing in a whole row, or their numbers
+                of rows or of outputs disagree.
+        """
+        X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
+        check_finite(X, "X")
+        if Y.dim() < 2 or X.dim() < 2 or Y.shape[-2] != X.shape[-2]:
+            raise ValueError(
+                "Expected X of shape ... x k x d and Y of shape ... x k x m with a row for each, "
+                f"got {tuple(X.shape)} and {tuple(Y.shape)}."
+            )
+        if Y.shape[-1] != self.num_outputs:
+            raise ValueError(
+                f"Expected Y with {self.num_outputs} columns, one for each output, got shape "
+                f"{tuple(Y.shape)}."
+            )
+        check_observed(Y, "Y")
+        if isinstance(self.likelihood, FixedNoiseGaussianLikelihood) and "noise" not in kwargs:
+            raise ValueError(
+                "The model was built with known noise (train_Yvar), so that of new observations is "
+                "needed, too: pass `noise`, variances of the shape of Y."
+            )
+        if self.num_samples is not None:
+            # All samples see the same observations, unless these have a dimension for them, as
+            # fantasies have.
+            if fantasize_flag.on() or X.dim() == 2:
+                X = X.unsqueeze(MCMC_DIM)
+                X = X.expand(*X.shape[:MCMC_DIM], self.num_samples, *X.shape[-2:])
+            if Y.dim() == 2:
+                Y = Y.expand(self.num_samples, *Y.shape)
+        self.eval()
+        self.strategy()
+        # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
+        with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
+            return super().condition_on_observations(X, Y, **kwargs)

@@ -1,0 +1,100 @@
+"""A physics by the name under which Python can import it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from operator import attrgetter
+from typing import Any
+
+from torch import Tensor
+
+from gpadjust.physics.base import Physics
+from gpadjust.physics.function import FunctionPhysics
+from gpadjust.physics.joined import as_physics
+
+
+def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
+    """The path of a physics, for ``physics_from_path``.
+
+    Args:
+        physics: A callable, or a physics. A ``FunctionPhysics`` without a path of its own has that
+            of its function if it was made of this alone. A physics or another object has a path if
+            it is an attribute of the module of its class, or of that of its callables.
+
+    Returns:
+        ``"package.module:qualname"``; None for what has no name in a module, as lambdas and
+        functions inside of functions. A path in ``__main__`` holds for the same script only.
+
+    Example:
+        >>> import_path(physics_from_path), import_path(lambda X: X)
+        ('gpadjust.physics.import_path:physics_from_path', None)
+    """
+    path = _path_of(physics)
+    if path or type(physics) is not FunctionPhysics:
+        return path
+    plain = FunctionPhysics(physics.function)
+    return _path_of(physics.function) if _settings(plain) == _settings(physics) else None
+
+
+def physics_from_path(path: str) -> Physics:
+    """Imports the physics that a path of ``import_path`` names.
+
+    Importing a module runs its code, so take paths from files that you trust only.
+
+    Args:
+        path: ``"package.module:qualname"``.
+
+    Returns:
+        The physics, or the callable in a ``FunctionPhysics``.
+
+    Raises:
+        ValueError: If the path has another form, cannot be imported, or names something else.
+
+    Example:
+        >>> physics_from_path("torch:sin").name
+        'sin'
+    """
+    module, colon, name = path.partition(":")
+    if not (module and colon and name):
+        raise ValueError(
+            f"Found {path!r} as the path of a physics, expected 'package.module:qualname'."
+        )
+    try:
+        physics = attrgetter(name)(import_module(module))
+    except Exception as error:  # importing runs the user's code
+        raise ValueError(
+            f"The physics {path!r} cannot be imported ({type(error).__name__}: {error}). Put its "
+            "module where Python finds it, under its old name, or give the physics itself."
+        ) from error
+    try:
+        return as_physics(physics)
+    except TypeError as error:
+        raise ValueError(f"The path {path!r} does not name a physics: {error}") from error
+
+
+def _settings(physics: FunctionPhysics) -> tuple[Any, ...]:
+    return physics.name, physics.inputs, physics._memo.capacity
+
+
+def _path_of(thing: Any) -> str | None:
+    owners = [thing]
+    if isinstance(thing, Physics):
+        for part in thing.modules():
+            owners += [part, *map(vars(part).get, getattr(part, "_callables", ()))]
+    for owner in owners:
+        module = sys.modules.get(getattr(owner, "__module__", None) or "")
+        # Only functions and classes know their names.
+        own = getattr(thing, "__qualname__", None)
+        for name in [own] if own else getattr(module, "__dict__", ()):
+            if _attribute(module, name) is thing:
+                return f"{owner.__module__}:{name}"
+    return None
+
+
+def _attribute(module: Any, name: str) -> Any:
+    try:
+        return attrgetter(name)(module)
+    except AttributeError:
+        return None
