@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from gpadjust.active.arguments import as_bounds, as_outcomes, as_points, as_poin
 from gpadjust.active.best_points import best_points
 from gpadjust.active.design import among, sobol_points
 from gpadjust.active.measurement_log import MeasurementLog, Record
-from gpadjust.active.measurements import Measurements
+from gpadjust.active.measurements import Measurements, measurement
 from gpadjust.active.refitting import load_parameter_values, parameter_values, refit
 from gpadjust.models.sampled_functions import check_number, seeded
 
@@ -43,7 +42,8 @@ class Collection(Measurements):
     has the same points pending.
 
     Args:
-        model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64.
+        model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64, with
+            NaN where an output was not measured.
         bounds: Bounds of the inputs, ``2 x d``: lower, then upper.
         acquisition: Makes a BoTorch acquisition function of the fitted model.
         batch_size: Number of points that :meth:`ask` returns.
@@ -96,6 +96,12 @@ class Collection(Measurements):
         for name, given in (("model_factory", model_factory), ("acquisition", acquisition)):
             if not callable(given):
                 raise TypeError(f"Expected {name} to be callable, got {given!r}.")
+        if isinstance(acquisition, AcquisitionFunction):
+            kind = type(acquisition).__name__
+            raise TypeError(
+                "Expected acquisition to be a function that makes an acquisition function of each "
+                f"new model, got one of a model; pass `lambda model: {kind}(model, ...)`."
+            )
         if fit is not None and not callable(fit):
             raise TypeError(f"Expected fit to be callable, got {fit!r}.")
         self.model_factory, self.acquisition = model_factory, acquisition
@@ -129,12 +135,13 @@ class Collection(Measurements):
         """The model of all data so far, fitted when it is asked for first.
 
         Raises:
-            RuntimeError: If there are fewer than two measurements.
+            RuntimeError: If there are fewer than two measurements of an output.
         """
         if self._model is None:
-            if len(self.X) < 2:
+            if self.num_observed < 2:
                 raise RuntimeError(
-                    f"A model needs at least 2 measurements, there are {len(self.X)}."
+                    f"A model needs at least 2 measurements of each output, there are "
+                    f"{self.num_observed}."
                 )
             previous, count = self._previous()
             if count < len(self.X):
@@ -177,8 +184,8 @@ class Collection(Measurements):
         Args:
             X: The points, ``n x d``, as they were measured: one that is within a hundredth of the
                 bounds' widths of a pending one counts as that.
-            Y: What was measured, ``n x m`` or ``n``. A row with NaN or infinity has failed as a
-                whole; what it has of other outputs stays in the log.
+            Y: What was measured, ``n x m`` or ``n``. NaN or infinity stand for an output that was
+                not; a row of nothing else has failed.
 
         Raises:
             TypeError: If they are no numbers.
@@ -189,11 +196,7 @@ class Collection(Measurements):
         """
         X = as_points(X, self.bounds.shape[-1])
         Y = as_outcomes(Y, len(X), self.num_outputs)
-        records = []
-        for x, y in zip(X.tolist(), Y.tolist(), strict=True):
-            values = [value if math.isfinite(value) else None for value in y]
-            record: Record = {"x": x, "y": values}
-            records.append(record | ({"failed": f"measured {y}"} if None in values else {}))
+        records = [measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)]
         self._enter(records)
         self._warn(records)
 
@@ -225,7 +228,7 @@ class Collection(Measurements):
         """The next points that need no model, ``q x d``, or None if a model is to choose."""
         known = torch.cat([self.X, self.failed_X, self._asked])
         first = self._first_points[~among(self._first_points, known)]
-        if not len(first) and len(self.X) >= self._initial:
+        if not len(first) and len(self.X) >= self._initial and self.num_observed >= 2:
             return None
         return torch.cat([first, sobol_points(self.bounds, q, known, self.seed)])[:q]
 

@@ -10,6 +10,7 @@ from typing import Any
 from botorch.acquisition import AcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
+from tqdm import tqdm
 
 from gpadjust.active.arguments import as_outcomes
 from gpadjust.active.collection import Collection
@@ -52,16 +53,17 @@ def collect(
     A :class:`Collection` chooses the points, and its log makes the loop resumable: called again
     with the same arguments it goes on where it was killed, first with the points it was killed at.
 
-    A measurement that fails (the oracle raises an exception or returns NaN, infinity or a wrong
-    shape) is logged with its message and skipped, with a warning. It counts against the budget, and
-    no point within a hundredth of the bounds' widths of it is asked for again. An exception fails
-    the whole batch.
+    A measurement that fails (the oracle raises an exception or returns a wrong shape, or nothing
+    but NaN and infinity) is logged with its message and skipped, with a warning. It counts against
+    the budget, and no point within a hundredth of the bounds' widths of it is asked for again. An
+    exception fails the whole batch. Where some outputs are NaN, each output is learnt from its own
+    measurements.
 
     Args:
-        model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64.
+        model_factory: As of :class:`Collection`.
         oracle: Measures: maps points ``q x d`` to values ``q x m`` (or ``q``).
         bounds: Bounds of the inputs, ``2 x d``: lower, then upper.
-        acquisition: Makes a BoTorch acquisition function of the fitted model.
+        acquisition: Makes a BoTorch acquisition function of the fitted model, such as a class.
         budget: Number of measurements in all: failed ones and those of the log included, those of
             ``data`` not.
         batch_size: Number of points that are measured at a time.
@@ -72,7 +74,7 @@ def collect(
         optimizer_options: As of :class:`Collection`.
         log: As of :class:`Collection`.
         seed: As of :class:`Collection`.
-        progress: Whether to show a progress bar (needs tqdm).
+        progress: Whether to show a progress bar.
         max_failures: Number of calls of the oracle, in a row and without any result, that stop it.
 
     Returns:
@@ -82,7 +84,6 @@ def collect(
     Raises:
         TypeError: As :class:`Collection`, or if the oracle is not callable.
         ValueError: As :class:`Collection`, or if a number is out of range.
-        ImportError: If the progress bar is asked for, and tqdm is missing.
         CollectionError: If the oracle fails too often.
 
     Warns:
@@ -159,8 +160,4 @@ def _measure(
 
 def _bar(total: int, collection: Collection) -> Any:
     """A progress bar."""
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise ImportError("progress=True needs tqdm: pip install tqdm") from error
     return tqdm(total=total, initial=min(total, collection.num_measured), unit="measurement")

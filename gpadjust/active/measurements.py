@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from gpadjust.active.arguments import as_outcomes, as_points
 from gpadjust.active.design import NEAR, among, distances
 from gpadjust.active.measurement_log import Record
+from gpadjust.models.training_data import check_observed
 
 
 class Measurements:
@@ -17,9 +20,8 @@ class Measurements:
 
     - ``{"asked": [x, ...], "parameters": {...}}``: points that are to be measured, and the
       parameters of the model that chose them, if one did;
-    - ``{"x": x, "y": y}``: a measurement;
-    - ``{"x": x, "failed": message}``: one that failed; with ``"y"``, too, if values came out, of
-      which some are null;
+    - ``{"x": x, "y": y}``: a measurement, null where an output was not measured;
+    - ``{"x": x, "failed": message}``: one that failed, whether it has a ``"y"`` or not;
     - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more.
 
     A measurement is of the pending point that it is nearest to, if that is within a hundredth of
@@ -32,7 +34,7 @@ class Measurements:
 
     Attributes:
         X: The points measured, ``n x d``, those of ``data`` first.
-        Y: What was measured there, ``n x m``.
+        Y: What was measured there, ``n x m``; NaN where an output was not.
         failed_X: Where measuring failed, ``k x d``.
         pending: Points asked for and not told yet, ``l x d``.
         num_measured: Number of measurements, failed ones included, those of ``data`` not.
@@ -52,9 +54,13 @@ class Measurements:
         if data is not None:
             X = as_points(data[0], bounds.shape[-1], "the X of data")
             Y = as_outcomes(data[1], len(X), num_outputs)
-            if not Y.isfinite().all():
-                raise ValueError("Expected the Y of data to be finite; leave failed points out.")
+            check_observed(Y, "the Y of data")
             self.X, self.Y, self.num_outputs = X, Y, Y.shape[-1]
+
+    @property
+    def num_observed(self) -> int:
+        """Number of measurements of the output that was measured least often."""
+        return int((~self.Y.isnan()).sum(0).min()) if len(self.X) else 0
 
     def _take(self, record: Record) -> None:
         """Take in one record."""
@@ -78,7 +84,9 @@ class Measurements:
         if "failed" in record:
             self.failed_X = torch.cat([self.failed_X, x])
         else:
-            y = as_outcomes([record["y"]], 1, self.num_outputs)
+            values = [math.nan if value is None else value for value in record["y"]]
+            y = as_outcomes([values], 1, self.num_outputs)
+            check_observed(y, "y")
             self.num_outputs = y.shape[-1]
             self.X, self.Y = torch.cat([self.X, x]), torch.cat([self.Y, y]) if len(self.Y) else y
         self._no_longer_pending(x[0])
@@ -102,3 +110,18 @@ class Measurements:
         """The points of a record, ``n x d``."""
         d = self.X.shape[-1]
         return as_points(rows, d) if rows else self.X.new_zeros(0, d)
+
+
+def measurement(x: list[float], y: list[float]) -> Record:
+    """The record of what was measured at a point; one that failed if no value is finite.
+
+    Example:
+        >>> measurement([0.5], [1.25, float("nan")])
+        {'x': [0.5], 'y': [1.25, None]}
+        >>> measurement([0.5], [float("inf")])
+        {'x': [0.5], 'y': [None], 'failed': 'measured [inf]'}
+    """
+    values = [value if math.isfinite(value) else None for value in y]
+    record: Record = {"x": x, "y": values}
+    failed = all(value is None for value in values)
+    return record | ({"failed": f"measured {y}"} if failed else {})

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from torch import Tensor
 
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.state_spec import StateSpec
-from gpadjust.dynamics.transition_physics import Target, TransitionPhysics
+from gpadjust.dynamics.transition_physics import Target
 from gpadjust.inference.fitting import FitOptions
 from gpadjust.models import (
     CKA,
@@ -21,6 +21,7 @@ from gpadjust.models import (
     ScaleGP,
     ZeroMeanGP,
 )
+from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.physics import Physics
 
 
@@ -52,7 +53,7 @@ class GPDynamics(LearnedDynamics):
         self,
         train_X: Tensor,
         train_Y: Tensor,
-        physics: TransitionPhysics | None,
+        physics: Physics | None,
         **options: Any,
     ) -> ExactGPBase:
         return ZeroMeanGP(train_X, train_Y, **options)
@@ -69,7 +70,8 @@ class CKADynamics(LearnedDynamics):
         spec: What the entries of states and actions are.
         physics: The next values of the states that are neither exogenous nor previous actions,
             from these and the actions: columns ``[states, actions]`` in the order of the spec,
-            angles in rad.
+            angles in rad. Several: a list, or a dictionary with their names, as of
+            :class:`~gpadjust.CKA`.
         target: What the model learns: the ``"difference"`` of next state and state, of an angle
             the shortest way round, or the next state itself (``"absolute"``). A scaling of an
             absolute position or angle depends on where its origin is; one of a change does not.
@@ -97,7 +99,7 @@ class CKADynamics(LearnedDynamics):
     def __init__(
         self,
         spec: StateSpec,
-        physics: Physics | Callable[[Tensor], Tensor],
+        physics: PhysicsLike,
         *,
         target: Target = "difference",
         encode_angles: bool = True,
@@ -117,7 +119,7 @@ class CKADynamics(LearnedDynamics):
         self,
         train_X: Tensor,
         train_Y: Tensor,
-        physics: TransitionPhysics | None,
+        physics: Physics | None,
         **options: Any,
     ) -> ExactGPBase:
         assert physics is not None, "there is one"
@@ -172,7 +174,7 @@ class RRADynamics(CKADynamics):
     def __init__(
         self,
         spec: StateSpec,
-        physics: Physics | Callable[[Tensor], Tensor],
+        physics: PhysicsLike,
         *,
         prior: Literal["physics", "paper"] = "physics",
         num_features: int = 128,
@@ -201,7 +203,7 @@ class RRADynamics(CKADynamics):
         self,
         train_X: Tensor,
         train_Y: Tensor,
-        physics: TransitionPhysics | None,
+        physics: Physics | None,
         **options: Any,
     ) -> ExactGPBase:
         assert physics is not None, "there is one"

@@ -15,7 +15,7 @@ from torch.nn import Module
 
 from gpadjust.dynamics.identity import check_identity, identity
 from gpadjust.dynamics.model_dynamics import ModelDynamics
-from gpadjust.dynamics.next_state_physics import check_physics, warn_of_differences
+from gpadjust.dynamics.next_state_physics import check_physics, parts_of, warn_of_differences
 from gpadjust.dynamics.refitting import refit, search_rows
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transition_physics import Target, TransitionPhysics
@@ -24,7 +24,8 @@ from gpadjust.gp import AngleInput
 from gpadjust.inference import FitResult, fit
 from gpadjust.inference.fitting import FitOptions
 from gpadjust.models import ExactGPBase
-from gpadjust.physics import Physics
+from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.physics import Physics, as_physics
 
 
 class LearnedDynamics(ModelDynamics):
@@ -38,7 +39,7 @@ class LearnedDynamics(ModelDynamics):
     def __init__(
         self,
         spec: StateSpec,
-        physics: Physics | Any | None,
+        physics: PhysicsLike | None,
         *,
         target: Target = "difference",
         encode_angles: bool = True,
@@ -56,16 +57,18 @@ class LearnedDynamics(ModelDynamics):
         self.fit_result: FitResult | None = None
         self._compared = False  # the physics with transitions
         self._forget_data()
-        self._physics = (
-            None if self.physics is None else TransitionPhysics(self.physics, self.targets)
-        )
+        self._parts = {
+            name: TransitionPhysics(part, self.targets)
+            for name, part in ({} if self.physics is None else parts_of(self.physics)).items()
+        }
+        self._physics = as_physics(self._parts) if self._parts else None
 
     @abstractmethod
     def _make_model(
         self,
         train_X: Tensor,
         train_Y: Tensor,
-        physics: TransitionPhysics | None,
+        physics: Physics | None,
         **options: Any,
     ) -> ExactGPBase:
         """Build the model, from its options and an input transform."""
@@ -102,12 +105,14 @@ class LearnedDynamics(ModelDynamics):
         Args:
             states: ``N x state_dim``, with ``N >= 2``.
             actions: ``N x action_dim``.
-            next_states: ``N x state_dim``.
+            next_states: ``N x state_dim``; NaN where an entry was not measured: each state is
+                learnt from its own rows.
 
         Raises:
             TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, values are not finite, there are fewer than 2 rows, or
-                states are not what the spec says (:meth:`StateSpec.check_transitions`).
+            ValueError: If shapes disagree, values are not finite, a row of next states is NaN in
+                all that the model predicts, there are fewer than 2 rows of a state, or states are
+                not what the spec says (:meth:`StateSpec.check_transitions`).
             PhysicsError: If the physics fails.
         """
         data = self._checked(states, actions, next_states)
@@ -125,7 +130,7 @@ class LearnedDynamics(ModelDynamics):
         Args:
             states: ``N x state_dim``.
             actions: ``N x action_dim``.
-            next_states: ``N x state_dim``.
+            next_states: ``N x state_dim``; NaN as in :meth:`fit`.
             refit: Whether to fit the hyper-parameters again; if not, the model is conditioned on
                 the new transitions with those that it has (:meth:`condition`).
 
@@ -166,8 +171,10 @@ class LearnedDynamics(ModelDynamics):
 
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text; of objects, the class."""
+        several: dict[str, Any] = {"physics": [*self._parts]} if len(self._parts) > 1 else {}
         return identity(
             self,
+            **several,
             target=self.targets.target,
             encode_angles=self.encode_angles,
             model_options=self.model_options,
@@ -212,14 +219,15 @@ class LearnedDynamics(ModelDynamics):
             self._model = self._condition(self._model, data.rows(start, start + size))
             start += size
 
-    def _learn(
-        self, data: Transitions, known: Tensor | None, previous: ExactGPBase | None
-    ) -> None:
+    def _learn(self, data: Transitions, known: Tensor | None, previous: ExactGPBase | None) -> None:
         n = len(data.states)
-        if n < 2:
+        observed = ~data.next_states[:, self.spec.predicted].isnan()
+        least, i = observed.sum(0).min(0)
+        if least < 2:
+            of = "" if n < 2 else f" with a measured {self.spec.states[self.spec.predicted[i]]!r}"
             raise ValueError(
-                f"Expected at least 2 transitions to learn from, got {n}: there is no scale in "
-                "fewer. Collect more before the first update."
+                f"Expected at least 2 transitions to learn from, got {least}{of}: there is no "
+                "scale in fewer. Collect more before the first update."
             )
         if previous is None and known is not None and not self._compared:
             self._compare(data, known)
@@ -229,7 +237,7 @@ class LearnedDynamics(ModelDynamics):
         if previous is None:
             result = fit(model, **self.fit_options)
         else:
-            rows = search_rows(n) if searches else None
+            rows = search_rows(observed) if searches else None
             part = None if rows is None else self._build(data.some(rows), quiet=True)
             result = refit(model, previous, searches, part)
         self.fit_result = result
@@ -239,9 +247,10 @@ class LearnedDynamics(ModelDynamics):
 
     def _compare(self, data: Transitions, known: Tensor) -> None:
         """Warn of a physics that returns differences."""
-        assert self.physics is not None, "f_p is known"
-        change = self.targets.decode(data.states, known) - data.states[:, self.spec.predicted]
-        warn_of_differences(self.physics.name, self.spec, data, self.spec.predicted, change)
+        predicted = self.spec.predicted
+        for name, values in zip(self._parts, known.split(len(predicted), dim=-1), strict=True):
+            change = self.targets.decode(data.states, values) - data.states[:, predicted]
+            warn_of_differences(name, self.spec, data, predicted, change)
         self._compared = True
 
     def _build(self, data: Transitions, quiet: bool) -> ExactGPBase:
@@ -278,5 +287,9 @@ class LearnedDynamics(ModelDynamics):
             return self._physics(self.targets.inputs(data.states, data.actions))
 
     def _tell_physics(self, data: Transitions, known: Tensor | None) -> None:
-        if self._physics is not None and known is not None:
-            self._physics.know(self.targets.inputs(data.states, data.actions), known)
+        if known is None:
+            return
+        inputs = self.targets.inputs(data.states, data.actions)
+        values = known.split(len(self.spec.predicted), dim=-1)
+        for part, own in zip(self._parts.values(), values, strict=True):
+            part.know(inputs, own)

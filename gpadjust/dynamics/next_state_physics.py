@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.physics import ODEPhysics, Physics, as_physics
+from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.physics import JoinedPhysics, ODEPhysics, Physics, as_physics
 
 
-def check_physics(physics: Physics | Callable[[Tensor], Tensor]) -> Physics:
-    """A physics of next states, from what the user gave."""
-    physics = as_physics(physics)
-    if isinstance(physics, ODEPhysics) and physics.difference:
-        raise ValueError(
-            f"Physics {physics.name!r} returns the change of the state (difference=True), but "
-            "dynamics take the next state from it; build it with difference=False."
-        )
-    return physics
+def check_physics(physics: PhysicsLike) -> Physics:
+    """A physics of next states, or several of them joined, from what the user gave."""
+    whole = as_physics(physics)
+    for part in parts_of(whole).values():
+        if isinstance(part, ODEPhysics) and part.difference:
+            raise ValueError(
+                f"Physics {part.name!r} returns the change of the state (difference=True), but "
+                "dynamics take the next state from it; build it with difference=False."
+            )
+    return whole
+
+
+def parts_of(physics: Physics) -> dict[str, Physics]:
+    """The physics that a joined one holds, by their names; of any other, that one itself."""
+    if isinstance(physics, JoinedPhysics):
+        return {n: cast(Physics, p) for n, p in zip(physics.names, physics.parts, strict=True)}
+    return {physics.name: physics}
 
 
 def next_values(physics: Physics, inputs: Tensor, num_states: int) -> Tensor:
@@ -51,13 +60,13 @@ def warn_of_differences(
         change: Their change in the transitions, if the physics returns next states: ``N x m``.
     """
     truth = spec.change(data.states, data.next_states)
-    scale = truth.square().mean(0).sqrt()[columns]
+    scale = truth.square().nanmean(0).sqrt()[columns]
     errors = []
     for added in (torch.zeros_like(data.states), data.states):
         predicted = data.states.clone()
         predicted[:, columns] += change + added[:, columns]
         error = spec.change(data.next_states, predicted)[:, columns]
-        errors.append(float((error[:, scale > 0] / scale[scale > 0]).square().sum().sqrt()))
+        errors.append(float((error[:, scale > 0] / scale[scale > 0]).square().nansum().sqrt()))
     if errors[1] < errors[0] / 3:
         warnings.warn(
             f"Physics {name!r} seems to return the change of the state, but dynamics take the next "

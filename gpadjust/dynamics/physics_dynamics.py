@@ -10,7 +10,12 @@ from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.identity import check_identity, identity
-from gpadjust.dynamics.next_state_physics import check_physics, next_values, warn_of_differences
+from gpadjust.dynamics.next_state_physics import (
+    check_physics,
+    next_values,
+    parts_of,
+    warn_of_differences,
+)
 from gpadjust.dynamics.state_spec import StateSpec, check_columns
 from gpadjust.models import Prediction
 from gpadjust.physics import Physics
@@ -26,6 +31,10 @@ class PhysicsDynamics(Dynamics):
         physics: The next values of the states that are neither exogenous nor previous actions,
             from these and the actions: columns ``[states, actions]`` in the order of the spec.
 
+    Raises:
+        TypeError: If ``spec`` is no :class:`StateSpec`, or the physics is not callable.
+        ValueError: If there are several physics, or one returns the change of the state.
+
     Example:
         >>> import torch
         >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
@@ -39,6 +48,11 @@ class PhysicsDynamics(Dynamics):
     def __init__(self, spec: StateSpec, physics: Physics | Callable[[Tensor], Tensor]) -> None:
         super().__init__(spec)
         self.physics = check_physics(physics)
+        if len(parts_of(self.physics)) > 1:
+            raise ValueError(
+                "Expected one physics to follow, got "
+                f"{', '.join(map(repr, parts_of(self.physics)))}; CKADynamics learns their weights."
+            )
         self._compared = False  # with transitions
 
     @property

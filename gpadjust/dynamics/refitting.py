@@ -19,12 +19,21 @@ _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
 _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=8)
 
 
-def search_rows(num_points: int) -> Tensor | None:
-    """The points of the model that a search is made on; None for all."""
+def search_rows(observed: Tensor) -> Tensor | None:
+    """The points of the model that a search is made on; None for all.
+
+    Args:
+        observed: Which outputs were observed at each point, ``n x m``.
+    """
+    num_points = len(observed)
     if num_points <= _SEARCHED:
         return None
     generator = torch.Generator().manual_seed(num_points)
-    return torch.randperm(num_points, generator=generator)[:_SEARCHED]
+    order = torch.randperm(num_points, generator=generator)
+    observed = observed[order]
+    # The model of these points needs two observations of each output, however seldom they are.
+    needed = (observed & (observed.cumsum(0) <= 2)).any(-1)
+    return torch.cat([order[needed], order[~needed]])[:_SEARCHED]
 
 
 def refit(

@@ -198,7 +198,8 @@ class StateSpec:
 
         Args:
             states: ``N x state_dim``.
-            next_states: ``N x state_dim``.
+            next_states: ``N x state_dim``; NaN where an entry was not measured, which is not
+                checked.
             actions: ``N x action_dim``; may be left out if no state is a previous action.
 
         Raises:
@@ -225,8 +226,10 @@ class StateSpec:
             discrepancy = change[..., i] - self.step * (states[..., v] + next_states[..., v]) / 2
             if name in self.angles:
                 discrepancy = torch.atan2(discrepancy.sin(), discrepancy.cos())
-            velocities = (states[..., v], next_states[..., v])
-            check_integrated(name, velocity, self.step, velocities, discrepancy, rounding[..., i])
+            known = ~discrepancy.isnan()
+            velocities = (states[..., v][known], next_states[..., v][known])
+            found, unavoidable = discrepancy[known], rounding[..., i][known]
+            check_integrated(name, velocity, self.step, velocities, found, unavoidable)
 
     def _check_previous(self, next_states: Tensor, actions: Tensor | None) -> None:
         if actions is None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.state_spec import StateSpec, check_columns
-from gpadjust.models.training_data import check_finite
+from gpadjust.models.training_data import check_finite, check_observed
 
 
 class Transitions(NamedTuple):
@@ -17,7 +17,7 @@ class Transitions(NamedTuple):
     Args:
         states: ``N x state_dim``.
         actions: ``N x action_dim``.
-        next_states: ``N x state_dim``.
+        next_states: ``N x state_dim``; NaN where an entry was not measured.
     """
 
     states: Tensor
@@ -32,7 +32,8 @@ class Transitions(NamedTuple):
 
         Raises:
             TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, or values are not finite.
+            ValueError: If shapes disagree, there are no rows, values are not finite, or of a next
+                state nothing was measured that a model predicts.
         """
         named = {"states": states, "actions": actions, "next_states": next_states}
         for name, tensor in named.items():
@@ -47,7 +48,11 @@ class Transitions(NamedTuple):
                     "Expected states, actions and next_states with as many rows each, and at least "
                     f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
                 )
-            check_finite(tensor, name)
+            if name == "next_states":
+                check_observed(tensor, name)
+                check_observed(tensor[:, spec.predicted], "the predicted entries of next_states")
+            else:
+                check_finite(tensor, name)
         return cls(*(tensor.detach().clone() for tensor in named.values()))
 
     def append(self, other: Transitions) -> Transitions:

@@ -1,7 +1,6 @@
 """The GPyTorch pieces: terms of a model, and what they are made of."""
 
 from gpadjust.gp.angle_input import AngleInput
-from gpadjust.gp.fixed_standardize import FixedStandardize
 from gpadjust.gp.physics_columns import AppendedPhysics, PhysicsInput
 from gpadjust.gp.physics_mean import PhysicsMean
 from gpadjust.gp.physics_scaled_kernel import PhysicsScaledKernel
@@ -10,7 +9,6 @@ from gpadjust.gp.term import SumOfTerms, Term, TermsMean
 __all__ = [
     "AngleInput",
     "AppendedPhysics",
-    "FixedStandardize",
     "PhysicsInput",
     "PhysicsMean",
     "PhysicsScaledKernel",

@@ -1,17 +1,22 @@
-"""Gaussian targets: one covariance with noise, one Cholesky factor, one nugget."""
+"""Gaussian targets: one covariance with noise, one Cholesky factor, one nugget, few threads."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import cache
 from typing import NamedTuple
 
 import torch
 from gpytorch.distributions import MultivariateNormal
-from gpytorch.likelihoods import Likelihood
+from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, Likelihood
 from linear_operator.operators import DiagLinearOperator
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 _TRIES = 7  # each with ten times the nugget of the one before
+_SMALL = 256  # points of a covariance up to which a second thread costs more than it brings
 
 
 def nugget(n: int) -> float:
@@ -80,6 +85,13 @@ def noise_variances(likelihood: Likelihood, inputs: Tensor, **kwargs: Tensor) ->
     silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
     noisy = likelihood(silent, [inputs], **kwargs).lazy_covariance_matrix
     return noisy.diagonal(dim1=-1, dim2=-2)
+
+
+def known_noise(likelihood: Likelihood) -> Tensor | None:
+    """The noise variances of the training targets, ``... x n``, if they are known."""
+    if type(likelihood) is not FixedNoiseGaussianLikelihood:
+        return None
+    return None if likelihood.second_noise_covar is not None else likelihood.noise
 
 
 class LikelihoodValue(NamedTuple):
@@ -186,3 +198,40 @@ def least_squares(chol: Tensor, residual: Tensor, basis: Tensor) -> tuple[Tensor
     # for those that are so exactly, a physics that is constant, say.
     inverse = torch.linalg.pinv(white_basis, rtol=1e-10)
     return (inverse @ white_residual).squeeze(-1), inverse @ inverse.mT
+
+
+@contextmanager
+def threads_for(num_points: int, others: bool = False) -> Iterator[None]:
+    """Let PyTorch use one thread for a small problem; the user's setting is restored after.
+
+    Threads that wait for each other at every small product spin, and take their time from whatever
+    else the machine does: on a busy one, a fit of twelve points can take a hundred times as long.
+
+    Args:
+        num_points: Number of points of the covariances.
+        others: Whether NumPy's and SciPy's libraries are limited, too, which takes longer.
+
+    Example:
+        >>> import torch
+        >>> before = torch.get_num_threads()
+        >>> with threads_for(12):
+        ...     torch.get_num_threads()
+        1
+        >>> torch.get_num_threads() == before
+        True
+    """
+    before = torch.get_num_threads()
+    if num_points > _SMALL or (before == 1 and not others):
+        yield
+        return
+    with _controller().limit(limits=1) if others else nullcontext():
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()

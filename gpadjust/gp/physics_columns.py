@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from botorch.models.transforms.input import InputTransform
-from torch import Size, Tensor
+from torch import Tensor
 from torch.nn import Module
 
 from gpadjust.physics import Physics
@@ -131,10 +131,14 @@ class AppendedPhysics(Module):
                 f"f_p, got x with shape {tuple(x.shape)}. The model's input transform appends f_p: "
                 "call `model.posterior(X)`, or `model(model.transform_inputs(X))` in eval mode."
             )
-        values = (x[..., self.num_inputs :] * self.select).sum(-1) - self.offset
-        # Differences of rounding errors are none: a physics that is constant has no variation.
-        rounding = 8 * torch.finfo(values.dtype).eps * self.offset.abs()
-        values = torch.where(values.abs() <= rounding, values - values.detach(), values)
+        columns = x[..., self.num_inputs :]
+        one = columns.shape[-1] == 1
+        values = columns.squeeze(-1) if one else (columns * self.select).sum(-1)
+        if self.offset.any():
+            values = values - self.offset
+            # Differences of rounding errors are none: a physics that is constant has no variation.
+            rounding = 8 * torch.finfo(values.dtype).eps * self.offset.abs()
+            values = torch.where(values.abs() <= rounding, values - values.detach(), values)
         return values / self.scale
 
     def map_batches(self, change: Callable[[Tensor], Tensor]) -> AppendedPhysics:

@@ -13,15 +13,15 @@ from linear_operator import to_dense
 from torch import Size, Tensor
 from torch.nn import Module, ModuleList, Parameter
 
-from gpadjust.gp.stationary_kernel import StationaryRows, exponents, stationary_form
+from gpadjust.gp.stationary import exponents, rows_of, stationary_form
 
 
 class Term(Module):
     r"""A term :math:`b(x) g(x)` with :math:`g \sim GP(\bar g, k)`.
 
-    The basis b is a column of the physics, or 1. The prior mean :math:`\bar g` is a constant: given,
-    or unknown with the prior :math:`N(\bar g, \kappa)`, which adds the constant :math:`\kappa` to
-    the kernel. With a vague :math:`\kappa`, as :func:`gpadjust.fit` sets it, that is universal
+    The basis b is a column of the physics, or 1. The prior mean :math:`\bar g` is a constant:
+    given, or unknown with the prior :math:`N(\bar g, \kappa)`, which adds the constant :math:`\kappa`
+    to the kernel. With a vague :math:`\kappa`, as :func:`gpadjust.fit` sets it, that is universal
     kriging (Rasmussen and Williams 2006, sec. 2.7).
 
     All is in the units of the model's targets, after their transform.
@@ -90,31 +90,37 @@ class Term(Module):
             result = to_dense(self.kernel(x1[..., :d], x2[..., :d], diag=diag))
         return result if constant is None else result + constant
 
-    def covariance_with(self, train: Tensor) -> Callable[[Tensor], Tensor]:
-        """Prepare the covariances of g at any inputs ``... x q x (d + k)`` with these.
+    def log_covariance_with(self, train: Tensor, origin: Tensor) -> Tensor | None:
+        r"""A matrix R that makes the logarithms of the kernel between any inputs and the data.
+
+        With :math:`\tilde x = x - o` they are :math:`[\tilde x, \tilde x^2, 1] \, R`, one product
+        for any inputs; without gradients to hyper-parameters.
 
         Args:
             train: ``... x n x (d + k)``.
+            origin: :math:`o`, ``... x 1 x d``.
 
         Returns:
-            Maps inputs to ``... x q x n``. Gradients flow to the inputs, not to hyper-parameters.
+            ``... x (2 d + 1) x n``; None if the kernel is no scaled RBF kernel.
         """
         form = stationary_form(self.kernel, self.num_inputs)
-        if form is None or form.profile is not None or train.requires_grad:
-            return lambda inputs: self.covariance(inputs, train)
+        if form is None or form.profile is not None:
+            return None
         lengthscale, scale = (t.detach() for t in self._parameters_of_form())
-        x = train[..., : self.num_inputs]
-        origin = x.mean(-2, keepdim=True)
-        right = StationaryRows.of(x - origin, lengthscale)
-        log_scale = scale.log()[..., None, None]
-        constant = self.mean_variance.unsqueeze(-1).detach() if self.learns_mean else None
+        z, half = rows_of(train[..., : self.num_inputs] - origin, lengthscale)
+        square = (-0.5 / lengthscale.square()).expand_as(z)
+        last = scale.log()[..., None, None] - half
+        return torch.cat([z / lengthscale, square, last], dim=-1).mT.contiguous()
 
-        def covariance(inputs: Tensor) -> Tensor:
-            left = StationaryRows.of(inputs[..., : self.num_inputs] - origin, lengthscale)
-            values = exponents(left, right, log_scale).exp_()
-            return values if constant is None else values + constant
-
-        return covariance
+    def variance(self) -> Tensor | None:
+        """The prior variance of g, ``... x 1``, if it is the same everywhere; without gradient."""
+        constant = self.mean_variance.detach() if self.learns_mean else None
+        if self.kernel is None:
+            return constant
+        if stationary_form(self.kernel, self.num_inputs) is None:
+            return None
+        scale = self._parameters_of_form()[1].detach().unsqueeze(-1)
+        return scale if constant is None else scale + constant
 
     def _closed_form(self, x1: Tensor, x2: Tensor, diag: bool) -> Tensor | None:
         """A scaled RBF kernel, several times faster than through GPyTorch's modules."""
@@ -126,7 +132,7 @@ class Term(Module):
             batch = torch.broadcast_shapes(x1.shape[:-2], scale.shape)
             return scale.unsqueeze(-1).expand(*batch, x1.shape[-2])
         origin = x1.detach().mean(-2, keepdim=True)
-        rows = [StationaryRows.of(x - origin, lengthscale) for x in (x1, x2)]
+        rows = [rows_of(x - origin, lengthscale) for x in (x1, x2)]
         exponent = exponents(*rows)
         if x1 is x2:
             # The closest pairs come out as differences of large numbers, these known ones do not.
@@ -224,7 +230,9 @@ class SumOfTerms(Kernel):
     ) -> SumOfTerms:
         return SumOfTerms(
             [
-                term.map_batches(change, None if term.kernel is None else change_kernel(term.kernel))
+                term.map_batches(
+                    change, None if term.kernel is None else change_kernel(term.kernel)
+                )
                 for term in self.terms
             ],
             self.known_means,

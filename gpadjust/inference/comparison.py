@@ -17,16 +17,17 @@ from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 from tqdm import tqdm
 
+from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.inference.objective import Objective
 from gpadjust.models import CKA, RRA, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import JoinedPhysics, Physics, as_physics
-from gpadjust.threads import threads_for
 from gpadjust.validation import leave_one_out
 
 Criterion = Literal["leave-one-out", "evidence"]
+
 
 class Structure(NamedTuple):
     """A way to adjust a physics, one of those that :func:`compare` fits.
@@ -239,7 +240,7 @@ def compare(
             input_transform=deepcopy(input_transform),
         )
         search = Search(num_starts, num_screened, seed=seed)
-        with warnings.catch_warnings(), threads_for(len(data.X)):
+        with warnings.catch_warnings(), threads_for(len(data.X), others=True):
             warnings.simplefilter("ignore", OptimizationWarning)
             result = maximise(Objective(model), search)
             row, densities[structure.name] = _judge(structure, model, result)
@@ -269,9 +270,7 @@ def _known(structures: Sequence[str | Structure]) -> list[Structure]:
     return list({structure.name: structure for structure in found}.values())
 
 
-def _candidates(
-    structures: list[Structure], physics: Physics
-) -> list[tuple[Structure, Physics]]:
+def _candidates(structures: list[Structure], physics: Physics) -> list[tuple[Structure, Physics]]:
     """What is to be fitted: structures of one physics, or of each of several and of all."""
     if not isinstance(physics, JoinedPhysics):
         return [(structure, physics) for structure in structures]
@@ -319,7 +318,9 @@ def _preferred(model: ExactGPBase, X: Tensor) -> list[str]:
 
 def _best(order: list[str]) -> str:
     """The first of an order, but CKA itself rather than its approximation."""
-    return next((n for n in order if "RRA" not in n or n.replace("RRA", "CKA") not in order), order[0])
+    return next(
+        (n for n in order if "RRA" not in n or n.replace("RRA", "CKA") not in order), order[0]
+    )
 
 
 def _judge(structure: Structure, model: ExactGPBase, result: FitResult) -> tuple[Candidate, Tensor]:

@@ -8,11 +8,11 @@ from botorch.models import ModelListGP
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from botorch.utils.transforms import is_fully_bayesian
 
+from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.full_bayes import SampleResult, sample
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.inference.objective import Objective
 from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES
-from gpadjust.threads import threads_for
 
 Method = Literal["map", "hmc"]
 
@@ -127,7 +127,7 @@ def fit(
     if is_fully_bayesian(model):
         raise RuntimeError(HOLDS_SAMPLES)
     search = Search(**{name: value for name, value in options.items() if name in _SEARCH})
-    with threads_for(model.train_targets.shape[-1]):
+    with threads_for(model.train_targets.shape[-1], others=True):
         if method == "map":
             return maximise(Objective(model), search)
         return sample(
@@ -147,7 +147,9 @@ def _check(method: str, options: dict[str, Any]) -> None:
     for name, value in options.items():
         if name not in known:
             others = [other for other, names in _OPTIONS.items() if name in names]
-            hint = f"it is one of method {others[0]!r}" if others else f"expected {', '.join(known)}"
+            hint = (
+                f"it is one of method {others[0]!r}" if others else f"expected {', '.join(known)}"
+            )
             raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
         if value is None and name in ("num_starts", "num_screened"):
             continue

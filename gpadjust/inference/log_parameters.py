@@ -69,7 +69,7 @@ class LogParameters:
         self.num_problems = self.batch_shape.numel()
         self._shapes = [p.shape[len(self.batch_shape) :] for p in self._raw.values()]
         self._constraints = {name: constraint_of(model, name) for name in self.names}
-        self._sizes = typical_sizes(model)
+        self._sizes = self._typical_sizes(model)
         self.lower, self.upper = (self._bounds(side) for side in (0, 1))
         self.variances = self._mask(
             lambda name: kind_of(name) in ("outputscale", "noise") and self.is_free(name)
@@ -78,9 +78,10 @@ class LogParameters:
         self.is_constrained = self._mask(
             lambda name: self.is_log(name) and not self.is_free(name)
         ).bool()
-        # A start that the user gives may lie outside.
+        # A start that the user gives may lie outside, but not below the least noise.
         current = self.current()[0]
-        self.lower = torch.minimum(self.lower, current)
+        lower = torch.minimum(self.lower, current)
+        self.lower = torch.where(self.noise > 0, self.lower, lower)
         self.upper = torch.maximum(self.upper, current)
 
     def is_log(self, name: str) -> bool:
@@ -171,6 +172,18 @@ class LogParameters:
             noise = (spread * noise).to(parameter.device)
             values[name] = parameter + magnitude(parameter) * noise
         return self.clipped(self.flatten(values))
+
+    def _typical_sizes(self, model: BatchedMultiOutputGPyTorchModel) -> Parameters:
+        """The typical sizes before any fit, which moves unknown means and so the residual."""
+        sizes = typical_sizes(model)
+        if not any(term.learns_mean for term in getattr(model.covar_module, "terms", ())):
+            return sizes
+        for name, size in sizes.items():
+            constraint = self._constraints.get(name)
+            if isinstance(constraint, LogInterval) and constraint.is_default:
+                # The model keeps them as its bounds.
+                sizes[name] = size.maximum(constraint.lower_bound / KINDS[kind_of(name)].bounds[0])
+        return sizes
 
     def _draw_multiples(self, num_starts: int, generator: torch.Generator) -> Parameters:
         """Draw values as multiples of the typical sizes.

@@ -43,11 +43,10 @@ class LogPriors:
             {n: torch.full_like(v, of_logs and parameters.is_log(n)) for n, v in values.items()}
         )[0]
         self._normal: _Normal | None = None
-        if has_priors(model):
-            found = _normals(model, parameters)
-            if found is not None:
-                fields = ({n: f[i] for n, f in found.items()} for i in range(len(_Normal._fields)))
-                self._normal = _Normal(*(parameters.flatten(field)[0] for field in fields))
+        found = _normals(model, parameters)
+        if found is not None:
+            fields = ({n: f[i] for n, f in found.items()} for i in range(len(_Normal._fields)))
+            self._normal = _Normal(*(parameters.flatten(field)[0] for field in fields))
 
     def __call__(self, vectors: Tensor) -> Tensor:
         """Return the log density at ``vectors`` (``k x B x p``) as ``k x B``."""
@@ -114,11 +113,6 @@ class _Priors(Module):
             prior.log_prob(closure(module))
             for _, module, prior, closure, _ in self.model.named_priors()
         ]
-
-
-def has_priors(model: BatchedMultiOutputGPyTorchModel) -> bool:
-    """Whether any prior is registered on a model."""
-    return next(iter(model.named_priors()), None) is not None
 
 
 def _normals(

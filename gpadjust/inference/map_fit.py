@@ -20,9 +20,10 @@ _TOLERANCE = 1e-8  # relative decrease of the objective below which L-BFGS stops
 _RESTARTS = 3  # of runs that ended without convergence
 _STUCK = 1e-4  # relative decrease below which a restart has found nothing new
 _INFEASIBLE = 1e10  # what the optimiser sees where the likelihood cannot be evaluated
-_SEARCHED = 128  # observations that a search is made on; more would tell the same, and take longer
-_REFINED = 2  # optima of a search on some rows that are carried over to all of them
-_APART = 0.1  # nats by which optima differ at least
+_MANY = 150  # observations; a search is made on some of more
+_SEARCHED = 96  # of them, which tell what optima there are
+_ROUGH = 1e-5  # tolerance of that search
+_COMPARED = 5  # of its optima that are compared on all observations
 
 
 class Search(NamedTuple):
@@ -56,12 +57,10 @@ def maximise(objective: Objective, search: Search) -> FitResult:
     all.
     """
     model, parameters = objective.model, objective.parameters
-    starts = parameters.current()
+    starts = parameters.clipped(parameters.current())
     searches = search.num_screened != 0
-    if searches and parameters.is_batched and objective.num_points > 1.2 * _SEARCHED:
-        part = _part(objective, search.seed)
-        starts = torch.cat([starts, _search(part, search)])
-        starts = _distinct(objective, starts)
+    if searches and parameters.is_batched and objective.num_points > _MANY:
+        starts = _best(objective, torch.cat([starts, _optima_of_some(objective, search)]))
     elif searches:
         starts = _screened(objective, search)
     values = objective(starts)
@@ -89,38 +88,25 @@ def maximise(objective: Objective, search: Search) -> FitResult:
     return FitResult(-values[best, problems].reshape(parameters.batch_shape), converged)
 
 
-def _part(objective: Objective, seed: int) -> Objective:
-    """The objective of some of the observations."""
-    generator = torch.Generator().manual_seed(seed)
+def _optima_of_some(objective: Objective, search: Search) -> Tensor:
+    """Optima on some of the observations, ``k x B x p``; of each the best first."""
+    generator = torch.Generator().manual_seed(search.seed)
     rows = torch.randperm(objective.num_points, generator=generator)[:_SEARCHED].sort().values
-    return Objective(objective.model, rows=rows)
+    part = Objective(objective.model, rows=rows)
+    search = search._replace(
+        num_starts=search.num_starts or 8, num_screened=search.num_screened or _SEARCHED
+    )
+    starts = _screened(part, search)
+    reached, values, _ = _optimise(part, starts, min(search.max_iterations, 40), _ROUGH)
+    reached, values = part.at_best_scale(reached) if part.concentrated else (reached, values)
+    order = values.argsort(dim=0)[:_COMPARED]
+    return reached.gather(0, order.unsqueeze(-1).expand(-1, -1, reached.shape[-1]))
 
 
-def _search(objective: Objective, search: Search) -> Tensor:
-    """Optima of an objective, ``k x B x p``, best first."""
-    starts = _screened(objective, search)
-    reached, values, _ = _optimise(objective, starts, search.max_iterations)
-    if objective.concentrated:
-        shift = objective.best_scale(reached).log().unsqueeze(-1)
-        reached = reached + objective.parameters.variances * shift
-    order = values.argsort(dim=0)
-    return reached.gather(0, order.unsqueeze(-1).expand_as(reached))
-
-
-def _distinct(objective: Objective, candidates: Tensor) -> Tensor:
-    """The best few of candidates, ``k x B x p``, that are apart from each other."""
-    # Candidates come best first, so that the next best is often the same optimum once more.
-    values = objective(candidates[: 2 + 3 * _REFINED])
-    kept = []
-    for problem in range(values.shape[1]):
-        chosen: list[int] = []
-        for i in values[:, problem].argsort().tolist():
-            value = values[i, problem]
-            if all(abs(float(value - values[j, problem])) > _APART for j in chosen):
-                chosen.append(i)
-        chosen = (chosen + [chosen[0]] * _REFINED)[:_REFINED]
-        kept.append(candidates[chosen, problem])
-    return torch.stack(kept, dim=1)
+def _best(objective: Objective, candidates: Tensor) -> Tensor:
+    """The best candidate of each problem, ``1 x B x p``."""
+    order = objective(candidates).argmin(0, keepdim=True)
+    return candidates.gather(0, order.unsqueeze(-1).expand(-1, -1, candidates.shape[-1]))
 
 
 def _screened(objective: Objective, search: Search) -> Tensor:
@@ -134,12 +120,9 @@ def _screened(objective: Objective, search: Search) -> Tensor:
         num_starts = 16 if parameters.is_batched else 8
     generator = torch.Generator().manual_seed(search.seed)
     drawn = parameters.draw(num_screened, generator)
-    factor = objective.best_scale(drawn)
-    usable = factor.isfinite() & (factor > 0)
-    shift = factor.where(usable, torch.ones_like(factor)).log().unsqueeze(-1)
-    drawn = parameters.clipped(drawn + parameters.variances * shift)
-    starts = torch.cat([parameters.current(), drawn])
-    values = objective(starts)
+    drawn, values = objective.at_best_scale(drawn)
+    current = parameters.clipped(parameters.current())
+    starts, values = torch.cat([current, drawn]), torch.cat([objective(current), values])
     if parameters.noise.any() and num_starts > 1 and len(starts) > 2:
         # Optima with and without noise are apart, and without it a random start looks bad.
         clean = torch.zeros(len(starts), 1, dtype=torch.bool, device=starts.device)
@@ -162,7 +145,7 @@ def _screened(objective: Objective, search: Search) -> Tensor:
 
 
 def _optimise(
-    objective: Objective, starts: Tensor, max_iterations: int
+    objective: Objective, starts: Tensor, max_iterations: int, tolerance: float = _TOLERANCE
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run L-BFGS from all starts of all problems; return where it got, values, convergence.
 
@@ -195,7 +178,7 @@ def _optimise(
             start,
             bounds=list(zip(low, high, strict=True)),
             maxiter=max_iterations,
-            factr=_TOLERANCE / np.finfo(float).eps,
+            factr=tolerance / np.finfo(float).eps,
             pass_batch_indices=True,
         )
         flags = np.array([each["status"] for each in info])
@@ -204,7 +187,7 @@ def _optimise(
     flat = reached.reshape(-1, num_parameters).cpu().numpy()
     x, f, converged, spent = run(flat, np.arange(len(flat)))
     best = f.reshape(num_starts, num_problems).argmin(0) * num_problems + np.arange(num_problems)
-    for _ in range(_RESTARTS):
+    for _ in range(_RESTARTS if tolerance == _TOLERANCE else 0):
         stuck = best[~converged[best] & ~spent[best]]
         if not stuck.size:
             break

@@ -7,26 +7,26 @@ from collections.abc import Callable
 
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+from gpytorch.likelihoods import GaussianLikelihood
 from torch import Tensor
 
 from gpadjust.gp import SumOfTerms
 from gpadjust.gp.gaussian import (
     LikelihoodValue,
     cholesky,
+    known_noise,
     least_squares,
     negative_log_likelihood,
     nugget,
 )
-from gpadjust.inference.closed_form import ClosedForm
+from gpadjust.gp.stationary import StationarySum, StationaryTerm, stationary_form
 from gpadjust.inference.log_parameters import LogParameters, Parameters
-from gpadjust.inference.log_priors import LogPriors, has_priors
-from gpadjust.inference.target_distribution import (
-    ModuleDistribution,
-    TargetDistribution,
-    known_noise_of,
-)
+from gpadjust.inference.log_priors import LogPriors
+from gpadjust.inference.target_distribution import ModuleDistribution, TargetDistribution
+from gpadjust.models.hyperparameters import kernels_of
 from gpadjust.physics import PhysicsError
 
+_NOISE = "likelihood.noise_covar.raw_noise"
 _VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
 _AT_ONCE = 2**20  # numbers in the covariances of a batch; larger ones make memory the bottleneck
 
@@ -70,22 +70,26 @@ class Objective:
         self.model = model
         self.parameters = LogParameters(model)
         learns_inputs = any(name.startswith("input_transform.") for name in self.parameters.names)
-        raw, noise = model.train_inputs[0], known_noise_of(model)
+        raw, noise = model.train_inputs[0], known_noise(model.likelihood)
         with torch.no_grad():
             inputs = model.transform_inputs(raw)
         self.targets = model.train_targets
         if rows is not None:
-            raw, inputs, self.targets = raw[..., rows, :], inputs[..., rows, :], self.targets[..., rows]
+            raw, inputs, self.targets = (
+                raw[..., rows, :],
+                inputs[..., rows, :],
+                self.targets[..., rows],
+            )
             noise = None if noise is None else noise[..., rows]
         self._basis = None if marginal else _basis_of_constants(model, inputs)
         closed: TargetDistribution | None = None
         if self.parameters.is_batched and not autograd:
-            closed = ClosedForm.of(model, inputs, self.parameters, noise, marginal)
+            closed = _closed_form(model, inputs, self.parameters, noise, marginal)
         self._distribution = closed or ModuleDistribution(
             model, raw if learns_inputs else inputs, self.parameters, noise, marginal
         )
         self._log_priors: LogPriors | None = None
-        if of_logs or has_priors(model):
+        if of_logs or next(iter(model.named_priors()), None) is not None:
             self._log_priors = LogPriors(model, self.parameters, of_logs)
         # Targets that are met exactly would have no variance at all: their rounding errors have.
         square = self.targets.square().nanmean(-1)
@@ -101,12 +105,7 @@ class Objective:
     def assign(self, vector: Tensor) -> None:
         """Give the model a vector, ``B x p``, at its best scale, and its constant means."""
         if self.concentrated:
-            shift = self.best_scale(vector.unsqueeze(0))[0].log()
-            vector = vector + self.parameters.variances * shift.unsqueeze(-1)
-            # The least noise is met but for rounding errors.
-            vector = torch.where(
-                self.parameters.noise > 0, vector.maximum(self.parameters.lower), vector
-            )
+            vector = self.at_best_scale(vector.unsqueeze(0))[0][0]
         self.parameters.assign(vector)
         if self._basis is not None:
             with torch.no_grad():
@@ -117,7 +116,9 @@ class Objective:
 
         It is infinite where the covariance has no Cholesky factor.
         """
-        return self._in_chunks(lambda part: (self._evaluate(part, derivatives=False)[0],), vectors)[0]
+        return self._in_chunks(lambda part: (self._evaluate(part, derivatives=False)[0],), vectors)[
+            0
+        ]
 
     def value_and_gradient(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Return the objective and its gradient, ``k x B`` and ``k x B x p``.
@@ -130,22 +131,35 @@ class Objective:
         return value, gradient
 
     @torch.no_grad()
-    def best_scale(self, vectors: Tensor) -> Tensor:
-        r"""The factor of all variances that maximises the likelihood, ``k x B``.
+    def at_best_scale(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Multiply all variances by the factor that maximises the likelihood.
 
-        With :math:`c K` in place of :math:`K` it is :math:`(y - m)^T K^{-1} (y - m) / n`.
+        With :math:`c K` in place of :math:`K` it is :math:`(y - m)^T K^{-1} (y - m) / n`, or what
+        brings the noise to its bound.
+
+        Args:
+            vectors: ``k x B x p``.
+
+        Returns:
+            The vectors, moved into the bounds, and the objective there, ``k x B``.
         """
         if not self.parameters.is_batched:
-            return torch.ones_like(vectors[..., 0])
+            return vectors, self(vectors)
 
-        def scale(part: Tensor) -> tuple[Tensor]:
+        def likelihood(part: Tensor) -> tuple[Tensor, Tensor]:
             mean, covariance = self._distribution(self.parameters.unflatten(part))
-            likelihood = negative_log_likelihood(
-                self._residual(mean, covariance), covariance, self._basis, self._least_scale(part)
+            residual = self._residual(mean, covariance)
+            found = negative_log_likelihood(
+                residual, covariance, self._basis, self._least_scale(part)
             )
-            return (likelihood.scale.reshape(len(part), -1),)
+            shape = (len(part), self.parameters.num_problems)
+            return found.value.reshape(shape), found.scale.reshape(shape)
 
-        return self._in_chunks(scale, vectors)[0]
+        values, scale = self._in_chunks(likelihood, vectors)
+        usable = scale.isfinite() & (scale > 0)
+        shift = scale.where(usable, torch.ones_like(scale)).log().unsqueeze(-1)
+        moved = self.parameters.clipped(vectors + self.parameters.variances * shift)
+        return moved, values if self.concentrated else self(moved)
 
     def _in_chunks(
         self, function: Callable[[Tensor], tuple[Tensor, ...]], vectors: Tensor
@@ -269,9 +283,7 @@ class Objective:
         )
 
 
-def _basis_of_constants(
-    model: BatchedMultiOutputGPyTorchModel, inputs: Tensor
-) -> Tensor | None:
+def _basis_of_constants(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
     """The bases of the unknown constant means, ``... x n x q``, or None."""
     if not isinstance(model.covar_module, SumOfTerms):
         return None
@@ -282,3 +294,58 @@ def _basis_of_constants(
             if term.learns_mean
         ]
     return torch.stack(columns, dim=-1) if columns else None
+
+
+def _closed_form(
+    model: BatchedMultiOutputGPyTorchModel,
+    inputs: Tensor,
+    parameters: LogParameters,
+    noise: Tensor | None,
+    marginal: bool,
+) -> StationarySum | None:
+    """The distribution of the targets without autograd, or None if the model has another form.
+
+    Args:
+        model: The model.
+        inputs: Its transformed training inputs, or some rows of them.
+        parameters: Its learnable parameters.
+        noise: The noise variances of these inputs, if they are known.
+        marginal: Whether the prior variances of unknown constants count.
+    """
+    if noise is None and type(model.likelihood) is not GaussianLikelihood:
+        return None
+    terms, names = [], set() if noise is not None else {_NOISE}
+    origin = inputs.mean(-2, keepdim=True)
+    with torch.no_grad():
+        for path, kernel, num_inputs, basis in kernels_of(model):
+            d = inputs.shape[-1] if num_inputs is None else num_inputs
+            form = stationary_form(kernel, d)
+            if form is None:
+                return None
+            lengthscale = f"{path}.{form.lengthscale}"
+            scale = None if form.outputscale is None else f"{path}.{form.outputscale}"
+            weight = None if basis is None else basis(inputs)
+            x = (inputs - origin)[..., :d]
+            terms.append(StationaryTerm(x, weight, lengthscale, scale, form.profile))
+            names |= {name for name in (lengthscale, scale) if name is not None}
+        if not terms or not names.issuperset(parameters.names):
+            return None
+        constant = _constant_covariance(model, inputs) if marginal else None
+        shape = (*model.train_targets.shape[:-1], inputs.shape[-2])
+        mean = model.mean_module(inputs).expand(shape)
+        values = {}
+        for name in names:
+            path, _, leaf = name.rpartition(".")
+            value: Tensor = getattr(model.get_submodule(path), leaf.removeprefix("raw_"))
+            values[name] = value.log()
+    return StationarySum(terms, mean, constant, _NOISE if noise is None else noise, values)
+
+
+def _constant_covariance(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
+    """What unknown constants add to the covariance, ``... x n x n``, or None."""
+    basis = _basis_of_constants(model, inputs)
+    if basis is None:
+        return None
+    learnt = [term for term in model.covar_module.terms if term.learns_mean]
+    scaled = basis * torch.stack([term.mean_variance.sqrt() for term in learnt], dim=-1)
+    return scaled @ scaled.mT

@@ -8,7 +8,6 @@ from typing import Protocol
 import gpytorch
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
-from gpytorch.likelihoods import FixedNoiseGaussianLikelihood
 from linear_operator import to_dense
 from torch import Tensor
 from torch.func import functional_call
@@ -117,11 +116,3 @@ class _NoisyPrior(Module):
         noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
         mean = model.mean_module(inputs).expand(noise.shape)
         return mean, covariance + torch.diag_embed(noise)
-
-
-def known_noise_of(model: BatchedMultiOutputGPyTorchModel) -> Tensor | None:
-    """The known noise variances of the training targets, ``... x n``, or None."""
-    likelihood = model.likelihood
-    if type(likelihood) is not FixedNoiseGaussianLikelihood:
-        return None
-    return None if likelihood.second_noise_covar is not None else likelihood.noise

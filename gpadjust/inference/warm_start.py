@@ -9,9 +9,7 @@ from gpadjust.models import ExactGPBase
 from gpadjust.models.hyperparameters import constraint_of, is_rho, kernels_of, kind_of
 
 
-def warm_start(
-    model: ExactGPBase, previous: ExactGPBase
-) -> None:
+def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
     """Give a model the hyper-parameters of an earlier one of the same structure.
 
     They are the same in the user's units: lengthscales, and the variance of a scaling of the

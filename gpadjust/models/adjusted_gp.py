@@ -16,11 +16,11 @@ from gpytorch.likelihoods import Likelihood
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import AppendedPhysics, FixedStandardize, PhysicsInput, Term
+from gpadjust.gp import AppendedPhysics, PhysicsInput, Term
 from gpadjust.gp.gaussian import least_squares
 from gpadjust.models.cholesky_strategy import Weights
 from gpadjust.models.exact_gp_base import ExactGPBase
-from gpadjust.models.training_data import ArrayLike, training_data
+from gpadjust.models.training_data import ArrayLike, estimated, residual_scale, training_data
 from gpadjust.physics import Physics, as_physics
 
 PhysicsLike = (
@@ -108,8 +108,9 @@ class AdjustedGP(ExactGPBase):
         start = _start(data.Y, f, rho_means)
         if isinstance(outcome_transform, _DefaultType):
             mean = sum((w * v for w, v in zip(start, f, strict=True)), torch.zeros_like(data.Y))
-            outcome_transform = FixedStandardize.from_residual(data.Y, mean)
-        units = FixedStandardize.from_transform(outcome_transform, data.Y, X)
+            units: Standardize | None = residual_scale(data.Y, mean)
+        else:
+            units = estimated(outcome_transform, data.Y, X)
         zero = torch.zeros_like(data.X[..., :1, :1]).expand(*data.X.shape[:-2], 1, m)
         shift, scale = (zero, zero + 1) if units is None else (units.means, units.stdvs)
 
@@ -207,6 +208,8 @@ class AdjustedGP(ExactGPBase):
         for name in names:
             if physics is not None and physics in (name, name.removeprefix("rho_")):
                 return name
+        if not names:
+            raise ValueError(f"{type(self).__name__} has no rho, as it has no physics.")
         raise ValueError(
             f"Expected physics to be one of {', '.join(n.removeprefix('rho_') for n in names)}, or "
             f"a number from 0 to {len(names) - 1}, got {physics!r}."
@@ -225,9 +228,7 @@ class AdjustedGP(ExactGPBase):
         return float(values[output])
 
     @classmethod
-    def construct_inputs(
-        cls, training_data: SupervisedDataset, **options: Any
-    ) -> dict[str, Any]:
+    def construct_inputs(cls, training_data: SupervisedDataset, **options: Any) -> dict[str, Any]:
         """Construct keyword arguments of the model from a dataset.
 
         Args:
@@ -300,9 +301,7 @@ def _means(rho: Adjustment | None, number: int) -> list[float | Literal["learn"]
     return [float(each) for each in means]
 
 
-def _start(
-    Y: Tensor, f: list[Tensor], means: list[float | Literal["learn"]]
-) -> list[Tensor]:
+def _start(Y: Tensor, f: list[Tensor], means: list[float | Literal["learn"]]) -> list[Tensor]:
     """The means of the rhos to begin with, ``batch_shape x 1 x m`` each.
 
     Unknown weights of several physics, whose scales may be anything, are at least squares.
@@ -340,7 +339,9 @@ def _kernels(
         )
     given.extend(part for part in each if isinstance(part, Module))
     return [
-        None if part is None else make_kernel(part, f"the kernel of {name}", num_inputs, batch_shape)
+        None
+        if part is None
+        else make_kernel(part, f"the kernel of {name}", num_inputs, batch_shape)
         for part, name in zip(each, names, strict=True)
     ]
 

@@ -14,17 +14,24 @@ from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.constraints import Interval
+from gpytorch.likelihoods import Likelihood
 from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.likelihoods.noise_models import MultitaskHomoskedasticNoise
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
-from gpadjust.gp import FixedStandardize, Term
+from gpadjust.gp import Term
 from gpadjust.gp.physics_columns import check_one_to_one
 from gpadjust.models.adjusted_gp import KernelLike, PhysicsLike, make_kernel
 from gpadjust.models.exact_gp_base import ExactGPBase
 from gpadjust.models.hyperparameters import default_constraint, scaled_rbf
-from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
+from gpadjust.models.training_data import (
+    ArrayLike,
+    TrainingData,
+    estimated,
+    standardize,
+    training_data,
+)
 from gpadjust.physics import as_physics
 
 
@@ -211,17 +218,15 @@ class AR1(ExactGPBase):
         Y = torch.cat([low.Y, high.Y], dim=-2)
         if isinstance(outcome_transform, _DefaultType):
             spread = low.Y.std(-2, keepdim=True)
-            outcome_transform = FixedStandardize.from_moments(
-                low.Y.mean(-2, keepdim=True), spread.where(spread > 0, torch.ones_like(spread))
-            )
-        likelihood: _GaussianLikelihoodBase | None = None
-        Yvar: Tensor | None = None
-        if high.Yvar is None:
-            likelihood = LevelLikelihood(default_constraint(), batch_shape)
+            spread = spread.where(spread > 0, torch.ones_like(spread))
+            units: Standardize | None = standardize(low.Y.mean(-2, keepdim=True), spread)
         else:
+            units = estimated(outcome_transform, Y, X)
+        Yvar: Tensor | None = None
+        if high.Yvar is not None:
             # f_p is known without error, but GPyTorch wants at least 1e-6 for fixed noise.
             low_Yvar = 1e-5 * low.Y.var(-2, keepdim=True)
-            low_Yvar = low_Yvar.clamp_min(1e-6) if outcome_transform is None else low_Yvar
+            low_Yvar = low_Yvar.clamp_min(1e-6) if units is None else low_Yvar
             Yvar = torch.cat([low_Yvar.expand_as(low.Y), high.Yvar], dim=-2)
         d = transform(X).shape[-1] - 1
         zero = torch.zeros(*batch_shape, 1, dtype=torch.float64)
@@ -235,11 +240,15 @@ class AR1(ExactGPBase):
                 Term("low", kernels[0], d, Level(batch_shape), zero),
                 Term("delta", kernels[1], d, Level(), zero),
             ],
-            likelihood,
-            FixedStandardize.from_transform(outcome_transform, Y, X),
+            None,
+            units,
             transform,
             (low_covar_module, delta_covar_module),
         )
+
+    @staticmethod
+    def _learnt_noise(batch_shape: Size) -> Likelihood:
+        return LevelLikelihood(default_constraint(), batch_shape)
 
     @classmethod
     def construct_inputs(cls, training_data: SupervisedDataset, **options: Any) -> dict[str, Any]:

@@ -163,6 +163,7 @@ class ScaleGP(AdjustedGP):
             input_transform=input_transform,
         )
         size = self.physics(to_tensor(train_X, "train_X")).detach().abs()
+        size = size.unflatten(-1, (-1, self.num_outputs)).sum(-2)  # over several physics
         typical = size.square().mean(-2, keepdim=True).sqrt()
         if (typical == 0).any():
             raise ValueError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -20,6 +19,62 @@ from gpadjust.gp.gaussian import cholesky, noise_variances
 
 Weights = list[tuple[Term, Tensor | None]]
 """Terms and what each is multiplied by, ``... x n``, or None for 1."""
+
+
+class TermsOfData(NamedTuple):
+    """What is remembered of some unknown terms and the training data, to predict from.
+
+    Attributes:
+        terms: The terms.
+        train: The transformed training inputs, ``... x n x (d + k)``.
+        origin: Their mean, ``... x 1 x d``.
+        stack: Of the terms with scaled RBF kernels, what makes the logarithms of covariances with
+            the data (:meth:`Term.log_covariance_with`), ``... x T x (2 d + 1) x n``.
+        stacked: The names of these.
+        bases: The terms' bases at the data, ``... x n``, or None for 1.
+        variances: Their prior variances, ``... x 1``, or None where these are not the same
+            everywhere.
+    """
+
+    terms: list[Term]
+    train: Tensor
+    origin: Tensor
+    stack: Tensor | None
+    stacked: list[str]
+    bases: list[Tensor | None]
+    variances: list[Tensor | None]
+
+    @classmethod
+    def of(cls, terms: list[Term], train: Tensor) -> TermsOfData:
+        """Prepare some terms, at training inputs ``... x n x (d + k)``."""
+        d = max(term.num_inputs for term in terms)
+        origin = train[..., :d].mean(-2, keepdim=True)
+        found = [] if train.requires_grad else terms
+        matrices = {term.name: term.log_covariance_with(train, origin) for term in found}
+        stacked = {name: matrix for name, matrix in matrices.items() if matrix is not None}
+        stack = torch.stack(torch.broadcast_tensors(*stacked.values()), -3) if stacked else None
+        bases = [term.weights(train) for term in terms]
+        return cls(
+            terms, train, origin, stack, [*stacked], bases, [term.variance() for term in terms]
+        )
+
+    def covariances(self, inputs: Tensor) -> list[Tensor]:
+        """The covariances of the terms with those at the data, without bases, ``... x q x n``."""
+        values: Tensor | None = None
+        if self.stack is not None:
+            x = inputs[..., : self.origin.shape[-1]] - self.origin
+            left = torch.cat([x, x.square(), torch.ones_like(x[..., :1])], dim=-1)
+            values = (left.unsqueeze(-3) @ self.stack).exp_()
+        parts = []
+        for term in self.terms:
+            if values is None or term.name not in self.stacked:
+                parts.append(term.covariance(inputs, self.train))
+                continue
+            part = values.select(-3, self.stacked.index(term.name))
+            if term.learns_mean:
+                part = part + term.mean_variance.detach().unsqueeze(-1)
+            parts.append(part)
+        return parts
 
 
 class Factors(NamedTuple):
@@ -90,12 +145,12 @@ class Factors(NamedTuple):
         n_0, n, k = self.base.shape[-1], *cross.shape[-1:], cross.shape[-2]
         observed = ~residual.isnan()
         residual = residual.nan_to_num(nan=0.0)
-        if not observed.all():
+        if observed.all():
+            observed = observed.new_ones(k)  # without the fantasies' dimension: they share factors
+        else:
             cross = cross * observed.unsqueeze(-1)
         border = self.whiten(cross)
-        chol, _ = cholesky(
-            corner - border @ border.mT, None if observed.all() else observed, n + k
-        )
+        chol, _ = cholesky(corner - border @ border.mT, None if observed.all() else observed, n + k)
         row = pad(batched_product(border[..., :n_0], self.base), n - n_0)
         if self.rows.shape[-2]:
             row = row + border[..., n_0:] @ self.rows
@@ -105,6 +160,15 @@ class Factors(NamedTuple):
         rows = torch.cat([pad(self.rows, k).expand(*row.shape[:-2], -1, -1), row], dim=-2)
         whitened = row[..., n:] @ residual.unsqueeze(-1)
         return Factors(self.base, rows, pad(self.alpha, k) + (row.mT @ whitened).squeeze(-1))
+
+
+def _scaled(matrix: Tensor, factor: Tensor) -> Tensor:
+    """Multiply a matrix, in place where its shape and autograd allow."""
+    traced = torch.is_grad_enabled() and (matrix.requires_grad or factor.requires_grad)
+    expanded = 0 in matrix.stride() or torch.broadcast_shapes(matrix.shape, factor.shape) != (
+        matrix.shape
+    )
+    return matrix * factor if traced or expanded else matrix.mul_(factor)
 
 
 def pad(tensor: Tensor, k: int) -> Tensor:
@@ -164,7 +228,7 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         self._train_shape = train_prior_dist.event_shape
         self._factors: Factors | None = None
         self.kept: dict[str, Any] = {}  # what else a model makes of the same data
-        self._prepared: dict[str, tuple[Callable[[Tensor], Tensor], Tensor | None]] | None = None
+        self._terms: dict[tuple[str, ...], TermsOfData] = {}
 
     def factors(self) -> Factors:
         """Return the factors, computed at the first call."""
@@ -202,25 +266,24 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         Returns:
             ``... x q x n``.
         """
-        if self._prepared is None:
-            (train,) = self.train_inputs
-            self._prepared = {
-                term.name: (term.covariance_with(train), term.weights(train))
-                for term in self.kernel.terms
-                if not term.is_known
-            }
-        total: Tensor | None = None
-        for term, weight in weights:
-            if term.name not in self._prepared:
-                continue
-            covariance, basis = self._prepared[term.name]
-            part = covariance(inputs)
-            part = part if basis is None else part * basis.unsqueeze(-2)
-            part = part if weight is None else part * weight.unsqueeze(-1)
-            total = part if total is None else total + part
-        if total is None:
-            total = inputs.new_zeros(*inputs.shape[:-1], self.num_train)
-        return total
+        unknown = [(term, weight) for term, weight in weights if not term.is_known]
+        if not unknown:
+            return inputs.new_zeros(*inputs.shape[:-1], self.num_train)
+        data = self.terms_of_data([term for term, _ in unknown])
+        parts = data.covariances(inputs)
+        for i, ((_, weight), basis) in enumerate(zip(unknown, data.bases, strict=True)):
+            factors = [] if basis is None else [basis.unsqueeze(-2)]
+            factors += [] if weight is None else [weight.unsqueeze(-1)]
+            for factor in factors:
+                parts[i] = _scaled(parts[i], factor)
+        return sum(parts[1:], parts[0])
+
+    def terms_of_data(self, terms: list[Term]) -> TermsOfData:
+        """What is remembered of some unknown terms, and of the data."""
+        names = tuple(term.name for term in terms)
+        if names not in self._terms:
+            self._terms[names] = TermsOfData.of(terms, self.train_inputs[0])
+        return self._terms[names]
 
     @property
     def mean_cache(self) -> Tensor:
@@ -257,22 +320,28 @@ class CholeskyStrategy(DefaultPredictionStrategy):
             covariance = covariance + torch.diag_embed(excess)
         return to_linear_operator(covariance)
 
-    def marginals(
-        self, prior_mean: Tensor, prior_variance: Tensor, covariance: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Predict each point by itself.
+    def marginals(self, inputs: Tensor, weights: Weights, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Predict a weighted sum of terms at each point by itself.
 
         Args:
-            prior_mean: Prior means, ``... x q``.
-            prior_variance: Prior variances, ``... x q``.
-            covariance: Covariances with the training points, ``... x q x n``.
+            inputs: Transformed inputs, ``... x q x d``.
+            weights: The terms and their weights at the inputs.
+            mean: The prior mean of the sum, ``... x q``.
 
         Returns:
             Posterior means and variances, ``... x q`` each.
         """
-        variance = prior_variance - self.factors().whiten(covariance).square().sum(-1)
-        variance = variance.clamp_min(self._least_variance(prior_variance))
-        return self.exact_predictive_mean(prior_mean, covariance), variance
+        unknown = [(term, weight) for term, weight in weights if not term.is_known]
+        if not unknown:
+            return mean, torch.zeros_like(mean)
+        data, prior = self.terms_of_data([term for term, _ in unknown]), inputs.new_zeros(())
+        for (term, weight), variance in zip(unknown, data.variances, strict=True):
+            part = term.covariance(inputs, inputs, diag=True) if variance is None else variance
+            prior = prior + (part if weight is None else part * weight.square())
+        cross = self.cross_covariance(inputs, weights)
+        known = torch.linalg.vector_norm(self.factors().whiten(cross), dim=-1).square()
+        variance = (prior - known).maximum(self._least_variance(prior))
+        return self.exact_predictive_mean(mean, cross), variance
 
     def _least_variance(self, prior_variance: Tensor) -> Tensor:
         """What rounding errors leave of a variance at a point that is known without noise."""

@@ -9,6 +9,7 @@ import torch
 from botorch.acquisition.objective import PosteriorTransform
 from botorch.models import SingleTaskGP
 from botorch.models.transforms.input import InputTransform
+from botorch.models.transforms.outcome import Standardize
 from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM
@@ -19,8 +20,8 @@ from linear_operator import to_dense
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import FixedStandardize, SumOfTerms, Term, TermsMean
-from gpadjust.gp.gaussian import noise_variances
+from gpadjust.gp import SumOfTerms, Term, TermsMean
+from gpadjust.gp.gaussian import noise_variances, threads_for
 from gpadjust.models.cholesky_strategy import CholeskyStrategy, Weights
 from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES, hold_samples
 from gpadjust.models.hyperparameters import learnt_noise, set_initial_values
@@ -73,28 +74,38 @@ class ExactGPBase(SingleTaskGP):
         data: TrainingData,
         terms: Sequence[Term],
         likelihood: Likelihood | None,
-        outcome_transform: FixedStandardize | None,
+        outcome_transform: Standardize | None,
         input_transform: InputTransform | None,
         given: Sequence[object] = (),
     ) -> None:
         covar_module = SumOfTerms(terms)
         if likelihood is None and data.Yvar is None:
-            made: Likelihood | None = learnt_noise(self.get_batch_dimensions(data.X, data.Y)[1])
+            made = self._learnt_noise(self.get_batch_dimensions(data.X, data.Y)[1])
         else:
             made = likelihood
+        Y, Yvar = data.Y, data.Yvar
+        if outcome_transform is not None:
+            Y, Yvar = outcome_transform(Y, Yvar)
         with validate_input_scaling(False):  # ours is by the data's scales, and NaN is missing
             super().__init__(
                 data.X,
-                data.Y,
-                data.Yvar,
+                Y,
+                Yvar,
                 likelihood=made,
                 covar_module=covar_module,
                 mean_module=TermsMean(covar_module),
-                outcome_transform=outcome_transform,
+                outcome_transform=None,
                 input_transform=input_transform,
             )
+        if outcome_transform is not None:  # not earlier: BoTorch would estimate it anew
+            self.outcome_transform = outcome_transform
         self.input_names, self.output_names = data.input_names, data.output_names
         set_initial_values(self, *given, likelihood)
+
+    @staticmethod
+    def _learnt_noise(batch_shape: Size) -> Likelihood:
+        """The default likelihood."""
+        return learnt_noise(batch_shape)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -205,9 +216,12 @@ class ExactGPBase(SingleTaskGP):
             torch.Size([1000, 1])
         """
         inputs = self.model_inputs(X)
-        mean, variance = self._marginals(inputs, [(t, t.weights(inputs)) for t in self.terms])
+        with threads_for(self.train_targets.shape[-1]):
+            mean, variance = self._marginals(inputs, [(t, t.weights(inputs)) for t in self.terms])
         noise = self._noise(inputs, observation_noise)
         variance = variance if noise is None else variance + noise
+        # Fantasies share their variances.
+        mean, variance = torch.broadcast_tensors(mean, variance)
         shift, scale = self._units()
         mean, variance = mean * scale + shift, variance * scale.square()
         mean, variance = (
@@ -315,21 +329,13 @@ class ExactGPBase(SingleTaskGP):
 
     def _marginals(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
         """As :meth:`_joint`, with the variances only."""
-        strategy = self.strategy()
-        prior: Tensor = inputs.new_zeros(())
-        for term, weight in weights:
-            if not term.is_known:
-                part = term.covariance(inputs, inputs, diag=True)
-                prior = prior + (part if weight is None else part * weight.square())
-        cross = strategy.cross_covariance(inputs, weights)
-        return strategy.marginals(self._prior_mean(inputs, weights), prior, cross)
+        return self.strategy().marginals(inputs, weights, self._prior_mean(inputs, weights))
 
     @staticmethod
     def _prior_mean(inputs: Tensor, weights: Weights) -> Tensor:
         """The prior mean of a weighted sum of terms, ``... x (m) x q``."""
-        total = torch.zeros_like(inputs[..., 0])
-        for term, weight in weights:
-            total = total + (term.mean if weight is None else weight * term.mean)
+        parts = [term.mean if weight is None else weight * term.mean for term, weight in weights]
+        total: Tensor = sum(parts, torch.zeros_like(inputs[..., 0]))
         return total
 
     def left_out(self) -> tuple[Tensor, Tensor]:
@@ -343,7 +349,9 @@ class ExactGPBase(SingleTaskGP):
             self.eval()
         factors = self.strategy().factors()
         precision = factors.squared_columns()
-        variance = precision.where(precision > 0, torch.full_like(precision, torch.nan)).reciprocal()
+        variance = precision.where(
+            precision > 0, torch.full_like(precision, torch.nan)
+        ).reciprocal()
         return self.train_targets - factors.alpha * variance, variance
 
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:

@@ -46,9 +46,7 @@ KINDS = {
     # The mean square of the targets' residual from the prior mean, v, over that of the basis. The
     # prior is all but flat, so that near-polynomial functions, of long lengthscales and large
     # variance, are not ruled out.
-    "outputscale": Kind(
-        initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(1.0, 5.0)
-    ),
+    "outputscale": Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(1.0, 5.0)),
     # v. Less noise than a millionth of the residual is not told from none.
     "noise": Kind(initial=1e-2, bounds=(1e-12, 1e1), starts=(1e-6, 1.0), prior=(1e-4, 4.0)),
 }

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
+from linear_operator.utils.cholesky import psd_safe_cholesky
 from torch import Tensor
 
 from gpadjust.gp import SumOfTerms
-from gpadjust.gp.gaussian import cholesky
 from gpadjust.models.cholesky_strategy import Factors
 from gpadjust.models.exact_gp_base import ExactGPBase
 
@@ -119,6 +119,7 @@ def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
     sd = noise.sqrt()
     scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
     identity = torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device)
-    chol, _ = cholesky(scaled + identity)
+    # Eigenvalues are 1 or more: a nugget would be taken for information.
+    chol = psd_safe_cholesky(scaled + identity)
     log_sds: Tensor = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
     return log_sds

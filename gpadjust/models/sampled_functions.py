@@ -15,6 +15,7 @@ from torch.nn import Module, ModuleList
 
 from gpadjust.gp import Term
 from gpadjust.gp.gaussian import noise_variances
+from gpadjust.models.cholesky_strategy import TermsOfData
 from gpadjust.models.hyperparameter_samples import take_samples
 
 
@@ -58,7 +59,8 @@ class SampledFunctions(Module):
             self.register_buffer(name, tensor)
         self.weights, self.updates = [*weights], [*updates]
         self.requires_grad_(False).eval()
-        self.cross = [term.covariance_with(train.detach()) for term in self.terms]
+        unknown = [term for term in self.terms if not term.is_known]
+        self.data = TermsOfData.of(unknown, train.detach())
 
     @classmethod
     def by_matheron(cls, model: Any, num_functions: int, num_features: int) -> SampledFunctions:
@@ -75,8 +77,13 @@ class SampledFunctions(Module):
             noise = noise * torch.randn(num_functions, *train.shape[:-1]).to(train)
             prior = cls(model, features, weights)._values(train)
             residual = (model.train_targets - prior - noise).nan_to_num(nan=0.0)
-            update, bases = strategy.factors().solve(residual), [t.weights(train) for t in model.terms]
-            return cls(model, features, weights, [update if b is None else b * update for b in bases])
+            update, bases = (
+                strategy.factors().solve(residual),
+                [t.weights(train) for t in model.terms],
+            )
+            return cls(
+                model, features, weights, [update if b is None else b * update for b in bases]
+            )
 
     def forward(self, X: Tensor) -> Tensor:
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
@@ -112,11 +119,12 @@ class SampledFunctions(Module):
             extra: How many dimensions of them lead those of the model.
         """
         total = inputs.new_zeros(())
+        cross = iter(self.data.covariances(inputs) if self.updates else [])
         for i, (term, features) in enumerate(zip(self.terms, self.features, strict=True)):
             phi = features(inputs)
             part = term.mean + _product(phi, self.weights[i], extra)
             if self.updates and not term.is_known:
-                part = part + _product(self.cross[i](inputs), self.updates[i], extra)
+                part = part + _product(next(cross), self.updates[i], extra)
             basis = term.weights(inputs)
             part = part if basis is None else part * basis
             total = total + part

@@ -1,4 +1,4 @@
-"""The data that a model is built on: tensors, arrays or frames, and what is checked of them."""
+"""The data that a model is built on: what is taken and checked, and the units they are put in."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from botorch.models.transforms.outcome import OutcomeTransform, Standardize
 from torch import Tensor
 
 ArrayLike = Any
@@ -168,3 +169,52 @@ def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Ten
             f"Expected {name} (variances) not to be negative, got {variances.min():.3g}."
         )
     return variances
+
+
+def standardize(means: Tensor, stdvs: Tensor) -> Standardize:
+    """BoTorch's transform with given ``batch_shape x 1 x m`` shifts and (positive) scales."""
+    transform = Standardize(m=means.shape[-1], batch_shape=means.shape[:-2])
+    transform.means, transform.stdvs, transform._stdvs_sq = means, stdvs, stdvs.square()
+    transform._is_trained = torch.tensor(True)
+    return transform.eval()
+
+
+def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
+    r"""The default outcome transform: divide by the root mean square of ``Y - mean``.
+
+    BoTorch's default takes shift and scale from the targets. A model with physics wants the scale
+    of the residual, so that a good physics does not push the noise under the likelihood's floor,
+    and no shift, so that :math:`\rho` keeps its meaning.
+
+    Args:
+        Y: Targets, ``batch_shape x n x m``.
+        mean: The prior mean at the training inputs, of the same shape. Where it meets the targets
+            but for rounding, the scale is a millionth of theirs (or 1 if they are zero).
+    """
+
+    def rms(values: Tensor) -> Tensor:
+        return values.square().nanmean(-2, keepdim=True).sqrt()
+
+    scale, size = rms(Y - mean), rms(Y)
+    tiny = 1e-6 * size.where(size > 0, torch.full_like(size, 1e6))
+    return standardize(torch.zeros_like(scale), scale.where(scale > 1e-13 * size, tiny))
+
+
+def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Standardize | None:
+    """The user's outcome transform with shift and scale estimated from the targets.
+
+    Raises:
+        ValueError: If it is not a shift and scale of each output.
+    """
+    if transform is None:
+        return None
+    if type(transform) is not Standardize:
+        raise ValueError(
+            f"The outcome transform {type(transform).__name__} is not supported: f_p lives in the "
+            "units of the targets, so the transform must be one shift and scale per output. Use "
+            "Standardize, None, or the default, which divides by the residual's scale; to model "
+            "log(y), say, take the logarithm of both train_Y and the physics."
+        )
+    transform.train()
+    transform(Y, X=X)
+    return transform.eval()

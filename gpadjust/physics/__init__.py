@@ -3,8 +3,7 @@
 from gpadjust.physics.base import Physics
 from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError
-from gpadjust.physics.function import FunctionPhysics
-from gpadjust.physics.joined import JoinedPhysics, as_physics
+from gpadjust.physics.function import FunctionPhysics, JoinedPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
 
 __all__ = [

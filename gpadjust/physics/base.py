@@ -6,7 +6,8 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import deepcopy
-from typing import Any, ClassVar, Self
+from operator import index
+from typing import Any, ClassVar, Self, SupportsIndex
 
 import torch
 from torch import Tensor
@@ -14,7 +15,6 @@ from torch import Tensor
 from gpadjust.physics.carrier import pack, unpack
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.memo import RowMemo
-from gpadjust.physics.settings import column_numbers, whole_number
 
 
 class Physics(torch.nn.Module, ABC):
@@ -296,3 +296,38 @@ def _without_copies(X: Tensor) -> Tensor:
 
 def _same(a: Tensor, b: Tensor) -> bool:
     return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
+
+
+def whole_number(name: str, value: SupportsIndex) -> int:
+    """A setting as an int.
+
+    Raises:
+        TypeError: If it is no whole number.
+
+    Example:
+        >>> whole_number("memo", 1.5)
+        Traceback (most recent call last):
+        TypeError: memo must be a whole number; found 1.5.
+    """
+    try:
+        return index(value)
+    except TypeError:
+        raise TypeError(f"{name} must be a whole number; found {value!r}.") from None
+
+
+def column_numbers(inputs: Sequence[int]) -> tuple[int, ...]:
+    """The setting ``inputs`` as a tuple.
+
+    Raises:
+        TypeError: If it holds something else than whole numbers.
+        ValueError: If it is empty.
+    """
+    try:
+        columns = tuple(index(i) for i in inputs)
+    except TypeError:
+        raise TypeError(
+            f"inputs must be a sequence of column numbers, such as [0, 2]; found {inputs!r}."
+        ) from None
+    if not columns:
+        raise ValueError("inputs is empty; name at least one column of X, or None for all.")
+    return columns

@@ -1,14 +1,19 @@
-"""A torch function as physics."""
+"""A torch function as physics, several physics side by side, and whatever else passes for one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import cast
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
+
+AnyPhysics = Physics | Callable[[Tensor], Tensor]
+Parts = Sequence[AnyPhysics] | Mapping[str, AnyPhysics]
 
 
 class FunctionPhysics(Physics):
@@ -84,3 +89,147 @@ class FunctionPhysics(Physics):
                 "ignore this if the outputs do not depend on X."
             )
         return Y
+
+
+class JoinedPhysics(Physics):
+    """Several physics of the same inputs, their outputs side by side.
+
+    Each part reads its own columns of X and keeps its own memo and gradient; it is asked once per
+    call.
+
+    Args:
+        physics: ``k`` physics or callables (see ``as_physics``), or a mapping from names to such.
+        name: The name in messages. Default: the class's.
+
+    Attributes:
+        parts: The ``k`` physics.
+        names: One name for each. Default: that of the physics, or ``f_i`` for the i-th (from 1) if
+            it is a lambda or shares its name with another.
+        num_outputs: ``k m``, for ``k`` parts of ``m`` outputs each; None until the first call.
+
+    Raises:
+        TypeError: If ``physics`` is neither a sequence nor a mapping with text as keys, or a part
+            is no physics.
+        ValueError: If ``physics`` is empty.
+
+    Example:
+        >>> joined = JoinedPhysics([torch.sin, torch.cos])
+        >>> joined.names
+        ('sin', 'cos')
+        >>> joined(torch.zeros(1, 1))
+        tensor([[0., 1.]])
+    """
+
+    def __init__(self, physics: Parts, *, name: str | None = None) -> None:
+        if not isinstance(physics, Sequence | Mapping):
+            raise TypeError(
+                "JoinedPhysics takes a list of physics, or a mapping from names to physics; found "
+                f"a {type(physics).__name__}. For a single one use as_physics(physics)."
+            )
+        if not physics:
+            raise ValueError("There is no physics to join; give at least one.")
+        super().__init__(memo=0, name=name)
+        given = [*physics.values()] if isinstance(physics, Mapping) else [*physics]
+        parts = [as_physics(part) for part in given]
+        self.names = _names([*physics] if isinstance(physics, Mapping) else None, parts)
+        for part, origin, own in zip(parts, given, self.names, strict=True):
+            if part is not origin:  # a wrapper of ours
+                part.name = own
+        self.parts = torch.nn.ModuleList(parts)
+
+    def evaluate(self, X: Tensor) -> Tensor:
+        """The outputs of the parts, each by its own memo.
+
+        Args:
+            X: ``N x d``.
+
+        Returns:
+            ``N x (k m)``, those of the first part first.
+
+        Raises:
+            PhysicsError: If a part fails, or the parts differ in their number of outputs.
+        """
+        outputs = []
+        for name, part in zip(self.names, cast(Iterable[Physics], self.parts), strict=True):
+            part._check_input(X)
+            try:
+                # Not forward: an error's rows are then still those of X.
+                outputs.append(part._evaluate_rows(part._columns(X)))
+            except PhysicsError as error:
+                if name != part.name:
+                    error.add_note(f"This physics is {name!r} of {self.names}.")
+                raise
+        counts = {name: Y.shape[1] for name, Y in zip(self.names, outputs, strict=True)}
+        if len(set(counts.values())) > 1:
+            found = ", ".join(f"{count} of {name!r}" for name, count in counts.items())
+            raise PhysicsError(
+                f"The parts of physics {self.name!r} differ in their number of outputs: found "
+                f"{found}; expected the same of each. Make them predict the same quantities."
+            )
+        Y = torch.cat(outputs, dim=-1)
+        self.num_outputs = Y.shape[1]
+        return Y
+
+    def forget(self) -> None:
+        """Empties the memos of the parts."""
+        for part in cast(Iterable[Physics], self.parts):
+            part.forget()
+
+    def extra_repr(self) -> str:
+        """The settings that ``repr`` shows."""
+        return f"name={self.name!r}, names={self.names}, num_outputs={self.num_outputs}"
+
+    def _evaluate_rows(self, rows: Tensor) -> Tensor:
+        # Checks, memo and gradients are the parts'.
+        return self.evaluate(rows)
+
+
+def as_physics(physics: AnyPhysics | Parts) -> Physics:
+    """Takes a physics as it is, wraps any other callable, and joins several.
+
+    Args:
+        physics: A physics; or a torch function of rows ``N x d``, which becomes a
+            ``FunctionPhysics``; or a list, tuple or dict of these, which become a
+            ``JoinedPhysics`` if there is more than one.
+
+    Raises:
+        TypeError: If ``physics`` is none of these, or a class instead of an instance of it.
+        ValueError: If the list is empty.
+
+    Example:
+        >>> as_physics(torch.sin)
+        FunctionPhysics(name='sin', inputs=None, num_outputs=None, memo=100000)
+        >>> as_physics([torch.sin, torch.cos]).names
+        ('sin', 'cos')
+    """
+    if isinstance(physics, Physics):
+        return physics
+    if isinstance(physics, list | tuple | dict):
+        joined = JoinedPhysics(physics)
+        return joined if len(joined.parts) > 1 else cast(Physics, joined.parts[0])
+    if not callable(physics) or isinstance(physics, type):
+        found = f"a {type(physics).__name__}"
+        if isinstance(physics, type):
+            found = f"the class {physics.__name__}"
+        raise TypeError(
+            f"physics must be a Physics or a callable, or a list of them; found {found}. Pass a "
+            "torch function of rows N x d, ODEPhysics(rhs, step, state_dim) for an equation of "
+            "motion, or BlackBoxPhysics(function) for NumPy code and simulators."
+        )
+    return FunctionPhysics(physics)
+
+
+def _names(keys: list[str] | None, parts: list[Physics]) -> tuple[str, ...]:
+    if keys is not None:
+        wrong = [key for key in keys if not isinstance(key, str)]
+        if wrong:
+            raise TypeError(f"The names of joined physics must be text; found {wrong}.")
+        return tuple(keys)
+    own = [part.name for part in parts]
+    numbered = [f"f_{i}" for i in range(1, len(own) + 1)]
+    names = [
+        name if own.count(name) == 1 and name != "<lambda>" else number
+        for name, number in zip(own, numbered, strict=True)
+    ]
+    # A physics may be called f_2 without being the second.
+    return tuple(names if len(set(names)) == len(names) else numbered)

@@ -11,8 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from gpadjust.physics.base import Physics
-from gpadjust.physics.function import FunctionPhysics
-from gpadjust.physics.joined import as_physics
+from gpadjust.physics.function import FunctionPhysics, as_physics
 
 
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:

@@ -72,6 +72,7 @@ class RowMemo:
         """Forgets every row."""
         with self._lock:
             self._slots: dict[bytes, int] = {}
+            self._used = 0  # rows of the table; more than slots where two threads were at one row
             self._values: Tensor | None = None
 
     def recall(self, rows: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
@@ -161,18 +162,15 @@ class RowMemo:
         """Remembers new rows, and no more than ``capacity`` of them.
 
         Args:
-            keys: ``N`` distinct keys. Those that it knows already keep their values.
+            keys: ``N`` distinct keys.
             values: ``N x m``, without an autograd graph.
         """
         # The table outlives inference mode, whose tensors could not be written to afterwards.
         with self._lock, torch.inference_mode(False):
-            if not self._slots.keys().isdisjoint(keys):  # another thread was faster
-                new = (self.lookup(keys) < 0).nonzero().flatten().tolist()
-                keys, values = [keys[i] for i in new], values[new]
-            if len(self) + len(keys) > self.capacity:
+            if self._used + len(keys) > self.capacity:
                 self.clear()
                 keys, values = keys[: self.capacity], values[: self.capacity]
-            start, end = len(self), len(self) + len(keys)
+            start, end = self._used, self._used + len(keys)
             if self._values is None:
                 self._values = values.clone()
             elif end > self._values.shape[0]:
@@ -181,11 +179,12 @@ class RowMemo:
                 self._values = torch.cat([self._values[:start], room])
             self._values[start:end] = values
             self._slots.update(zip(keys, range(start, end), strict=True))
+            self._used = end
 
     def __getstate__(self) -> dict[str, Any]:
         """The state for a pickle, without the lock and the table's spare rows."""
         with self._lock:
-            values = None if self._values is None else self._values[: len(self)].clone()
+            values = None if self._values is None else self._values[: self._used].clone()
             state = {**self.__dict__, "_values": values, "_slots": self._slots.copy()}
         del state["_lock"]
         return state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -9,9 +10,8 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint
 
-from gpadjust.physics.base import Physics
+from gpadjust.physics.base import Physics, whole_number
 from gpadjust.physics.error import PhysicsError
-from gpadjust.physics.settings import is_finite, whole_number
 
 FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
 ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
@@ -171,3 +171,19 @@ class ODEPhysics(Physics):
 
     def _times(self, intervals: int, X: Tensor) -> Tensor:
         return torch.linspace(0.0, self.step, intervals + 1, dtype=X.dtype, device=X.device)
+
+
+def is_finite(name: str, value: float) -> bool:
+    """Whether a setting is finite.
+
+    Raises:
+        TypeError: If it is no number.
+
+    Example:
+        >>> is_finite("step", float("inf"))
+        False
+    """
+    try:
+        return math.isfinite(value)
+    except TypeError:
+        raise TypeError(f"{name} must be a number; found {value!r}.") from None

@@ -12,6 +12,7 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from torch import Tensor
 
 from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
+from gpadjust.models import PaperRRA
 from paper.forrester.problem import CRUDE, GRID, Reading
 
 Protocol = Literal["paper", "gpadjust"]
@@ -29,31 +30,33 @@ def trained(name: str, protocol: Protocol, reading: Reading, X: Tensor, Y: Tenso
         # f_p crosses zero, and GP-scale is here to show what that does to it.
         warnings.filterwarnings("ignore", message=".*nearly zero.*")
         if protocol == "gpadjust":
-            model = _build(name, reading, X, Y)
+            model = _build(name, protocol, reading, X, Y)
             fit(model)
         else:
-            model = _build(name, reading, X, Y, **_plain(name, Y))
+            model = _build(name, protocol, reading, X, Y, **_plain(name, Y))
             if name == "RRA":
-                for kernel in (model.rho_covar_module, model.delta_covar_module):
-                    kernel.base_kernel.lengthscale = RBFKernel().lengthscale.detach().double()
+                for term in model.terms:
+                    term.kernel.base_kernel.lengthscale = RBFKernel().lengthscale.detach().double()
             _adam(model)
     return model
 
 
-def _build(name: str, reading: Reading, X: Tensor, Y: Tensor, **options: Any) -> SingleTaskGP:
+def _build(
+    name: str, protocol: Protocol, reading: Reading, X: Tensor, Y: Tensor, **options: Any
+) -> SingleTaskGP:
     physics = CRUDE[reading]
     if name == "Zero-mean GP":
         return ZeroMeanGP(X, Y, **options)
     if name == "AR1":
         return AR1(X, Y, physics=physics, low_X=GRID, **options)
     if name == LEARNT:
-        options |= {"learn_rho_mean": True, "learn_delta_mean": True}
+        options |= {"rho_mean": "learn", "delta_mean": "learn"}
     kinds = {
         "Phy-mean GP": PhysicsMeanGP,
         "GP-bias": BiasGP,
         "GP-scale": ScaleGP,
         "CKA": CKA,
-        "RRA": RRA,
+        "RRA": PaperRRA if protocol == "paper" else RRA,
         LEARNT: CKA,
     }
     return kinds[name](X, Y, physics=physics, **options)
@@ -61,9 +64,10 @@ def _build(name: str, reading: Reading, X: Tensor, Y: Tensor, **options: Any) ->
 
 def _plain(name: str, Y: Tensor) -> dict[str, Any]:
     """Options that make a model as plain GPyTorch does: its initial values, y as it is."""
-    options: dict[str, Any] = {"train_Yvar": torch.full_like(Y, NOISE), "outcome_transform": None}
+    options: dict[str, Any] = {"train_Yvar": torch.full_like(Y, NOISE)}
     if name == "RRA":
-        return {**options, "prior": "paper"}
+        return options
+    options["outcome_transform"] = None
     kernels = {
         "AR1": ("low_covar_module", "delta_covar_module"),
         "CKA": ("rho_covar_module", "delta_covar_module"),

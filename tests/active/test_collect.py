@@ -1,6 +1,5 @@
 """The loop: what it measures, what it survives, and how it goes on."""
 
-import builtins
 import json
 import os
 import signal
@@ -210,6 +209,52 @@ class TestFailures:
         result = collect(**laboratory(oracle=oracle, batch_size=3, budget=6))
         assert (len(result.X), len(result.failed_X)) == (4, 2)
 
+    @pytest.mark.parametrize("at", [3, 6])
+    def test_each_output_is_learnt_from_its_own_measurements(self, laboratory, tmp_path, at):
+        def oracle(killed_at=None):
+            seen = []
+
+            def measure(X):
+                seen.append(X)
+                if len(seen) == killed_at:
+                    raise KeyboardInterrupt
+                Y = truth(X).repeat(1, 2)
+                Y[X[:, 1] > 0.2, 1] = float("nan")
+                return Y
+
+            return measure
+
+        path = tmp_path / "log.jsonl"
+        options = {"acquisition": qAdjustmentInformationGain}
+        whole = collect(**laboratory(oracle=oracle(), **options))
+        assert whole.Y[:, 0].isfinite().all()
+        assert 0 < whole.Y[:, 1].isnan().sum() < 6
+        assert len(whole.failed_X) == 0
+        assert torch.equal(whole.model.train_targets.isnan(), whole.Y.mT.isnan())
+        with pytest.raises(KeyboardInterrupt):
+            collect(**laboratory(oracle=oracle(at), log=path, **options))
+        result = collect(**laboratory(oracle=oracle(), log=path, **options))
+        assert torch.equal(result.X, whole.X)
+        torch.testing.assert_close(result.Y, whole.Y, rtol=0, atol=0, equal_nan=True)
+        assert torch.equal(_parameters(result.model), _parameters(whole.model))
+
+    def test_a_design_goes_on_until_each_output_is_known(self, laboratory):
+        seen = []
+
+        def oracle(X):
+            seen.append(X)
+            Y = truth(X).repeat(1, 2)
+            if len(seen) < 6:
+                Y[:, 1] = float("nan")
+            return Y
+
+        options = {"oracle": oracle, "acquisition": qAdjustmentInformationGain}
+        result = collect(**laboratory(budget=8, **options))
+        assert result.num_observed == 3
+        assert result.model.num_outputs == 2
+        result = collect(**laboratory(budget=1, data=(result.X, result.Y), **options))
+        assert result.num_observed == 4
+
     @quiet
     def test_several_in_a_row_stop_it(self, laboratory, tmp_path):
         path = tmp_path / "log.jsonl"
@@ -256,7 +301,7 @@ class TestResuming:
             from gpadjust import CKA
 
             options["model_factory"] = lambda X, Y: CKA(
-                X, Y, physics=lambda X: 2 + X[..., :1], learn_rho_mean=True, learn_delta_mean=True
+                X, Y, physics=lambda X: 2 + X[..., :1], rho_mean="learn", delta_mean="learn"
             )
         path = tmp_path / "log.jsonl"
         whole = collect(**laboratory(log=path, **options))
@@ -341,18 +386,6 @@ class TestProgress:
         collect(**laboratory(budget=2))
         assert capsys.readouterr().err == ""
 
-    def test_without_tqdm(self, laboratory, monkeypatch):
-        real = builtins.__import__
-
-        def without(name, *args, **kwargs):
-            if name == "tqdm":
-                raise ImportError(name)
-            return real(name, *args, **kwargs)
-
-        monkeypatch.setattr(builtins, "__import__", without)
-        with pytest.raises(ImportError, match="pip install tqdm"):
-            collect(**laboratory(progress=True))
-
 
 class TestErrors:
     @pytest.mark.parametrize("name", ["budget", "batch_size", "max_failures", "num_outputs"])
@@ -383,6 +416,12 @@ class TestErrors:
         with pytest.raises(TypeError, match="to be a BoTorch AcquisitionFunction, got CKA"):
             collect(**laboratory(acquisition=lambda model: model))
 
+    def test_an_acquisition_function_of_one_model(self, laboratory, uniform):
+        X = uniform(4, 2)
+        model = SingleTaskGP(X, truth(X))
+        with pytest.raises(TypeError, match="pass `lambda model: LogExpectedImprovement"):
+            collect(**laboratory(acquisition=LogExpectedImprovement(model, best_f=1.0)))
+
     def test_an_acquisition_function_of_single_points(self, laboratory):
         analytic = lambda model: LogExpectedImprovement(model, best_f=1.0)  # noqa: E731
         with pytest.raises(ValueError, match=r"LogExpectedImprovement takes one .* got q = 2"):
@@ -399,8 +438,10 @@ class TestErrors:
 
     def test_data(self, laboratory, uniform):
         X = uniform(4, 2)
-        with pytest.raises(ValueError, match="Expected the Y of data to be finite"):
+        with pytest.raises(ValueError, match="Expected the Y of data to hold an observation in each row"):
             collect(**laboratory(data=(X, X[:, :1].log() * float("nan"))))
+        with pytest.raises(ValueError, match="Expected the Y of data to be finite"):
+            collect(**laboratory(data=(X, X[:, :1] / 0)))
         with pytest.raises(ValueError, match=r"shape 4 x m, .* got \(3, 1\)"):
             collect(**laboratory(data=(X, X[:3, :1])))
 

@@ -95,17 +95,33 @@ def test_it_is_the_nearest_of_the_pending_points(make):
     assert torch.equal(collection.pending, X[[0, 2]]), "another point"
 
 
-def test_values_beside_a_missing_one_stay_in_the_log(make, tmp_path):
+@pytest.mark.parametrize("missing", [float("nan"), float("inf")])
+def test_some_of_the_outputs(make, tmp_path, missing):
     path = tmp_path / "log.jsonl"
     collection = make(log=path, num_outputs=2)
-    X = collection.ask()
-    with pytest.warns(MeasurementWarning, match=r"measured \[50.0, nan\]"):
-        collection.tell(X, torch.tensor([[50.0, float("nan")]]))
-    record = json.loads(path.read_text().splitlines()[-1])
-    assert record["y"] == [50.0, None]
-    again = make(log=path, num_outputs=2)
-    assert torch.equal(again.failed_X, X)
-    assert len(again.X) == 0
+    X = collection.ask(2)
+    with pytest.warns(MeasurementWarning, match=r"1 of 2 .* measured \[nan, nan\]"):
+        collection.tell(X, torch.tensor([[50.0, missing], [float("nan")] * 2]))
+    records = [json.loads(line) for line in path.read_text().splitlines()[-2:]]
+    assert [record["y"] for record in records] == [[50.0, None], [None, None]]
+    for each in (collection, make(log=path, num_outputs=2), make(log=path)):
+        assert torch.equal(each.X, X[:1])
+        assert torch.equal(each.Y.isnan(), torch.tensor([[False, True]]))
+        assert torch.equal(each.failed_X, X[1:])
+        assert len(each.pending) == each.num_observed == 0
+        with pytest.raises(RuntimeError, match="2 measurements of each output, there are 0"):
+            each.model  # noqa: B018
+
+
+def test_a_failure_of_an_earlier_version_stays_one(make, tmp_path):
+    path = tmp_path / "log.jsonl"
+    make(log=path, num_outputs=2).ask()
+    record = {"x": [0.5, 0.5], "y": [50.0, None], "failed": "measured [50.0, nan]"}
+    with path.open("a") as file:
+        file.write(json.dumps(record) + "\n")
+    collection = make(log=path, num_outputs=2)
+    assert len(collection.X) == 0
+    assert len(collection.failed_X) == 1
 
 
 def test_first_points_out_of_bounds(make):
@@ -156,7 +172,7 @@ def test_a_log_of_another_structure_is_no_hindrance(make, tmp_path):
 
 
 def test_a_model_needs_data(make):
-    with pytest.raises(RuntimeError, match="at least 2 measurements, there are 0"):
+    with pytest.raises(RuntimeError, match="at least 2 measurements of each output, there are 0"):
         make().model  # noqa: B018
 
 

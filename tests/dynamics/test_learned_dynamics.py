@@ -236,7 +236,7 @@ def test_raw_angles_on_request(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude, encode_angles=False)
     dynamics.update(*system.trial(0))
-    assert dynamics.model.rho_covar_module.base_kernel.ard_num_dims == 5
+    assert all(term.num_inputs == 5 for term in dynamics.model.terms)
 
 
 def test_predictions_take_leading_dimensions(cart_pole_system, make):
@@ -265,9 +265,11 @@ def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make)
     dynamics.update(states, actions, next_states)
     before = dynamics.predict(states, actions).mean
     broken = next_states.clone()
-    broken[4, 2] = math.nan
+    broken[4, 2] = math.inf
     with pytest.raises(ValueError, match=r"next_states to be finite.*row 4"):
         dynamics.update(states, actions, broken)
+    with pytest.raises(ValueError, match=r"states to be finite.*row 4"):
+        dynamics.update(broken, actions, next_states)
     with pytest.raises(TypeError, match=r"actions in float64, got torch\.float32"):
         dynamics.update(states, actions.float(), next_states)
     with pytest.raises(ValueError, match="as many rows each"):

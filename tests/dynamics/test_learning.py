@@ -5,10 +5,10 @@ import warnings
 
 import pytest
 import torch
+from botorch.models.transforms.outcome import Standardize
 from gpytorch.kernels import MaternKernel, ScaleKernel
 
 from gpadjust import fit
-from gpadjust.gp import FixedStandardize
 from gpadjust.inference.warm_start import warm_start
 
 pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
@@ -116,12 +116,11 @@ def test_a_warm_start_is_the_same_in_the_users_units(cart_pole_system, make):
     dynamics.update(states, actions, next_states)
     before = dynamics.predict(states, actions)
     model = dynamics._build(dynamics._data, quiet=True)
-    scale = model.outcome_transform.stdvs.clone()
     again = type(model)(
         dynamics.targets.inputs(states, actions),
         dynamics.targets.encode(states, next_states),
         physics=dynamics._physics,
-        outcome_transform=FixedStandardize.of(torch.zeros_like(scale), 3 * scale),
+        outcome_transform=Standardize(m=4),
         input_transform=model.input_transform.base,
     )
     warm_start(again, dynamics.model)
@@ -145,8 +144,9 @@ def test_kernels_of_the_users(cart_pole_system, make):
     dynamics = make("CKA", system.spec, system.crude, model_options=options)
     for seed in range(2):
         dynamics.update(*system.trial(seed))
-    assert isinstance(dynamics.model.rho_covar_module.base_kernel, MaternKernel)
-    assert isinstance(dynamics.model.delta_covar_module.base_kernel, MaternKernel)
+    assert dynamics.model.term_names == ("rho", "delta")
+    for term in dynamics.model.terms:
+        assert isinstance(term.kernel.base_kernel, MaternKernel)
     assert all(torch.equal(p, initial[name]) for name, p in module.named_parameters())
     assert dynamics.score(*system.trial(9)).rmse.isfinite().all()
 

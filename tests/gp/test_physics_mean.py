@@ -5,9 +5,8 @@ from unittest import TestCase
 import pytest
 import torch
 from gpytorch.test.base_mean_test_case import BaseMeanTestCase
-from torch import Size
 
-from gpadjust.gp import PhysicsColumn, PhysicsMean
+from gpadjust.gp import PhysicsMean
 
 
 class TestAsGPyTorchsMeans(BaseMeanTestCase, TestCase):
@@ -23,12 +22,6 @@ def test_values(uniform):
     X = uniform(3, 4, 2)
     mean = PhysicsMean(lambda X: X.square(), output=1)
     torch.testing.assert_close(mean(X), X[..., 1].square())
-
-
-def test_a_batch_reads_its_own_column(uniform):
-    X = uniform(6, 4)
-    column = PhysicsColumn(2, 2, Size([2]), scale=torch.tensor([[2.0], [3.0]], dtype=torch.float64))
-    torch.testing.assert_close(PhysicsMean(column)(X), torch.stack([X[:, 2] / 2, X[:, 3] / 3]))
 
 
 def test_parameters_of_the_physics_are_those_of_the_mean():

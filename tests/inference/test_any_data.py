@@ -15,10 +15,10 @@ BUILD = {
     "CKA": CKA,
     "PhysicsMeanGP": PhysicsMeanGP,
     "CKA, centred, rho mean": lambda *data, physics: CKA(
-        *data, physics=physics, center="mean", learn_rho_mean=True
+        *data, physics=physics, center="mean", rho_mean="learn"
     ),
     "CKA, both means": lambda *data, physics: CKA(
-        *data, physics=physics, learn_rho_mean=True, learn_delta_mean=True
+        *data, physics=physics, rho_mean="learn", delta_mean="learn"
     ),
 }
 
@@ -73,9 +73,13 @@ def problems(draw):
         Y[n:] = Y[: n // 2 + 1] + repeat[1]
     kind = draw(st.sampled_from(list(PHYSICS)))
     x_unit, y_unit = (draw(st.sampled_from([1.0, 1e-9, 1e9])) for _ in range(2))
+    several = n >= 6 and draw(st.booleans())
+    if several:  # a second output, which is missing in some rows
+        Y = torch.cat([Y, Y.flip(0) + X[:, :1]], -1)
+        Y[::3, 1] = torch.nan
 
     def physics(X):
-        return y_unit * PHYSICS[kind](X / x_unit)
+        return (y_unit * PHYSICS[kind](X / x_unit)).expand(*X.shape[:-1], 1 + several)
 
     Z = torch.cat([2 * torch.rand(4, d, dtype=torch.float64) - 0.5, X[:2]])
     return x_unit * X, y_unit * Y, physics, x_unit * Z
@@ -103,7 +107,7 @@ def check(kind, problem):
         assert mean.isfinite().all()
         assert (variance >= 0).all()
         # Of the size of targets and physics; or else, far from the data, known to be unsure.
-        size = max(Y.abs().max(), physics(X).abs().max(), physics(Z).abs().max())
+        size = max(Y.nan_to_num().abs().max(), physics(X).abs().max(), physics(Z).abs().max())
         assert (mean.abs() <= 1e3 * size + 10 * variance.sqrt()).all()
 
 

@@ -1,14 +1,20 @@
-"""The objective of the fit against GPyTorch's marginal likelihood."""
+"""The objective of the fit: GPyTorch's marginal likelihood, concentrated or not; its vectors."""
+
+import math
 
 import gpytorch
 import pytest
 import torch
 from gpytorch.kernels import RBFKernel, ScaleKernel
 from gpytorch.mlls import ExactMarginalLogLikelihood
-from gpytorch.priors import GammaPrior
+from gpytorch.priors import GammaPrior, LogNormalPrior
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.inference.objective import Objective
+from gpadjust.models import PaperRRA
+from gpadjust.models.hyperparameters import KINDS
 
 
 def crude(X):
@@ -24,119 +30,227 @@ class Gain(torch.nn.Module):
         return self.gain * crude(X)
 
 
+def with_prior(X, Y):
+    base = RBFKernel(batch_shape=torch.Size([2]), lengthscale_prior=LogNormalPrior(0.0, 1.0))
+    kernel = ScaleKernel(base, batch_shape=torch.Size([2])).double()
+    return CKA(X, Y, physics=crude, delta_covar_module=kernel)
+
+
 BUILD = {
     "ZeroMeanGP": ZeroMeanGP,
     "PhysicsMeanGP": lambda X, Y: PhysicsMeanGP(X, Y, physics=crude),
-    "BiasGP": lambda X, Y: BiasGP(X, Y, physics=crude),
     "ScaleGP": lambda X, Y: ScaleGP(X, Y, physics=crude),
     "CKA": lambda X, Y: CKA(X, Y, physics=crude),
-    "CKA-known-noise": lambda X, Y: CKA(X, Y, torch.full_like(Y, 0.01), physics=crude),
-    "CKA-learning": lambda X, Y: CKA(X, Y, physics=Gain()),
+    "known noise": lambda X, Y: CKA(X, Y, torch.full_like(Y, 0.01), physics=crude),
+    "learnt means": lambda X, Y: CKA(X, Y, physics=crude, rho_mean="learn", delta_mean="learn"),
+    "two physics": lambda X, Y: CKA(X, Y, physics=[crude, lambda X: X], rho_mean=[1.0, 0.5]),
+    "learnt physics": lambda X, Y: CKA(X, Y, physics=Gain()),
+    "prior": with_prior,
     "AR1": lambda X, Y: AR1(X, Y, physics=crude, bounds=torch.tensor([[0.0, 0], [1, 1]])),
     "RRA": lambda X, Y: RRA(X, Y, physics=crude, num_features=16),
-    "RRA-paper": lambda X, Y: RRA(X, Y, physics=crude, num_features=16, prior="paper"),
+    "PaperRRA": lambda X, Y: PaperRRA(X, Y, physics=crude, num_features=16),
 }
 
 
+@pytest.fixture
+def XY(uniform):
+    X = uniform(9, 2)
+    return X, 1.5 * crude(X) + X.flip(-1)
+
+
 @pytest.fixture(params=list(BUILD))
-def model(request, uniform):
+def model(request, XY):
     """Two outputs of two inputs."""
-    X = uniform(8, 2)
-    return BUILD[request.param](X, 1.5 * crude(X) + X.flip(-1))
+    return BUILD[request.param](*XY)
 
 
 def exact(model):
     """GPyTorch's negative log marginal likelihood, one number for each problem."""
     model.train()
     mll = ExactMarginalLogLikelihood(model.likelihood, model)
-    with gpytorch.settings.cholesky_jitter(double_value=0.0):
+    with gpytorch.settings.cholesky_jitter(double_value=0.0), torch.no_grad():
         value = mll(model(*model.train_inputs), model.train_targets, *model.train_inputs)
     return -value * model.train_targets.shape[-1]
 
 
-def neighbours(objective, k, spread=0.2):
+def neighbours(objective, k=3, spread=0.2):
     generator = torch.Generator().manual_seed(1)
-    current = objective.current()
-    noise = torch.randn(k, *current.shape[1:], generator=generator, dtype=torch.float64)
-    return current + spread * noise
+    current = objective.parameters.current()
+    return current + spread * torch.randn(
+        k, *current.shape[1:], generator=generator, dtype=torch.float64
+    )
+
+
+def assert_gradient(objective, vectors):
+    """By finite differences."""
+    values, gradient = objective.value_and_gradient(vectors)
+    torch.testing.assert_close(values, objective(vectors))
+    for i in range(vectors.shape[-1]):
+        step = torch.zeros_like(vectors)
+        step[..., i] = 1e-5
+        difference = (objective(vectors + step) - objective(vectors - step)) / 2e-5
+        torch.testing.assert_close(gradient[..., i], difference, rtol=1e-4, atol=1e-4)
 
 
 def test_it_is_gpytorchs_likelihood(model):
     objective = Objective(model, marginal=True)
-    settings = neighbours(objective, 3)
-    values = objective(settings).detach()
-    assert values.shape == (3, objective.num_problems)
-    for setting, value in zip(settings, values, strict=True):
-        objective.assign(setting)
-        expected = exact(model).detach()
-        if objective.num_problems == 1:
+    vectors = neighbours(objective)
+    values = objective(vectors)
+    assert values.shape == (3, objective.parameters.num_problems)
+    for vector, value in zip(vectors, values, strict=True):
+        objective.assign(vector)
+        expected = exact(model)
+        if objective.parameters.num_problems == 1:
             expected = expected.sum().reshape(1)
         torch.testing.assert_close(value, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_its_gradient_is_that_of_finite_differences(model):
-    objective = Objective(model, marginal=True)
-    settings = neighbours(objective, 2)
-    values, gradient = objective.value_and_gradient(settings)
-    torch.testing.assert_close(values, objective(settings).detach())
-    for i in range(objective.num_parameters):
-        step = torch.zeros_like(settings)
-        step[..., i] = 1e-5
-        difference = (objective(settings + step) - objective(settings - step)).detach() / 2e-5
-        torch.testing.assert_close(gradient[..., i], difference, rtol=1e-4, atol=1e-4)
+@pytest.mark.parametrize("marginal", [False, True])
+def test_its_gradient_is_that_of_finite_differences(model, marginal):
+    objective = Objective(model, marginal=marginal)
+    assert_gradient(objective, neighbours(objective, 2))
 
 
-def test_priors_are_added(uniform):
-    X = uniform(8, 2)
+@pytest.mark.parametrize("name", ["CKA", "learnt means", "known noise", "RRA", "learnt physics"])
+def test_missing_targets_are_those_of_models_without_them(name, XY):
+    X, Y = XY
+    Y = Y.clone()
+    Y[2, 0] = Y[5:7, 1] = torch.nan
+    options = {"physics": crude, "outcome_transform": None}
+    objective = Objective(CKA(X, Y, **options), marginal=True)
+    vectors = neighbours(objective)
+    for j in range(2):
+        rows = ~Y[:, j].isnan()
+        options["physics"] = lambda X, j=j: crude(X)[..., [j]]
+        single = CKA(X[rows], Y[rows][:, [j]], **options)
+        expected = Objective(single, marginal=True)(vectors[:, [j]])
+        torch.testing.assert_close(objective(vectors)[:, [j]], expected, rtol=1e-9, atol=1e-9)
+    objective = Objective(BUILD[name](X, Y))
+    assert_gradient(objective, neighbours(objective, 2))
+
+
+def test_rows_are_those_of_a_model_of_them(XY):
+    X, Y = XY
+    rows = torch.tensor([0, 2, 3, 6, 8])
+    options = {"physics": crude, "outcome_transform": None}
+    part = Objective(CKA(X, Y, **options), marginal=True, rows=rows)
+    alone = Objective(CKA(X[rows], Y[rows], **options), marginal=True)
+    vectors = neighbours(alone)
+    torch.testing.assert_close(part(vectors), alone(vectors), rtol=1e-9, atol=1e-9)
+
+
+def test_priors_are_added(XY):
+    X, Y = XY[0], XY[1][:, :1]
 
     def build(*prior):
         base = RBFKernel(ard_num_dims=2, lengthscale_prior=prior[0] if prior else None)
-        kernel = ScaleKernel(base, outputscale_prior=prior[1] if prior else None)
-        return CKA(
-            X,
-            crude(X)[:, :1] + X[:, 1:],
-            physics=lambda X: crude(X)[:, :1],
-            delta_covar_module=kernel.double(),
-        )
+        kernel = ScaleKernel(base, outputscale_prior=prior[1] if prior else None).double()
+        return CKA(X, Y, physics=lambda X: crude(X)[:, :1], delta_covar_module=kernel)
 
     priors = GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5)
     plain, penalised = Objective(build(), True), Objective(build(*priors), True)
-    settings = neighbours(plain, 3)
-    with torch.no_grad():
-        difference = penalised(settings) - plain(settings)
-    for setting, value in zip(settings, difference, strict=True):
-        penalised.assign(setting)
-        kernel = penalised.model.delta_covar_module
+    vectors = neighbours(plain)
+    difference = penalised(vectors) - plain(vectors)
+    for vector, value in zip(vectors, difference, strict=True):
+        penalised.assign(vector)
+        kernel = penalised.model.terms[1].kernel
         density = priors[0].log_prob(kernel.base_kernel.lengthscale).sum()
         density = density + priors[1].log_prob(kernel.outputscale).sum()
         torch.testing.assert_close(value, -density.detach().reshape(1))
-        expected = exact(penalised.model).detach().reshape(1)
-        torch.testing.assert_close(penalised(setting[None])[0].detach(), expected)
+        expected = exact(penalised.model).reshape(1)
+        torch.testing.assert_close(penalised(vector[None])[0], expected)
 
 
-def test_packing_is_undone(model):
-    objective = Objective(model, marginal=True)
-    settings = neighbours(objective, 3)
-    assert torch.equal(objective.flatten(objective.unflatten(settings)), settings)
-    objective.assign(settings[1])
-    assert torch.equal(objective.current()[0], settings[1])
-
-
-def test_a_covariance_that_is_not_positive_definite_is_infinitely_bad(uniform):
-    X = torch.zeros(6, 1, dtype=torch.float64)
-    X[1:] += uniform(5, 1)
-    model = CKA(X, crude(X), torch.full_like(X, 1e-6), physics=crude)
-    objective = Objective(model, marginal=True)
-    settings = objective.current().repeat(2, 1, 1)
-    settings[1] = 800.0
-    values, gradient = objective.value_and_gradient(settings)
+def test_a_covariance_that_is_not_positive_definite_is_infinitely_bad(XY):
+    X = XY[0][:, :1]
+    objective = Objective(CKA(X, crude(X), torch.full_like(X, 1e-6), physics=crude), marginal=True)
+    vectors = objective.parameters.current().repeat(2, 1, 1)
+    vectors[1] = 800.0
+    values, gradient = objective.value_and_gradient(vectors)
     assert values[0].isfinite()
-    assert values[1] == float("inf")
-    assert gradient[0].isfinite().all()
+    assert values[1] == math.inf
+    assert gradient.isfinite().all()
+    assert (gradient[1] == 0).all()
 
 
-def test_nothing_to_learn(uniform):
-    X = uniform(8, 2)
-    model = CKA(X, crude(X), physics=crude).requires_grad_(False)
-    with pytest.raises(ValueError, match="no learnable parameter"):
-        Objective(model, marginal=True)
+class TestConcentration:
+    @settings(max_examples=10, deadline=None, derandomize=True)
+    @given(
+        name=st.sampled_from(["CKA", "PhysicsMeanGP", "ZeroMeanGP", "learnt means"]),
+        seed=st.integers(0, 2**31),
+        factor=st.floats(1e-6, 1e6),
+    )
+    def test_a_common_factor_of_the_variances_makes_no_difference(self, name, seed, factor):
+        generator = torch.Generator().manual_seed(seed)
+        X = torch.rand(9, 2, generator=generator, dtype=torch.float64)
+        objective = Objective(BUILD[name](X, 1.5 * crude(X) + X.flip(-1)))
+        assert objective.concentrated
+        variances = objective.parameters.variances
+        point = objective.parameters.current()
+        moved = point + math.log(factor) * variances
+        torch.testing.assert_close(objective(moved), objective(point), rtol=1e-8, atol=1e-8)
+        _, gradient = objective.value_and_gradient(point)
+        along = (gradient * variances).sum(-1)
+        torch.testing.assert_close(along, torch.zeros_like(along), rtol=0, atol=1e-6)
+        ratio = objective.best_scale(point) / objective.best_scale(moved)
+        torch.testing.assert_close(ratio, torch.full_like(ratio, factor), rtol=1e-6, atol=0)
+
+    @pytest.mark.parametrize("name", ["known noise", "prior", "learnt physics"])
+    def test_it_is_not_for_models_with_a_scale_of_their_own(self, XY, name):
+        assert not Objective(BUILD[name](*XY)).concentrated
+
+    def test_it_is_the_marginal_likelihood_at_the_best_scale(self, XY):
+        model = BUILD["CKA"](*XY)
+        concentrated, marginal = Objective(model), Objective(model, marginal=True)
+        point, variances = concentrated.parameters.current(), concentrated.parameters.variances
+        best = point + variances * concentrated.best_scale(point).log().unsqueeze(-1)
+        torch.testing.assert_close(marginal(best), concentrated(point), rtol=1e-9, atol=1e-9)
+        for other in (-0.1, 0.1):
+            assert (marginal(best + other * variances) > marginal(best)).all()
+
+    @pytest.mark.parametrize("excess", [-0.5, 0.5, 3.0])
+    def test_as_far_as_the_noise_keeps_to_its_least_value(self, XY, excess):
+        model = BUILD["CKA"](*XY)
+        with torch.no_grad():
+            for term in model.terms:  # well conditioned without noise
+                term.kernel.base_kernel.raw_lengthscale.fill_(-2.5)
+            model.likelihood.noise_covar.raw_noise.fill_(-20.0)
+        objective, marginal = Objective(model), Objective(model, marginal=True)
+        parameters, point = objective.parameters, objective.parameters.current()
+        bound = parameters.lower - objective.best_scale(point).log().unsqueeze(-1) - excess
+        point = torch.where(parameters.noise > 0, bound, point)
+        assert_gradient(objective, point)
+        scale = objective.best_scale(point).log().unsqueeze(-1)
+        at_scale = point + parameters.variances * scale
+        torch.testing.assert_close(objective(point), marginal(at_scale), rtol=1e-9, atol=1e-9)
+        objective.assign(point[0])
+        floor = KINDS["noise"].bounds[0] * (XY[1] - crude(XY[0])).square().mean(0)
+        ratio = model.likelihood.noise.mT * model.outcome_transform.stdvs.square() / floor
+        expected = torch.full_like(ratio, math.exp(max(0.0, -excess)))
+        torch.testing.assert_close(ratio, expected, rtol=1e-6, atol=0)
+
+
+class TestVectors:
+    def test_packing_is_undone(self, model):
+        parameters = Objective(model).parameters
+        vectors = neighbours(Objective(model))
+        assert torch.equal(parameters.flatten(parameters.unflatten(vectors)), vectors)
+        parameters.assign(vectors[1])
+        torch.testing.assert_close(parameters.current()[0], vectors[1], rtol=1e-12, atol=1e-12)
+
+    def test_bounds_hold_the_start_and_the_draws(self, model):
+        with torch.no_grad():
+            for name, parameter in model.named_parameters():
+                if parameter.requires_grad:
+                    change = 30.0 * torch.randn_like(parameter)
+                    parameter += change.abs() if "noise" in name else change
+        parameters = Objective(model).parameters
+        drawn = parameters.draw(50, torch.Generator().manual_seed(0))
+        assert drawn.isfinite().all()
+        for vectors in (parameters.current(), drawn):
+            assert torch.equal(parameters.clipped(vectors), vectors)
+
+    def test_nothing_to_learn(self, XY):
+        model = CKA(*XY, physics=crude).requires_grad_(False)
+        with pytest.raises(ValueError, match="no learnable parameter"):
+            Objective(model, marginal=True)

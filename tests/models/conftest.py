@@ -74,11 +74,43 @@ def close():
 
     def close(actual, expected, tolerance=1e-8):
         assert actual.shape == expected.shape
+        size = expected.abs().max().item() if expected.numel() else 0.0
         torch.testing.assert_close(
-            actual, expected, rtol=tolerance, atol=tolerance * expected.abs().max().item()
+            actual.detach(), expected.detach(), rtol=tolerance, atol=tolerance * size
         )
 
     return close
+
+
+@pytest.fixture
+def same(close):
+    """Asserts that two models say the same at `Z`: joint, one by one, and of each term."""
+
+    def same(a, b, Z, tolerance=1e-8, outputs=slice(None)):
+        assert a.term_names == b.term_names
+        p, q = a.predict(Z), b.predict(Z)
+        close(p.mean, q.mean[..., outputs], tolerance)
+        close(p.variance, q.variance[..., outputs], tolerance)
+        for name in (None, *a.term_names):
+            p, q = (m.posterior(Z) if name is None else m.term(name, Z) for m in (a, b))
+            close(p.mean, q.mean[..., outputs], tolerance)
+            close(p.variance, q.variance[..., outputs], tolerance)
+            if outputs == slice(None):
+                p, q = (r.distribution.covariance_matrix for r in (p, q))
+                close(p, q, tolerance)
+
+    return same
+
+
+@pytest.fixture
+def kernel_of():
+    """`kernel_of(model, name)` is the kernel of a term."""
+
+    def kernel_of(model, name):
+        (kernel,) = (term.kernel for term in model.terms if term.name == name)
+        return kernel
+
+    return kernel_of
 
 
 @pytest.fixture
@@ -86,10 +118,7 @@ def rebuild(build):
     """A model on other data with the hyper-parameters and units of the one given."""
 
     def on(kind, model, X, Y, Yvar=None, **options):
-        low = {}
-        if kind == "AR1":
-            low = {"low_X": options.pop("low_X"), "low_Y": options.pop("low_Y")}
-        new = build(kind, X, Y, Yvar, **options, **low)
+        new = build(kind, X, Y, Yvar, **options)
         own = new.state_dict()
         state = {k: v for k, v in model.state_dict().items() if own[k].shape == v.shape}
         new.load_state_dict({**own, **state})

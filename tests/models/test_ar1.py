@@ -22,11 +22,10 @@ def ar1(levels, shuffle):
 
 
 @pytest.fixture
-def users_units(ar1, rbf):
+def users_units(ar1, rbf, kernel_of):
     """Kernels, rho and noises of the model in the user's units."""
     scale, shift = ar1.outcome_transform.stdvs.squeeze(), ar1.outcome_transform.means.squeeze()
-    low = ar1.covar_module.low_kernel.base_kernel
-    delta = ar1.covar_module.delta_kernel.base_kernel
+    low, delta = kernel_of(ar1, "low"), kernel_of(ar1, "delta")
     noise = ar1.likelihood.noise.detach() * scale**2
 
     def kernel(part):
@@ -39,8 +38,8 @@ def test_joint_co_kriging(ar1, users_units, levels, close, uniform):
     X, Y, low_X, low_Y = levels
     k_1, k_delta, rho, noise, shift = users_units
     Z = uniform(5, 2, high=2.0, seed=3)
-    high = rho**2 * k_1(X, X) + k_delta(X, X) + noise[1] * torch.eye(7)
-    low = k_1(low_X, low_X) + noise[0] * torch.eye(11)
+    high = rho**2 * k_1(X, X) + k_delta(X, X) + noise[1] * torch.eye(7, dtype=torch.float64)
+    low = k_1(low_X, low_X) + noise[0] * torch.eye(11, dtype=torch.float64)
     between = rho * k_1(low_X, X)
     K = torch.cat([torch.cat([low, between], 1), torch.cat([between.mT, high], 1)])
     cross = torch.cat([rho * k_1(Z, low_X), rho**2 * k_1(Z, X) + k_delta(Z, X)], dim=1)
@@ -54,7 +53,7 @@ def test_joint_co_kriging(ar1, users_units, levels, close, uniform):
     close(noisy.detach(), covariance.diagonal() + noise[1])
 
 
-def test_recursive_co_kriging_on_nested_designs(shuffle, rbf, close, uniform, crude_physics):
+def test_recursive_co_kriging_on_nested_designs(rbf, close, uniform, crude_physics, kernel_of):
     """Le Gratiet and Garnier's recursion equals the joint model when there is no noise."""
     low_X = uniform(12, 2, high=2.0, seed=2)
     X = low_X[:6]
@@ -62,13 +61,10 @@ def test_recursive_co_kriging_on_nested_designs(shuffle, rbf, close, uniform, cr
     Y = 1.7 * low_Y[:6] + X.sum(-1, keepdim=True).sin()
     model = AR1(X, Y, low_X=low_X, low_Y=low_Y, outcome_transform=None)
     with torch.no_grad():
-        for kernel, length in (
-            (model.covar_module.low_kernel.base_kernel, 0.5),
-            (model.covar_module.delta_kernel.base_kernel, 0.9),
-        ):
-            kernel.base_kernel.raw_lengthscale.fill_(np.log(length))
-            kernel.raw_outputscale.fill_(0.0)
-        model.covar_module.rho.fill_(1.4)
+        for name, length in (("low", 0.5), ("delta", 0.9)):
+            kernel_of(model, name).base_kernel.raw_lengthscale.fill_(np.log(length))
+            kernel_of(model, name).raw_outputscale.fill_(0.0)
+        model.rho_constant.fill_(1.4)
         model.likelihood.noise_covar.raw_noise.fill_(np.log(1e-12))
     k_1, k_delta = rbf(0.5, 1.0), rbf(0.9, 1.0)
     Z = uniform(5, 2, high=2.0, seed=3)
@@ -131,13 +127,13 @@ def test_low_values_are_computed_where_only_inputs_are_given(levels, crude_physi
     torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
 
 
-def test_without_bias_and_noise_it_follows_the_scaled_low_level(levels, uniform, crude_physics):
+def test_without_bias_and_noise_it_follows_the_scaled_low_level(levels, crude_physics, kernel_of):
     X, _, low_X, low_Y = levels
     Y = 2 * crude_physics(X)[:, :1]
     model = AR1(X, Y, low_X=low_X, low_Y=low_Y, outcome_transform=None)
     with torch.no_grad():
-        model.covar_module.rho.fill_(2.0)
-        model.covar_module.delta_kernel.base_kernel.raw_outputscale.fill_(np.log(1e-9))
+        model.rho_constant.fill_(2.0)
+        kernel_of(model, "delta").raw_outputscale.fill_(np.log(1e-9))
         model.likelihood.noise_covar.raw_noise.fill_(np.log(1e-9))
     posterior = model.eval().posterior(low_X)
     torch.testing.assert_close(posterior.mean, 2 * low_Y, rtol=1e-3, atol=1e-3)

@@ -5,89 +5,131 @@ import torch
 from botorch.models.transforms import Normalize
 from botorch.sampling import SobolQMCNormalSampler
 
+from gpadjust.models.cholesky_strategy import batched_product
 
-@pytest.mark.parametrize("normalize", [False, True], ids=["raw", "normalize"])
-@pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
+
+def sampler(num_fantasies):
+    return SobolQMCNormalSampler(torch.Size([num_fantasies]), seed=0)
+
+
+@pytest.fixture
+def low_level(kind, uniform, crude_physics, num_outputs):
+    if kind != "AR1":
+        return {}
+    low_X = uniform(10, 2, high=2.0, seed=8)
+    return {"low_X": low_X, "low_Y": crude_physics(low_X)[:, :num_outputs]}
+
+
+@pytest.mark.parametrize("sizes", [(3,), (1, 1, 1), (2, 1)], ids=str)
+@pytest.mark.parametrize("setting", ["learnt noise", "known noise"])
 def test_conditioning_is_rebuilding(
-    data, build, rebuild, kind, num_outputs, shuffle, uniform, crude_physics, known_noise, normalize
+    data, build, rebuild, kind, num_outputs, shuffle, uniform, same, low_level, setting, sizes
 ):
     X, Y = data(num_outputs=num_outputs, n=12)
-    options = {}
-    if kind == "AR1":
-        low_X = uniform(10, 2, high=2.0, seed=8)
-        options = {"low_X": low_X, "low_Y": crude_physics(low_X)[:, :num_outputs]}
-    if normalize:
+    options, Yvar = {**low_level}, None
+    if setting == "known noise":
         bounds = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
         options["input_transform"] = Normalize(2, bounds=bounds)
-    if known_noise:
         options["outcome_transform"] = None
-    Yvar = uniform(*Y.shape, low=0.01, high=0.1, seed=2) if known_noise else None
-    first = None if Yvar is None else Yvar[:9]
-    model = shuffle(build(kind, X[:9], Y[:9], first, **options))
-    kwargs = {} if Yvar is None else {"noise": Yvar[9:]}
-    conditioned = model.condition_on_observations(X[9:], Y[9:], **kwargs)
-    expected = rebuild(kind, model, X, Y, Yvar, **options)
-    Z = uniform(5, 2, high=2.0, seed=4)
-    for name in ("posterior", "rho", "delta"):
-        if callable(getattr(model, name, None)):
-            a, b = getattr(conditioned, name)(Z), getattr(expected, name)(Z)
-            torch.testing.assert_close(a.mean, b.mean, rtol=1e-6, atol=1e-7)
-            torch.testing.assert_close(a.variance, b.variance, rtol=1e-6, atol=1e-7)
-
-
-def test_the_model_itself_stays(data, build, kind, num_outputs, uniform):
-    X, Y = data(num_outputs=num_outputs, n=12)
-    model = build(kind, X[:9], Y[:9]).eval()
-    Z = uniform(5, 2, seed=4)
-    before = model.posterior(Z).mean.detach()
-    model.condition_on_observations(X[9:], Y[9:] + 1)
-    torch.testing.assert_close(model.posterior(Z).mean.detach(), before)
-
-
-def test_conditioning_twice(data, build, kind, num_outputs, shuffle, uniform):
-    X, Y = data(num_outputs=num_outputs, n=12)
-    model = shuffle(build(kind, X[:8], Y[:8]))
-    once = model.condition_on_observations(X[8:], Y[8:])
-    twice = model.condition_on_observations(X[8:10], Y[8:10])
-    twice = twice.condition_on_observations(X[10:], Y[10:])
-    Z = uniform(5, 2, seed=4)
-    torch.testing.assert_close(
-        once.posterior(Z).mean, twice.posterior(Z).mean, rtol=1e-6, atol=1e-7
-    )
+        Yvar = uniform(*Y.shape, low=0.01, high=0.1, seed=2)
+    model = shuffle(build(kind, X[:9], Y[:9], Yvar if Yvar is None else Yvar[:9], **options))
+    conditioned, n, Z = model, 9, uniform(5, 2, high=2.0, seed=4)
+    before = model.posterior(Z).mean
+    for size in sizes:
+        new = slice(n, n := n + size)
+        noise = {} if Yvar is None else {"noise": Yvar[new]}
+        conditioned = conditioned.condition_on_observations(X[new], Y[new], **noise)
+    same(conditioned, rebuild(kind, model, X, Y, Yvar, **options), Z, 1e-7)
+    assert torch.equal(model.posterior(Z).mean, before)
 
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
-def test_fantasies(data, build, kind, num_outputs, uniform, known_noise):
+def test_fantasies(data, build, kind, num_outputs, uniform, close, known_noise):
     X, Y = data(num_outputs=num_outputs)
     model = build(kind, X, Y, 0.01 * torch.ones_like(Y) if known_noise else None)
     new_X, Z = uniform(4, 2, 2, high=2.0, seed=3), uniform(5, 2, high=2.0, seed=4)
-    fantasy = model.fantasize(new_X, SobolQMCNormalSampler(torch.Size([6]), seed=0))
-    posterior = fantasy.posterior(Z)
-    assert posterior.mean.shape == (6, 4, 5, num_outputs)
+    fantasy = model.fantasize(new_X, sampler(6))
+    prediction, posterior = fantasy.predict(Z), fantasy.posterior(Z)
+    assert posterior.mean.shape == prediction.mean.shape == (6, 4, 5, num_outputs)
     assert posterior.mean.std(0).max() > 1e-6
-    at_new = fantasy.posterior(new_X).variance
-    assert (at_new < model.posterior(new_X).variance + 1e-9).all()
+    close(prediction.mean, posterior.mean)
+    close(prediction.variance, posterior.variance.expand(6, 4, 5, num_outputs))
+    assert (fantasy.posterior(new_X).variance < model.posterior(new_X).variance + 1e-9).all()
+    more_Y = torch.zeros(6, 4, 1, num_outputs, dtype=torch.float64)
+    noise = {"noise": more_Y + 0.01} if known_noise else {}
+    more = fantasy.condition_on_observations(Z[:1].expand(6, 4, 1, 2), more_Y, **noise)
+    assert more.predict(Z).mean.shape == (6, 4, 5, num_outputs)
 
 
 def test_fantasies_average_to_the_model(data, build, kind, uniform):
-    X, Y = data()
-    model = build(kind, X, Y)
+    model = build(kind, *data())
     if kind == "RRA-paper":
         pytest.skip("its covariance is not that of its own update")
     new_X, Z = uniform(1, 1, 2, high=2.0, seed=3), uniform(5, 2, high=2.0, seed=4)
-    fantasy = model.fantasize(new_X, SobolQMCNormalSampler(torch.Size([2048]), seed=0))
-    average = fantasy.posterior(Z).mean.mean(0)
+    average = model.fantasize(new_X, sampler(2048)).posterior(Z).mean.mean(0)
     torch.testing.assert_close(average, model.posterior(Z).mean[None], rtol=1e-2, atol=1e-2)
 
 
-def test_a_batch_of_observations(data, build, kind, num_outputs, uniform):
-    X, Y = data(num_outputs=num_outputs)
-    model = build(kind, X, Y).eval()
-    new_X = uniform(3, 2, 2, high=2.0, seed=3)
+def test_fantasies_share_the_base(data, build, num_outputs, uniform):
+    model = build("CKA", *data(num_outputs=num_outputs))
+    fantasy = model.fantasize(uniform(4, 1, 2), sampler(3)).prediction_strategy.factors()
+    base = model.prediction_strategy.factors().base
+    assert fantasy.base is base or fantasy.base.data_ptr() == base.data_ptr()
+    outputs = () if num_outputs == 1 else (num_outputs,)
+    assert fantasy.rows.shape == (4, *outputs, 1, 10)
+    assert fantasy.alpha.shape == (3, 4, *outputs, 10)
+
+
+# BoTorch warns about the shapes that it makes itself.
+@pytest.mark.filterwarnings("ignore:Non-strict enforcement")
+def test_no_new_points(data, build, kind, num_outputs, uniform, close):
+    model, Z = build(kind, *data(num_outputs=num_outputs)), uniform(5, 2)
+    fantasy = model.fantasize(torch.empty(4, 0, 2, dtype=torch.float64), sampler(3))
+    close(fantasy.predict(Z).mean, model.predict(Z).mean.expand(3, 4, 5, num_outputs))
+
+
+def test_a_batch_of_observations(data, build, kind, num_outputs, uniform, close):
+    model = build(kind, *data(num_outputs=num_outputs)).eval()
+    new_X, Z = uniform(3, 2, 2, high=2.0, seed=3), uniform(5, 2, high=2.0, seed=4)
     new_Y = 4 + uniform(3, 2, num_outputs, seed=5)
-    Z = uniform(5, 2, high=2.0, seed=4)
     batch = model.condition_on_observations(new_X, new_Y).posterior(Z)
     assert batch.mean.shape == (3, 5, num_outputs)
     for i in range(3):
         single = model.condition_on_observations(new_X[i], new_Y[i]).posterior(Z)
-        torch.testing.assert_close(batch.mean[i], single.mean, rtol=1e-7, atol=1e-8)
+        close(batch.mean[i], single.mean)
+
+
+def test_gradient_to_the_new_inputs(data, build, kind, num_outputs, uniform):
+    X, Y = data(num_outputs=num_outputs)
+    model, Z = build(kind, X, Y).requires_grad_(False).eval(), uniform(2, 2, high=2.0)
+
+    def predict(new_X):
+        return model.condition_on_observations(new_X, Y[:2]).predict(Z)
+
+    new_X = uniform(2, 2, high=2.0, seed=7).requires_grad_()
+    assert torch.autograd.gradcheck(predict, new_X, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("lead", [(3,), (3, 2), ()], ids=str)
+@pytest.mark.parametrize("batch", [(), (4,), (5, 4)], ids=str)
+def test_a_batched_product(uniform, lead, batch):
+    left, right = uniform(*lead, *batch, 2, 6), uniform(*batch, 6, 7, seed=1)
+    torch.testing.assert_close(batched_product(left, right), left @ right)
+
+
+def test_bad_observations(data, build, kind):
+    X, Y = data()
+    model = build(kind, X, Y)
+    for bad, found in ((float("inf"), "to be finite"), (float("nan"), "to hold an observation")):
+        wrong = torch.tensor([[0.0], [bad]], dtype=torch.float64)
+        with pytest.raises(ValueError, match=rf"Expected Y {found}.*row 1"):
+            model.condition_on_observations(X[:2], wrong)
+        with pytest.raises(ValueError, match=r"Expected X to be finite.*row 1"):
+            model.condition_on_observations(wrong.expand(2, 2), Y[:2])
+    with pytest.raises(ValueError, match="with a row for each"):
+        model.condition_on_observations(X[:2], Y[:3])
+    with pytest.raises(ValueError, match="Expected Y with 1 columns"):
+        model.condition_on_observations(X[:2], Y[:2].expand(2, 2))
+    known = build(kind, X, Y, 0.1)
+    with pytest.raises(ValueError, match="pass `noise`"):
+        known.condition_on_observations(X[:1], Y[:1])

@@ -1,36 +1,39 @@
 """Models from BoTorch's datasets."""
 
+import inspect
+
+import pytest
 import torch
 from botorch.utils.datasets import SupervisedDataset
 
 
-def test_a_model_from_a_dataset(data, build, kind, num_outputs, crude_physics, uniform):
+@pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
+def test_a_model_from_a_dataset(data, build, kind, num_outputs, crude_physics, uniform, known_noise):
     X, Y = data(num_outputs=num_outputs)
-    direct = build(kind, X, Y).eval()
+    Yvar = uniform(*Y.shape, low=0.01, high=0.1) if known_noise else None
     dataset = SupervisedDataset(
-        X, Y, feature_names=["a", "b"], outcome_names=[f"y{i}" for i in range(num_outputs)]
+        X, Y, feature_names=["a", "b"], outcome_names=["y", "z"][:num_outputs], Yvar=Yvar
     )
     options = {}
     if kind != "ZeroMeanGP":
         options["physics"] = lambda X: crude_physics(X)[:, :num_outputs]
-    arguments = type(direct).construct_inputs(dataset, **options)
     if kind == "AR1":
-        arguments |= {"bounds": torch.tensor([[0.0, 0.0], [2.0, 2.0]]), "num_low": 12}
+        options |= {"bounds": torch.tensor([[0.0, 0.0], [2.0, 2.0]]), "num_low": 12}
     if kind.startswith("RRA"):
-        arguments["num_features"] = 24
-    if kind == "RRA-paper":
-        arguments["prior"] = "paper"
+        options["num_features"] = 24
+    direct = build(kind, X, Y, Yvar).eval()
+    model = type(direct)(**type(direct).construct_inputs(dataset, **options)).eval()
     Z = uniform(4, 2)
-    model = type(direct)(**arguments).eval()
-    torch.testing.assert_close(model.posterior(Z).mean, direct.posterior(Z).mean)
+    p, q = model.posterior(Z), direct.posterior(Z)
+    torch.testing.assert_close(p.mean, q.mean)
+    torch.testing.assert_close(p.variance, q.variance)
 
 
-def test_known_noise_is_passed_on(data, build, crude_physics, uniform):
+def test_every_option_is_taken(data, build, kind):
     X, Y = data()
-    Yvar = uniform(*Y.shape, low=0.01, high=0.1)
-    direct = build("CKA", X, Y, Yvar).eval()
-    dataset = SupervisedDataset(X, Y, feature_names=["a", "b"], outcome_names=["y"], Yvar=Yvar)
-    arguments = type(direct).construct_inputs(dataset, physics=lambda X: crude_physics(X)[:, :1])
-    model = type(direct)(**arguments).eval()
-    Z = uniform(4, 2)
-    torch.testing.assert_close(model.posterior(Z).variance, direct.posterior(Z).variance)
+    model, names = build(kind, X, Y), {"feature_names": ["a", "b"], "outcome_names": ["y"]}
+    dataset = SupervisedDataset(X, Y, **names)
+    data_names = {"self", "train_X", "train_Y", "train_Yvar"}
+    options = dict.fromkeys(inspect.signature(type(model)).parameters.keys() - data_names)
+    arguments = type(model).construct_inputs(dataset, **options)
+    assert arguments.keys() == options.keys() | {"train_X", "train_Y"}

@@ -29,8 +29,6 @@ def test_the_likelihood_rises(data, build, costly_kind, num_outputs, batch_shape
 
 @pytest.mark.parametrize("transform", ["none", "standardize"])
 def test_with_transforms_and_known_noise(data, build, costly_kind, transform):
-    if costly_kind == "RRA-paper" and transform == "standardize":
-        pytest.skip("is refused")
     X, Y = data()
     outcome = Standardize(1) if transform == "standardize" else None
     model = build(

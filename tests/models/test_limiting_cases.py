@@ -18,11 +18,13 @@ def copy_parameters(source, target):
             parameter.copy_(values[name])
 
 
-def give(model, *, rho=None, delta=None, likelihood):
-    for kernel, source in ((model.rho_covar_module, rho), (model.delta_covar_module, delta)):
-        if source is not None:
-            copy_parameters(source, kernel)
-    copy_parameters(likelihood, model.likelihood)
+def give(model, source, **terms):
+    """Give a model the noise of another one, and some of its kernels: the target's name first."""
+    kernels = {term.name: term.kernel for term in source.terms}
+    for term in model.terms:
+        if term.name in terms:
+            copy_parameters(kernels[terms[term.name]], term.kernel)
+    copy_parameters(source.likelihood, model.likelihood)
     return model.eval()
 
 
@@ -31,10 +33,10 @@ def switch_off(kernel):
         kernel.raw_outputscale.fill_(torch.tensor(NOTHING).log())
 
 
-def same(close, a, b, Z, tolerance=1e-8):
+def agree(close, a, b, Z, tolerance=1e-8):
     a, b = a.posterior(Z), b.posterior(Z)
-    close(a.mean.detach(), b.mean.detach(), tolerance)
-    close(a.variance.detach(), b.variance.detach(), tolerance)
+    close(a.mean, b.mean, tolerance)
+    close(a.variance, b.variance, tolerance)
 
 
 @pytest.fixture
@@ -45,32 +47,24 @@ def Z(uniform):
 def test_without_physics_it_is_a_gp_with_deltas_kernel(data, shuffle, close, Z):
     X, Y = data(num_outputs=2)
     model = shuffle(CKA(X, Y, physics=lambda X: X.new_zeros(len(X), 2)))
-    plain = ZeroMeanGP(X, Y)
-    copy_parameters(model.delta_covar_module, plain.covar_module)
-    copy_parameters(model.likelihood, plain.likelihood)
-    same(close, model, plain.eval(), Z)
+    agree(close, model, give(ZeroMeanGP(X, Y), model, f="delta"), Z)
 
 
-def test_without_rho_it_is_the_physics_mean_gp(data, build, shuffle, close, Z):
+def test_without_rho_it_is_the_physics_mean_gp(data, build, shuffle, close, kernel_of, Z):
     X, Y = data(num_outputs=2)
-    model = build("CKA", X, Y)
-    shuffle(model)
-    switch_off(model.rho_covar_module)
-    mean_gp = build("PhysicsMeanGP", X, Y)
-    give(mean_gp, delta=model.delta_covar_module, likelihood=model.likelihood)
-    same(close, model, mean_gp, Z)
+    model = shuffle(build("CKA", X, Y))
+    switch_off(kernel_of(model, "rho"))
+    agree(close, model, give(build("PhysicsMeanGP", X, Y), model, delta="delta"), Z)
 
 
-def test_without_delta_it_is_the_scale_gp(data, build, shuffle, close, Z):
+def test_without_delta_it_is_the_scale_gp(data, build, shuffle, close, kernel_of, Z):
     X, Y = data(num_outputs=2)
-    model = build("CKA", X, Y)
-    shuffle(model)
-    switch_off(model.delta_covar_module)
-    scale_gp = build("ScaleGP", X, Y)
-    give(scale_gp, rho=model.rho_covar_module, likelihood=model.likelihood)
-    same(close, model, scale_gp, Z)
-    close(model.rho(Z).mean.detach(), scale_gp.rho(Z).mean.detach())
-    close(model.rho(Z).variance.detach(), scale_gp.rho(Z).variance.detach())
+    model = shuffle(build("CKA", X, Y))
+    switch_off(kernel_of(model, "delta"))
+    scale_gp = give(build("ScaleGP", X, Y), model, rho="rho")
+    agree(close, model, scale_gp, Z)
+    close(model.rho(Z).mean, scale_gp.rho(Z).mean)
+    close(model.rho(Z).variance, scale_gp.rho(Z).variance)
 
 
 @pytest.mark.parametrize("transform", [None, Standardize(1)], ids=["none", "standardize"])
@@ -100,27 +94,24 @@ def test_the_prior_mean_is_the_physics(
         options["input_transform"] = Normalize(2)
     model = build(kind, X, Y, **options).eval()
     with gpytorch.settings.prior_mode():
-        mean = model.posterior(Z).mean.detach()
-    close(mean, crude_physics(Z)[:, :num_outputs], 1e-12)
+        prior = model(model.model_inputs(Z)).mean.reshape(num_outputs, 6).mT
+    if transform != "none":
+        prior = model.outcome_transform.untransform(prior)[0]
+    close(prior, crude_physics(Z)[:, :num_outputs], 1e-12)
 
 
-def test_bias_gp_physics_mean_gp_and_gp_of_the_residual_are_one(
+def test_the_physics_mean_gp_is_a_gp_of_the_residual(
     data, build, shuffle, close, crude_physics, Z, num_outputs
 ):
+    assert BiasGP is PhysicsMeanGP
     X, Y = data(num_outputs=num_outputs)
-    bias = shuffle(build("BiasGP", X, Y))
-    mean_gp = build("PhysicsMeanGP", X, Y)
-    give(mean_gp, delta=bias.delta_covar_module, likelihood=bias.likelihood)
+    model = shuffle(build("PhysicsMeanGP", X, Y))
     residual = ZeroMeanGP(X, Y - crude_physics(X)[:, :num_outputs])
-    copy_parameters(bias.delta_covar_module, residual.covar_module)
-    copy_parameters(bias.likelihood, residual.likelihood)
-    posterior = residual.eval().posterior(Z)
+    posterior = give(residual, model, f="delta").posterior(Z)
     f_p = crude_physics(Z)[:, :num_outputs]
-    for model in (bias, mean_gp):
-        close(model.posterior(Z).mean.detach(), f_p + posterior.mean.detach())
-        close(model.posterior(Z).variance.detach(), posterior.variance.detach())
-    close(bias.delta(Z).mean.detach(), posterior.mean.detach())
-    close(bias.delta(Z).variance.detach(), posterior.variance.detach())
+    for mean, ours in ((posterior.mean + f_p, model.posterior(Z)), (posterior.mean, model.delta(Z))):
+        close(ours.mean, mean)
+        close(ours.variance, posterior.variance)
 
 
 def test_rra_tends_to_cka_as_features_grow(data, build, shuffle, Z):
@@ -132,40 +123,35 @@ def test_rra_tends_to_cka_as_features_grow(data, build, shuffle, Z):
         errors = []
         for seed in range(4):
             rra = build("RRA", X, Y, num_features=num_features, seed=seed)
-            give(
-                rra,
-                rho=cka.rho_covar_module,
-                delta=cka.delta_covar_module,
-                likelihood=cka.likelihood,
-            )
-            posterior = rra.posterior(Z)
+            posterior = give(rra, cka, rho="rho", delta="delta").posterior(Z)
             mean = (posterior.mean - expected.mean).abs().mean()
             sd = (posterior.variance.sqrt() - expected.variance.sqrt()).abs().mean()
             errors.append(torch.stack([mean, sd]).detach())
         return torch.stack(errors).mean(0)
 
-    few, many = error(50), error(20_000)
-    assert (many < 0.2 * few).all()
-    assert (many < 0.02 * Y.std()).all()
+    few, many = error(20), error(500)
+    assert (many < 0.35 * few).all()
+    assert (many < 0.1 * Y.std()).all()
 
 
-def test_standardised_is_raw_with_matched_hyper_parameters(data, build, shuffle, close, kind, Z):
+def test_standardised_is_raw_with_matched_hyper_parameters(
+    data, build, shuffle, close, kind, kernel_of, Z
+):
     if kind in ("AR1", "ZeroMeanGP", "RRA-paper"):
         pytest.skip("Standardize shifts its zero mean, or is refused")
     X, Y = data()
     model = shuffle(build(kind, X, Y, outcome_transform=Standardize(1)))
     raw = build(kind, X, Y, outcome_transform=None)
-    copy_parameters(model, raw)
+    give(raw, model, **{name: name for name in model.term_names})
     squared = model.outcome_transform.stdvs.square().log().squeeze()
     with torch.no_grad():
-        for kernel in (getattr(raw, "delta_covar_module", None), raw.likelihood.noise_covar):
-            if kernel is not None:
-                raw_parameter = getattr(kernel, "raw_outputscale", getattr(kernel, "raw_noise", 0))
-                raw_parameter += squared
-    same(close, model, raw.eval(), Z)
+        raw.likelihood.noise_covar.raw_noise += squared
+        if "delta" in raw.term_names:
+            kernel_of(raw, "delta").raw_outputscale += squared
+    agree(close, model, raw.eval(), Z)
 
 
-@pytest.mark.parametrize("cls", [PhysicsMeanGP, BiasGP, ScaleGP, CKA, RRA])
+@pytest.mark.parametrize("cls", [PhysicsMeanGP, ScaleGP, CKA, RRA])
 def test_a_perfect_physics_is_left_alone(data, close, Z, cls):
     X, _ = data()
 
@@ -174,7 +160,7 @@ def test_a_perfect_physics_is_left_alone(data, close, Z, cls):
 
     model = cls(X, physics(X), physics=physics).eval()
     close(model.posterior(Z).mean.detach(), physics(Z), 1e-12)
-    if hasattr(model, "rho"):
+    if "rho" in model.term_names:
         close(model.rho(Z).mean.detach(), torch.ones(6, 1, dtype=torch.float64), 1e-9)
-    if hasattr(model, "delta"):
+    if "delta" in model.term_names:
         assert model.delta(Z).mean.abs().max() < 1e-9

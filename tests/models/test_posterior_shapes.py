@@ -7,12 +7,11 @@ from botorch.models.transforms import Normalize, Standardize
 
 
 @pytest.fixture(params=["default", "raw units", "standardize and normalize"])
-def options(request, kind, num_outputs):
+def options(request, num_outputs):
     """Options of a model, as a function of its batch shape."""
     if request.param == "standardize and normalize":
-        outcome = None if kind == "RRA-paper" else Standardize(num_outputs)
         return lambda batch_shape: {
-            "outcome_transform": outcome and Standardize(num_outputs, batch_shape=batch_shape),
+            "outcome_transform": Standardize(num_outputs, batch_shape=batch_shape),
             "input_transform": Normalize(2),
         }
     return lambda batch_shape: {"outcome_transform": None} if request.param == "raw units" else {}
@@ -24,6 +23,7 @@ def test_posterior(data, build, uniform, kind, num_outputs, batch_shape, options
     X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
     Yvar = 0.01 * torch.ones_like(Y) if known_noise else None
     model = build(kind, X, Y, Yvar, **options(torch.Size(batch_shape)))
+    assert isinstance(model, SingleTaskGP)
     assert model.num_outputs == num_outputs
     assert model.batch_shape == batch_shape
     for leading in ((), (5, *batch_shape), (2, 5, *batch_shape)):
@@ -49,10 +49,6 @@ def test_a_batched_input_transform(data, build, uniform, kind):
     Z = uniform(4, 2, high=2.0, seed=3)
     one_by_one = torch.stack([model.posterior(Z.expand(3, 4, 2)).mean[i] for i in range(3)])
     torch.testing.assert_close(model.posterior(Z).mean, one_by_one)
-
-
-def test_is_a_single_task_gp(data, build, kind):
-    assert isinstance(build(kind, *data()), SingleTaskGP)
 
 
 def test_output_indices(data, build, kind, uniform):
@@ -82,19 +78,17 @@ def test_batched_inputs_are_predicted_apart(data, build, kind, num_outputs, unif
         torch.testing.assert_close(batch.variance[i], single.variance)
 
 
-@pytest.mark.parametrize("name", ["rho", "delta"])
 @pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])
-def test_rho_and_delta(data, build, kind, num_outputs, batch_shape, uniform, name):
-    if kind == "AR1":
-        pytest.skip("rho is a constant there")
+def test_terms(data, build, kind, num_outputs, batch_shape, uniform):
     X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
     model = build(kind, X, Y)
-    if not hasattr(model, name):
-        pytest.skip("has no such adjustment")
-    for leading in ((), (5, *batch_shape)):
-        posterior = getattr(model, name)(uniform(*leading, 4, 2))
-        expected = (*(leading or batch_shape), 4, num_outputs)
-        assert posterior.mean.shape == posterior.variance.shape == expected
+    for name in model.term_names:
+        for leading in ((), (5, *batch_shape)):
+            posterior = model.term(name, uniform(*leading, 4, 2))
+            expected = (*(leading or batch_shape), 4, num_outputs)
+            assert posterior.mean.shape == posterior.variance.shape == expected
+    with pytest.raises(ValueError, match="has no unknown term 'gamma'; it has '"):
+        model.term("gamma", X)
 
 
 def test_the_data_are_met_where_the_noise_is_small(data, build, kind, num_outputs):

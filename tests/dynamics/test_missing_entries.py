@@ -1,0 +1,157 @@
+"""Transitions of which some entries of the next states were not measured."""
+
+import math
+
+import pytest
+import torch
+
+from gpadjust.dynamics import CKADynamics, GPDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics.refitting import search_rows
+
+pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+
+
+@pytest.fixture
+def holed(cart_pole_system):
+    """A trial without angles in two rows, and without all but the position in one."""
+    states, actions, next_states = (t.clone() for t in cart_pole_system.trial(0))
+    next_states[[2, 9], 1] = math.nan
+    next_states[4, 1:] = math.nan
+    return states, actions, next_states
+
+
+def assert_same(found, expected, columns=slice(None), **tolerance):
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one[..., columns], other[..., columns], **tolerance)
+
+
+@pytest.mark.parametrize("target", ["difference", "absolute"])
+def test_targets_of_missing_entries_are_missing(cart_pole_system, make, holed, target):
+    targets = make("CKA", cart_pole_system.spec, cart_pole_system.crude, target=target).targets
+    Y = targets.encode(holed[0], holed[2])
+    assert torch.equal(Y.isnan(), holed[2].isnan())
+
+
+def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, kind, holed):
+    system, test = cart_pole_system, cart_pole_system.trial(9)[:2]
+    dynamics = make(kind, system.spec, system.crude)
+    dynamics.update(*holed)
+    for column in range(4):
+        known = ~holed[2][:, column].isnan()
+        states, actions, next_states = (t[known] for t in holed)
+        # What else these rows hold does not count: outputs are independent.
+        filled = system.truth(torch.cat([states, actions], -1)).where(
+            next_states.isnan(), next_states
+        )
+        alone = make(kind, system.spec, system.crude)
+        alone.fit(states, actions, filled)
+        alone.load_state_dict({**alone.state_dict(), "model": dynamics.state_dict()["model"]})
+        assert_same(alone.predict(*test), dynamics.predict(*test), column, rtol=1e-4, atol=1e-7)
+
+
+def test_learning_goes_on(cart_pole_system, make, holed):
+    system, test = cart_pole_system, cart_pole_system.trial(9)
+    dynamics, other = (make("CKA", system.spec, system.crude) for _ in range(2))
+    dynamics.update(*system.trial(1))
+    before = dynamics.score(*test).rmse
+    dynamics.update(*holed)
+    assert (dynamics.score(*test).rmse < before).all()
+    dynamics.condition(*holed)
+    assert dynamics.num_transitions == 75
+    other.load_state_dict(dynamics.state_dict())
+    assert_same(other.predict(*test[:2]), dynamics.predict(*test[:2]))
+
+
+def test_conditioning_skips_what_is_missing(cart_pole_system, make, holed):
+    system, test = cart_pole_system, cart_pole_system.trial(9)[:2]
+    dynamics, other = (make("CKA", system.spec, system.crude) for _ in range(2))
+    dynamics.update(*system.trial(1))
+    other.load_state_dict(dynamics.state_dict())
+    dynamics.condition(*(t[4:5] for t in holed))
+    other.condition(*(t[4:5] for t in system.trial(0)))
+    assert_same(dynamics.predict(*test), other.predict(*test), 0)
+    before = make("CKA", system.spec, system.crude)
+    before.update(*system.trial(1))
+    assert_same(dynamics.predict(*test), before.predict(*test), slice(1, None))
+
+
+def test_scores_are_over_what_was_measured(cart_pole_system, make, holed):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    dynamics.update(*system.trial(1))
+    scores = dynamics.score(*holed)
+    for column in range(4):
+        known = ~holed[2][:, column].isnan()
+        whole = dynamics.score(*(t[known] for t in system.trial(0)))
+        assert_same(scores, whole, column)
+
+
+def test_a_state_that_is_seldom_measured(cart_pole_system, make):
+    system = cart_pole_system
+    trials = [system.trial(seed) for seed in range(8)]
+    states, actions, next_states = (torch.cat(parts) for parts in zip(*trials, strict=True))
+    next_states[1:150, 3] = next_states[151:, 3] = math.nan
+    dynamics = make("GP", system.spec, None)
+    dynamics.update(*(t[:2] for t in trials[0]))
+    dynamics.update(states, actions, next_states)  # searches on some of the rows
+    assert dynamics.score(*system.trial(9)).rmse.isfinite().all()
+    with pytest.raises(ValueError, match="from, got 1 with a measured 'omega'"):
+        make("GP", system.spec, None).update(states[:150], actions[:150], next_states[:150])
+
+
+def test_rows_of_a_search_hold_two_observations_of_each_output():
+    observed = torch.zeros(400, 3, dtype=torch.bool)
+    observed[:, 0] = observed[[7, 300], 1] = observed[[7, 8, 9], 2] = True
+    rows = search_rows(observed)
+    assert len(set(rows.tolist())) == 128
+    assert (observed[rows].sum(0) >= 2).all()
+    assert search_rows(observed[:128]) is None
+
+
+def test_a_row_of_nothing_is_refused(cart_pole_system, make, holed):
+    system = cart_pole_system
+    states, actions, next_states = holed
+    dynamics = make("CKA", system.spec, system.crude)
+    next_states[11] = math.nan
+    for call in (dynamics.update, dynamics.fit):
+        with pytest.raises(ValueError, match=r"observation in each row.*\(row 11\)"):
+            call(states, actions, next_states)
+    dynamics.update(*system.trial(1))
+    for call in (dynamics.condition, dynamics.score):
+        with pytest.raises(ValueError, match=r"observation in each row.*\(row 11\)"):
+            call(states, actions, next_states)
+    assert dynamics.num_transitions == 25
+
+
+def test_declared_states_are_checked_where_they_were_measured():
+    spec = StateSpec(["q", "v", "goal"], ["a"], integrated={"q": "v"}, step=0.1, exogenous=["goal"])
+    states = torch.rand(8, 3, dtype=torch.float64)
+    actions = torch.rand(8, 1, dtype=torch.float64)
+    following = states.clone()
+    following[:, 1] += 0.1 * actions[:, 0]
+    following[:, 0] += 0.05 * (states[:, 1] + following[:, 1])
+    following[1, 0] = following[2, 2] = math.nan
+    dynamics = GPDynamics(spec)
+    dynamics.update(states, actions, following)
+    wrong = following.clone()
+    wrong[:, 0] = states[:, 0] + 3 * (following[:, 0] - states[:, 0])
+    with pytest.raises(ValueError, match="'q' is said to be integrated"):
+        dynamics.update(states, actions, wrong)
+    wrong = following.clone()
+    wrong[5, 2] += 1
+    with pytest.raises(ValueError, match="'goal' is said to be exogenous.*row 5"):
+        dynamics.update(states, actions, wrong)
+    following[6, 1] = math.nan  # all that the model predicts
+    with pytest.raises(ValueError, match=r"predicted entries of next_states.*row 6"):
+        dynamics.update(states, actions, following)
+
+
+def test_a_physics_of_differences_is_still_found_out(cart_pole_system, holed):
+    system = cart_pole_system
+
+    def change(X):
+        return system.crude(X) - X[:, :4]
+
+    for dynamics in (CKADynamics(system.spec, change), PhysicsDynamics(system.spec, change)):
+        with pytest.warns(UserWarning, match="seems to return the change"):
+            dynamics.update(*holed)

@@ -1,0 +1,109 @@
+"""Dynamics of several physics."""
+
+import io
+
+import pytest
+import torch
+
+from gpadjust.dynamics import CKADynamics, PhysicsDynamics, TrajectoryInformation
+from gpadjust.physics import JoinedPhysics, ODEPhysics, PhysicsError
+
+pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA", "RRA-paper"]
+
+
+@pytest.fixture
+def still():
+    """A second physics: nothing moves but by its velocity."""
+    return lambda X: X[:, :4] + 0.1 * torch.cat([X[:, 2:4], torch.zeros_like(X[:, 2:4])], -1)
+
+
+@pytest.mark.parametrize("kind", SEVERAL)
+def test_every_structure_takes_several(cart_pole_system, make, still, kind):
+    system = cart_pole_system
+    dynamics = make(kind, system.spec, {"rod": system.crude, "still": still})
+    dynamics.update(*system.trial(0))
+    assert dynamics.score(*system.trial(1)).rmse.isfinite().all()
+    assert "rho_rod" in [term.name for term in dynamics.model.terms]
+
+
+def test_targets_are_those_of_each_part(cart_pole_system, make, still):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, [system.crude, still])
+    states, actions, _ = system.trial(0)
+    one = [make("CKA", system.spec, part) for part in (system.crude, still)]
+    inputs = dynamics.targets.inputs(states, actions)
+    expected = torch.cat([each._physics(inputs) for each in one], -1)
+    assert torch.equal(dynamics._physics(inputs), expected)
+
+
+def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
+    system = cart_pole_system
+    dynamics = make("PhysicsMean", system.spec, {"still": still, "truth": system.truth})
+    dynamics.update(*system.trial(0))
+    states, actions, next_states = system.trial(1)
+    torch.testing.assert_close(
+        dynamics.predict(states, actions).mean, next_states, rtol=0, atol=1e-4
+    )
+    rho = dynamics.model.rho(dynamics.targets.inputs(states, actions), "truth").mean
+    torch.testing.assert_close(rho, torch.ones_like(rho), rtol=0, atol=1e-3)
+
+
+def test_loading_does_not_run_them_at_the_data(cart_pole_system, make, still):
+    system, calls = cart_pole_system, []
+
+    def counted(X):
+        calls.append(len(X))
+        return still(X)
+
+    def named(part):
+        return make("CKA", system.spec, {"rod": system.crude, "still": part})
+
+    dynamics, other = named(still), named(counted)
+    for seed in (0, 1):
+        dynamics.update(*system.trial(seed))
+    dynamics.condition(*(t[:1] for t in system.trial(2)))
+    file = io.BytesIO()
+    torch.save(dynamics.state_dict(), file)
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert not calls
+    for each in (dynamics, other):
+        each.update(*system.trial(3))
+    assert calls == [25]  # of the new transitions
+    test = system.trial(9)[:2]
+    for one, two in zip(dynamics.predict(*test), other.predict(*test), strict=True):
+        assert torch.equal(one, two)
+    swapped = make("CKA", system.spec, {"still": still, "rod": system.crude})
+    with pytest.raises(RuntimeError, match="physics is"):
+        swapped.load_state_dict(dynamics.state_dict())
+
+
+def test_functions_and_information(cart_pole_system, make, still):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, [system.crude, still])
+    dynamics.update(*system.trial(0))
+    states, actions, _ = (t[:3] for t in system.trial(1))
+    drawn = dynamics.sample_functions(2, seed=0)(
+        states.expand(2, -1, -1), actions.expand(2, -1, -1)
+    )
+    assert drawn.shape == (2, 3, 4)
+    assert TrajectoryInformation(dynamics)(states, actions) > 0
+
+
+def test_each_part_is_checked(cart_pole_system, still):
+    system = cart_pole_system
+    change = ODEPhysics(lambda s, a: s, 0.1, 4, difference=True)
+    with pytest.raises(ValueError, match="difference=False"):
+        CKADynamics(system.spec, [system.crude, change])
+    with pytest.raises(ValueError, match="Expected one physics to follow"):
+        PhysicsDynamics(system.spec, [system.crude, still])
+    assert PhysicsDynamics(system.spec, JoinedPhysics([still])).is_fitted
+    dynamics = CKADynamics(
+        system.spec, {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
+    )
+    with pytest.warns(UserWarning, match="'late' seems to return the change"):
+        dynamics.update(*system.trial(0))
+    dynamics = CKADynamics(system.spec, [system.crude, lambda X: X[:, :3]])
+    with pytest.raises(PhysicsError, match="next values of the 4 states"):
+        dynamics.update(*system.trial(0))
