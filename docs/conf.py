@@ -19,7 +19,13 @@ author = "The gpadjust authors"
 project_copyright = author
 release = version = gpadjust.__version__
 
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+]
+myst_enable_extensions = ["dollarmath"]
 exclude_patterns = ["_build"]
 default_role = "py:obj"  # single backticks link where they can, and are code elsewhere
 nitpicky = True
@@ -29,7 +35,8 @@ nitpick_ignore = [  # what signatures name, but users do not call by name
     ("py:class", "gpadjust.envs.cart_pole_view.CartPoleView"),
     ("py:class", "gpadjust.envs.viewed_env.ViewedEnv"),
     ("py:class", "gpadjust.inference.fitting.FitOptions"),
-    ("py:class", "gpadjust.models.hyperparameter_samples.HyperparameterSamples"),
+    ("py:class", "gpadjust.models.cholesky_strategy.CholeskyStrategy"),
+    ("py:class", "gpadjust.models.sampled_functions.TermFeatures"),
     ("py:class", "gpadjust.rl.mixed_replay_buffer.CompactReplayBuffer"),
     ("py:class", "gpadjust.rl.model_vec_env.ModelStep"),
     ("py:class", "gpadjust.rl.recorded_trials.RecordedTrials"),
@@ -71,7 +78,8 @@ def link_other_names(
     found = locate(node["reftarget"])
     entry = ENTRIES.get(id(found))
     if entry is None and hasattr(found, "__qualname__"):
-        entry = f"{found.__module__}.{found.__qualname__}"
+        owner, _, name = f"{found.__module__}.{found.__qualname__}".rpartition(".")
+        entry = f"{ENTRIES.get(id(locate(owner)), owner)}.{name}"
     if entry in (None, node["reftarget"]):
         return None
     domain = env.get_domain("py")

@@ -1,6 +1,6 @@
 """Gaussian processes that adjust a physics model to data."""
 
-from gpadjust.inference import Comparison, FitResult, SampleResult, compare, fit
+from gpadjust.inference import FitResult, SampleResult, fit
 from gpadjust.models import (
     AR1,
     CKA,
@@ -9,8 +9,18 @@ from gpadjust.models import (
     PhysicsMeanGP,
     ScaleGP,
     ZeroMeanGP,
+    load,
+    save,
 )
-from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, ODEPhysics, Physics, PhysicsError
+from gpadjust.physics import (
+    BlackBoxPhysics,
+    FunctionPhysics,
+    JoinedPhysics,
+    ODEPhysics,
+    Physics,
+    PhysicsError,
+)
+from gpadjust.validation import Comparison, compare
 
 __version__ = "0.1.0"
 
@@ -23,6 +33,7 @@ __all__ = [
     "Comparison",
     "FitResult",
     "FunctionPhysics",
+    "JoinedPhysics",
     "ODEPhysics",
     "Physics",
     "PhysicsError",
@@ -32,4 +43,6 @@ __all__ = [
     "ZeroMeanGP",
     "compare",
     "fit",
+    "load",
+    "save",
 ]

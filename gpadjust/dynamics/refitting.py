@@ -16,7 +16,7 @@ from gpadjust.models import ExactGPBase
 
 _SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
 _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
-_REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=8)
+_REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=15)
 
 
 def search_rows(observed: Tensor) -> Tensor | None:

@@ -20,14 +20,14 @@ _SMALL = 256  # points of a covariance up to which a second thread costs more th
 
 
 def nugget(n: int) -> float:
-    r"""The nugget of every factorised covariance of ``n`` points, :math:`10 n^2 \epsilon`.
+    r"""The nugget of every factorised covariance of ``n`` points, :math:`\max(100 n, n^2)\epsilon`.
 
     It is relative to the mean of the diagonal, and always there, in fits and in predictions alike.
     With less, rounding errors would decide what a model without noise knows: they are of the order
     of :math:`n \epsilon` of the prior variance, and the variance of a prediction is no smaller than
     the nugget.
     """
-    return 10 * n**2 * torch.finfo(torch.float64).eps
+    return max(100 * n, n**2) * torch.finfo(torch.float64).eps
 
 
 def cholesky(
@@ -110,6 +110,12 @@ class LikelihoodValue(NamedTuple):
     by_mean: Tensor | None = None
     by_covariance: Tensor | None = None
     by_least_scale: Tensor | None = None
+
+    def gradient(self) -> tuple[Tensor, Tensor]:
+        """The derivatives by mean and covariance, which were asked for."""
+        if self.by_mean is None or self.by_covariance is None:
+            raise ValueError("The derivatives were not asked for: pass derivatives=True.")
+        return self.by_mean, self.by_covariance
 
 
 def negative_log_likelihood(

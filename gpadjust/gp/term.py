@@ -20,8 +20,8 @@ class Term(Module):
     r"""A term :math:`b(x) g(x)` with :math:`g \sim GP(\bar g, k)`.
 
     The basis b is a column of the physics, or 1. The prior mean :math:`\bar g` is a constant:
-    given, or unknown with the prior :math:`N(\bar g, \kappa)`, which adds the constant :math:`\kappa`
-    to the kernel. With a vague :math:`\kappa`, as :func:`gpadjust.fit` sets it, that is universal
+    given, or unknown with the prior :math:`N(\bar g, \kappa)`, which adds :math:`\kappa` to the
+    kernel. With a vague :math:`\kappa`, as :func:`gpadjust.fit` sets it, that is universal
     kriging (Rasmussen and Williams 2006, sec. 2.7).
 
     All is in the units of the model's targets, after their transform.
@@ -205,6 +205,17 @@ class SumOfTerms(Kernel):
         if total is None:
             raise ValueError("Expected at least one term with a kernel or an unknown mean.")
         return total
+
+    def basis_of_means(self, x: Tensor) -> Tensor | None:
+        """The bases of the terms whose means are unknown, ``... x n x q``, or None."""
+        learnt = [term for term in self.terms if term.learns_mean]
+        one = torch.ones_like(x[..., 0])
+        columns = [one if term.basis is None else term.basis(x) for term in learnt]
+        return torch.stack(columns, dim=-1) if columns else None
+
+    def local_load_samples(self, samples_dict: Any, memo: Any, prefix: str) -> None:
+        """GPyTorch's hook for Pyro's samples; the batch shape follows the terms."""
+        super(Kernel, self).local_load_samples(samples_dict, memo, prefix)
 
     def __getitem__(self, index: Any) -> SumOfTerms:
         """The kernel of a part of the batch."""

@@ -23,7 +23,9 @@ _INFEASIBLE = 1e10  # what the optimiser sees where the likelihood cannot be eva
 _MANY = 150  # observations; a search is made on some of more
 _SEARCHED = 96  # of them, which tell what optima there are
 _ROUGH = 1e-5  # tolerance of that search
-_COMPARED = 5  # of its optima that are compared on all observations
+_COMPARED = 6  # of its optima that are compared on all observations
+_REFINED = 2  # of these that the search goes on from
+_APART = 0.3  # by which these differ in some logarithm
 
 
 class Search(NamedTuple):
@@ -93,8 +95,10 @@ def _optima_of_some(objective: Objective, search: Search) -> Tensor:
     generator = torch.Generator().manual_seed(search.seed)
     rows = torch.randperm(objective.num_points, generator=generator)[:_SEARCHED].sort().values
     part = Objective(objective.model, rows=rows)
+    # A search should not take longer than what follows it.
+    few = 8 if objective.num_points < 4 * _SEARCHED else 16
     search = search._replace(
-        num_starts=search.num_starts or 8, num_screened=search.num_screened or _SEARCHED
+        num_starts=search.num_starts or few, num_screened=search.num_screened or _SEARCHED
     )
     starts = _screened(part, search)
     reached, values, _ = _optimise(part, starts, min(search.max_iterations, 40), _ROUGH)
@@ -104,9 +108,15 @@ def _optima_of_some(objective: Objective, search: Search) -> Tensor:
 
 
 def _best(objective: Objective, candidates: Tensor) -> Tensor:
-    """The best candidate of each problem, ``1 x B x p``."""
-    order = objective(candidates).argmin(0, keepdim=True)
-    return candidates.gather(0, order.unsqueeze(-1).expand(-1, -1, candidates.shape[-1]))
+    """The best candidates of each problem that are apart from each other, ``k x B x p``."""
+    values = objective(candidates)
+    kept = []
+    for problem, order in enumerate(values.argsort(dim=0).mT):
+        ranked = candidates[order, problem]
+        apart = (ranked - ranked[0]).abs().amax(-1) > _APART
+        others = apart.nonzero().flatten()[: _REFINED - 1].tolist()
+        kept.append(ranked[[0, *others, *[0] * (_REFINED - 1 - len(others))]])
+    return torch.stack(kept, dim=1)
 
 
 def _screened(objective: Objective, search: Search) -> Tensor:
@@ -149,14 +159,16 @@ def _optimise(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run L-BFGS from all starts of all problems; return where it got, values, convergence.
 
-    The optimiser has one box for all problems: it sees vectors in shares of their bounds.
+    The optimiser has one box for all problems: it sees vectors less their lower bounds. Its first
+    step is of length one, a factor of e in logarithms: a longer one may end in noise so small that
+    the nugget hides it, where nothing leads back.
     """
     num_starts, num_problems, num_parameters = starts.shape
     parameters = objective.parameters
     width = parameters.upper - parameters.lower
     bounded = width.isfinite() & (width > 0)
     zero = torch.where(bounded, parameters.lower, torch.zeros_like(width))
-    unit = torch.where(bounded, width, magnitude(parameters.current()[0]))
+    unit = torch.where(bounded, torch.ones_like(width), magnitude(parameters.current()[0]))
     low = ((parameters.lower - zero) / unit).amin(0).tolist()
     high = ((parameters.upper - zero) / unit).amax(0).tolist()
     reached = (starts - zero) / unit

@@ -81,12 +81,18 @@ class Objective:
                 self.targets[..., rows],
             )
             noise = None if noise is None else noise[..., rows]
-        self._basis = None if marginal else _basis_of_constants(model, inputs)
+        with torch.no_grad():
+            basis = None if marginal else _basis_of_means(model, inputs)
+        self._learns_constants = basis is not None
+        # That of a physics which learns changes: the distribution has it in its mean.
+        self._basis = None if learns_inputs else basis
+        self._inputs = raw if learns_inputs else inputs
         closed: TargetDistribution | None = None
         if self.parameters.is_batched and not autograd:
             closed = _closed_form(model, inputs, self.parameters, noise, marginal)
+        targets = self.targets if learns_inputs and self._learns_constants else None
         self._distribution = closed or ModuleDistribution(
-            model, raw if learns_inputs else inputs, self.parameters, noise, marginal
+            model, self._inputs, self.parameters, noise, marginal, targets
         )
         self._log_priors: LogPriors | None = None
         if of_logs or next(iter(model.named_priors()), None) is not None:
@@ -107,7 +113,7 @@ class Objective:
         if self.concentrated:
             vector = self.at_best_scale(vector.unsqueeze(0))[0][0]
         self.parameters.assign(vector)
-        if self._basis is not None:
+        if self._learns_constants:
             with torch.no_grad():
                 self._assign_constants(vector)
 
@@ -200,8 +206,7 @@ class Objective:
             return likelihood.value.reshape(len(vectors), -1), torch.zeros_like(vectors)
         mean, covariance, pull_back = self._distribution.with_pull_back(values)
         likelihood = self._likelihood(mean, covariance, least, derivatives=True)
-        assert likelihood.by_mean is not None and likelihood.by_covariance is not None
-        found = pull_back(likelihood.by_mean, likelihood.by_covariance)
+        found = pull_back(*likelihood.gradient())
         gradient = self.parameters.flatten(found)
         value = likelihood.value.reshape(len(vectors), -1)
         if likelihood.by_least_scale is not None:
@@ -227,8 +232,7 @@ class Objective:
             # Parameters that the physics cannot run with are a bad vector, not the end of a fit.
             return vector.new_full((1,), math.inf), gradient
         likelihood = self._likelihood(mean, covariance, None, derivatives=True)
-        assert likelihood.by_mean is not None and likelihood.by_covariance is not None
-        found = pull_back(likelihood.by_mean, likelihood.by_covariance)
+        found = pull_back(*likelihood.gradient())
         gradient = self.parameters.flatten({name: v.unsqueeze(0) for name, v in found.items()})[0]
         return likelihood.value.sum().reshape(1), gradient
 
@@ -249,11 +253,15 @@ class Objective:
 
     def _assign_constants(self, vector: Tensor) -> None:
         values: Parameters = self.parameters.unflatten(vector.unsqueeze(0))
-        mean, covariance = self._distribution({name: value[0] for name, value in values.items()})
-        residual = self.targets - mean
+        _, covariance = self._distribution({name: value[0] for name, value in values.items()})
+        inputs, basis = self._inputs, self._basis
+        if basis is None:
+            inputs = self.model.transform_inputs(inputs)
+            basis = _basis_of_means(self.model, inputs)
+        residual = self.targets - self.model.mean_module(inputs)
         observed = ~residual.isnan()
         chol, _ = cholesky(covariance, None if observed.all() else observed)
-        basis = self._basis * observed.unsqueeze(-1)
+        basis = basis * observed.unsqueeze(-1)
         basis = basis.expand(*chol.shape[:-1], -1)
         shift, variance = least_squares(chol, residual.nan_to_num(nan=0.0), basis)
         vague = _VAGUE * variance.diagonal(dim1=-1, dim2=-2)
@@ -283,17 +291,10 @@ class Objective:
         )
 
 
-def _basis_of_constants(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
-    """The bases of the unknown constant means, ``... x n x q``, or None."""
-    if not isinstance(model.covar_module, SumOfTerms):
-        return None
-    with torch.no_grad():
-        columns = [
-            torch.ones_like(inputs[..., 0]) if term.basis is None else term.basis(inputs)
-            for term in model.covar_module.terms
-            if term.learns_mean
-        ]
-    return torch.stack(columns, dim=-1) if columns else None
+def _basis_of_means(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
+    """The bases of unknown constant means, ``... x n x q``; None for models of other libraries."""
+    kernel = model.covar_module
+    return kernel.basis_of_means(inputs) if isinstance(kernel, SumOfTerms) else None
 
 
 def _closed_form(
@@ -343,7 +344,7 @@ def _closed_form(
 
 def _constant_covariance(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
     """What unknown constants add to the covariance, ``... x n x n``, or None."""
-    basis = _basis_of_constants(model, inputs)
+    basis = _basis_of_means(model, inputs)
     if basis is None:
         return None
     learnt = [term for term in model.covar_module.terms if term.learns_mean]

@@ -14,7 +14,7 @@ from torch.func import functional_call
 from torch.nn import Module
 
 from gpadjust.gp import SumOfTerms
-from gpadjust.gp.gaussian import noise_variances
+from gpadjust.gp.gaussian import cholesky, least_squares, noise_variances
 from gpadjust.inference.log_parameters import LogParameters, Parameters
 
 # Maps derivatives by mean and covariance to those by the (logarithmic) parameters.
@@ -44,6 +44,7 @@ class ModuleDistribution:
         parameters: Its learnable parameters.
         known_noise: The noise variances of these inputs, if they are known.
         marginal: Whether the prior variances of unknown constants count.
+        targets: The targets, for a mean with the unknown constants at their least squares estimate.
     """
 
     def __init__(
@@ -53,8 +54,9 @@ class ModuleDistribution:
         parameters: LogParameters,
         known_noise: Tensor | None,
         marginal: bool,
+        targets: Tensor | None,
     ) -> None:
-        self._noisy_prior = _NoisyPrior(model, inputs, parameters, known_noise, marginal)
+        self._noisy_prior = _NoisyPrior(model, inputs, parameters, known_noise, marginal, targets)
         self._parameters = parameters
 
     def __call__(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
@@ -95,11 +97,13 @@ class _NoisyPrior(Module):
         parameters: LogParameters,
         known_noise: Tensor | None,
         marginal: bool,
+        targets: Tensor | None,
     ) -> None:
         super().__init__()
         self.model = model
         self.inputs = inputs
         self.known_noise = known_noise
+        self.targets = targets
         self.transforms = any(name.startswith("input_transform.") for name in parameters.names)
         kernel = model.covar_module
         self.known_means = isinstance(kernel, SumOfTerms) and not marginal
@@ -115,4 +119,18 @@ class _NoisyPrior(Module):
         noise = noise_variances(model.likelihood, inputs) if noise is None else noise
         noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
         mean = model.mean_module(inputs).expand(noise.shape)
-        return mean, covariance + torch.diag_embed(noise)
+        covariance = covariance + torch.diag_embed(noise)
+        if self.targets is not None:
+            basis = model.covar_module.basis_of_means(inputs)
+            # The estimate minimises the objective, so that no derivative goes through it.
+            best = self._constants(self.targets - mean.detach(), covariance, basis)
+            mean = mean + (basis @ best.unsqueeze(-1)).squeeze(-1)
+        return mean, covariance
+
+    @staticmethod
+    @torch.no_grad()
+    def _constants(residual: Tensor, covariance: Tensor, basis: Tensor) -> Tensor:
+        observed = ~residual.isnan()
+        chol, _ = cholesky(covariance.clone(), None if observed.all() else observed)
+        basis = (basis * observed.unsqueeze(-1)).expand(*chol.shape[:-1], -1)
+        return least_squares(chol, residual.nan_to_num(nan=0.0), basis)[0]

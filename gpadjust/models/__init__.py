@@ -7,6 +7,7 @@ from gpadjust.models.cka import CKA
 from gpadjust.models.exact_gp_base import ExactGPBase, Prediction
 from gpadjust.models.rra import RRA, PaperRRA
 from gpadjust.models.sampled_functions import SampledFunctions
+from gpadjust.models.saving import load, save
 
 __all__ = [
     "AR1",
@@ -22,4 +23,6 @@ __all__ = [
     "SampledFunctions",
     "ScaleGP",
     "ZeroMeanGP",
+    "load",
+    "save",
 ]

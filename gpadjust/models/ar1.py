@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any, Self
+from typing import Any
 
 import gpytorch
 import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
+from botorch.sampling.pathwise.update_strategies import GaussianUpdate
 from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
@@ -21,6 +22,7 @@ from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
 from gpadjust.gp import Term
+from gpadjust.gp.gaussian import noise_variances
 from gpadjust.gp.physics_columns import check_one_to_one
 from gpadjust.models.adjusted_gp import KernelLike, PhysicsLike, make_kernel
 from gpadjust.models.exact_gp_base import ExactGPBase
@@ -72,8 +74,9 @@ class LevelInput(InputTransform):
         )
 
     def untransform(self, X: Tensor) -> Tensor:
-        """Map ``... x n x (d' + 1)`` back to raw ``... x n x d``."""
-        return X[..., :-1] if self.base is None else self.base.untransform(X[..., :-1])
+        """Map ``... x n x (d' + 1)`` back to ``... x n x (d + 1)``, raw inputs with their level."""
+        inputs = X[..., :-1] if self.base is None else self.base.untransform(X[..., :-1])
+        return torch.cat([inputs, X[..., -1:]], dim=-1)
 
 
 class Level(gpytorch.Module):
@@ -267,6 +270,19 @@ class AR1(ExactGPBase):
         basis: Any = self.terms[0].basis
         return basis.rho.squeeze(-1)
 
+    def data(self) -> dict[str, Tensor | None]:
+        """As the base class, of each level."""
+        both = super().data()
+        inputs, rows = self.measured_rows(both["train_X"])
+        low = slice(None, rows.start)
+        high = {name: None if v is None else v[..., rows, :] for name, v in both.items()}
+        return {
+            **high,
+            "train_X": inputs[..., rows, :],
+            "low_X": inputs[..., low, :],
+            "low_Y": both["train_Y"][..., low, :],
+        }
+
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
         """Inputs without their level, and the rows of the high level."""
         return inputs[..., :-1], slice(int((inputs[..., -1] == 0).sum(-1).max()), None)
@@ -285,9 +301,19 @@ class AR1(ExactGPBase):
             )
         return super().model_inputs(X, with_basis)
 
-    def condition_on_observations(self, X: ArrayLike, Y: ArrayLike, **kwargs: Any) -> Self:
-        """Condition on observations of the high level; see BoTorch."""
-        return super().condition_on_observations(self.input_transform.with_level(X), Y, **kwargs)
+    def _new_inputs(self, X: Tensor) -> Tensor:
+        transform = self.input_transform
+        if X.shape[-1] == transform.num_inputs:
+            return transform.with_level(X)
+        return super()._new_inputs(X)
+
+
+@GaussianUpdate.register(AR1, LevelLikelihood)  # type: ignore[untyped-decorator, unused-ignore]
+def _update_of_levels(model: AR1, likelihood: LevelLikelihood, **arguments: Any) -> Any:
+    """BoTorch's pathwise update, with the noise of each point's level."""
+    noise = DiagLinearOperator(noise_variances(likelihood, model.train_inputs[0]))
+    update = GaussianUpdate.dispatch(type(model), _GaussianLikelihoodBase)
+    return update(model, likelihood, **{"noise_covariance": noise, **arguments})
 
 
 def _samples(train_X: Tensor, bounds: Tensor | None, num_low: int, seed: int) -> Tensor:

@@ -15,7 +15,7 @@ from linear_operator.utils.errors import NotPSDError
 from torch import Tensor
 
 from gpadjust.gp import SumOfTerms, Term
-from gpadjust.gp.gaussian import cholesky, noise_variances
+from gpadjust.gp.gaussian import cholesky, noise_variances, nugget
 
 Weights = list[tuple[Term, Tensor | None]]
 """Terms and what each is multiplied by, ``... x n``, or None for 1."""
@@ -45,18 +45,17 @@ class TermsOfData(NamedTuple):
     variances: list[Tensor | None]
 
     @classmethod
-    def of(cls, terms: list[Term], train: Tensor) -> TermsOfData:
-        """Prepare some terms, at training inputs ``... x n x (d + k)``."""
+    def of(cls, terms: list[Term], train: Tensor, with_graph: bool = False) -> TermsOfData:
+        """Prepare some terms, at training inputs ``... x n x (d + k)``, by autograd or faster."""
         d = max(term.num_inputs for term in terms)
         origin = train[..., :d].mean(-2, keepdim=True)
-        found = [] if train.requires_grad else terms
+        found = [] if with_graph else terms
         matrices = {term.name: term.log_covariance_with(train, origin) for term in found}
         stacked = {name: matrix for name, matrix in matrices.items() if matrix is not None}
         stack = torch.stack(torch.broadcast_tensors(*stacked.values()), -3) if stacked else None
         bases = [term.weights(train) for term in terms]
-        return cls(
-            terms, train, origin, stack, [*stacked], bases, [term.variance() for term in terms]
-        )
+        variances = [None if with_graph else term.variance() for term in terms]
+        return cls(terms, train, origin, stack, [*stacked], bases, variances)
 
     def covariances(self, inputs: Tensor) -> list[Tensor]:
         """The covariances of the terms with those at the data, without bases, ``... x q x n``."""
@@ -78,11 +77,14 @@ class TermsOfData(NamedTuple):
 
 
 class Factors(NamedTuple):
-    r"""The inverse Cholesky factor of ``n`` points by its blocks of rows, and the weights.
+    r"""The Cholesky factor L of ``n`` points by its blocks of rows, and the weights.
+
+    It is solved with, not inverted, which would take as long: where there is no noise, its inverse
+    would leave no digit of a posterior variance.
 
     Args:
-        base: The first ``n_0`` rows without their zeros, ``... x n_0 x n_0``. Rows and columns of
-            missing observations are zero, so that covariances with these do not count.
+        base: The first ``n_0`` rows without their zeros, ``... x n_0 x n_0``. Missing observations
+            have an infinite variance, so that covariances with these do not count.
         rows: The other rows, ``... x (n - n_0) x n``; one base serves a batch of them.
         alpha: The weights :math:`K^{-1} (y - m)`, ``... x n``.
     """
@@ -90,15 +92,6 @@ class Factors(NamedTuple):
     base: Tensor
     rows: Tensor
     alpha: Tensor
-
-    def whiten(self, covariance: Tensor) -> Tensor:
-        r"""Return :math:`A L^{-T}` for :math:`A`, ``... x q x n``."""
-        first = batched_product(covariance[..., : self.base.shape[-1]], self.base.mT)
-        if not self.rows.shape[-2]:
-            return first
-        rest = batched_product(covariance, self.rows.mT)
-        shape = torch.broadcast_shapes(first.shape[:-1], rest.shape[:-1])
-        return torch.cat([first.expand(*shape, -1), rest.expand(*shape, -1)], dim=-1)
 
     @classmethod
     def of(cls, covariance: Tensor, residual: Tensor) -> Factors:
@@ -116,22 +109,37 @@ class Factors(NamedTuple):
                 "The covariance of the training targets has no Cholesky factor, with any nugget: "
                 "some hyper-parameter is not finite."
             )
-        identity = torch.diag_embed(observed.to(chol))
-        inverse = torch.linalg.solve_triangular(chol, identity.expand_as(chol), upper=False)
-        whitened = inverse @ residual.nan_to_num(nan=0.0).unsqueeze(-1)
-        return cls(inverse, inverse[..., :0, :], (inverse.mT @ whitened).squeeze(-1))
+        chol = _without(chol, observed)
+        alpha = torch.cholesky_solve(residual.nan_to_num(nan=0.0).unsqueeze(-1), chol)
+        return cls(chol, chol[..., :0, :], alpha.squeeze(-1))
+
+    def whiten(self, covariance: Tensor) -> Tensor:
+        r"""Return :math:`A L^{-T}` for :math:`A`, ``... x q x n``."""
+        n_0 = self.base.shape[-1]
+        first = batched_solve(covariance[..., :n_0], self.base.mT, upper=True)
+        if not self.rows.shape[-2]:
+            return first
+        rest = covariance[..., n_0:] - batched_product(first, self.rows[..., :n_0].mT)
+        rest = batched_solve(rest, self.rows[..., n_0:].mT, upper=True)
+        return torch.cat([first.expand(*rest.shape[:-1], n_0), rest], dim=-1)
 
     def solve(self, residual: Tensor) -> Tensor:
         """Return :math:`K^{-1} r` for r, ``... x n``."""
-        white = self.whiten(residual.unsqueeze(-2))
+        return self._unwhiten(self.whiten(residual.unsqueeze(-2))).squeeze(-2)
+
+    def _unwhiten(self, white: Tensor) -> Tensor:
+        r"""Return :math:`A L^{-1}` for :math:`A`, ``... x q x n``."""
         n_0 = self.base.shape[-1]
-        first = pad(white[..., :n_0] @ self.base, residual.shape[-1] - n_0)
-        return (first + white[..., n_0:] @ self.rows).squeeze(-2)
+        first, rest = white[..., :n_0], white[..., n_0:]
+        if rest.shape[-1]:
+            rest = batched_solve(rest, self.rows[..., n_0:], upper=False)
+            first = first - batched_product(rest, self.rows[..., :n_0])
+        return torch.cat([batched_solve(first, self.base, upper=False), rest], dim=-1)
 
     def squared_columns(self) -> Tensor:
         """The diagonal of the inverse covariance, ``... x n``; zero for missing observations."""
-        first = self.base.square().sum(-2)
-        return pad(first, self.rows.shape[-2]) + self.rows.square().sum(-2)
+        identity = torch.eye(self.alpha.shape[-1]).to(self.base)
+        return self.whiten(identity).square().sum(-1)
 
     def append(self, cross: Tensor, corner: Tensor, residual: Tensor) -> Factors:
         """Return the factors with ``k`` more points.
@@ -142,24 +150,42 @@ class Factors(NamedTuple):
             residual: New targets less their prediction by the old ones, ``... x k``; NaN where one
                 is missing.
         """
-        n_0, n, k = self.base.shape[-1], *cross.shape[-1:], cross.shape[-2]
+        n, k = cross.shape[-1], cross.shape[-2]
         observed = ~residual.isnan()
-        residual = residual.nan_to_num(nan=0.0)
+        residual = residual.nan_to_num(nan=0.0).unsqueeze(-1)
         if observed.all():
             observed = observed.new_ones(k)  # without the fantasies' dimension: they share factors
         else:
             cross = cross * observed.unsqueeze(-1)
         border = self.whiten(cross)
+        size = corner.diagonal(dim1=-1, dim2=-2).mean(-1)
+        identity = torch.eye(k, dtype=corner.dtype, device=corner.device)
+        corner = corner + nugget(n + k) * size[..., None, None] * identity
         chol, _ = cholesky(corner - border @ border.mT, None if observed.all() else observed, n + k)
-        row = pad(batched_product(border[..., :n_0], self.base), n - n_0)
-        if self.rows.shape[-2]:
-            row = row + border[..., n_0:] @ self.rows
-        identity = torch.diag_embed(observed.to(chol)).expand(*row.shape[:-2], k, k)
-        chol = chol.expand(*row.shape[:-2], k, k)
-        row = torch.linalg.solve_triangular(chol, torch.cat([-row, identity], -1), upper=False)
-        rows = torch.cat([pad(self.rows, k).expand(*row.shape[:-2], -1, -1), row], dim=-2)
-        whitened = row[..., n:] @ residual.unsqueeze(-1)
-        return Factors(self.base, rows, pad(self.alpha, k) + (row.mT @ whitened).squeeze(-1))
+        chol = _without(chol, observed).expand(*border.shape[:-1], k)
+        rows = torch.cat([border, chol], dim=-1)
+        rows = torch.cat([pad(self.rows, k).expand(*rows.shape[:-2], -1, -1), rows], dim=-2)
+        last = torch.cholesky_solve(residual, chol).mT
+        first = self.alpha - self._unwhiten(last @ border).squeeze(-2)
+        return Factors(self.base, rows, torch.cat([first, last.squeeze(-2)], dim=-1))
+
+
+def _without(chol: Tensor, observed: Tensor) -> Tensor:
+    """A Cholesky factor with an infinite variance of what is not observed, ``... x n``."""
+    if observed.all():
+        return chol
+    return chol + torch.diag_embed((~observed).to(chol) * 1e200)
+
+
+def batched_solve(left: Tensor, right: Tensor, upper: bool) -> Tensor:
+    """``left`` times the inverse of a triangular ``right``, as :func:`batched_product`."""
+    extra = left.dim() - right.dim()
+    if extra <= 0 or left.shape[extra:-2] != right.shape[:-2]:
+        return torch.linalg.solve_triangular(right, left, upper=upper, left=False)
+    lead, (q, n) = left.shape[:extra], left.shape[-2:]
+    stacked = left.flatten(0, extra - 1).movedim(0, -3).reshape(*right.shape[:-2], -1, n)
+    solved = torch.linalg.solve_triangular(right, stacked, upper=upper, left=False)
+    return solved.unflatten(-2, (lead.numel(), q)).movedim(-3, 0).unflatten(0, lead)
 
 
 def _scaled(matrix: Tensor, factor: Tensor) -> Tensor:
@@ -196,16 +222,16 @@ class CholeskyStrategy(DefaultPredictionStrategy):
     r"""GPyTorch's exact prediction from two cached factors, which new points only border.
 
     With the covariance :math:`K = L L^T` of the ``n`` noisy targets y and their prior mean m, the
-    factors are :math:`L^{-1}` and :math:`\alpha = K^{-1} (y - m)` (Rasmussen and Williams 2006,
+    factors are L and :math:`\alpha = K^{-1} (y - m)` (Rasmussen and Williams 2006,
     sec. 2.2). For ``k`` further observations of cross-covariance U and covariance S, with residual
     :math:`r = y' - m' - U^T \alpha`,
 
     .. math::
 
         B = L^{-1} U, \quad C C^T = S - B^T B, \quad
-        M = C^{-1} \begin{bmatrix} -B^T L^{-1} & I \end{bmatrix}, \quad
-        L^{-1} \leftarrow \begin{bmatrix} L^{-1} \; 0 \\ M \end{bmatrix}, \quad
-        \alpha \leftarrow \begin{bmatrix} \alpha \\ 0 \end{bmatrix} + M^T C^{-1} r,
+        L \leftarrow \begin{bmatrix} L & 0 \\ B^T & C \end{bmatrix}, \quad
+        v = (C C^T)^{-1} r, \quad
+        \alpha \leftarrow \begin{bmatrix} \alpha - L^{-T} B v \\ v \end{bmatrix},
 
     which takes :math:`O(n^2 k)` operations where GPyTorch refactorises in :math:`O(n^3)`. The
     factors live and die with the strategy, that is with ``model.prediction_strategy``.
@@ -248,7 +274,7 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         return factors
 
     def noisy_covariance(self, kernel: SumOfTerms) -> Tensor:
-        """The covariance of the training targets under a kernel, noise included, ``... x n x n``."""
+        """The covariance of the targets under a kernel, noise included, ``... x n x n``."""
         (train,) = self.train_inputs
         return kernel.forward(train, train) + self.noise_covariance()
 
@@ -280,10 +306,20 @@ class CholeskyStrategy(DefaultPredictionStrategy):
 
     def terms_of_data(self, terms: list[Term]) -> TermsOfData:
         """What is remembered of some unknown terms, and of the data."""
+        (train,) = self.train_inputs
+        if self.has_graph:
+            return TermsOfData.of(terms, train, with_graph=True)
         names = tuple(term.name for term in terms)
         if names not in self._terms:
-            self._terms[names] = TermsOfData.of(terms, self.train_inputs[0])
+            with torch.no_grad():
+                self._terms[names] = TermsOfData.of(terms, train)
         return self._terms[names]
+
+    @property
+    def has_graph(self) -> bool:
+        """Whether gradients flow to what is remembered, which is then made anew each time."""
+        wanted = detach_test_caches.off() or self.train_inputs[0].requires_grad
+        return torch.is_grad_enabled() and wanted
 
     @property
     def mean_cache(self) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from inspect import signature
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -21,12 +22,18 @@ from torch import Size, Tensor
 from torch.nn import Module
 
 from gpadjust.gp import SumOfTerms, Term, TermsMean
-from gpadjust.gp.gaussian import noise_variances, threads_for
+from gpadjust.gp.gaussian import known_noise, noise_variances, threads_for
 from gpadjust.models.cholesky_strategy import CholeskyStrategy, Weights
 from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES, hold_samples
 from gpadjust.models.hyperparameters import learnt_noise, set_initial_values
-from gpadjust.models.posteriors import HyperparameterMixture, ScaleFreePosterior, mixture_moments
+from gpadjust.models.posteriors import (
+    HyperparameterMixture,
+    ScaleFreePosterior,
+    mixture_moments,
+    mixture_quantile,
+)
 from gpadjust.models.sampled_functions import SampledFunctions, draw_functions
+from gpadjust.models.summary import summary, title
 from gpadjust.models.training_data import (
     ArrayLike,
     TrainingData,
@@ -106,6 +113,28 @@ class ExactGPBase(SingleTaskGP):
     def _learnt_noise(batch_shape: Size) -> Likelihood:
         """The default likelihood."""
         return learnt_noise(batch_shape)
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Remember the options that the model is built with, for :func:`gpadjust.save`."""
+        model = super().__new__(cls)
+        names = [*signature(cls.__init__).parameters][1:]
+        every = {**dict(zip(names, args, strict=False)), **options}
+        kept = {n: v for n, v in every.items() if not n.startswith(("train_", "low_"))}
+        model.__dict__["options"] = kept
+        return model
+
+    def __repr__(self) -> str:
+        """One line; :meth:`summary` says more."""
+        return title(self)
+
+    def summary(self) -> str:
+        """What the model has learnt, as a text in the user's units.
+
+        The structure; the log marginal likelihood; means, standard deviations and lengthscales of
+        the terms; the noise as a standard deviation; and what is at a bound of the search. Of a
+        model that holds samples, their medians and the ranges of 95 % of them.
+        """
+        return summary(self)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -215,6 +244,13 @@ class ExactGPBase(SingleTaskGP):
             >>> mean.shape
             torch.Size([1000, 1])
         """
+        mean, variance = self._components(X, observation_noise)
+        if self.num_samples is None:
+            return Prediction(mean.squeeze(MCMC_DIM), variance.squeeze(MCMC_DIM))
+        return Prediction(*mixture_moments(mean, variance))
+
+    def _components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
+        """Means and variances for each sample of the hyper-parameters, ``... x S x q x m``."""
         inputs = self.model_inputs(X)
         with threads_for(self.train_targets.shape[-1]):
             mean, variance = self._marginals(inputs, [(t, t.weights(inputs)) for t in self.terms])
@@ -227,9 +263,31 @@ class ExactGPBase(SingleTaskGP):
         mean, variance = (
             t.mT if self._num_outputs > 1 else t.unsqueeze(-1) for t in (mean, variance)
         )
-        if self.num_samples is not None:
-            mean, variance = mixture_moments(mean, variance)
-        return Prediction(mean, variance)
+        if self.num_samples is None:
+            mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
+        return mean, variance
+
+    def interval(
+        self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
+    ) -> tuple[Tensor, Tensor]:
+        """The central interval at each point by itself.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            level: The probability that it holds, between 0 and 1.
+            observation_noise: As in :meth:`predict`.
+
+        Returns:
+            Lower and upper ends, ``batch_shape x q x m`` each, in the user's units.
+
+        Raises:
+            ValueError: If ``level`` is not between 0 and 1.
+        """
+        if not isinstance(level, float) or not 0 < level < 1:
+            raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
+        mean, variance = self._components(X, observation_noise)
+        low, high = (mixture_quantile(mean, variance, (1 + side * level) / 2) for side in (-1, 1))
+        return low, high
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
@@ -353,6 +411,27 @@ class ExactGPBase(SingleTaskGP):
             precision > 0, torch.full_like(precision, torch.nan)
         ).reciprocal()
         return self.train_targets - factors.alpha * variance, variance
+
+    def data(self) -> dict[str, Tensor | None]:
+        """The data that the model could be built on: raw inputs, targets and known variances."""
+        self.eval()
+        inputs = (
+            self.train_inputs[0]
+            if self._original_train_inputs is None
+            else self._original_train_inputs
+        )
+        shift, scale = self._units()
+        targets, noise = self.train_targets * scale + shift, known_noise(self.likelihood)
+        noise = None if noise is None else noise * scale.square()
+        if self._num_outputs > 1:
+            inputs, targets = inputs.select(-3, 0), targets.mT
+            noise = None if noise is None else noise.mT
+        else:
+            targets = targets.unsqueeze(-1)
+            noise = None if noise is None else noise.unsqueeze(-1)
+        if self.num_samples is not None:
+            inputs, targets = inputs[0], targets[0]
+        return {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
 
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
         """Raw training inputs without what the model added to them, and the user's rows of them."""
@@ -494,6 +573,13 @@ class ExactGPBase(SingleTaskGP):
         subset.output_names = tuple(self.output_names[i] for i in idcs)
         return subset
 
+    def _new_inputs(self, X: Tensor) -> Tensor:
+        """Raw inputs to condition on; BoTorch's entropy searches transform them."""
+        inputs = self.train_inputs[0].shape[-1]
+        if X.shape[-1] == inputs != len(self.input_names) and hasattr(self, "input_transform"):
+            return self.input_transform.untransform(X)
+        return X
+
     def condition_on_observations(self, X: ArrayLike, Y: ArrayLike, **kwargs: Any) -> Self:
         """Condition on new observations; see BoTorch. No posterior has to be called before.
 
@@ -512,6 +598,7 @@ class ExactGPBase(SingleTaskGP):
         """
         X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
         check_finite(X, "X")
+        X = self._new_inputs(X)
         if Y.dim() < 2 or X.dim() < 2 or Y.shape[-2] != X.shape[-2]:
             raise ValueError(
                 "Expected X of shape ... x k x d and Y of shape ... x k x m with a row for each, "

@@ -7,7 +7,7 @@ from copy import deepcopy
 from typing import Any
 
 import torch
-from gpytorch.kernels import Kernel
+from gpytorch.kernels import Kernel, RFFKernel
 from gpytorch.likelihoods.noise_models import FixedGaussianNoise
 from torch import Size, Tensor
 from torch.nn import Parameter
@@ -61,8 +61,8 @@ def _change(model: Any, change: Callable[[Tensor], Tensor]) -> None:
             continue
         if isinstance(module, Kernel) and module._batch_shape[: len(outputs)] == outputs:
             module._batch_shape = changed(module._batch_shape)
-        elif isinstance(module, AppendedPhysics):
-            for name, buffer in module.named_buffers(recurse=False):
+        if isinstance(module, AppendedPhysics | RFFKernel):
+            for name, buffer in list(module.named_buffers(recurse=False)):
                 setattr(module, name, change(buffer))
         for name, parameter in list(module.named_parameters(recurse=False)):
             if parameter.shape[: len(outputs)] == outputs:

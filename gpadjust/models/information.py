@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from linear_operator.utils.cholesky import psd_safe_cholesky
 from torch import Tensor
 
 from gpadjust.gp import SumOfTerms
+from gpadjust.gp.gaussian import cholesky
 from gpadjust.models.cholesky_strategy import Factors
 from gpadjust.models.exact_gp_base import ExactGPBase
 
@@ -119,7 +119,13 @@ def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
     sd = noise.sqrt()
     scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
     identity = torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device)
-    # Eigenvalues are 1 or more: a nugget would be taken for information.
-    chol = psd_safe_cholesky(scaled + identity)
+    matrix = scaled + identity
+    chol, info = torch.linalg.cholesky_ex(matrix)
+    if info.any():
+        # What rounding leaves of a covariance far above the noise. Elsewhere the eigenvalues are 1
+        # or more, and a nugget would be taken for information.
+        failed = (info > 0)[..., None, None]
+        sound = torch.linalg.cholesky(torch.where(failed, identity, matrix))
+        chol = torch.where(failed, cholesky(matrix)[0], sound)
     log_sds: Tensor = chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
     return log_sds

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from botorch.posteriors import GPyTorchPosterior, Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM, GaussianMixturePosterior
@@ -116,6 +118,21 @@ def mixture_moments(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     # Not as a difference of second moments, which cancels.
     spread = mean.var(MCMC_DIM, correction=0)
     return mean.mean(MCMC_DIM), variance.mean(MCMC_DIM) + spread
+
+
+def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
+    """The quantile ``... x q x m`` of mixtures of Gaussians ``... x S x q x m``, by bisection."""
+    sd = variance.sqrt()
+    z = math.sqrt(2) * float(torch.erfinv(torch.tensor(2 * level - 1, dtype=torch.float64)))
+    low, high = ((mean + z * sd).amin(MCMC_DIM), (mean + z * sd).amax(MCMC_DIM))
+    for _ in range(60 if mean.shape[MCMC_DIM] > 1 else 0):
+        middle = (low + high) / 2
+        share = torch.special.ndtr((middle.unsqueeze(MCMC_DIM) - mean) / sd).mean(MCMC_DIM)
+        low, high = (
+            torch.where(share < level, middle, low),
+            torch.where(share < level, high, middle),
+        )
+    return (low + high) / 2
 
 
 def _variance(distribution: MultivariateNormal) -> Tensor:

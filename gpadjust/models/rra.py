@@ -220,8 +220,10 @@ class RRA(AdjustedGP):
     def _weights_posterior(self) -> tuple[Tensor, Tensor]:
         """Mean and a root of the covariance of the weights, in their prior's units."""
         strategy = self.strategy()
+        if strategy.has_graph:
+            return self._regress()
         if "weights" not in strategy.kept:
-            with torch.set_grad_enabled(self.train_inputs[0].requires_grad):
+            with torch.no_grad():
                 strategy.kept["weights"] = self._regress()
         return strategy.kept["weights"]
 

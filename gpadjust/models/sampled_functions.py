@@ -8,12 +8,13 @@ from copy import deepcopy
 from typing import Any
 
 import torch
-from botorch.sampling.pathwise.features import gen_kernel_features
+from botorch.sampling.pathwise.features import FeatureMap, gen_kernel_features
+from botorch.sampling.pathwise.features.generators import GenKernelFeatures
 from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, RFFKernel, ScaleKernel
 from torch import Size, Tensor
 from torch.nn import Module, ModuleList
 
-from gpadjust.gp import Term
+from gpadjust.gp import SumOfTerms, Term
 from gpadjust.gp.gaussian import noise_variances
 from gpadjust.models.cholesky_strategy import TermsOfData
 from gpadjust.models.hyperparameter_samples import take_samples
@@ -199,6 +200,33 @@ def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> 
     return [gen_kernel_features(kernel, num_inputs=num_inputs, num_outputs=num_features)]
 
 
+class SumFeatures(FeatureMap):
+    """The features of all terms of a sum, side by side, for BoTorch's pathwise sampling."""
+
+    input_transform = output_transform = None
+
+    def __init__(self, kernel: SumOfTerms, num_features: int) -> None:
+        super().__init__()
+        self.terms = kernel.terms
+        self.features = ModuleList(TermFeatures(term, num_features) for term in kernel.terms)
+        self.num_outputs = sum(each.num_features for each in self.features)
+        self.batch_shape = kernel.batch_shape
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return ``... x n x D``."""
+        parts = []
+        for term, features in zip(self.terms, self.features, strict=True):
+            phi, basis = features(x), term.weights(x)
+            parts.append(phi if basis is None else phi * basis.unsqueeze(-1))
+        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
+
+
+@GenKernelFeatures.register(SumOfTerms)  # type: ignore[untyped-decorator, unused-ignore]
+def _sum_of_terms(kernel: SumOfTerms, *, num_inputs: int, num_outputs: int) -> SumFeatures:
+    return SumFeatures(kernel, num_outputs)
+
+
 class FunctionPerBatch(Module):
     """One function of each batch of a model, seen as so many functions of the same inputs.
 
@@ -229,6 +257,7 @@ def draw_functions(model: Any, num_functions: int, seed: int | None, num_feature
         raise ValueError(
             f"Expected num_features to be even (sines and cosines), got {num_features}."
         )
+    model.eval()
     with seeded(seed):
         if model.num_samples is None:
             return model._draw_functions(num_functions, num_features)

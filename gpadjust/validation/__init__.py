@@ -1,11 +1,17 @@
 """Judging predictions. Plots are in `gpadjust.validation.plots`, which needs matplotlib."""
 
+from gpadjust.validation.comparison import STRUCTURES, Candidate, Comparison, Structure, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
 
 __all__ = [
+    "STRUCTURES",
+    "Candidate",
+    "Comparison",
     "LeaveOneOut",
     "Scores",
+    "Structure",
+    "compare",
     "coverage",
     "crps",
     "leave_one_out",

@@ -438,7 +438,7 @@ class TestErrors:
 
     def test_data(self, laboratory, uniform):
         X = uniform(4, 2)
-        with pytest.raises(ValueError, match="Expected the Y of data to hold an observation in each row"):
+        with pytest.raises(ValueError, match="the Y of data to hold an observation in each row"):
             collect(**laboratory(data=(X, X[:, :1].log() * float("nan"))))
         with pytest.raises(ValueError, match="Expected the Y of data to be finite"):
             collect(**laboratory(data=(X, X[:, :1] / 0)))

@@ -25,9 +25,9 @@ def test_step(benchmark, record_ratio, uniform, other):
     Y = (1 + 0.3 * X[:, :1]) * crude(X) + X[:, :4].square()
     model = CKA(X, Y + 0.01 * torch.randn(500, 4, dtype=torch.float64), physics=crude)
     objective = Objective(model)
-    point = objective.current()
+    point = objective.parameters.current()
     with torch.no_grad():
-        _, covariance = objective._moments(objective.unflatten(point))
+        _, covariance = objective._distribution(objective.parameters.unflatten(point))
     mll = ExactMarginalLogLikelihood(model.likelihood, model)
     step = get_loss_closure_with_grads(
         mll, {name: p for name, p in mll.named_parameters() if p.requires_grad}

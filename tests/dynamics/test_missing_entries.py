@@ -139,7 +139,7 @@ def test_declared_states_are_checked_where_they_were_measured():
         dynamics.update(states, actions, wrong)
     wrong = following.clone()
     wrong[5, 2] += 1
-    with pytest.raises(ValueError, match="'goal' is said to be exogenous.*row 5"):
+    with pytest.raises(ValueError, match=r"'goal' is said to be exogenous.*row 5"):
         dynamics.update(states, actions, wrong)
     following[6, 1] = math.nan  # all that the model predicts
     with pytest.raises(ValueError, match=r"predicted entries of next_states.*row 6"):

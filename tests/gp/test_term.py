@@ -77,15 +77,6 @@ def test_the_formula(terms, uniform, j):
     assert kernel.batch_shape == (2,)
 
 
-def test_prepared_covariances(terms, uniform):
-    train, X = uniform(6, 5), uniform(4, 5, seed=1).requires_grad_()
-    for term in terms:
-        prepared, direct = term.covariance_with(train)(X), term.covariance(X, train)
-        torch.testing.assert_close(prepared, direct)
-        gradients = [torch.autograd.grad(k.square().sum(), X)[0] for k in (prepared, direct)]
-        torch.testing.assert_close(*gradients)
-
-
 def test_known_means(terms, uniform):
     X, rho = uniform(6, 5), terms[0]
     assert rho.learns_mean

@@ -10,8 +10,10 @@ from gpytorch.kernels import MaternKernel, ScaleKernel
 from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.priors import LogNormalPrior
+from torch.distributions import MultivariateNormal
 
 from gpadjust import AR1, CKA, RRA, BiasGP, FitResult, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
+from gpadjust.gp.gaussian import nugget
 from gpadjust.inference import map_fit
 from gpadjust.models import PaperRRA
 from gpadjust.models.hyperparameters import LogInterval
@@ -55,12 +57,17 @@ def model(request, XY):
 
 
 def log_likelihood(model):
+    """That of a multivariate normal, with the nugget that is always there."""
     model.train()
-    mll = ExactMarginalLogLikelihood(model.likelihood, model)
     with torch.no_grad():
-        value = mll(model(*model.train_inputs), model.train_targets, *model.train_inputs)
+        prior = model.likelihood(model(*model.train_inputs), *model.train_inputs)
+        covariance = prior.covariance_matrix
+        n = covariance.shape[-1]
+        size = nugget(n) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1)
+        covariance = covariance + size[..., None, None] * torch.eye(n, dtype=torch.float64)
+        value = MultivariateNormal(prior.mean, covariance).log_prob(model.train_targets)
     model.eval()
-    return value * model.train_targets.shape[-1]
+    return value
 
 
 class TestResult:
@@ -189,7 +196,7 @@ class TestManyPoints:
     @pytest.mark.slow
     def test_it_is_as_good_as_a_search_on_all(self, problem, monkeypatch):
         found = fit(problem()).log_likelihood
-        monkeypatch.setattr(map_fit, "_SEARCHED", 1000)
+        monkeypatch.setattr(map_fit, "_MANY", 1000)
         assert (found >= fit(problem()).log_likelihood - 0.1).all()
 
     def test_it_is_never_worse_than_the_start(self, problem):

@@ -3,7 +3,12 @@
 import pytest
 import torch
 
+from gpadjust import CKA
+from gpadjust.inference.full_bayes import potential_of
 from gpadjust.inference.hmc import hmc
+from gpadjust.inference.map_fit import Search, maximise
+from gpadjust.inference.objective import Objective
+from gpadjust.inference.priors import register_priors
 
 
 def generator(seed=0):
@@ -87,3 +92,34 @@ def test_infinite_potentials_are_never_accepted():
     positions = hmc(half_line, start, 40, 200, generator()).positions
     assert (positions[..., 0] > 0).all()
     assert positions[..., 0].mean() == pytest.approx((2 / torch.pi) ** 0.5, abs=0.08)
+
+
+class TestBadStarts:
+    @pytest.fixture(scope="class")
+    def objective(self):
+        """That of the README's ten lines, at its optimum, where the noise is at its bound."""
+        X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        model = CKA(X, 2 * (6 * X).sin() + X, physics=lambda X: (6 * X).sin())
+        register_priors(model)
+        objective = Objective(model, marginal=True, of_logs=True)
+        maximise(objective, Search())
+        return objective
+
+    @pytest.mark.parametrize("where", ["at the bound", "below the bound", "around the bound"])
+    @pytest.mark.parametrize("seed", [0, 1, 2])
+    def test_all_chains_move(self, objective, where, seed):
+        parameters = objective.parameters
+        noise = parameters.noise > 0
+        start = parameters.current().expand(16, -1, -1)
+        start = start + 0.3 * torch.randn(start.shape, generator=generator(seed))
+        offset = {"at the bound": 0.0, "below the bound": -0.3}.get(where)
+        if offset is None:
+            offset = 3 * torch.randn(16, 1, 1, generator=generator(seed))
+        start = torch.where(noise, parameters.lower + offset, start)
+        potential = potential_of(objective)
+        if where == "below the bound":
+            assert potential(start)[0].isinf().all()
+        positions = hmc(potential, start, 40, 1, generator(seed)).positions
+        moved = (positions[-1] != start).any(-1)
+        assert int(moved.sum()) == 16
+        assert parameters.is_allowed(positions[-1]).all()

@@ -31,13 +31,13 @@ def test_densities(build, data, num_outputs):
     d = 2
     medians = {
         "likelihood.noise_covar.noise_prior": (1e-4 * v.unsqueeze(-1), 4),
-        "covar_module.kernels.1.base_kernel.outputscale_prior": (v, 5),
-        "covar_module.kernels.0.base_kernel.base_kernel.outputscale_prior": (v * 0 + 0.25, 1.5),
+        "covar_module.terms.1.kernel.outputscale_prior": (v, 5),
+        "covar_module.terms.0.kernel.outputscale_prior": (v * 0 + 0.25, 1.5),
     }
     median = ranges * math.sqrt(d) * math.exp(math.sqrt(2) - 1)
     for name in (
-        "covar_module.kernels.1.base_kernel.base_kernel.lengthscale_prior",
-        "covar_module.kernels.0.base_kernel.base_kernel.base_kernel.lengthscale_prior",
+        "covar_module.terms.1.kernel.base_kernel.lengthscale_prior",
+        "covar_module.terms.0.kernel.base_kernel.lengthscale_prior",
     ):
         medians[name] = (median.expand(num_outputs, 1, 2), math.sqrt(3))
     assert set(found) == set(medians)
@@ -54,7 +54,9 @@ def test_constant_rho_of_ar1(build, data):
     register_priors(model)
     rho = torch.tensor([2.5], dtype=torch.float64)
     expected = Normal(1.0, 1.0).log_prob(rho)
-    torch.testing.assert_close(priors(model)["covar_module.rho_prior"].log_prob(rho), expected)
+    torch.testing.assert_close(
+        priors(model)["covar_module.terms.0.basis.rho_prior"].log_prob(rho), expected
+    )
 
 
 def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics):
@@ -62,10 +64,10 @@ def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics)
     own = GammaPrior(3.0, 6.0)
     kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=own))
     model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel)
-    model.delta_covar_module.raw_outputscale.requires_grad_(False)
+    model.terms[1].kernel.raw_outputscale.requires_grad_(False)
     register_priors(model)
     assert kernel.base_kernel.lengthscale_prior is own
-    assert not hasattr(model.delta_covar_module, "outputscale_prior")
+    assert not hasattr(model.terms[1].kernel, "outputscale_prior")
     before = priors(model)
     register_priors(model)
     assert priors(model) == before
@@ -83,7 +85,7 @@ def test_objective_is_gpytorchs_log_posterior(build, data, shuffle, kind, num_ou
     expected = likelihood.log_prob(model.train_targets).sum() + sum(
         prior.log_prob(read(module)).sum() for _, module, prior, read, _ in model.named_priors()
     )
-    value = objective(objective.current())
+    value = objective(objective.parameters.current())
     torch.testing.assert_close(-value.sum(), expected, rtol=1e-9, atol=1e-9)
 
 
@@ -94,9 +96,9 @@ def test_potential_has_the_jacobian_of_the_logarithm(data, crude_physics, prior)
     model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel)
     register_priors(model)
     objective = Objective(model, marginal=True)
-    of_settings = Objective(model, marginal=True, of_settings=True)
-    potential = of_settings.value_and_gradient
-    settings = objective.current() + 0.1
+    of_logs = Objective(model, marginal=True, of_logs=True)
+    potential = of_logs.value_and_gradient
+    settings = objective.parameters.current() + 0.1
     value, gradient = potential(settings)
     # All parameters are positive and sampled as logarithms.
     torch.testing.assert_close(value, objective(settings) - settings.sum(-1))

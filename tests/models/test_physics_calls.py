@@ -6,7 +6,7 @@ import pytest
 import torch
 from botorch.sampling import SobolQMCNormalSampler
 
-from gpadjust import fit
+from gpadjust import FunctionPhysics, fit
 
 
 @pytest.fixture
@@ -25,7 +25,10 @@ def counting(crude_physics):
     return Counting()
 
 
-@pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "RRA", "RRA-paper"])
+PHYSICAL = ["PhysicsMeanGP", "ScaleGP", "CKA", "RRA", "RRA-paper"]
+
+
+@pytest.mark.parametrize("kind", PHYSICAL)
 def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs, kind):
     counting.num_outputs = num_outputs
     X, Y = data(num_outputs=num_outputs)
@@ -35,24 +38,29 @@ def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs,
     with torch.no_grad():
         model.posterior(Z)
         model.posterior(Z.unsqueeze(-2), observation_noise=True)
+        model.predict(Z)
+        model.sample_functions(3)(Z)
         conditioned = model.condition_on_observations(new_X, 3 + new_X[:, :num_outputs])
         conditioned.posterior(Z)
         fantasies = model.fantasize(new_X, SobolQMCNormalSampler(torch.Size([3])))
         fantasies.posterior(Z)
+        for name in model.term_names:
+            model.term(name, uniform(4, 2, low=-3.0, seed=3))
     expected = {tuple(row) for row in torch.cat([X, Z, new_X]).tolist()}
     assert set(counting.rows) == expected
     assert set(counting.rows.values()) == {1}
 
 
-@pytest.mark.parametrize("kind", ["BiasGP", "ScaleGP", "CKA", "RRA", "RRA-paper"])
-def test_rho_and_delta_do_not_evaluate_it_at_new_inputs(data, build, uniform, counting, kind):
+@pytest.mark.parametrize("kind", PHYSICAL)
+def test_each_call_evaluates_it_once(data, build, uniform, counting, kind):
     X, Y = data()
-    model = build(kind, X, Y, physics=counting).eval()
-    Z = uniform(4, 2, low=-3.0, seed=1)
-    for name in ("rho", "delta"):
-        if hasattr(model, name):
-            getattr(model, name)(Z)
-    assert set(counting.rows) == {tuple(row) for row in X.tolist()}
+    model = build(kind, X, Y, physics=FunctionPhysics(counting, memo=0)).eval()
+    functions = model.sample_functions(3)
+    model.posterior(X)
+    counting.rows.clear()
+    for number, call in enumerate((model.posterior, model.predict, functions), start=1):
+        call(X)
+        assert set(counting.rows.values()) == {number}
 
 
 def test_ar1_evaluates_the_samples_only(data, build, uniform, counting):

@@ -7,6 +7,8 @@ from botorch.models.transforms import Normalize, Standardize
 from pyro.infer import MCMC, NUTS, Predictive
 from pyro.infer.autoguide import AutoLaplaceApproximation
 
+from gpadjust.models import PaperRRA
+
 
 @pytest.fixture(autouse=True)
 def _clear_pyro():
@@ -196,15 +198,15 @@ def test_functions_of_a_batch_of_data_sets(data, build, uniform):
 
 def test_evidence_is_that_of_the_weights_marginalised(data, build, shuffle):
     X, Y = data()
-    model = shuffle(build("RRA", X, Y, num_features=5))
+    model = shuffle(build("RRA", X, Y, num_features=6))
     scale = model.outcome_transform.stdvs.item()
-    unit = torch.eye(10, dtype=torch.float64)
+    unit = torch.eye(12, dtype=torch.float64)
     zero = model.functions(torch.zeros_like(unit[:1]))(X)
     design = (model.functions(unit)(X) - zero).squeeze(-1).mT
-    s_rho, s_delta = model.rho_covar_module.outputscale, model.delta_covar_module.outputscale
-    prior = torch.cat([s_rho.expand(5), (s_delta * scale**2).expand(5)])
+    s_rho, s_delta = (term.kernel.outputscale for term in model.terms)
+    prior = torch.cat([s_rho.expand(6), (s_delta * scale**2).expand(6)])
     noise = model.likelihood.noise * scale**2
-    covariance = design @ prior.diag() @ design.mT + noise * torch.eye(len(X))
+    covariance = design @ prior.diag() @ design.mT + noise * torch.eye(len(X), dtype=X.dtype)
     expected = torch.distributions.MultivariateNormal(zero[0, :, 0], covariance).log_prob(Y[:, 0])
     model.train()
     marginal = model.likelihood(model(*model.train_inputs))
@@ -222,21 +224,14 @@ def test_the_papers_closed_form(data, build, shuffle, close, crude_physics, unif
     posterior, noisy = model.posterior(Z), model.posterior(Z, observation_noise=True)
     weights = model.weights()
     for j in range(2):
-        lengthscales = [
-            kernel.base_kernel.lengthscale[j].detach()
-            for kernel in (model.rho_covar_module, model.delta_covar_module)
-        ]
-        maps = [
-            kernel.base_kernel.features
-            for kernel in (model.rho_covar_module, model.delta_covar_module)
-        ]
+        kernels = [term.kernel.base_kernel for term in model.terms]
 
-        def phi(X, j=j, lengthscales=lengthscales, maps=maps):
-            rho, delta = (
-                (2 / 6) ** 0.5 * torch.cos((X / length) @ m.frequencies.mT + m.phases)
-                for length, m in zip(lengthscales, maps, strict=True)
-            )
-            return torch.cat([crude_physics(X)[:, [j]] * rho, delta], dim=-1)
+        def phi(X, j=j, kernels=kernels):
+            parts = []
+            for kernel in kernels:
+                angles = (X / kernel.lengthscale[j].detach()) @ kernel.randn_weights[j]
+                parts.append(torch.cat([angles.cos(), angles.sin()], dim=-1) / 3**0.5)
+            return torch.cat([crude_physics(X)[:, [j]] * parts[0], parts[1]], dim=-1)
 
         ridge = 0.3 if known_noise else model.likelihood.noise[j].item()
         eye = torch.eye(12, dtype=torch.float64)
@@ -256,7 +251,7 @@ def test_the_papers_prior_falls_to_zero_without_data(data, build, uniform):
     X, Y = data()
     model = build("RRA-paper", X, Y).eval()
     assert (model.weights().variance <= 1).all()
-    assert not model.rho_covar_module.raw_outputscale.requires_grad
+    assert not any(term.kernel.raw_outputscale.requires_grad for term in model.terms)
     functions = model.functions(torch.zeros(1, 48, dtype=torch.float64))
     assert (functions(uniform(4, 2)) == 0).all()
 
@@ -276,10 +271,16 @@ def test_the_seed_makes_the_features(data, build, uniform):
     assert not torch.equal(first, other)
 
 
-def test_rho_and_delta_have_features_of_their_own(data, build):
-    model = build("RRA", *data())
-    rho, delta = (
-        kernel.base_kernel.features.frequencies
-        for kernel in (model.rho_covar_module, model.delta_covar_module)
-    )
+def test_rho_and_delta_have_features_of_their_own_which_the_outputs_share(data, build):
+    model = build("RRA", *data(num_outputs=2))
+    rho, delta = (term.kernel.base_kernel.randn_weights for term in model.terms)
     assert not torch.equal(rho, delta)
+    assert torch.equal(rho[0], rho[1])
+
+
+def test_papers_refusals(data, build):
+    model = build("RRA-paper", *data())
+    with pytest.raises(ValueError, match="cannot be fully Bayesian"):
+        model.hold_samples({})
+    with pytest.raises(TypeError, match="outcome_transform"):
+        PaperRRA(*data(), physics=lambda X: X, outcome_transform=None)

@@ -7,10 +7,10 @@ import torch
 from botorch.models.deterministic import MatheronPathModel
 from botorch.models.transforms import Normalize
 from botorch.sampling.pathwise import draw_kernel_feature_paths, draw_matheron_paths
-from gpytorch.kernels import ConstantKernel, RBFKernel
+from gpytorch.kernels import ConstantKernel, RBFKernel, RFFKernel, ScaleKernel
 
-from gpadjust.gp import FourierFeatures, FourierKernel, InputsKernel, PhysicsScaledKernel
-from gpadjust.gp.feature_maps import features_of
+from gpadjust.gp import Term
+from gpadjust.models.sampled_functions import TermFeatures
 
 
 def test_moments(data, build, kind, num_outputs, uniform):
@@ -79,10 +79,15 @@ def test_a_later_fit_leaves_them(data, build, kind, shuffle, uniform):
     torch.testing.assert_close(copy.deepcopy(functions)(Z), before)
 
 
-@pytest.mark.parametrize("number", [0, -1, 2.5])
-def test_a_wrong_number(data, build, kind, number):
-    with pytest.raises(ValueError, match="num_functions to be a whole number >= 1"):
-        build(kind, *data()).sample_functions(number)
+def test_wrong_numbers(data, build, kind):
+    model = build(kind, *data())
+    for number in (0, -1, 2.5):
+        with pytest.raises(ValueError, match="num_functions to be a whole number >= 1"):
+            model.sample_functions(number)
+        with pytest.raises(ValueError, match="num_features to be a whole number >= 1"):
+            model.sample_functions(1, num_features=number)
+    with pytest.raises(ValueError, match="num_features to be even"):
+        model.sample_functions(1, num_features=7)
 
 
 def test_botorch_draws_paths(data, build, kind, num_outputs, uniform):
@@ -91,20 +96,25 @@ def test_botorch_draws_paths(data, build, kind, num_outputs, uniform):
     shape = (4, 5) if num_outputs == 1 else (4, num_outputs, 5)
     for draw in (draw_matheron_paths, draw_kernel_feature_paths):
         assert draw(model, torch.Size([4]))(Z).shape == shape
+    values = draw_matheron_paths(model, torch.Size([512]))(Z).detach()
+    posterior = model.posterior(Z)
+    if kind != "RRA-paper":
+        error = values.mean(0).reshape(num_outputs, 5).mT - posterior.mean
+        assert (error.abs() < 0.25 * posterior.variance.sqrt()).all()
     assert MatheronPathModel(model, seed=0).posterior(Z).mean.shape == (5, num_outputs)
 
 
 @pytest.mark.parametrize("outputs", [(), (2,)], ids=["1-output", "2-outputs"])
 def test_features_make_the_kernel(uniform, outputs):
     shape = torch.Size(outputs)
-    rbf = RBFKernel(batch_shape=shape).double()
-    fourier = FourierKernel(FourierFeatures(8, 2), batch_shape=shape).double()
     constant = ConstantKernel(batch_shape=shape).double()
     constant.constant = torch.full((*shape, 1), 2.5, dtype=torch.float64)
-    rho = PhysicsScaledKernel(InputsKernel(fourier + constant, 2), lambda X: 2 + X[..., 2])
-    kernel = rho + InputsKernel(constant, 2) + InputsKernel(rbf, 2)
+    rff = RFFKernel(num_samples=4, num_dims=2, batch_shape=shape).double()
+    rbf, mean = RBFKernel(batch_shape=shape), torch.zeros(*shape, 1, dtype=torch.float64)
     x = uniform(6, 3)
-    features = features_of(kernel, 3, 4096)(x)
-    expected = kernel(x).to_dense().detach()
-    actual = (features @ features.mT).detach()
-    torch.testing.assert_close(actual, expected, rtol=0, atol=0.01 * expected.max().item())
+    for kernel, tolerance in ((ScaleKernel(rff) + constant, 1e-12), (rbf + constant, 0.01)):
+        term = Term("f", kernel.double(), 2, None, mean, mean + 0.7)
+        features = TermFeatures(term, 4096)(x)
+        expected = term.covariance(x, x).detach()
+        close = {"rtol": 0, "atol": tolerance * expected.max().item()}
+        torch.testing.assert_close((features @ features.mT).detach(), expected, **close)

@@ -6,8 +6,7 @@ import statistics
 import pytest
 import torch
 
-from gpadjust import CKA, PhysicsMeanGP, fit
-from gpadjust.inference.objective import Objective
+from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, fit
 
 QUICK = {"num_screened": 16, "num_starts": 2}
 MEANS = [("rho",), ("delta",), ("rho", "delta")]
@@ -30,7 +29,7 @@ def fitted(X, Y, means=("rho", "delta"), center=0.0, **options):
         Y,
         physics=lambda X: crude(X)[..., :m],
         center=center,
-        **{f"learn_{name}_mean": True for name in means},
+        **{f"{name}_mean": "learn" for name in means},
         **options,
     )
     fit(model, **QUICK)
@@ -46,7 +45,7 @@ class UniversalKriging:
     def __init__(self, model, j, X, y, means, center, rbf):
         pick = (lambda t: t.detach()[j]) if model.num_outputs > 1 else (lambda t: t.detach())
         scale = model.outcome_transform.stdvs.reshape(-1)[j]
-        rho, delta = model.rho_covar_module, model.delta_covar_module
+        rho, delta = (term.kernel for term in model.terms)
         self.k_rho = rbf(pick(rho.base_kernel.lengthscale), pick(rho.outputscale))
         self.k_delta = rbf(pick(delta.base_kernel.lengthscale), pick(delta.outputscale) * scale**2)
         noise = pick(model.likelihood.noise) * scale**2
@@ -125,94 +124,80 @@ def test_a_constant_factor_is_recovered(uniform, factor):
     def physics(X):
         return 2 + (5 * X).sin()
 
-    model = PhysicsMeanGP(X, factor * physics(X), physics=physics, learn_rho_mean=True)
+    model = PhysicsMeanGP(X, factor * physics(X), physics=physics, rho_mean="learn")
     fit(model, **QUICK)
-    assert model.mean_module.rho_mean.item() == pytest.approx(factor, rel=1e-6)
+    assert model.term_mean("rho") == pytest.approx(factor, rel=1e-6)
+    torch.testing.assert_close(model.rho(Z).mean, torch.full_like(Z, factor), rtol=1e-6, atol=0)
     torch.testing.assert_close(
         model.posterior(Z).mean.detach(), factor * physics(Z), rtol=1e-5, atol=1e-5 * abs(factor)
     )
 
 
 @pytest.mark.parametrize("means", MEANS, ids="+".join)
-def test_far_from_the_data_the_constants_remain(uniform, means):
+@pytest.mark.parametrize("center", [0.0, "mean"])
+def test_far_from_the_data_the_constants_remain(uniform, means, center):
     X, Y = problem(uniform)
-    model = fitted(X, Y, means)
+    model = fitted(X, Y, means, center)
     with torch.no_grad():
-        for kernel in (model.rho_covar_module, model.delta_covar_module):
-            kernel.base_kernel.raw_lengthscale.fill_(-3.0)
-    model.train()
-    fit_constants(model)
+        for term in model.terms:
+            term.kernel.base_kernel.raw_lengthscale.fill_(-3.0).requires_grad_(False)
+    fit(model.train(), num_screened=0, num_starts=1)  # the constants at these lengthscales
     Z = torch.full((1, 2), 30.0, dtype=torch.float64)
-    rho, delta = (model.mean_module.rho_mean, model.mean_module.delta_mean)
-    scale = model.outcome_transform.stdvs
-    expected = rho * crude(Z)[..., :1] + delta * scale
-    torch.testing.assert_close(model.posterior(Z).mean, expected, rtol=1e-3, atol=1e-3)
-    if "rho" not in means:
-        assert rho == 1.0
-    if "delta" not in means:
-        assert delta == 0.0
+    rho, delta = (model.term_mean(name) for name in ("rho", "delta"))
+    posterior = model.eval().posterior(Z)
+    torch.testing.assert_close(posterior.mean, rho * crude(Z)[..., :1] + delta, rtol=1e-3, atol=1e-3)
+    assert ("rho" in means) != (rho == 1.0)
+    known = 0.0 if center == 0.0 else (1 - rho) * crude(X)[..., 0].mean().item()
+    assert ("delta" in means) != (delta == pytest.approx(known, abs=1e-9))
 
 
-def fit_constants(model):
-    """Set the constants at the hyper-parameters that the model has."""
-    objective = Objective(model)
-    objective.assign(objective.current()[0])
-    model.eval()
+def test_given_means(uniform):
+    X, Y = problem(uniform, 2)
+    model = CKA(X, Y, physics=crude, rho_mean=2.5, delta_mean=-7.0, center="mean")
+    Z = torch.full((1, 2), 300.0, dtype=torch.float64)
+    for j in range(2):
+        assert model.term_mean("rho", j) == pytest.approx(2.5)
+        assert model.term_mean("delta", j) == pytest.approx(-7.0)
+    torch.testing.assert_close(model.posterior(Z).mean, 2.5 * crude(Z) - 7.0)
+    torch.testing.assert_close(model.delta(Z).mean, torch.full_like(Z, -7.0))
+    assert not any(term.learns_mean for term in model.terms)
 
 
-@pytest.mark.parametrize("m", [1, 2])
-def test_conditioning_is_rebuilding(uniform, m):
+@pytest.mark.parametrize(
+    ("cls", "m"), [(CKA, 1), (CKA, 2), (PhysicsMeanGP, 2), (ScaleGP, 1), (RRA, 2)]
+)
+def test_conditioning_and_copies(uniform, same, cls, m):
     X, Y = problem(uniform, m)
-    model = fitted(X, Y)
-    Z = uniform(6, 2, seed=3)
+    Z, options = uniform(6, 2, seed=3), {"rho_mean": "learn", "delta_mean": "learn"}
+    if cls is ScaleGP:
+        options.pop("delta_mean")
+
+    def build(*data):
+        return cls(*data, physics=Column(m), **options)
+
+    model = build(X, Y)
+    fit(model, **QUICK)
+    with torch.no_grad():
+        model.likelihood.noise_covar.raw_noise.fill_(-7.0)
     new_X, new_Y = uniform(2, 2, seed=4), Y[:2]
-    model.posterior(Z)
-    conditioned = model.condition_on_observations(new_X, new_Y)
-    rebuilt = CKA(
-        torch.cat([X, new_X]),
-        torch.cat([Y, new_Y]),
-        physics=lambda X: crude(X)[..., :m],
-        learn_rho_mean=True,
-        learn_delta_mean=True,
-        outcome_transform=model.outcome_transform,
-    )
+    rebuilt = build(torch.cat([X, new_X]), torch.cat([Y, new_Y]))
     rebuilt.load_state_dict(model.state_dict())
-    torch.testing.assert_close(
-        conditioned.posterior(Z).mean, rebuilt.posterior(Z).mean, rtol=1e-6, atol=1e-6
-    )
-    torch.testing.assert_close(
-        conditioned.posterior(Z).variance, rebuilt.posterior(Z).variance, rtol=1e-4, atol=1e-8
-    )
+    same(model.condition_on_observations(new_X, new_Y), rebuilt.eval(), Z, 1e-5)
+    same(pickle.loads(pickle.dumps(model)), model, Z, 1e-12)
+    if m > 1:
+        for outputs in ([0], [1, 0]):
+            same(model.subset_output(outputs), model, Z, 1e-9, outputs)
 
 
-class TestCopies:
-    def assert_same(self, one, other, Z, outputs=slice(None)):
-        for quantity in ("posterior", "rho", "delta"):
-            a, b = (getattr(model, quantity)(Z) for model in (one, other))
-            torch.testing.assert_close(a.mean, b.mean[..., outputs])
-            torch.testing.assert_close(a.variance, b.variance[..., outputs])
+class Column(torch.nn.Module):
+    """The first columns of the crude physics."""
 
-    def test_state_dict(self, uniform):
-        X, Y = problem(uniform, 2)
-        model = fitted(X, Y)
-        state = model.state_dict()
-        assert {"mean_module.rho_mean", "mean_module.delta_mean"} <= set(state)
-        other = CKA(X, Y, physics=crude, learn_rho_mean=True, learn_delta_mean=True)
-        other.load_state_dict(state)
-        self.assert_same(other.eval(), model, uniform(5, 2, seed=3))
+    def __init__(self, m):
+        super().__init__()
+        self.m = m
 
-    def test_pickle(self, uniform):
-        X, Y = problem(uniform, 2)
-        model = CKA(X, Y, physics=crude, learn_rho_mean=True, learn_delta_mean=True)
-        fit(model, **QUICK)
-        self.assert_same(pickle.loads(pickle.dumps(model)), model, uniform(5, 2, seed=3))
-
-    @pytest.mark.parametrize("outputs", [[0], [1], [1, 0]])
-    def test_subset_output(self, uniform, outputs):
-        X, Y = problem(uniform, 2)
-        model = fitted(X, Y)
-        subset = model.subset_output(outputs)
-        self.assert_same(subset, model, uniform(5, 2, seed=3), outputs)
+    def forward(self, X):
+        return crude(X)[..., : self.m]
 
 
 class TestForrester:
@@ -225,8 +210,8 @@ class TestForrester:
             Y * factor,
             physics=forrester.crude,
             center="mean",
-            learn_rho_mean=True,
-            learn_delta_mean=True,
+            rho_mean="learn",
+            delta_mean="learn",
         )
         fit(model)
         Z = forrester.test_X
@@ -243,10 +228,3 @@ class TestForrester:
     def test_at_length(self, forrester, factor, limit):
         errors = [self.error(forrester, seed, factor) for seed in range(20)]
         assert statistics.mean(errors) <= limit
-
-
-def test_no_constant_is_learnt_unless_asked(uniform):
-    X, Y = problem(uniform)
-    model = CKA(X, Y, physics=lambda X: crude(X)[..., :1])
-    assert not model.constant_means
-    assert not any("constant" in name for name, _ in model.named_parameters())

@@ -5,7 +5,8 @@ import torch
 from botorch.models import ModelListGP, SingleTaskGP
 from botorch.models.transforms import Log, Normalize, Standardize
 
-from gpadjust.gp import FixedStandardize
+from gpadjust import CKA
+from gpadjust.models.training_data import standardize
 from gpadjust.validation import coverage, crps, leave_one_out, nlpd, pit, rmse
 
 
@@ -28,7 +29,7 @@ def brute_force(construct, kind, model, X, Y, Yvar, options):
     """Predict each point by a model without it, of the same hyper-parameters and units."""
     transform = getattr(model, "outcome_transform", None)
     if transform is not None:
-        options["outcome_transform"] = FixedStandardize.of(transform.means, transform.stdvs)
+        options["outcome_transform"] = standardize(transform.means, transform.stdvs)
     state = model.state_dict()
     mean, variance = torch.empty_like(Y), torch.empty_like(Y)
     for i in range(X.shape[-2]):
@@ -37,7 +38,7 @@ def brute_force(construct, kind, model, X, Y, Yvar, options):
         part = construct(kind, X[..., rest, :], Y[..., rest, :], noise, **options)
         own = part.state_dict()
         same = {k: v for k, v in state.items() if own[k].shape == v.shape}
-        part.load_state_dict({**own, **same}, keep_transforms=False)
+        part.load_state_dict({**own, **same})
         posterior = part.eval().posterior(X[..., i : i + 1, :], observation_noise=Yvar is None)
         mean[..., i, :] = posterior.mean[..., 0, :]
         variance[..., i, :] = posterior.variance[..., 0, :]
@@ -152,3 +153,38 @@ def test_after_conditioning(data, construct, kind, num_outputs, normalize):
     model = construct(kind, X[:6], Y[:6], **options).eval()
     conditioned = model.condition_on_observations(X[6:], Y[6:])
     check(construct, kind, conditioned, X, Y, **options)
+
+
+@pytest.mark.parametrize("known_noise", [False, True])
+@pytest.mark.parametrize("options", [{}, {"rho_mean": "learn", "center": 1.0}])
+def test_missing_observations_are_those_of_models_of_each_output(
+    data, crude_physics, shuffle, known_noise, options
+):
+    X, Y = data(num_outputs=2)
+    Y[2, 0] = Y[4:6, 1] = torch.nan
+    Yvar = torch.full_like(Y, 0.02) if known_noise else None
+    both = shuffle(CKA(X, Y, Yvar, physics=crude_physics, **options))
+    found, parameters = leave_one_out(both), dict(both.named_parameters())
+    assert torch.equal(found.Y.isnan(), Y.isnan())
+    assert found.mean.isfinite().all()
+    for j in range(2):
+        seen = ~Y[:, j].isnan()
+        noise = None if Yvar is None else Yvar[seen][:, [j]]
+        model = CKA(
+            X[seen],
+            Y[seen][:, [j]],
+            noise,
+            physics=lambda X, j=j: crude_physics(X)[..., [j]],
+            **options,
+        )
+        with torch.no_grad():
+            for name, parameter in model.named_parameters():
+                parameter.copy_(parameters[name][j].reshape(parameter.shape))
+        alone = leave_one_out(model)
+        for name in ("Y", "mean", "variance"):
+            actual = getattr(found, name)[seen][:, [j]]
+            torch.testing.assert_close(actual, getattr(alone, name), rtol=1e-7, atol=1e-7)
+        for name in ("rmse", "nlpd", "crps"):
+            score = getattr(found, name)[j : j + 1]
+            torch.testing.assert_close(score, getattr(alone, name), rtol=1e-7, atol=1e-7)
+        torch.testing.assert_close(found.coverage()[j], alone.coverage()[0])

@@ -18,13 +18,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gpadjust.gp.gaussian import threads_for
-from gpadjust.inference.map_fit import FitResult, Search, maximise
-from gpadjust.inference.objective import Objective
+from gpadjust.inference.fitting import fit
+from gpadjust.inference.map_fit import FitResult
 from gpadjust.models import CKA, RRA, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import JoinedPhysics, Physics, as_physics
-from gpadjust.validation import leave_one_out
+from gpadjust.validation.leave_one_out import leave_one_out
 
 Criterion = Literal["leave-one-out", "evidence"]
 
@@ -195,9 +195,9 @@ def compare(
         adjusting it is better than taking it as the mean.
 
     Raises:
-        TypeError: As :class:`~gpadjust.CKA`.
-        ValueError: As :class:`~gpadjust.CKA`; if a structure or criterion is unknown, or there is
-            a batch of data sets.
+        TypeError: As :class:`~gpadjust.CKA` and :func:`~gpadjust.fit`.
+        ValueError: As these two; if a structure or criterion is unknown, or there is a batch of
+            data sets.
         PhysicsError: As :class:`~gpadjust.CKA`.
 
     Example:
@@ -239,10 +239,9 @@ def compare(
             physics=deepcopy(part),
             input_transform=deepcopy(input_transform),
         )
-        search = Search(num_starts, num_screened, seed=seed)
         with warnings.catch_warnings(), threads_for(len(data.X), others=True):
             warnings.simplefilter("ignore", OptimizationWarning)
-            result = maximise(Objective(model), search)
+            result = fit(model, num_starts=num_starts, num_screened=num_screened, seed=seed)
             row, densities[structure.name] = _judge(structure, model, result)
         models[structure.name] = model
         rows.append(row)

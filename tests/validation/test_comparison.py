@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from botorch.models.transforms import Normalize
 
-from gpadjust import compare
-from gpadjust.inference.comparison import STRUCTURES
+from gpadjust import CKA, compare
+from gpadjust.inference import STRUCTURES, Structure
+from gpadjust.inference.objective import Objective
 from gpadjust.validation import leave_one_out
 
 QUICK = {"num_starts": 2, "num_screened": 32}
@@ -96,7 +98,7 @@ def test_evidence_is_in_the_users_units(scaled):
 @pytest.mark.slow
 def test_all_structures_by_default(scaled):
     comparison = compare(*scaled, crude, **QUICK)
-    assert set(comparison.models) == set(STRUCTURES)
+    assert set(comparison.models) == {structure.name for structure in STRUCTURES}
     assert not says(comparison, "does not help")
 
 
@@ -149,6 +151,103 @@ class TestAdvice:
         assert not says(comparison, "no better")
 
 
+class Wave(torch.nn.Module):
+    """sin(rate x), with a rate to be learnt."""
+
+    def __init__(self):
+        super().__init__()
+        self.rate = torch.nn.Parameter(torch.tensor(6.5, dtype=torch.float64))
+
+    def forward(self, X):
+        return 2 + (self.rate * X[..., :1]).sin()
+
+
+class TestEachModelHasItsOwn:
+    def test_physics_and_input_transform(self, scaled):
+        X, Y = 100 + 50 * scaled[0], scaled[1]
+        wave, normalize = Wave(), Normalize(1)
+
+        class Physics(torch.nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.wave = wave
+
+            def forward(self, X):
+                return self.wave((X - 100) / 50)
+
+        names = [*THREE, "constant rho"]
+        comparison = compare(X, Y, Physics(), structures=names, input_transform=normalize, **QUICK)
+        assert wave.rate.item() == 6.5
+        rates = {
+            name: model.physics.function.wave.rate.item()
+            for name, model in comparison.models.items()
+            if name != "zero mean"
+        }
+        assert len(set(rates.values())) == len(rates)
+        assert comparison.best is comparison.models[comparison.chosen]
+        for name, model in comparison.models.items():
+            number, loo = row(comparison, name), leave_one_out(model)
+            assert number.log_predictive == pytest.approx(-loo.nlpd.item() * len(X), rel=1e-9)
+            assert number.rmse == pytest.approx((loo.rmse / Y.std(0)).item(), rel=1e-9)
+            # As good as on the data: a model whose physics moved after its fit would be off.
+            error = (model.predict(X).mean - Y).square().mean().sqrt() / Y.std()
+            assert error <= number.rmse
+            evidence = evidence_of(model)
+            assert number.evidence == pytest.approx(evidence, rel=1e-6, abs=1e-4)
+
+    def test_a_structure_of_the_users(self, scaled):
+        own = Structure("mine", lambda *data, **options: CKA(*data, rho_mean=2.0, **options))
+        comparison = compare(*scaled, crude, structures=["zero mean", own], **QUICK)
+        assert comparison.chosen == "mine"
+        assert comparison.best.term_mean("rho") == 2.0
+
+
+def evidence_of(model):
+    """The log marginal likelihood, with unknown means as the fit left them, in the users' units."""
+    value = -Objective(model)(Objective(model).parameters.current()).sum().item()
+    model.eval()
+    return value - model.train_targets.shape[-1] * model.outcome_transform.stdvs.log().sum().item()
+
+
+def test_missing_targets(X, scaled, noise):
+    Y = torch.cat([scaled[1], 3 * crude(X) + X.square() + noise], dim=-1)
+    Y[2:5, 1] = torch.nan
+    seen = ~Y[:, 1].isnan()
+    both = compare(X, Y, lambda X: crude(X).expand(-1, 2), structures=THREE)
+    first = compare(X, Y[:, :1], crude, structures=THREE)
+    second = compare(X[seen], Y[seen][:, 1:], crude, structures=THREE)
+    for name in THREE:
+        alone = [row(each, name) for each in (first, second)]
+        for field in ("evidence", "log_predictive"):
+            expected = sum(getattr(each, field) for each in alone)
+            assert getattr(row(both, name), field) == pytest.approx(expected, abs=0.1)
+
+
+class TestSeveralPhysics:
+    @pytest.fixture
+    def comparison(self, X, noise):
+        def wave(X):
+            return 2 + (7 * X).sin()
+
+        def line(X):
+            return 5 * X
+
+        Y = torch.where(X < 0.5, wave(X), line(X)) + noise
+        physics = {"wave": wave, "line": line}
+        return compare(X, Y, physics, structures=[*THREE, "constant rho"], **QUICK)
+
+    def test_each_alone_and_all(self, comparison):
+        kinds = ("physics mean", "CKA", "constant rho")
+        names = {f"{kind} of {name}" for kind in kinds for name in ("wave", "line", "all")}
+        assert set(comparison.models) == {"zero mean", *names}
+        for name, model in comparison.models.items():
+            loo = leave_one_out(model)
+            assert row(comparison, name).log_predictive == pytest.approx(-loo.nlpd.item() * 14)
+
+    def test_the_table_prints(self, comparison):
+        assert "CKA of all" in str(comparison)
+
+
 def test_known_noise(scaled):
     X, Y = scaled
     comparison = compare(X, Y, crude, torch.full_like(Y, 1e-3), structures=THREE, **QUICK)
@@ -185,3 +284,16 @@ class TestBadInput:
         X, Y = scaled
         with pytest.raises(ValueError, match="train_Y"):
             compare(X, Y[:5], crude)
+
+    @pytest.mark.parametrize(
+        ("option", "value", "error"),
+        [
+            ("num_starts", 0, ValueError),
+            ("num_starts", 1.5, TypeError),
+            ("num_screened", -1, ValueError),
+            ("seed", None, TypeError),
+        ],
+    )
+    def test_options_of_the_fits(self, scaled, option, value, error):
+        with pytest.raises(error, match=f"Expected {option}"):
+            compare(*scaled, crude, structures=["CKA"], **{option: value})

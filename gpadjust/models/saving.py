@@ -1,0 +1,125 @@
+"""Models as files: data, settings and hyper-parameters, and the physics by its name."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gpadjust.models.exact_gp_base import ExactGPBase
+from gpadjust.physics import JoinedPhysics, Physics, as_physics
+from gpadjust.physics.import_path import import_path, physics_from_path
+
+_FORMAT = 1
+_PLAIN = bool | int | float | str | torch.Tensor | None
+
+
+def save(model: ExactGPBase, path: str | Path) -> None:
+    """Save a model: data, settings, hyper-parameters (or samples of them), and names.
+
+    The physics is saved by its import path, if it is a function or object of a module. What cannot
+    be saved (a lambda, a kernel or transform of yours) is to be given to :func:`load` again.
+
+    Args:
+        model: The model.
+        path: The file, which ``torch.load`` reads with ``weights_only=True``.
+
+    Raises:
+        TypeError: If it is no model of this library.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from gpadjust import CKA, load, save
+        >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CKA(X, 2 * X.sin() + X, physics=torch.sin)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(model, f"{folder}/model.pt")
+        ...     again = load(f"{folder}/model.pt")
+        >>> torch.equal(again.posterior(X).mean, model.posterior(X).mean)
+        True
+    """
+    if not isinstance(model, ExactGPBase):
+        raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
+    options = {n: v for n, v in model.options.items() if n != "physics"}
+    missing = [name for name, value in options.items() if not _is_plain(value)]
+    physics: Any = None
+    if model.options.get("physics") is not None:
+        given = as_physics(model.options["physics"])
+        parts = (
+            dict(zip(given.names, given.parts, strict=True))
+            if isinstance(given, JoinedPhysics)
+            else {"": given}
+        )
+        physics = {name: import_path(part) for name, part in parts.items()}
+        if None in physics.values():
+            missing.append("physics")
+    content = {
+        "format": _FORMAT,
+        "class": f"{type(model).__module__}:{type(model).__qualname__}",
+        "options": {name: v for name, v in options.items() if name not in missing},
+        "missing": missing,
+        "physics": physics,
+        "data": model.data(),
+        "names": [list(model.input_names), list(model.output_names)],
+        "state": model.state_dict(),
+    }
+    target = Path(path)
+    part = target.with_name(f"{target.name}.part")
+    torch.save(content, part)
+    part.replace(target)
+
+
+def load(path: str | Path, **objects: Any) -> ExactGPBase:
+    """Load a model that :func:`save` wrote.
+
+    The classes of model and physics are imported by the names in the file, which runs the code of
+    their modules: open files that you trust only.
+
+    Args:
+        path: The file.
+        objects: ``physics`` and other arguments of the model that could not be saved; an error
+            says which.
+
+    Raises:
+        ValueError: If it is no such file, if objects are missing, or a physics cannot be imported.
+    """
+    try:
+        content = torch.load(path, weights_only=True)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path} is not a model that gpadjust saved: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ValueError(
+            f"{path} is not a model that this version of gpadjust saved; expected format {_FORMAT}."
+        )
+    missing = [name for name in content["missing"] if name not in objects]
+    if missing:
+        given = ", ".join(f"{name}=..." for name in missing)
+        raise ValueError(
+            f"{path} could not hold {' and '.join(missing)}: give what the model was built with, "
+            f"load(path, {given})."
+        )
+    module, _, name = content["class"].partition(":")
+    model_class = getattr(import_module(module), name, None)
+    if not isinstance(model_class, type) or not issubclass(model_class, ExactGPBase):
+        raise ValueError(f"{path} is of {content['class']}, which is no model of gpadjust.")
+    if content["physics"] is not None and "physics" not in objects:
+        objects["physics"] = _physics(content["physics"])
+    model = model_class(**content["data"], **{**content["options"], **objects})
+    model.load_state_dict(content["state"])
+    model.input_names, model.output_names = (tuple(names) for names in content["names"])
+    return model.eval()
+
+
+def _physics(paths: dict[str, str]) -> Physics:
+    parts = {name: physics_from_path(path) for name, path in paths.items()}
+    return parts[""] if "" in parts else as_physics(parts)
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return isinstance(value, _PLAIN)

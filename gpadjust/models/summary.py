@@ -1,0 +1,117 @@
+"""What a model has learnt, in words and in the user's units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from botorch.models.transforms.input import Normalize
+from torch import Tensor
+
+from gpadjust.gp import PhysicsInput, Term
+from gpadjust.gp.gaussian import negative_log_likelihood, noise_variances
+from gpadjust.models.hyperparameters import KINDS, is_rho, kind_of, typical_sizes
+
+_NEAR = 1.01  # times a bound is at the bound
+
+
+def title(model: Any) -> str:
+    """One line: the structure, and of what data it is."""
+    transform = getattr(model, "input_transform", None)
+    of = f" of {transform.physics.name!r}" if isinstance(transform, PhysicsInput) else ""
+    counts = {
+        "point": model.train_targets.shape[-1],
+        "input": len(model.input_names),
+        "output": model.num_outputs,
+    }
+    if model.num_samples is not None:
+        counts["sample"] = model.num_samples
+    parts = [f"{n} {noun}" + ("" if n == 1 else "s") for noun, n in counts.items()]
+    return f"{type(model).__name__}{of}: {', '.join(parts)}"
+
+
+@torch.no_grad()
+def summary(model: Any) -> str:
+    """The text of :meth:`~gpadjust.CKA.summary`."""
+    model.eval()
+    lines = [title(model)]
+    for i, name in enumerate(model.output_names):
+        lines += [f"{name}:", *_lines(model.subset_output([i]))]
+    return "\n".join(lines)
+
+
+def log_likelihood(model: Any) -> Tensor:
+    """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
+    strategy, scale = model.strategy(), model._units()[1].squeeze(-1)
+    residual = model.train_targets - strategy.train_prior_dist.mean
+    value = negative_log_likelihood(residual, strategy.noisy_covariance(model.covar_module)).value
+    return -value - (~residual.isnan()).sum(-1) * scale.log()
+
+
+def _lines(model: Any) -> list[str]:
+    """What there is to say of one output."""
+    scale, sizes = model._units()[1].squeeze(-1), typical_sizes(model)
+    lines = [f"  log likelihood {_text(log_likelihood(model))}"]
+    for i, term in enumerate(model.terms):
+        unit = torch.ones_like(scale) if is_rho(term.basis) else scale
+        mean = model.term_mean(term.name) if hasattr(model, "term_mean") else 0.0
+        lines.append(f"  {term.name}: {'learnt ' * term.learns_mean}mean {mean:.4g}")
+        lines += _of_term(model, term, f"covar_module.terms.{i}.kernel", unit, sizes)
+    name = "likelihood.noise_covar.raw_noise"
+    noise = noise_variances(model.likelihood, model.train_inputs[0]).mean(-1)
+    sd = _text(noise.sqrt() * scale)
+    return [*lines, f"  noise: sd {sd}{_at_bound(noise, 'noise', sizes.get(name))}"]
+
+
+def _of_term(
+    model: Any, term: Term, path: str, unit: Tensor, sizes: dict[str, Tensor]
+) -> list[str]:
+    """A line for each hyper-parameter of a term's kernel."""
+    lines: list[str] = []
+    for name, _ in [] if term.kernel is None else term.kernel.named_parameters():
+        module, _, leaf = f"{path}.{name}".rpartition(".")
+        kind, size = kind_of(leaf), sizes.get(f"{path}.{name}")
+        value: Tensor = getattr(model.get_submodule(module), leaf.removeprefix("raw_"))
+        if kind == "outputscale":
+            lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, kind, size)}")
+        elif kind == "lengthscale":
+            for j, (column, length) in enumerate(_columns(model, value.shape[-1])):
+                part = value[..., j]
+                at = _at_bound(part, kind, None if size is None else size[..., j])
+                lines.append(f"    lengthscale of {column}: {_text(part * length)}{at}")
+        else:
+            lines.append(f"    {leaf.removeprefix('raw_')} {_text(value)}")
+    return lines
+
+
+def _columns(model: Any, number: int) -> list[tuple[str, float]]:
+    """The names of a kernel's inputs, and what a length of one is in the user's units."""
+    transform = getattr(model, "input_transform", None)
+    base = transform.base if hasattr(transform, "base") else transform
+    if number == len(model.input_names):
+        if isinstance(base, Normalize):
+            lengths = base.coefficient.flatten()[-number:].tolist()
+            return list(zip(model.input_names, lengths, strict=True))
+        if base is None:
+            return [(name, 1.0) for name in model.input_names]
+    return [(f"transformed input {i + 1}", 1.0) for i in range(number)]
+
+
+def _at_bound(value: Tensor, kind: str, size: Tensor | None) -> str:
+    """A remark on a value at the bounds of a search."""
+    if size is None:
+        return ""
+    low, high = (bound * size.flatten()[0] for bound in KINDS[kind].bounds)
+    middle = value.flatten().median()
+    if middle <= _NEAR * low:
+        return " (at its lower bound)"
+    return " (at its upper bound)" if middle >= high / _NEAR else ""
+
+
+def _text(values: Tensor) -> str:
+    """A number, or the median of samples with the range of 95 % of them."""
+    if values.numel() == 1:
+        return f"{float(values):.4g}"
+    levels = torch.tensor([0.025, 0.5, 0.975]).to(values)
+    low, middle, high = torch.quantile(values.flatten(), levels)
+    return f"{middle:.4g} ({low:.3g} to {high:.3g})"

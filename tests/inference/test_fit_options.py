@@ -1,0 +1,147 @@
+"""Options of a fit: what is refused, seeds, and the threads it takes."""
+
+import pytest
+import torch
+from botorch.exceptions.warnings import OptimizationWarning
+
+from gpadjust import CKA, compare, fit
+
+QUICK = {"num_screened": 16, "num_starts": 2}
+
+
+def crude(X):
+    return 2 + (3 * X).sin()
+
+
+@pytest.fixture
+def model(uniform):
+    X = uniform(9, 2)
+    return CKA(X, 1.5 * crude(X) + X.flip(-1) + 0.1 * uniform(9, 2, seed=5), physics=crude)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("method", ["map", "hmc"])
+    @pytest.mark.parametrize(
+        ("option", "value", "error", "says"),
+        [
+            ("num_starts", 0, ValueError, "Expected num_starts >= 1, got 0"),
+            ("num_starts", 1.5, TypeError, r"Expected num_starts .* whole number, got 1\.5"),
+            ("num_screened", -1, ValueError, "Expected num_screened >= 0, got -1"),
+            ("max_iterations", 0, ValueError, "Expected max_iterations >= 1, got 0"),
+            ("max_iterations", None, TypeError, "Expected max_iterations .* got None"),
+            ("seed", None, TypeError, "Expected seed .* whole number, got None"),
+            ("seed", -1, ValueError, "Expected seed >= 0, got -1"),
+            ("nmu_starts", 2, ValueError, "no option 'nmu_starts'; expected num_starts, "),
+        ],
+    )
+    def test_values(self, model, method, option, value, error, says):
+        with pytest.raises(error, match=says):
+            fit(model, method, **{option: value})
+
+    @pytest.mark.parametrize("option", ["num_samples", "num_warmup", "progress"])
+    def test_options_of_the_other_method(self, model, option):
+        with pytest.raises(ValueError, match=f"'map' has no option '{option}'; .* method 'hmc'"):
+            fit(model, **{option: 64})
+
+    @pytest.mark.parametrize(("option", "least"), [("num_samples", 1), ("num_warmup", 8)])
+    def test_options_of_sampling(self, model, option, least):
+        with pytest.raises(ValueError, match=f"Expected {option} >= {least}"):
+            fit(model, "hmc", **{option: least - 1})
+
+    @pytest.mark.parametrize("method", ["gibbs", "nuts"])
+    def test_method(self, model, method):
+        with pytest.raises(ValueError, match="expected 'map' or 'hmc'"):
+            fit(model, method)
+
+    def test_another_kind_of_model(self):
+        with pytest.raises(TypeError, match=r"Expected a model of gpadjust.*got Linear"):
+            fit(torch.nn.Linear(2, 1))
+
+    def test_nothing_to_learn(self, model):
+        with pytest.raises(ValueError, match="no learnable parameter"):
+            fit(model.requires_grad_(False))
+
+    def test_a_likelihood_that_cannot_be_evaluated(self, model):
+        raw = model.terms[0].kernel.raw_outputscale
+        with torch.no_grad():
+            raw.fill_(float("nan"))
+        raw.requires_grad_(False)
+        before = [p.clone() for p in model.parameters() if p.requires_grad]
+        with pytest.raises(RuntimeError, match="could not be evaluated at any start"):
+            fit(model, **QUICK)
+        after = [p for p in model.parameters() if p.requires_grad]
+        assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
+        assert not model.training
+
+
+class TestSeed:
+    def test_the_same_seed_gives_the_same_fit(self, model):
+        before = {name: value.clone() for name, value in model.state_dict().items()}
+        fitted = []
+        for _ in range(2):
+            torch.rand(3)
+            model.load_state_dict(before)
+            fit(model, seed=3, **QUICK)
+            fitted.append([p.clone() for p in model.parameters()])
+        assert all(torch.equal(a, b) for a, b in zip(*fitted, strict=True))
+
+    def test_other_seeds_draw_other_starts(self, model):
+        before = {name: value.clone() for name, value in model.state_dict().items()}
+        values = set()
+        for seed in (1, 2):
+            model.load_state_dict(before)
+            with pytest.warns(OptimizationWarning):
+                result = fit(model, seed=seed, num_screened=64, num_starts=1, max_iterations=1)
+            values.add(tuple(result.log_likelihood.tolist()))
+        assert len(values) == 2
+
+    def test_the_global_generator_is_left_alone(self, model):
+        state = torch.get_rng_state()
+        fit(model, **QUICK)
+        assert torch.equal(torch.get_rng_state(), state)
+
+
+class TestThreads:
+    @pytest.fixture(autouse=True)
+    def seen(self, monkeypatch):
+        """The numbers of threads at each Cholesky factorisation; the user's setting is 2."""
+        before, factorise, seen = torch.get_num_threads(), torch.linalg.cholesky_ex, []
+
+        def recorded(*args, **options):
+            seen.append(torch.get_num_threads())
+            return factorise(*args, **options)
+
+        monkeypatch.setattr(torch.linalg, "cholesky_ex", recorded)
+        torch.set_num_threads(2)
+        yield seen
+        torch.set_num_threads(before)
+
+    @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
+    @pytest.mark.parametrize("method", ["map", "hmc"])
+    def test_a_small_fit_takes_one(self, model, seen, method):
+        fit(model, method, **QUICK, **({"num_samples": 8} if method == "hmc" else {}))
+        assert set(seen) == {1}
+        assert torch.get_num_threads() == 2
+
+    def test_a_comparison_takes_one(self, model, seen):
+        X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
+        compare(X, Y, crude, structures=["physics mean", "CKA"], **QUICK)
+        assert set(seen) == {1}
+        assert torch.get_num_threads() == 2
+
+    @pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
+    def test_a_large_fit_takes_the_users(self, seen, uniform):
+        X = uniform(300, 1)
+        fit(CKA(X, 2 * crude(X), physics=crude), num_screened=0, max_iterations=1)
+        assert set(seen) == {2}
+
+    def test_after_an_error(self, model):
+        def fail(*args, **options):
+            raise KeyboardInterrupt
+
+        torch.linalg.cholesky_ex = fail
+        X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
+        for attempt in (lambda: fit(model), lambda: compare(X, Y, crude)):
+            with pytest.raises(KeyboardInterrupt):
+                attempt()
+            assert torch.get_num_threads() == 2

@@ -1,0 +1,42 @@
+"""One model asked by several threads at once."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+
+@pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
+def test_answers_are_those_of_one_thread(data, build, kind, uniform, num_outputs, known_noise):
+    X, Y = data(num_outputs=num_outputs)
+    Yvar = 0.01 * torch.ones_like(Y) if known_noise else None
+    fresh, model = build(kind, X, Y, Yvar), build(kind, X, Y, Yvar)
+    questions = [uniform(6, 2, high=2.0, seed=s) for s in range(4)]
+
+    def ask(model, Z):
+        answers = [model.posterior(Z).mean, model.predict(Z).variance]
+        answers += [model.term(name, Z).variance for name in model.term_names]
+        answers.append(model.condition_on_observations(Z[:1], Y[:1], **new).predict(Z).mean)
+        assert model.posterior(Z).rsample().isfinite().all()
+        assert model.sample_functions(2)(Z).isfinite().all()
+        return answers
+
+    new = {"noise": Yvar[:1]} if known_noise else {}
+    with torch.no_grad():
+        expected = [ask(model, Z) for Z in questions]
+    for _ in range(3):
+        with ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(lambda Z: ask(fresh, Z), 4 * questions))
+        for i, answers in enumerate(found):
+            for actual, right in zip(answers, expected[i % 4], strict=True):
+                torch.testing.assert_close(actual.detach(), right)
+        fresh.train()
+
+
+def test_seeds(data, build, uniform):
+    model, Z = build("CKA", *data()), uniform(6, 2)
+    expected = [model.sample_functions(3, seed=s)(Z) for s in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda s: model.sample_functions(3, seed=s)(Z), 4 * list(range(8))))
+    for i, values in enumerate(found):
+        torch.testing.assert_close(values, expected[i % 8])
