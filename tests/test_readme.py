@@ -12,13 +12,19 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 
-def test_the_examples_run(capsys):
-    first, second, *_ = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+def test_the_examples_run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first, held, second, *_ = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     names = {}
     exec(first, names)
     truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
     assert (names["posterior"].mean - truth).abs().max() < 1e-2
     assert (names["rho"].mean - 2).abs().max() < 0.5
+    before = names["posterior"].mean
+    exec(held, names)
+    assert "noise: sd" in capsys.readouterr().out
+    assert (names["lower"] <= before).all()
+    torch.testing.assert_close(names["model"].posterior(names["test_X"]).mean, before)
     exec(second, names)
     assert "physics mean" in capsys.readouterr().out
     assert (names["mixture"].mixture_mean - truth).abs().max() < 1e-2
@@ -27,7 +33,7 @@ def test_the_examples_run(capsys):
 
 def test_measuring(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[2]
+    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[3]
     names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
     exec(code, names)
     X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
@@ -39,7 +45,7 @@ def test_measuring(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[3:]
+    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[4:]
     for long, short in (("=10 * 25", "=2 * 25"), ("model_trials=20", "model_trials=2")):
         assert long in code
         code = code.replace(long, short)

@@ -15,7 +15,7 @@ from linear_operator.operators import DiagLinearOperator
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-_TRIES = 7  # each with ten times the nugget of the one before
+_TRIES = 8  # each with ten times the nugget of the one before
 _SMALL = 256  # points of a covariance up to which a second thread costs more than it brings
 
 
@@ -46,9 +46,8 @@ def cholesky(
         of them failed all the same, ``...``.
     """
     n = covariance.shape[-1] if n is None else n
-    diagonal = covariance.diagonal(dim1=-1, dim2=-2)
     if observed is None:
-        added = nugget(n) * diagonal.mean(-1, keepdim=True)
+        added = nugget(n) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1, keepdim=True)
     else:
         pairs = observed.unsqueeze(-1) & observed.unsqueeze(-2)
         covariance = covariance.where(pairs, torch.zeros_like(covariance))
@@ -56,17 +55,14 @@ def cholesky(
         count = observed.sum(-1, keepdim=True).clamp_min(1)
         added = nugget(n) * diagonal.sum(-1, keepdim=True) / count
         covariance = covariance + torch.diag_embed((~observed).to(covariance))
-    covariance = _add_diagonal(covariance, added)
-    chol, info = torch.linalg.cholesky_ex(covariance)
-    if not info.any():
-        return chol, info > 0
+    step = added
     for _ in range(_TRIES):
-        covariance = _add_diagonal(covariance, 9 * added * (info > 0).unsqueeze(-1))
-        added = 10 * added
+        covariance = _add_diagonal(covariance, step)
         chol, info = torch.linalg.cholesky_ex(covariance)
-        if not info.any():
-            break
-    failed = info > 0
+        failed = info > 0
+        if not failed.any():
+            return chol, failed
+        step, added = 9 * added * failed.unsqueeze(-1), 10 * added
     identity = torch.eye(covariance.shape[-1], dtype=chol.dtype, device=chol.device)
     return torch.where(failed[..., None, None], identity, chol), failed
 
@@ -79,12 +75,21 @@ def _add_diagonal(matrix: Tensor, values: Tensor) -> Tensor:
     return matrix
 
 
+def scaled(matrix: Tensor, factor: Tensor) -> Tensor:
+    """Multiply a matrix, in place where its shape and autograd allow."""
+    traced = torch.is_grad_enabled() and (matrix.requires_grad or factor.requires_grad)
+    shapes = zip(reversed(factor.shape), reversed(matrix.shape), strict=False)
+    fits = factor.dim() <= matrix.dim() and all(ours in (1, theirs) for ours, theirs in shapes)
+    expanded = not fits or 0 in matrix.stride()
+    return matrix * factor if traced or expanded else matrix.mul_(factor)
+
+
 def noise_variances(likelihood: Likelihood, inputs: Tensor, **kwargs: Tensor) -> Tensor:
     """The noise of observations at transformed inputs ``... x n x d``, ``... x n``."""
     nothing = torch.zeros_like(inputs[..., 0])
     silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
-    noisy = likelihood(silent, [inputs], **kwargs).lazy_covariance_matrix
-    return noisy.diagonal(dim1=-1, dim2=-2)
+    noisy = likelihood(silent, [inputs], **kwargs)
+    return noisy.lazy_covariance_matrix.diagonal(dim1=-1, dim2=-2)
 
 
 def known_noise(likelihood: Likelihood) -> Tensor | None:
@@ -110,12 +115,6 @@ class LikelihoodValue(NamedTuple):
     by_mean: Tensor | None = None
     by_covariance: Tensor | None = None
     by_least_scale: Tensor | None = None
-
-    def gradient(self) -> tuple[Tensor, Tensor]:
-        """The derivatives by mean and covariance, which were asked for."""
-        if self.by_mean is None or self.by_covariance is None:
-            raise ValueError("The derivatives were not asked for: pass derivatives=True.")
-        return self.by_mean, self.by_covariance
 
 
 def negative_log_likelihood(
@@ -196,14 +195,12 @@ def least_squares(chol: Tensor, residual: Tensor, basis: Tensor) -> tuple[Tensor
     Returns:
         The coefficients, ``... x q``, and their covariance, ``... x q x q``.
     """
-    white = torch.linalg.solve_triangular(
-        chol, torch.cat([basis, residual.unsqueeze(-1)], dim=-1), upper=False
-    )
-    white_basis, white_residual = white[..., :-1], white[..., -1:]
+    both = torch.cat([basis, residual.unsqueeze(-1)], dim=-1)
+    white = torch.linalg.solve_triangular(chol, both, upper=False)
     # Through an orthogonal basis, for columns that are nearly collinear; the pseudo-inverse is
     # for those that are so exactly, a physics that is constant, say.
-    inverse = torch.linalg.pinv(white_basis, rtol=1e-10)
-    return (inverse @ white_residual).squeeze(-1), inverse @ inverse.mT
+    inverse = torch.linalg.pinv(white[..., :-1], rtol=1e-10)
+    return (inverse @ white[..., -1:]).squeeze(-1), inverse @ inverse.mT
 
 
 @contextmanager

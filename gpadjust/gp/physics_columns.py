@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any
 
 import torch
 from botorch.models.transforms.input import InputTransform
@@ -49,14 +48,12 @@ class PhysicsInput(InputTransform):
     def without_physics(self, X: Tensor) -> Tensor:
         """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
         self._check(X)
-        inputs = X if self.base is None else self.base(X)
         k = self.physics.num_outputs or 0  # it is known: f_p was evaluated at the training inputs
-        return torch.cat([inputs, inputs.new_zeros(*inputs.shape[:-1], k)], dim=-1)
+        return self._append(X if self.base is None else self.base(X), X.new_zeros(k))
 
     def untransform(self, X: Tensor) -> Tensor:
         """Map ``... x n x (d' + k)`` back to raw ``... x n x d``."""
-        k = self.physics.num_outputs or 0
-        inputs = X[..., : X.shape[-1] - k]
+        inputs = X[..., : X.shape[-1] - (self.physics.num_outputs or 0)]
         return inputs if self.base is None else self.base.untransform(inputs)
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
@@ -69,9 +66,9 @@ class PhysicsInput(InputTransform):
         """Whether ``other`` appends the same physics after an equal base transform."""
         if not isinstance(other, PhysicsInput) or self.physics is not other.physics:
             return False
-        if self.base is None or other.base is None:
-            return self.base is other.base
-        return self.base is other.base or self.base.equals(other.base)
+        if self.base is other.base:
+            return True
+        return self.base is not None and other.base is not None and self.base.equals(other.base)
 
     @staticmethod
     def _append(inputs: Tensor, values: Tensor) -> Tensor:
@@ -131,9 +128,8 @@ class AppendedPhysics(Module):
                 f"f_p, got x with shape {tuple(x.shape)}. The model's input transform appends f_p: "
                 "call `model.posterior(X)`, or `model(model.transform_inputs(X))` in eval mode."
             )
-        columns = x[..., self.num_inputs :]
-        one = columns.shape[-1] == 1
-        values = columns.squeeze(-1) if one else (columns * self.select).sum(-1)
+        values = x[..., self.num_inputs :]
+        values = values.squeeze(-1) if values.shape[-1] == 1 else (values * self.select).sum(-1)
         if self.offset.any():
             values = values - self.offset
             # Differences of rounding errors are none: a physics that is constant has no variation.
@@ -178,6 +174,3 @@ class CalledPhysics(Module):
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""
         return "" if self.output is None else f"output={self.output}"
-
-
-Basis = Any  # a module that maps `... x n x (d + k)` to `... x n`, with `map_batches`

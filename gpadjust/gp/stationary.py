@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
-from gpytorch.kernels import Kernel, MaternKernel, RBFKernel, ScaleKernel
+from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from torch import Tensor
+
+from gpadjust.gp.gaussian import scaled
 
 Parameters = dict[str, Tensor]
 # Maps -r^2 / 2 to the kernel, and (if asked for) to -2 dk / d(r^2).
@@ -30,7 +33,7 @@ class StationaryForm(NamedTuple):
     profile: Profile | None
 
 
-def stationary_form(kernel: Kernel | None, num_inputs: int) -> StationaryForm | None:
+def stationary_form(kernel: Any, num_inputs: int) -> StationaryForm | None:
     """Recognise a kernel of that form, with or without ``ScaleKernel``; None for any other."""
     outputscale, path = None, ""
     if type(kernel) is ScaleKernel and kernel.active_dims is None:
@@ -57,10 +60,8 @@ def exponents(left: Rows, right: Rows, shift: Tensor | None = None) -> Tensor:
     (z, half), (other, other_half) = left, right
     first = -half if shift is None else shift - half
     z = z.expand(*first.shape[:-1], z.shape[-1])
-    return (
-        torch.cat([z, torch.ones_like(first), first], -1)
-        @ torch.cat([other, -other_half, torch.ones_like(other_half)], -1).mT
-    )
+    columns = torch.cat([other, -other_half, torch.ones_like(other_half)], -1)
+    return torch.cat([z, torch.ones_like(first), first], -1) @ columns.mT
 
 
 class StationaryTerm(NamedTuple):
@@ -95,6 +96,7 @@ class TermValue(NamedTuple):
     z: Tensor
 
 
+@dataclass(eq=False)
 class StationarySum:
     r"""The targets' distribution with :math:`K = \sum_t s_t \, B_t k_t(X / \ell_t) B_t + K_0 + S`.
 
@@ -115,53 +117,43 @@ class StationarySum:
         values: Logarithms of those parameters that may not be learnt, by their names.
     """
 
-    def __init__(
-        self,
-        terms: Sequence[StationaryTerm],
-        mean: Tensor,
-        constant: Tensor | None,
-        noise: Tensor | str,
-        values: Parameters,
-    ) -> None:
-        self._terms = terms
-        self._mean = mean
-        self._constant = constant
-        self._noise = noise
-        self._values = values
+    terms: Sequence[StationaryTerm]
+    mean: Tensor
+    constant: Tensor | None
+    noise: Tensor | str
+    values: Parameters
 
     def __call__(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
         """Return mean ``... x n`` and covariance ``... x n x n`` at (logarithmic) parameters."""
-        covariance, _ = self._evaluate(parameters, derivatives=False)
-        return self._mean, covariance
+        return self.mean, self._evaluate(parameters, derivatives=False)[0]
 
     def with_pull_back(
         self, parameters: Parameters
     ) -> tuple[Tensor, Tensor, Callable[[Tensor, Tensor], Parameters]]:
         """As calling it, with the function that carries derivatives back to the parameters."""
         covariance, values = self._evaluate(parameters, derivatives=True)
-        shapes = {name: value.shape for name, value in parameters.items()}
 
         def pull_back(by_mean: Tensor, by_covariance: Tensor) -> Parameters:
             found: Parameters = {}
-            if isinstance(self._noise, str) and self._noise in parameters:
+            if isinstance(self.noise, str) and self.noise in parameters:
                 trace = by_covariance.diagonal(dim1=-1, dim2=-2).sum(-1, keepdim=True)
-                found[self._noise] = parameters[self._noise].exp() * trace
-            for term, value in zip(self._terms, values, strict=True):
-                found |= self._pull_back(term, value, by_covariance, shapes)
+                found[self.noise] = parameters[self.noise].exp() * trace
+            for term, value in zip(self.terms, values, strict=True):
+                found |= self._pull_back(term, value, by_covariance, parameters)
             return found
 
-        return self._mean, covariance, pull_back
+        return self.mean, covariance, pull_back
 
     def _evaluate(
         self, parameters: Parameters, derivatives: bool
     ) -> tuple[Tensor, list[TermValue]]:
-        every = {**self._values, **parameters}
-        values = [self._value(term, every, derivatives) for term in self._terms]
-        noise = every[self._noise].exp() if isinstance(self._noise, str) else self._noise
+        every = {**self.values, **parameters}
+        values = [self._value(term, every, derivatives) for term in self.terms]
+        noise = every[self.noise].exp() if isinstance(self.noise, str) else self.noise
         first, *others = (value.covariance for value in values)
         total = sum(others, first)
-        if self._constant is not None:
-            total = total + self._constant
+        if self.constant is not None:
+            total = total + self.constant
         elif not others:
             total = total.clone()
         if total.dim() < noise.dim() + 1:  # only the noise is learnt
@@ -183,42 +175,33 @@ class StationarySum:
         if term.weight is not None:
             factors += [term.weight.unsqueeze(-1), term.weight.unsqueeze(-2)]
         for factor in factors:
-            covariance = _scaled(covariance, factor)
-            slope = None if slope is None else _scaled(slope, factor)
+            covariance = scaled(covariance, factor)
+            slope = None if slope is None else scaled(slope, factor)
         return TermValue(covariance, slope, rows[0])
 
     @staticmethod
     def _pull_back(
-        term: StationaryTerm,
-        value: TermValue,
-        by_covariance: Tensor,
-        shapes: dict[str, torch.Size],
+        term: StationaryTerm, value: TermValue, by_covariance: Tensor, parameters: Parameters
     ) -> Parameters:
         """Turn a derivative by the covariance into those by the parameters of a term."""
         found: Parameters = {}
         total: Tensor | None = None
-        if term.lengthscale in shapes:
+        if term.lengthscale in parameters:
             slope = by_covariance * (value.covariance if value.slope is None else value.slope)
             # The slope is symmetric, and the product faster this way round.
             z = value.z.expand(*slope.shape[:-1], -1)
             products = (torch.cat([z, torch.ones_like(z[..., :1])], dim=-1).mT @ slope).mT
             products, row_sums = products[..., :-1], products[..., -1:]
             by_each = 2 * (z * (z * row_sums - products)).sum(-2)
-            shape = shapes[term.lengthscale]
+            shape = parameters[term.lengthscale].shape
             by_each = by_each if shape[-1] > 1 else by_each.sum(-1, keepdim=True)
             found[term.lengthscale] = by_each.reshape(shape)
             total = row_sums.sum((-1, -2)) if value.slope is None else None
-        if term.scale is not None and term.scale in shapes:
+        if term.scale is not None and term.scale in parameters:
             if total is None:
                 total = (by_covariance * value.covariance).sum((-1, -2))
-            found[term.scale] = total.reshape(shapes[term.scale])
+            found[term.scale] = total.reshape(parameters[term.scale].shape)
         return found
-
-
-def _scaled(matrix: Tensor, factor: Tensor) -> Tensor:
-    """Multiply a matrix, in place where its shape allows."""
-    in_place = torch.broadcast_shapes(matrix.shape, factor.shape) == matrix.shape
-    return matrix.mul_(factor) if in_place else matrix * factor
 
 
 def _matern12(exponent: Tensor, derivatives: bool) -> tuple[Tensor, Tensor | None]:

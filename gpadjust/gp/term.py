@@ -37,6 +37,8 @@ class Term(Module):
             it is known.
     """
 
+    basis: Any  # a module or None; it has `map_batches`, which mypy cannot know of a Module
+
     def __init__(
         self,
         name: str,
@@ -103,10 +105,10 @@ class Term(Module):
         Returns:
             ``... x (2 d + 1) x n``; None if the kernel is no scaled RBF kernel.
         """
-        form = stationary_form(self.kernel, self.num_inputs)
-        if form is None or form.profile is not None:
+        found = self._scaled_rbf()
+        if found is None:
             return None
-        lengthscale, scale = (t.detach() for t in self._parameters_of_form())
+        lengthscale, scale = (t.detach() for t in found)
         z, half = rows_of(train[..., : self.num_inputs] - origin, lengthscale)
         square = (-0.5 / lengthscale.square()).expand_as(z)
         last = scale.log()[..., None, None] - half
@@ -124,21 +126,25 @@ class Term(Module):
 
     def _closed_form(self, x1: Tensor, x2: Tensor, diag: bool) -> Tensor | None:
         """A scaled RBF kernel, several times faster than through GPyTorch's modules."""
-        form = stationary_form(self.kernel, self.num_inputs)
-        if form is None or form.profile is not None:
+        found = self._scaled_rbf()
+        if found is None:
             return None
-        lengthscale, scale = self._parameters_of_form()
+        lengthscale, scale = found
         if diag:
             batch = torch.broadcast_shapes(x1.shape[:-2], scale.shape)
             return scale.unsqueeze(-1).expand(*batch, x1.shape[-2])
         origin = x1.detach().mean(-2, keepdim=True)
-        rows = [rows_of(x - origin, lengthscale) for x in (x1, x2)]
-        exponent = exponents(*rows)
+        exponent = exponents(rows_of(x1 - origin, lengthscale), rows_of(x2 - origin, lengthscale))
         if x1 is x2:
             # The closest pairs come out as differences of large numbers, these known ones do not.
             zero = torch.eye(x1.shape[-2], dtype=torch.bool, device=x1.device)
             exponent = exponent.masked_fill(zero, 0.0)
         return scale[..., None, None] * exponent.clamp_max(0.0).exp()
+
+    def _scaled_rbf(self) -> tuple[Tensor, Tensor] | None:
+        """As :meth:`_parameters_of_form`, of a scaled RBF kernel; None for any other."""
+        form = stationary_form(self.kernel, self.num_inputs)
+        return None if form is None or form.profile is not None else self._parameters_of_form()
 
     def _parameters_of_form(self) -> tuple[Tensor, Tensor]:
         """Lengthscales ``... x 1 x d`` and outputscale ``...`` of a stationary kernel."""
@@ -147,14 +153,13 @@ class Term(Module):
             return kernel.base_kernel.lengthscale, kernel.outputscale
         return kernel.lengthscale, kernel.lengthscale.new_ones(())
 
-    def map_batches(self, change: Callable[[Tensor], Tensor], kernel: Kernel | None) -> Term:
-        """A copy with another kernel, and all else changed along its batch dimensions."""
+    def map_batches(self, change: Callable[[Any], Any]) -> Term:
+        """A copy whose kernel and tensors are changed along their batch dimensions."""
         new = deepcopy(self)
-        new.kernel = kernel
+        new.kernel = None if self.kernel is None else change(self.kernel)
         new.basis = None if self.basis is None else self.basis.map_batches(change)
         for name in ("mean", "mean_variance"):
-            value = change(getattr(self, name).detach())
-            setattr(new, name, Parameter(value, requires_grad=False))
+            setattr(new, name, Parameter(change(getattr(self, name).detach()), requires_grad=False))
         return new
 
 
@@ -165,6 +170,8 @@ class SumOfTerms(Kernel):
         terms: The terms; their names differ.
         known_means: Take the prior means as known, all kappa as zero.
     """
+
+    terms: Any  # a ModuleList, of which mypy would not know that it holds terms
 
     def __init__(self, terms: Sequence[Term], known_means: bool = False) -> None:
         super().__init__()
@@ -189,8 +196,8 @@ class SumOfTerms(Kernel):
         self, x1: Tensor, x2: Tensor | None = None, diag: bool = False, known_means: bool = False
     ) -> Tensor:
         """As :meth:`forward`; with ``known_means``, all kappa are zero."""
-        same = x2 is None or x2 is x1 or (x1.shape == x2.shape and torch.equal(x1, x2))
-        x2 = x1 if same or x2 is None else x2
+        if x2 is None or x2 is x1 or torch.equal(x1, x2):
+            x2 = x1
         total: Tensor | None = None
         for term in self.terms:
             if term.kernel is None and (known_means or not term.learns_mean):
@@ -198,7 +205,7 @@ class SumOfTerms(Kernel):
             part = term.covariance(x1, x2, diag, known_means)
             if term.basis is not None:
                 b1 = term.basis(x1)
-                b2 = b1 if same else term.basis(x2)
+                b2 = b1 if x2 is x1 else term.basis(x2)
                 # Dense scaling is faster here than a product of diagonal linear operators.
                 part = part * b1 * b2 if diag else part * b1.unsqueeze(-1) * b2.unsqueeze(-2)
             total = part if total is None else total + part
@@ -208,9 +215,8 @@ class SumOfTerms(Kernel):
 
     def basis_of_means(self, x: Tensor) -> Tensor | None:
         """The bases of the terms whose means are unknown, ``... x n x q``, or None."""
-        learnt = [term for term in self.terms if term.learns_mean]
-        one = torch.ones_like(x[..., 0])
-        columns = [one if term.basis is None else term.basis(x) for term in learnt]
+        bases = [term.weights(x) for term in self.terms if term.learns_mean]
+        columns = [torch.ones_like(x[..., 0]) if basis is None else basis for basis in bases]
         return torch.stack(columns, dim=-1) if columns else None
 
     def local_load_samples(self, samples_dict: Any, memo: Any, prefix: str) -> None:
@@ -222,32 +228,23 @@ class SumOfTerms(Kernel):
         if not self.batch_shape:
             return self
         index = index if isinstance(index, tuple) else (index,)
-        return self._map(
-            lambda tensor: tensor[index],
-            lambda kernel: kernel[index],
-        )
+        return self._map(lambda part: part[index])
 
     def expand_batch(self, *sizes: Any) -> SumOfTerms:
         """The kernel with its batch expanded to ``sizes``."""
         shape = Size(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else Size(sizes)
         lead = len(self.batch_shape)
         return self._map(
-            lambda tensor: tensor.expand(*shape, *tensor.shape[lead:]),
-            lambda kernel: kernel.expand_batch(shape),
+            lambda part: (
+                part.expand_batch(shape)
+                if isinstance(part, Kernel)
+                else part.expand(*shape, *part.shape[lead:])
+            )
         )
 
-    def _map(
-        self, change: Callable[[Tensor], Tensor], change_kernel: Callable[[Kernel], Kernel]
-    ) -> SumOfTerms:
-        return SumOfTerms(
-            [
-                term.map_batches(
-                    change, None if term.kernel is None else change_kernel(term.kernel)
-                )
-                for term in self.terms
-            ],
-            self.known_means,
-        )
+    def _map(self, change: Callable[[Any], Any]) -> SumOfTerms:
+        """A copy whose kernels and tensors are changed along their batch dimensions."""
+        return SumOfTerms([term.map_batches(change) for term in self.terms], self.known_means)
 
 
 class TermsMean(Mean):

@@ -66,7 +66,7 @@ def fit(
     ``"map"``: Random starts are screened in one batch beside the model's current parameters;
     L-BFGS then runs from the best of them, for all outputs in lockstep, on a likelihood whose
     overall scale (and constant means, where they are unknown) is at its optimum in closed form.
-    With more than some 150 points the search is made on 128 of them, and its best optima are
+    With more than some 150 points the search is made on 96 of them, and its best optima are
     refined on all. Starts and bounds follow the data's scales, so that units of inputs, targets
     and physics make no difference. The result is never less likely than the parameters that the
     model came with. Priors registered on the model are honoured (maximum a posteriori, otherwise
@@ -112,7 +112,8 @@ def fit(
         OptimizationWarning: If the optimiser did not converge.
         SamplingWarning: If the chains did not mix.
     """
-    _check(method, dict(options))
+    given: dict[str, Any] = {**options}
+    _check(method, given)
     if isinstance(model, ModelListGP):
         results: list[FitResult | SampleResult] = []
         for part in model.models:
@@ -126,17 +127,11 @@ def fit(
         )
     if is_fully_bayesian(model):
         raise RuntimeError(HOLDS_SAMPLES)
-    search = Search(**{name: value for name, value in options.items() if name in _SEARCH})
+    search = Search(**{name: given.pop(name) for name in _SEARCH if name in given})
     with threads_for(model.train_targets.shape[-1], others=True):
         if method == "map":
             return maximise(Objective(model), search)
-        return sample(
-            model,
-            search,
-            options.get("num_samples", 64),
-            options.get("num_warmup", 40),
-            options.get("progress", False),
-        )
+        return sample(model, search, **given)
 
 
 def _check(method: str, options: dict[str, Any]) -> None:
@@ -146,10 +141,8 @@ def _check(method: str, options: dict[str, Any]) -> None:
     known = _OPTIONS[method]
     for name, value in options.items():
         if name not in known:
-            others = [other for other, names in _OPTIONS.items() if name in names]
-            hint = (
-                f"it is one of method {others[0]!r}" if others else f"expected {', '.join(known)}"
-            )
+            of_other = name in _OPTIONS["hmc"]
+            hint = "it is one of method 'hmc'" if of_other else f"expected {', '.join(known)}"
             raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
         if value is None and name in ("num_starts", "num_screened"):
             continue

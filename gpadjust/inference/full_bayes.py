@@ -52,18 +52,13 @@ class SampleResult:
 def sample(
     model: BatchedMultiOutputGPyTorchModel,
     search: Search,
-    num_samples: int,
-    num_warmup: int,
-    progress: bool,
+    num_samples: int = 64,
+    num_warmup: int = 40,
+    progress: bool = False,
 ) -> SampleResult:
     """Sample the hyper-parameters of a model and put the samples into it, see :func:`fit`.
 
-    Args:
-        model: The model.
-        search: How the optimum is searched that the chains start around; with the seed of both.
-        num_samples: Number of samples that the model is to hold.
-        num_warmup: Number of iterations that adapt the sampler.
-        progress: Whether to show a progress bar.
+    The chains start around the optimum that the search finds; its seed is that of both.
     """
     if not isinstance(model, ExactGPBase):
         raise TypeError(
@@ -85,25 +80,18 @@ def sample(
         warnings.simplefilter("ignore", OptimizationWarning)
         maximise(objective, search)
     generator = torch.Generator().manual_seed(search.seed)
-    optimum = parameters.current()
-    shape = (_CHAINS, *optimum.shape[1:])
-    noise = torch.randn(shape, generator=generator, dtype=optimum.dtype).to(optimum)
+    optimum = parameters.current().expand(_CHAINS, -1, -1)
+    noise = torch.randn(optimum.shape, generator=generator, dtype=optimum.dtype).to(optimum)
     start = parameters.clipped(optimum + _SPREAD * noise)
     num_iterations = max(40, -(-4 * num_samples // _CHAINS))
     with tqdm(total=num_warmup + num_iterations, disable=not progress, unit="iteration") as bar:
         positions, acceptance = hmc(
-            potential_of(objective),
-            start,
-            num_warmup,
-            num_iterations,
-            generator,
-            lambda: bar.update() and None,
+            potential_of(objective), start, num_warmup, num_iterations, generator, bar.update
         )
     result = _diagnose(objective, positions, acceptance)
-    length, chains = positions.shape[:2]
-    index = torch.linspace(length * chains - 1, 0, num_samples).round().long().flip(0)
-    chosen = positions.reshape(-1, *positions.shape[2:])[index]
-    model.hold_samples(parameters.to_raw(parameters.unflatten(chosen)))
+    draws = positions.flatten(0, 1)
+    index = torch.linspace(len(draws) - 1, 0, num_samples).round().long().flip(0)
+    model.hold_samples(parameters.to_raw(parameters.unflatten(draws[index])))
     _warn(result, num_samples)
     return result
 
@@ -121,29 +109,22 @@ def potential_of(objective: Objective) -> Potential:
 
 
 def _diagnose(objective: Objective, positions: Tensor, acceptance: Tensor) -> SampleResult:
-    flat = positions[:, :, :, _learnt(positions)]
-    r_hat = split_gelman_rubin(flat, chain_dim=1, sample_dim=0).amax(-1)
-    size = effective_sample_size(flat, chain_dim=1, sample_dim=0).amin(-1)
+    moving = positions[..., positions.std((0, 1)).amin(0) > 0]
+    r_hat = split_gelman_rubin(moving, chain_dim=1, sample_dim=0).amax(-1)
+    size = effective_sample_size(moving, chain_dim=1, sample_dim=0).amin(-1)
     parameters, shape = objective.parameters, objective.parameters.batch_shape
-    length, chains = positions.shape[:2]
     raw = parameters.to_raw(parameters.unflatten(positions.flatten(0, 1)))
     draws = {}
     for name, values in raw.items():
         constraint = constraint_of(objective.model, name)
         values = values if constraint is None else constraint.transform(values)
-        draws[name.replace("raw_", "")] = values.unflatten(0, (length, chains))
+        draws[name.replace("raw_", "")] = values.unflatten(0, positions.shape[:2])
     return SampleResult(r_hat.reshape(shape), size.reshape(shape), acceptance.reshape(shape), draws)
 
 
-def _learnt(positions: Tensor) -> Tensor:
-    """Which parameters move at all."""
-    return positions.std((0, 1)).amin(0) > 0
-
-
 def _warn(result: SampleResult, num_samples: int) -> None:
-    bad = (result.r_hat > _MOST_R_HAT) | (
-        result.effective_sample_size < _LEAST_EFFECTIVE * num_samples
-    )
+    few = result.effective_sample_size < _LEAST_EFFECTIVE * num_samples
+    bad = few | (result.r_hat > _MOST_R_HAT)
     if bad.any():
         warnings.warn(
             f"The chains of {int(bad.sum())} of {bad.numel()} outputs have not mixed: R-hat "

@@ -36,7 +36,7 @@ def hmc(
     num_warmup: int,
     num_iterations: int,
     generator: torch.Generator,
-    progress: Callable[[], None] = lambda: None,
+    progress: Callable[[], object] = lambda: None,
 ) -> Draws:
     r"""Sample from :math:`\exp(-U)` with ``C`` chains of each of ``B`` problems, in lockstep.
 
@@ -62,57 +62,45 @@ def hmc(
     def uniform() -> Tensor:
         return torch.rand(chains, problems, generator=generator, dtype=start.dtype).to(start)
 
-    def move(
-        accept: Tensor, proposal: tuple[Tensor, Tensor, Tensor]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        x, f, g = proposal
+    def move(accept: Tensor, x: Tensor, f: Tensor, g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         each = accept.unsqueeze(-1)
-        return (
-            torch.where(each, x, position),
-            torch.where(accept, f, value),
-            torch.where(each, g, gradient),
-        )
+        return x.where(each, position), f.where(accept, value), g.where(each, gradient)
 
     position = start
     value, gradient = potential(position)
     mean: Tensor | None = None
-    root = 0.1 * torch.eye(p, dtype=start.dtype, device=start.device).expand(problems, p, p)
+    root = 0.1 * torch.eye(p).to(start).expand(problems, p, p)
     step = _DualAveraging(start.new_full((problems,), 0.5))
-    history: list[Tensor] = []
-    kept: list[Tensor] = []
-    accepted = start.new_zeros(problems)
+    history, kept, accepted = [], [], start.new_zeros(problems)
     updates = {num_warmup // 4, num_warmup // 2, 3 * num_warmup // 4}
     for iteration in range(num_warmup + num_iterations):
         warm = iteration < num_warmup
         size = step.current if warm else step.average
-        factor = 0.5 + torch.rand((), generator=generator).item()
-        length = factor * _TRAJECTORY / size.median().item()
-        num_steps = min(max(1, math.ceil(length)), _MOST_STEPS)
+        length = (0.5 + torch.rand((), generator=generator).item()) * _TRAJECTORY
+        num_steps = min(max(1, math.ceil(length / size.median().item())), _MOST_STEPS)
         # A bit of jitter, for the sake of ergodicity.
         size = size * (0.9 + 0.2 * torch.rand((), generator=generator).item())
         stretch = (size[:, None, None] * root).unsqueeze(0)
 
         momentum = normal()
         energy = value + 0.5 * momentum.square().sum(-1)
-        x, f, g, v = position, value, gradient, momentum
-        v = v - 0.5 * _transposed(stretch, g)
+        x, v = position, momentum - 0.5 * _times(stretch.mT, gradient)
         for inner in range(num_steps):
             x = x + _times(stretch, v)
             f, g = potential(x)
-            v = v - (0.5 if inner == num_steps - 1 else 1.0) * _transposed(stretch, g)
+            v = v - (0.5 if inner == num_steps - 1 else 1.0) * _times(stretch.mT, g)
         change = energy - f - 0.5 * v.square().sum(-1)
         rate = _rate(change, value)
-        position, value, gradient = move(uniform() < rate, (x, f, g))
+        position, value, gradient = move(uniform() < rate, x, f, g)
         if mean is not None:
             # A step to anywhere under the Gaussian, which may lead to another mode.
             white = normal() * _INFLATION
             x = mean + _times(root, white)
             f, g = potential(x)
-            here = torch.linalg.solve_triangular(
-                root, (position - mean).unsqueeze(-1), upper=False
-            ).squeeze(-1)
+            away = (position - mean).unsqueeze(-1)
+            here = torch.linalg.solve_triangular(root, away, upper=False).squeeze(-1)
             log_ratio = value - f + 0.5 * ((white.square() - here.square()).sum(-1) / _INFLATION**2)
-            position, value, gradient = move(uniform() < _rate(log_ratio, value), (x, f, g))
+            position, value, gradient = move(uniform() < _rate(log_ratio, value), x, f, g)
         if warm:
             history.append(position)
             step.update(rate.mean(0))
@@ -142,10 +130,6 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def _transposed(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix.mT @ vector.unsqueeze(-1)).squeeze(-1)
-
-
 def _root(positions: Tensor) -> Tensor:
     """Cholesky factors ``B x p x p`` of the regularised covariance of ``k x B x p`` positions."""
     k, _, p = positions.shape
@@ -154,8 +138,7 @@ def _root(positions: Tensor) -> Tensor:
     weight = k / (k + 5.0 * p)
     variance = covariance.diagonal(dim1=-1, dim2=-2)
     small = (1 - weight) * variance.clamp_min(1e-6)
-    root: Tensor = torch.linalg.cholesky(weight * covariance + torch.diag_embed(small))
-    return root
+    return torch.linalg.cholesky(weight * covariance + torch.diag_embed(small))
 
 
 class _DualAveraging:
@@ -171,11 +154,9 @@ class _DualAveraging:
     def update(self, rate: Tensor) -> None:
         """Take the acceptance rates of an iteration into account."""
         self._count += 1
-        count, offset, shrinkage, forget = self._count, 10.0, 0.05, 0.75
-        weight = 1 / (count + offset)
+        shrinkage, weight, eta = 0.05, 1 / (self._count + 10), self._count**-0.75
         self._error = (1 - weight) * self._error + weight * (_TARGET - rate)
-        log_step = self._centre - math.sqrt(count) / shrinkage * self._error
-        eta = count**-forget
+        log_step = self._centre - math.sqrt(self._count) / shrinkage * self._error
         self._log_average = eta * log_step + (1 - eta) * self._log_average
         self.current = log_step.exp().clamp(1e-4, 2.0)
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from torch import Size, Tensor
+from torch.func import functional_call
+from torch.nn import Module
 
 from gpadjust.models.hyperparameters import (
     KINDS,
@@ -19,7 +22,7 @@ from gpadjust.models.hyperparameters import (
 
 Parameters = dict[str, Tensor]
 
-_LITTLE_NOISE = (1e-12, 1e-6)  # the noise of half of the starts, in typical sizes
+_LITTLE_NOISE = (1e-11, 1e-6)  # the noise of half of the starts, in typical sizes
 
 
 class LogParameters:
@@ -44,6 +47,7 @@ class LogParameters:
         batch_shape: The shape whose elements are the problems; empty for one.
         num_problems: Number ``B`` of problems.
         is_batched: Whether outputs are problems of their own.
+        learns_inputs: Whether parameters of the input transform are among them.
         lower: Lower bounds, ``B x p``.
         upper: Upper bounds, ``B x p``.
         variances: 1 for a variance that nothing but the data bounds, 0 for others, ``B x p``.
@@ -55,6 +59,7 @@ class LogParameters:
     """
 
     def __init__(self, model: BatchedMultiOutputGPyTorchModel) -> None:
+        self._model = model
         self._raw = {n: p for n, p in model.named_parameters() if p.requires_grad}
         if not self._raw:
             raise ValueError(
@@ -62,22 +67,27 @@ class LogParameters:
             )
         self.names = list(self._raw)
         outputs = model._aug_batch_shape
-        learns_inputs = any(name.startswith("input_transform.") for name in self.names)
+        self.learns_inputs = any(name.startswith("input_transform.") for name in self.names)
         own = all(p.shape[: len(outputs)] == outputs for p in self._raw.values())
-        self.is_batched = own and not learns_inputs
+        self.is_batched = own and not self.learns_inputs
         self.batch_shape = outputs if self.is_batched else Size()
         self.num_problems = self.batch_shape.numel()
         self._shapes = [p.shape[len(self.batch_shape) :] for p in self._raw.values()]
         self._constraints = {name: constraint_of(model, name) for name in self.names}
+        # Of the parameters whose raw one is not their logarithm already.
+        self._squashes = {
+            name: constraint
+            for name, constraint in self._constraints.items()
+            if self.is_log(name) and not isinstance(constraint, LogInterval)
+        }
         self._sizes = self._typical_sizes(model)
-        self.lower, self.upper = (self._bounds(side) for side in (0, 1))
-        self.variances = self._mask(
-            lambda name: kind_of(name) in ("outputscale", "noise") and self.is_free(name)
+        self.lower = self.pack(lambda name: self._bound(name, 0))
+        self.upper = self.pack(lambda name: self._bound(name, 1))
+        self.noise = self.mask(lambda name: kind_of(name) == "noise" and self.is_free(name))
+        self.variances = self.noise + self.mask(
+            lambda name: kind_of(name) == "outputscale" and self.is_free(name)
         )
-        self.noise = self._mask(lambda name: kind_of(name) == "noise" and self.is_free(name))
-        self.is_constrained = self._mask(
-            lambda name: self.is_log(name) and not self.is_free(name)
-        ).bool()
+        self.is_constrained = self.mask(lambda n: self.is_log(n) and not self.is_free(n)).bool()
         # A start that the user gives may lie outside, but not below the least noise.
         current = self.current()[0]
         lower = torch.minimum(self.lower, current)
@@ -99,7 +109,7 @@ class LogParameters:
         return bool((lower <= 0).all()) and bool(upper.isinf().all())
 
     def flatten(self, values: Parameters) -> Tensor:
-        """Pack one tensor per parameter name, ``k x`` its shape, into ``k x B x p``."""
+        """Pack one tensor per parameter name, ``k x`` its shape (or its shape), ``k x B x p``."""
         parts = [
             values[name].detach().reshape(-1, self.num_problems, shape.numel())
             for name, shape in zip(self.names, self._shapes, strict=True)
@@ -114,33 +124,42 @@ class LogParameters:
             for name, part, shape in zip(self.names, parts, self._shapes, strict=True)
         }
 
+    def pack(self, value: Callable[[str], Tensor]) -> Tensor:
+        """Pack what a function makes of each name, of the parameter's shape, into ``B x p``."""
+        return self.flatten({name: value(name) for name in self.names})[0]
+
+    def mask(self, which: Callable[[str], bool]) -> Tensor:
+        """1 where a function of the name says so, 0 elsewhere, ``B x p``."""
+        return self.pack(lambda name: torch.full_like(self.value(name), float(which(name))))
+
     def value(self, name: str) -> Tensor:
         """The model's own value of a parameter, its logarithm if it is taken as that."""
         raw = self._raw[name].detach()
-        constraint = self._constraints[name]
-        if not self.is_log(name) or isinstance(constraint, LogInterval):
-            return raw
-        return constraint.transform(raw).log()
+        return self._squashes[name].transform(raw).log() if name in self._squashes else raw
 
     def current(self) -> Tensor:
         """The model's own vectors, ``1 x B x p``."""
-        return self.flatten({name: self.value(name).unsqueeze(0) for name in self.names})
+        return self.pack(self.value).unsqueeze(0)
 
     def to_raw(self, parameters: Parameters) -> Parameters:
         """Turn values into GPyTorch's raw parameters; differentiable."""
         return {
-            name: value
-            if not self.is_log(name) or isinstance(self._constraints[name], LogInterval)
-            else self._constraints[name].inverse_transform(value.exp())
+            name: self._squashes[name].inverse_transform(value.exp())
+            if name in self._squashes
+            else value
             for name, value in parameters.items()
         }
 
+    def call_at(self, parameters: Parameters, function: Callable[[], Any]) -> Any:
+        """Call a function that reads the model, at other values of it; differentiable."""
+        named = {f"model.{name}": value for name, value in self.to_raw(parameters).items()}
+        return functional_call(_Call(self._model, function), named, ())
+
     def assign(self, vector: Tensor) -> None:
         """Give the model a vector, ``B x p``."""
-        values = {name: v[0] for name, v in self.unflatten(vector.unsqueeze(0)).items()}
         with torch.no_grad():
-            for name, value in self.to_raw(values).items():
-                self._raw[name].copy_(value)
+            for name, value in self.to_raw(self.unflatten(vector.unsqueeze(0))).items():
+                self._raw[name].copy_(value[0])
 
     def clipped(self, vectors: Tensor) -> Tensor:
         """The vectors (``k x B x p``) moved into the bounds."""
@@ -168,7 +187,7 @@ class LogParameters:
             noise = torch.randn(shape, generator=generator, dtype=parameter.dtype)
             spread = 10 ** torch.rand(shape, generator=generator, dtype=parameter.dtype)
             if name.startswith("input_transform."):
-                spread = torch.full_like(spread, 0.3)
+                spread.fill_(0.3)
             noise = (spread * noise).to(parameter.device)
             values[name] = parameter + magnitude(parameter) * noise
         return self.clipped(self.flatten(values))
@@ -214,25 +233,15 @@ class LogParameters:
                     multiple *= stretch.pow((4 * power - 2).clamp_min(0.0).to(stretch.device))
         return multiples
 
-    def _mask(self, which: Callable[[str], bool]) -> Tensor:
-        """1 where a function of the name says so, ``B x p``."""
-        return self.flatten(
-            {n: torch.full_like(self.value(n), float(which(n))).unsqueeze(0) for n in self.names}
-        )[0]
-
-    def _bounds(self, side: int) -> Tensor:
-        """Lower (0) or upper (1) bounds, ``B x p``."""
-        return self.flatten({n: self._bound(n, side).unsqueeze(0) for n in self.names})[0]
-
     def _bound(self, name: str, side: int) -> Tensor:
+        """The lower (0) or upper (1) bound of a parameter, of its shape."""
         like = self.value(name)
         if self.is_log(name):
             return self._log(name, torch.full_like(like, KINDS[kind_of(name)].bounds[side]))
-        constraint = self._constraints[name]
-        limits = (-math.inf, math.inf)
+        constraint, limit = self._constraints[name], (-math.inf, math.inf)[side]
         if constraint is not None and not constraint.enforced:
-            limits = (constraint.lower_bound.item(), constraint.upper_bound.item())
-        return torch.full_like(like, limits[side])
+            limit = (constraint.lower_bound, constraint.upper_bound)[side].item()
+        return torch.full_like(like, limit)
 
     def _log(self, name: str, multiple: Tensor) -> Tensor:
         """The logarithm of a multiple of a parameter's typical size, within its constraint."""
@@ -246,6 +255,15 @@ class LogParameters:
             margin = 1e-6 * torch.where(upper.isfinite(), upper - lower, value.new_ones(()))
             lower, upper = lower + margin, upper - margin
         return value.clamp(lower, upper).log()
+
+
+class _Call(Module):
+    """A function beside a model, for `functional_call` to replace the model's parameters."""
+
+    def __init__(self, model: Module, function: Callable[[], Any]) -> None:
+        super().__init__()
+        self.model = model
+        self.forward = function
 
 
 def magnitude(values: Tensor) -> Tensor:

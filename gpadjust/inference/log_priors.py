@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.priors import LogNormalPrior, NormalPrior
 from torch import Tensor
-from torch.func import functional_call
-from torch.nn import Module
 
 from gpadjust.inference.log_parameters import LogParameters
 
@@ -35,27 +33,19 @@ class LogPriors:
         parameters: LogParameters,
         of_logs: bool = False,
     ) -> None:
+        self._model = model
         self._parameters = parameters
-        self._priors = _Priors(model)
         # What the density of the logarithms has in addition, by each of them.
-        values = {name: parameters.value(name).unsqueeze(0) for name in parameters.names}
-        self._slope = parameters.flatten(
-            {n: torch.full_like(v, of_logs and parameters.is_log(n)) for n, v in values.items()}
-        )[0]
-        self._normal: _Normal | None = None
-        found = _normals(model, parameters)
-        if found is not None:
-            fields = ({n: f[i] for n, f in found.items()} for i in range(len(_Normal._fields)))
-            self._normal = _Normal(*(parameters.flatten(field)[0] for field in fields))
+        self._slope = parameters.mask(lambda name: of_logs and parameters.is_log(name))
+        self._normal = _normals(model, parameters)
 
     def __call__(self, vectors: Tensor) -> Tensor:
         """Return the log density at ``vectors`` (``k x B x p``) as ``k x B``."""
         between = (self._slope * vectors).sum(-1)
         if self._normal is not None:
             return self._normal.log_density(vectors) + between
-        raw = self._parameters.to_raw(self._parameters.unflatten(vectors))
-        named = {f"model.{name}": value for name, value in raw.items()}
-        densities: list[Tensor] = functional_call(self._priors, named, ())
+        values = self._parameters.unflatten(vectors)
+        densities: list[Tensor] = self._parameters.call_at(values, self._densities)
         batch = (len(vectors), *self._parameters.batch_shape)
         total = vectors.new_zeros(batch)
         for density in densities:
@@ -74,7 +64,14 @@ class LogPriors:
             total = self(leaf)
         if not total.requires_grad:
             return total, torch.zeros_like(vectors)
-        return total.detach(), torch.autograd.grad(total.sum(), leaf)[0]
+        return total.detach(), torch.autograd.grad(total, leaf, torch.ones_like(total))[0]
+
+    def _densities(self) -> list[Tensor]:
+        """The log density of each prior at the model's parameters."""
+        return [
+            prior.log_prob(closure(module))
+            for _, module, prior, closure, _ in self._model.named_priors()
+        ]
 
 
 class _Normal(NamedTuple):
@@ -103,47 +100,25 @@ class _Normal(NamedTuple):
         return self.precision * (self.location - value) - self.of_log
 
 
-class _Priors(Module):
-    def __init__(self, model: Any) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self) -> list[Tensor]:
-        return [
-            prior.log_prob(closure(module))
-            for _, module, prior, closure, _ in self.model.named_priors()
-        ]
-
-
-def _normals(
-    model: BatchedMultiOutputGPyTorchModel, parameters: LogParameters
-) -> dict[str, tuple[Tensor, Tensor, Tensor]] | None:
-    """Location, precision and kind of the priors of all learnt parameters.
-
-    None if a prior is of another form, or of a parameter that is not learnt.
-    """
-    zero = {n: torch.zeros_like(parameters.value(n)).unsqueeze(0) for n in parameters.names}
-    found = {name: (zero[name], zero[name], zero[name]) for name in parameters.names}
+def _normals(model: BatchedMultiOutputGPyTorchModel, parameters: LogParameters) -> _Normal | None:
+    """The priors; None if one is of another form, or of a parameter that is not learnt."""
+    zero = {name: torch.zeros_like(parameters.value(name)) for name in parameters.names}
+    location, precision, logs = zero.copy(), zero.copy(), zero.copy()
     for full_name, module, prior, closure, _ in model.named_priors():
         path, _, leaf = full_name.removesuffix("_prior").rpartition(".")
         name = f"{path}.raw_{leaf}" if f"{path}.raw_{leaf}" in zero else f"{path}.{leaf}"
         of_log = type(prior) is LogNormalPrior
         if name not in zero or type(prior) not in (LogNormalPrior, NormalPrior):
             return None
-        value = parameters.value(name)
-        expected = value.exp() if of_log else value
-        read = closure(module).detach()
+        value, read = parameters.value(name), closure(module).detach()
         if (
             parameters.is_log(name) != of_log
             or read.shape != value.shape
-            or not torch.allclose(read, expected)
+            or not torch.allclose(read, value.exp() if of_log else value)
             or torch.broadcast_shapes(prior.loc.shape, value.shape) != value.shape
         ):
             return None
-        precision = prior.scale.square().reciprocal()
-        found[name] = (
-            prior.loc.expand_as(value).unsqueeze(0),
-            precision.expand_as(value).unsqueeze(0),
-            zero[name] + float(of_log),
-        )
-    return found
+        location[name] = prior.loc.expand_as(value)
+        precision[name] = prior.scale.square().reciprocal().expand_as(value)
+        logs[name] = torch.full_like(value, of_log)
+    return _Normal(*(parameters.flatten(each)[0] for each in (location, precision, logs)))

@@ -55,8 +55,7 @@ class FitResult:
 def maximise(objective: Objective, search: Search) -> FitResult:
     """Bring the model of an objective to its optimum, see :func:`~gpadjust.fit`.
 
-    With many observations the search is made on some of them, and its best optima are refined on
-    all.
+    With many observations the search is made on some of them.
     """
     model, parameters = objective.model, objective.parameters
     starts = parameters.clipped(parameters.current())
@@ -74,11 +73,10 @@ def maximise(objective: Objective, search: Search) -> FitResult:
             "noise through train_Yvar."
         )
     reached, values, converged = _optimise(objective, starts, search.max_iterations)
-    best = values.argmin(0)
-    problems = torch.arange(parameters.num_problems)
-    objective.assign(reached[best, problems])
+    best = values.argmin(0), torch.arange(parameters.num_problems)
+    objective.assign(reached[best])
     model.eval()
-    converged = converged[best, problems].reshape(parameters.batch_shape)
+    converged = converged[best].reshape(parameters.batch_shape)
     if not converged.all():
         warnings.warn(
             f"L-BFGS did not converge for {int((~converged).sum())} of {parameters.num_problems} "
@@ -87,7 +85,7 @@ def maximise(objective: Objective, search: Search) -> FitResult:
             OptimizationWarning,
             stacklevel=4,
         )
-    return FitResult(-values[best, problems].reshape(parameters.batch_shape), converged)
+    return FitResult(-values[best].reshape(parameters.batch_shape), converged)
 
 
 def _optima_of_some(objective: Objective, search: Search) -> Tensor:
@@ -102,9 +100,9 @@ def _optima_of_some(objective: Objective, search: Search) -> Tensor:
     )
     starts = _screened(part, search)
     reached, values, _ = _optimise(part, starts, min(search.max_iterations, 40), _ROUGH)
-    reached, values = part.at_best_scale(reached) if part.concentrated else (reached, values)
-    order = values.argsort(dim=0)[:_COMPARED]
-    return reached.gather(0, order.unsqueeze(-1).expand(-1, -1, reached.shape[-1]))
+    if part.concentrated:
+        reached, values = part.at_best_scale(reached)
+    return _rows(reached, values.argsort(dim=0)[:_COMPARED])
 
 
 def _best(objective: Objective, candidates: Tensor) -> Tensor:
@@ -129,29 +127,27 @@ def _screened(objective: Objective, search: Search) -> Tensor:
     if num_starts is None:
         num_starts = 16 if parameters.is_batched else 8
     generator = torch.Generator().manual_seed(search.seed)
-    drawn = parameters.draw(num_screened, generator)
-    drawn, values = objective.at_best_scale(drawn)
+    drawn, values = objective.at_best_scale(parameters.draw(num_screened, generator))
     current = parameters.clipped(parameters.current())
     starts, values = torch.cat([current, drawn]), torch.cat([objective(current), values])
     if parameters.noise.any() and num_starts > 1 and len(starts) > 2:
         # Optima with and without noise are apart, and without it a random start looks bad.
-        clean = torch.zeros(len(starts), 1, dtype=torch.bool, device=starts.device)
+        clean = torch.zeros_like(values, dtype=torch.bool)
         clean[1 : 1 + len(starts) // 2] = True
-        worst = torch.full_like(values, math.inf)
-        parts = [
-            values.where(stratum, worst).argsort(dim=0)[:number]
-            for stratum, number in (
-                (~clean, num_starts - num_starts // 2),
-                (clean, num_starts // 2),
-            )
-        ]
-        order = torch.cat(parts)
+        noisy = values.masked_fill(clean, math.inf).argsort(dim=0)[: (num_starts + 1) // 2]
+        noiseless = values.masked_fill(~clean, math.inf).argsort(dim=0)[: num_starts // 2]
+        order = torch.cat([noisy, noiseless])
         order = order.gather(0, values.gather(0, order).argsort(dim=0))
     else:
         order = values.argsort(dim=0)[:num_starts]
     if num_starts > 1 and not parameters.is_batched and not (order == 0).any():
         order[-1] = 0  # the user's guess of the physics' parameters is worth a start of its own
-    return starts.gather(0, order.unsqueeze(-1).expand(-1, -1, starts.shape[-1]))
+    return _rows(starts, order)
+
+
+def _rows(vectors: Tensor, numbers: Tensor) -> Tensor:
+    """Those of the vectors ``k x B x p`` of the numbers ``k' x B``, for each problem."""
+    return vectors.gather(0, numbers.unsqueeze(-1).expand(-1, -1, vectors.shape[-1]))
 
 
 def _optimise(

@@ -10,24 +10,16 @@ from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.likelihoods import GaussianLikelihood
 from torch import Tensor
 
-from gpadjust.gp import SumOfTerms
-from gpadjust.gp.gaussian import (
-    LikelihoodValue,
-    cholesky,
-    known_noise,
-    least_squares,
-    negative_log_likelihood,
-    nugget,
-)
+from gpadjust.gp import SumOfTerms, Term
+from gpadjust.gp.gaussian import LikelihoodValue, known_noise, negative_log_likelihood
 from gpadjust.gp.stationary import StationarySum, StationaryTerm, stationary_form
-from gpadjust.inference.log_parameters import LogParameters, Parameters
+from gpadjust.inference.log_parameters import LogParameters
 from gpadjust.inference.log_priors import LogPriors
-from gpadjust.inference.target_distribution import ModuleDistribution, TargetDistribution
+from gpadjust.inference.target_distribution import ModuleDistribution, constant_means
 from gpadjust.models.hyperparameters import kernels_of
 from gpadjust.physics import PhysicsError
 
 _NOISE = "likelihood.noise_covar.raw_noise"
-_VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
 _AT_ONCE = 2**20  # numbers in the covariances of a batch; larger ones make memory the bottleneck
 
 
@@ -69,31 +61,23 @@ class Objective:
         model.train()
         self.model = model
         self.parameters = LogParameters(model)
-        learns_inputs = any(name.startswith("input_transform.") for name in self.parameters.names)
+        kept = slice(None) if rows is None else rows
         raw, noise = model.train_inputs[0], known_noise(model.likelihood)
+        self.targets = model.train_targets[..., kept]
+        noise = None if noise is None else noise[..., kept]
         with torch.no_grad():
-            inputs = model.transform_inputs(raw)
-        self.targets = model.train_targets
-        if rows is not None:
-            raw, inputs, self.targets = (
-                raw[..., rows, :],
-                inputs[..., rows, :],
-                self.targets[..., rows],
-            )
-            noise = None if noise is None else noise[..., rows]
-        with torch.no_grad():
+            inputs = model.transform_inputs(raw)[..., kept, :]
             basis = None if marginal else _basis_of_means(model, inputs)
         self._learns_constants = basis is not None
-        # That of a physics which learns changes: the distribution has it in its mean.
-        self._basis = None if learns_inputs else basis
-        self._inputs = raw if learns_inputs else inputs
-        closed: TargetDistribution | None = None
-        if self.parameters.is_batched and not autograd:
-            closed = _closed_form(model, inputs, self.parameters, noise, marginal)
-        targets = self.targets if learns_inputs and self._learns_constants else None
-        self._distribution = closed or ModuleDistribution(
-            model, self._inputs, self.parameters, noise, marginal, targets
-        )
+        self._inputs, self._basis, targets = inputs, basis, None
+        if self.parameters.learns_inputs:
+            self._inputs, self._basis = raw[..., kept, :], None
+            # The basis changes with the physics: the distribution has it in its mean.
+            targets = None if basis is None else self.targets
+        closed = self.parameters.is_batched and not autograd
+        self._distribution = (
+            self._closed_form(inputs, noise, marginal) if closed else None
+        ) or ModuleDistribution(model, self._inputs, self.parameters, noise, marginal, targets)
         self._log_priors: LogPriors | None = None
         if of_logs or next(iter(model.named_priors()), None) is not None:
             self._log_priors = LogPriors(model, self.parameters, of_logs)
@@ -122,19 +106,14 @@ class Objective:
 
         It is infinite where the covariance has no Cholesky factor.
         """
-        return self._in_chunks(lambda part: (self._evaluate(part, derivatives=False)[0],), vectors)[
-            0
-        ]
+        return self._in_chunks(lambda part: self._evaluate(part, derivatives=False), vectors)[0]
 
     def value_and_gradient(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Return the objective and its gradient, ``k x B`` and ``k x B x p``.
 
         The gradient is zero where the objective is infinite.
         """
-        value, gradient = self._in_chunks(
-            lambda part: self._evaluate(part, derivatives=True), vectors.detach()
-        )
-        return value, gradient
+        return self._in_chunks(lambda part: self._evaluate(part, derivatives=True), vectors)
 
     @torch.no_grad()
     def at_best_scale(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -153,13 +132,8 @@ class Objective:
             return vectors, self(vectors)
 
         def likelihood(part: Tensor) -> tuple[Tensor, Tensor]:
-            mean, covariance = self._distribution(self.parameters.unflatten(part))
-            residual = self._residual(mean, covariance)
-            found = negative_log_likelihood(
-                residual, covariance, self._basis, self._least_scale(part)
-            )
-            shape = (len(part), self.parameters.num_problems)
-            return found.value.reshape(shape), found.scale.reshape(shape)
+            found, _ = self._likelihood(part, self._least_scale(part), derivatives=False)
+            return found.value.reshape(len(part), -1), found.scale.reshape(len(part), -1)
 
         values, scale = self._in_chunks(likelihood, vectors)
         usable = scale.isfinite() & (scale > 0)
@@ -168,82 +142,58 @@ class Objective:
         return moved, values if self.concentrated else self(moved)
 
     def _in_chunks(
-        self, function: Callable[[Tensor], tuple[Tensor, ...]], vectors: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Evaluate a function of vectors in parts that fit in memory."""
-        at_once = max(1, _AT_ONCE // (self.parameters.num_problems * self.num_points**2))
-        parts = [function(part) for part in vectors.split(at_once)]
-        return tuple(torch.cat(part) for part in zip(*parts, strict=True))
+        self, function: Callable[[Tensor], tuple[Tensor, Tensor]], vectors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluate a function of vectors in parts that fit in memory.
 
+        Where problems share parameters, as the physics learns, it is one vector after the other.
+        """
+        size = self.parameters.num_problems * self.num_points**2
+        at_once = max(1, _AT_ONCE // size) if self.parameters.is_batched else 1
+        first, second = zip(*(function(part) for part in vectors.split(at_once)), strict=True)
+        return torch.cat(first), torch.cat(second)
+
+    @torch.no_grad()
     def _evaluate(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
-        if self.parameters.is_batched:
-            value, gradient = self._apart(vectors, derivatives)
-        else:
-            pairs = [self._together(each, derivatives) for each in vectors]
-            value = torch.stack([pair[0] for pair in pairs])
-            gradient = torch.stack([pair[1] for pair in pairs])
-        if self._log_priors is not None:
-            if derivatives:
-                log_prior, by_prior = self._log_priors.with_gradient(vectors)
-                gradient = gradient - by_prior
-            else:
-                with torch.no_grad():
-                    log_prior = self._log_priors(vectors)
-            value = value - log_prior
+        """The objective and its gradient (zero if not asked for)."""
+        least = self._least_scale(vectors) if self.concentrated else None
+        try:
+            found, gradient = self._likelihood(vectors, least, derivatives)
+        except PhysicsError:
+            # Parameters that the physics cannot run with are a bad vector, not the end of a fit.
+            return vectors.new_full(vectors.shape[:-1], math.inf), torch.zeros_like(vectors)
+        # Outputs that share parameters are independent given these.
+        value = found.value.reshape(*vectors.shape[:-1], -1).sum(-1)
+        if found.by_least_scale is not None:
+            # The least scale is that of the least noise, in inverse proportion to the noise.
+            by_least = found.by_least_scale.reshape(*value.shape, 1)
+            gradient = gradient - self.parameters.noise * by_least
+        if self._log_priors is not None and derivatives:
+            log_prior, by_prior = self._log_priors.with_gradient(vectors)
+            value, gradient = value - log_prior, gradient - by_prior
+        elif self._log_priors is not None:
+            value = value - self._log_priors(vectors)
         # NaN and minus infinity are what only failures give.
         value = value.nan_to_num(math.inf, math.inf, math.inf)
         good = (value.isfinite() & gradient.isfinite().all(-1)).unsqueeze(-1)
         return value, torch.where(good, gradient, torch.zeros_like(gradient))
 
-    @torch.no_grad()
-    def _apart(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
-        """The likelihood of problems of their own, and its gradient (zero if not asked for)."""
-        values = self.parameters.unflatten(vectors)
-        least = self._least_scale(vectors) if self.concentrated else None
-        if not derivatives:
-            mean, covariance = self._distribution(values)
-            likelihood = self._likelihood(mean, covariance, least)
-            return likelihood.value.reshape(len(vectors), -1), torch.zeros_like(vectors)
-        mean, covariance, pull_back = self._distribution.with_pull_back(values)
-        likelihood = self._likelihood(mean, covariance, least, derivatives=True)
-        found = pull_back(*likelihood.gradient())
-        gradient = self.parameters.flatten(found)
-        value = likelihood.value.reshape(len(vectors), -1)
-        if likelihood.by_least_scale is not None:
-            # The least scale is that of the least noise, in inverse proportion to the noise.
-            by_least = likelihood.by_least_scale.reshape(value.shape)
-            gradient = gradient - self.parameters.noise * by_least.unsqueeze(-1)
-        return value, gradient
-
-    def _together(self, vector: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
-        """Negative log likelihood and its gradient of one vector, ``1`` and ``1 x p``.
-
-        Its outputs are independent given the parameters that they share.
-        """
-        values = {n: v[0] for n, v in self.parameters.unflatten(vector.unsqueeze(0)).items()}
-        gradient = torch.zeros_like(vector)
-        try:
-            if not derivatives:
-                with torch.no_grad():
-                    likelihood = self._likelihood(*self._distribution(values), None)
-                return likelihood.value.sum().reshape(1), gradient
-            mean, covariance, pull_back = self._distribution.with_pull_back(values)
-        except PhysicsError:
-            # Parameters that the physics cannot run with are a bad vector, not the end of a fit.
-            return vector.new_full((1,), math.inf), gradient
-        likelihood = self._likelihood(mean, covariance, None, derivatives=True)
-        found = pull_back(*likelihood.gradient())
-        gradient = self.parameters.flatten({name: v.unsqueeze(0) for name, v in found.items()})[0]
-        return likelihood.value.sum().reshape(1), gradient
-
     def _likelihood(
-        self, mean: Tensor, covariance: Tensor, least: Tensor | None, derivatives: bool = False
-    ) -> LikelihoodValue:
-        residual = self._residual(mean, covariance)
-        return negative_log_likelihood(residual, covariance, self._basis, least, derivatives)
-
-    def _residual(self, mean: Tensor, covariance: Tensor) -> Tensor:
-        return (self.targets - mean).expand(covariance.shape[:-1])
+        self, vectors: Tensor, least: Tensor | None, derivatives: bool
+    ) -> tuple[LikelihoodValue, Tensor]:
+        """The likelihood, and its gradient at a fixed scale (zero if not asked for)."""
+        values = self.parameters.unflatten(vectors)
+        if not self.parameters.is_batched:
+            values = {name: value[0] for name, value in values.items()}
+        if derivatives:
+            mean, covariance, pull_back = self._distribution.with_pull_back(values)
+        else:
+            mean, covariance = self._distribution(values)
+        residual = (self.targets - mean).expand(covariance.shape[:-1])
+        found = negative_log_likelihood(residual, covariance, self._basis, least, derivatives)
+        if found.by_mean is None or found.by_covariance is None:
+            return found, torch.zeros_like(vectors)
+        return found, self.parameters.flatten(pull_back(found.by_mean, found.by_covariance))
 
     def _least_scale(self, vectors: Tensor) -> Tensor:
         """The factor of all variances that brings the noise to its bound, ``k x batch_shape``."""
@@ -252,72 +202,28 @@ class Objective:
         return least.reshape(len(vectors), *self.parameters.batch_shape)
 
     def _assign_constants(self, vector: Tensor) -> None:
-        values: Parameters = self.parameters.unflatten(vector.unsqueeze(0))
+        values = self.parameters.unflatten(vector.unsqueeze(0))
         _, covariance = self._distribution({name: value[0] for name, value in values.items()})
         inputs, basis = self._inputs, self._basis
         if basis is None:
             inputs = self.model.transform_inputs(inputs)
-            basis = _basis_of_means(self.model, inputs)
+            basis = self.model.covar_module.basis_of_means(inputs)
         residual = self.targets - self.model.mean_module(inputs)
-        observed = ~residual.isnan()
-        chol, _ = cholesky(covariance, None if observed.all() else observed)
-        basis = basis * observed.unsqueeze(-1)
-        basis = basis.expand(*chol.shape[:-1], -1)
-        shift, variance = least_squares(chol, residual.nan_to_num(nan=0.0), basis)
-        vague = _VAGUE * variance.diagonal(dim1=-1, dim2=-2)
-        # A wider prior would drown the smallest pivot in rounding errors.
-        pivot = chol.diagonal(dim1=-1, dim2=-2).amin(-1, keepdim=True).square()
-        size = basis.square().amax(-2).clamp_min(torch.finfo(chol.dtype).tiny)
-        vague = vague.minimum(pivot / (nugget(chol.shape[-1]) * size))
-        learnt = [term for term in self.model.covar_module.terms if term.learns_mean]
-        for i, term in enumerate(learnt):
-            term.mean += shift[..., i : i + 1]
+        shift, vague = constant_means(residual, covariance, basis)
+        for i, term in enumerate(_terms_of_means(self.model)):
+            term.mean.add_(shift[..., i : i + 1])
             term.mean_variance.copy_(vague[..., i : i + 1])
 
-    def _is_homogeneous(self) -> bool:
-        """Whether a factor of all variances is one of the covariance, and no prior minds."""
-        parameters = self.parameters
-        one_noise = bool((parameters.noise.sum(-1) <= 1).all())
-        if not parameters.is_batched or self._log_priors is not None or not one_noise:
-            return False
-        vector = parameters.current()
-        with torch.no_grad():
-            mean, covariance = self._distribution(parameters.unflatten(vector))
-            doubled = vector + parameters.variances * math.log(2)
-            mean2, covariance2 = self._distribution(parameters.unflatten(doubled))
-            off = (covariance2 - 2 * covariance).abs().amax((-1, -2))
-        return bool((off <= 1e-9 * covariance.abs().amax((-1, -2))).all()) and bool(
-            (mean2 == mean).all()
-        )
-
-
-def _basis_of_means(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
-    """The bases of unknown constant means, ``... x n x q``; None for models of other libraries."""
-    kernel = model.covar_module
-    return kernel.basis_of_means(inputs) if isinstance(kernel, SumOfTerms) else None
-
-
-def _closed_form(
-    model: BatchedMultiOutputGPyTorchModel,
-    inputs: Tensor,
-    parameters: LogParameters,
-    noise: Tensor | None,
-    marginal: bool,
-) -> StationarySum | None:
-    """The distribution of the targets without autograd, or None if the model has another form.
-
-    Args:
-        model: The model.
-        inputs: Its transformed training inputs, or some rows of them.
-        parameters: Its learnable parameters.
-        noise: The noise variances of these inputs, if they are known.
-        marginal: Whether the prior variances of unknown constants count.
-    """
-    if noise is None and type(model.likelihood) is not GaussianLikelihood:
-        return None
-    terms, names = [], set() if noise is not None else {_NOISE}
-    origin = inputs.mean(-2, keepdim=True)
-    with torch.no_grad():
+    @torch.no_grad()
+    def _closed_form(
+        self, inputs: Tensor, noise: Tensor | None, marginal: bool
+    ) -> StationarySum | None:
+        """The distribution without autograd, or None if the model has another form."""
+        model = self.model
+        if noise is None and type(model.likelihood) is not GaussianLikelihood:
+            return None
+        terms, names = [], set() if noise is not None else {_NOISE}
+        origin = inputs.mean(-2, keepdim=True)
         for path, kernel, num_inputs, basis in kernels_of(model):
             d = inputs.shape[-1] if num_inputs is None else num_inputs
             form = stationary_form(kernel, d)
@@ -328,25 +234,44 @@ def _closed_form(
             weight = None if basis is None else basis(inputs)
             x = (inputs - origin)[..., :d]
             terms.append(StationaryTerm(x, weight, lengthscale, scale, form.profile))
-            names |= {name for name in (lengthscale, scale) if name is not None}
-        if not terms or not names.issuperset(parameters.names):
+            names |= {lengthscale} if scale is None else {lengthscale, scale}
+        if not terms or not names.issuperset(self.parameters.names):
             return None
-        constant = _constant_covariance(model, inputs) if marginal else None
-        shape = (*model.train_targets.shape[:-1], inputs.shape[-2])
-        mean = model.mean_module(inputs).expand(shape)
+        mean = model.mean_module(inputs).expand(self.targets.shape)
+        bases = _basis_of_means(model, inputs) if marginal else None
+        constant: Tensor | None = None
+        if bases is not None:
+            variances = torch.stack([t.mean_variance for t in _terms_of_means(model)], dim=-1)
+            root = bases * variances.sqrt()
+            constant = root @ root.mT
         values = {}
         for name in names:
             path, _, leaf = name.rpartition(".")
             value: Tensor = getattr(model.get_submodule(path), leaf.removeprefix("raw_"))
             values[name] = value.log()
-    return StationarySum(terms, mean, constant, _NOISE if noise is None else noise, values)
+        return StationarySum(terms, mean, constant, _NOISE if noise is None else noise, values)
+
+    @torch.no_grad()
+    def _is_homogeneous(self) -> bool:
+        """Whether a factor of all variances is one of the covariance, and no prior minds."""
+        parameters = self.parameters
+        several_noises = bool((parameters.noise.sum(-1) > 1).any())
+        if not parameters.is_batched or self._log_priors is not None or several_noises:
+            return False
+        vector = parameters.current()
+        mean, covariance = self._distribution(parameters.unflatten(vector))
+        doubled = parameters.unflatten(vector + parameters.variances * math.log(2))
+        mean2, covariance2 = self._distribution(doubled)
+        off = (covariance2 - 2 * covariance).abs().amax((-1, -2))
+        close = (off <= 1e-9 * covariance.abs().amax((-1, -2))).all()
+        return bool(close) and torch.equal(mean2, mean)
 
 
-def _constant_covariance(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
-    """What unknown constants add to the covariance, ``... x n x n``, or None."""
-    basis = _basis_of_means(model, inputs)
-    if basis is None:
-        return None
-    learnt = [term for term in model.covar_module.terms if term.learns_mean]
-    scaled = basis * torch.stack([term.mean_variance.sqrt() for term in learnt], dim=-1)
-    return scaled @ scaled.mT
+def _basis_of_means(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:
+    """The bases of unknown constant means, ``... x n x q``; None for models of other libraries."""
+    kernel = model.covar_module
+    return kernel.basis_of_means(inputs) if isinstance(kernel, SumOfTerms) else None
+
+
+def _terms_of_means(model: BatchedMultiOutputGPyTorchModel) -> list[Term]:
+    return [term for term in model.covar_module.terms if term.learns_mean]

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.priors import LogNormalPrior, NormalPrior
-from torch import Tensor
 
 from gpadjust.models.ar1 import Level
 from gpadjust.models.hyperparameters import (
@@ -66,18 +63,13 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
             median *= math.sqrt(size.shape[-1])
         elif kind == "outputscale" and any(name.startswith(f"{path}.") for path in of_rho):
             size, (median, spread) = torch.ones_like(size), RHO_VARIANCE.prior
-        _register(module, kind, size.log() + math.log(median), spread)
+        if f"{kind}_prior" in module._priors or not getattr(module, f"raw_{kind}").requires_grad:
+            continue
+        location = (size.log() + math.log(median)).detach()
+        prior = LogNormalPrior(location, torch.full_like(location, spread))
+        read, write = getattr(module, f"_{kind}_param"), getattr(module, f"_{kind}_closure")
+        module.register_prior(f"{kind}_prior", prior, read, write)
     for module in model.covar_module.modules():
         if isinstance(module, Level) and module.rho is not None and not module._priors:
             one = torch.ones_like(module.rho)
             module.register_prior("rho_prior", NormalPrior(one, one), "rho")
-
-
-def _register(module: Any, name: str, location: Tensor, scale: float) -> None:
-    """Register a log-normal prior on a learnable parameter of a kernel or likelihood."""
-    has_prior = f"{name}_prior" in module._priors
-    if has_prior or not getattr(module, f"raw_{name}").requires_grad:
-        return
-    prior = LogNormalPrior(location.detach().clone(), torch.full_like(location, scale))
-    read: Callable[[Any], Tensor] = getattr(module, f"_{name}_param")
-    module.register_prior(f"{name}_prior", prior, read, getattr(module, f"_{name}_closure"))

@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import gpytorch
 import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from linear_operator import to_dense
 from torch import Tensor
-from torch.func import functional_call
-from torch.nn import Module
 
 from gpadjust.gp import SumOfTerms
-from gpadjust.gp.gaussian import cholesky, least_squares, noise_variances
+from gpadjust.gp.gaussian import cholesky, least_squares, noise_variances, nugget
 from gpadjust.inference.log_parameters import LogParameters, Parameters
 
-# Maps derivatives by mean and covariance to those by the (logarithmic) parameters.
-PullBack = Callable[[Tensor, Tensor], Parameters]
-
-
-class TargetDistribution(Protocol):
-    """Mean and covariance of the targets, noise included, as functions of the parameters."""
-
-    def __call__(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
-        """Return mean ``... x n`` and covariance ``... x n x n``, which may be overwritten."""
-
-    def with_pull_back(self, parameters: Parameters) -> tuple[Tensor, Tensor, PullBack]:
-        """As calling it, with the function that carries derivatives back to the parameters."""
+_VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
 
 
 class ModuleDistribution:
@@ -56,18 +42,43 @@ class ModuleDistribution:
         marginal: bool,
         targets: Tensor | None,
     ) -> None:
-        self._noisy_prior = _NoisyPrior(model, inputs, parameters, known_noise, marginal, targets)
+        self._model = model
+        self._inputs = inputs
         self._parameters = parameters
+        self._known_noise = known_noise
+        self._marginal = marginal
+        self._targets = targets
 
     def __call__(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
-        """Return mean ``... x n`` and covariance ``... x n x n``, noise included."""
-        raw = self._parameters.to_raw(parameters)
-        named = {f"model.{name}": value for name, value in raw.items()}
+        """Return mean ``... x n`` and covariance ``... x n x n``, which may be overwritten."""
         with gpytorch.settings.lazily_evaluate_kernels(False):
-            moments: tuple[Tensor, Tensor] = functional_call(self._noisy_prior, named, ())
+            moments: tuple[Tensor, Tensor] = self._parameters.call_at(parameters, self._moments)
         return moments
 
-    def with_pull_back(self, parameters: Parameters) -> tuple[Tensor, Tensor, PullBack]:
+    def _moments(self) -> tuple[Tensor, Tensor]:
+        """Mean and covariance at the model's parameters."""
+        model, inputs, noise = self._model, self._inputs, self._known_noise
+        if self._parameters.learns_inputs:
+            inputs = model.transform_inputs(inputs)
+        if self._marginal or not isinstance(model.covar_module, SumOfTerms):
+            covariance = to_dense(model.covar_module(inputs))
+        else:
+            covariance = model.covar_module.covariance(inputs, known_means=True)
+        noise = noise_variances(model.likelihood, inputs) if noise is None else noise
+        noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
+        mean = model.mean_module(inputs).expand(noise.shape)
+        covariance = covariance + torch.diag_embed(noise)
+        if self._targets is not None:
+            basis = model.covar_module.basis_of_means(inputs)
+            residual = self._targets - mean.detach()
+            # The estimate minimises the objective, so that no derivative goes through it.
+            best, _ = constant_means(residual, covariance.detach().clone(), basis.detach())
+            mean = mean + (basis @ best.unsqueeze(-1)).squeeze(-1)
+        return mean, covariance
+
+    def with_pull_back(
+        self, parameters: Parameters
+    ) -> tuple[Tensor, Tensor, Callable[[Tensor, Tensor], Parameters]]:
         """As calling it, with the function that carries derivatives back to the parameters."""
         leaves = {name: v.detach().requires_grad_() for name, v in parameters.items()}
         with torch.enable_grad():
@@ -89,48 +100,24 @@ class ModuleDistribution:
         return mean.detach(), covariance.detach().clone(), pull_back
 
 
-class _NoisyPrior(Module):
-    def __init__(
-        self,
-        model: BatchedMultiOutputGPyTorchModel,
-        inputs: Tensor,
-        parameters: LogParameters,
-        known_noise: Tensor | None,
-        marginal: bool,
-        targets: Tensor | None,
-    ) -> None:
-        super().__init__()
-        self.model = model
-        self.inputs = inputs
-        self.known_noise = known_noise
-        self.targets = targets
-        self.transforms = any(name.startswith("input_transform.") for name in parameters.names)
-        kernel = model.covar_module
-        self.known_means = isinstance(kernel, SumOfTerms) and not marginal
+@torch.no_grad()
+def constant_means(residual: Tensor, covariance: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """Estimate unknown constant means by generalised least squares.
 
-    def forward(self) -> tuple[Tensor, Tensor]:
-        model = self.model
-        inputs = model.transform_inputs(self.inputs) if self.transforms else self.inputs
-        if self.known_means:
-            covariance = model.covar_module.covariance(inputs, known_means=True)
-        else:
-            covariance = to_dense(model.covar_module(inputs))
-        noise = self.known_noise
-        noise = noise_variances(model.likelihood, inputs) if noise is None else noise
-        noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
-        mean = model.mean_module(inputs).expand(noise.shape)
-        covariance = covariance + torch.diag_embed(noise)
-        if self.targets is not None:
-            basis = model.covar_module.basis_of_means(inputs)
-            # The estimate minimises the objective, so that no derivative goes through it.
-            best = self._constants(self.targets - mean.detach(), covariance, basis)
-            mean = mean + (basis @ best.unsqueeze(-1)).squeeze(-1)
-        return mean, covariance
+    Args:
+        residual: Targets less the rest of their mean, ``... x n``; NaN where there is none.
+        covariance: Their covariance, ``... x n x n``; it is overwritten.
+        basis: The bases of the means, ``... x n x q``.
 
-    @staticmethod
-    @torch.no_grad()
-    def _constants(residual: Tensor, covariance: Tensor, basis: Tensor) -> Tensor:
-        observed = ~residual.isnan()
-        chol, _ = cholesky(covariance.clone(), None if observed.all() else observed)
-        basis = (basis * observed.unsqueeze(-1)).expand(*chol.shape[:-1], -1)
-        return least_squares(chol, residual.nan_to_num(nan=0.0), basis)[0]
+    Returns:
+        The estimates, and vague prior variances around them, ``... x q`` both.
+    """
+    observed = ~residual.isnan()
+    chol, _ = cholesky(covariance, None if observed.all() else observed)
+    basis = (basis * observed.unsqueeze(-1)).expand(*chol.shape[:-1], -1)
+    means, errors = least_squares(chol, residual.nan_to_num(nan=0.0), basis)
+    vague = _VAGUE * errors.diagonal(dim1=-1, dim2=-2)
+    # A wider prior would drown the smallest pivot in rounding errors.
+    pivot = chol.diagonal(dim1=-1, dim2=-2).amin(-1, keepdim=True).square()
+    size = basis.square().amax(-2).clamp_min(torch.finfo(chol.dtype).tiny)
+    return means, vague.minimum(pivot / (nugget(chol.shape[-1]) * size))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.posteriors import Posterior
-from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.kernels import Kernel
 from gpytorch.likelihoods import Likelihood
@@ -29,7 +28,7 @@ PhysicsLike = (
     | Sequence[Physics | Callable[[Tensor], Tensor]]
     | dict[str, Physics | Callable[[Tensor], Tensor]]
 )
-KernelLike = Kernel | Callable[[int, Size], Kernel]
+KernelLike: TypeAlias = Kernel | Callable[[int, Size], Kernel]
 Means = float | Sequence[float] | Literal["learn"]
 
 
@@ -66,18 +65,12 @@ class AdjustedGP(ExactGPBase):
     model's own term :math:`\delta_0`.
 
     Args:
-        train_X: As in :class:`~gpadjust.CKA`, like all that are not listed here.
-        train_Y: See there.
-        train_Yvar: See there.
-        physics: See there; None for a model without physics, whose only term is ``f``.
+        physics: As in :class:`~gpadjust.CKA`, like all that are not listed here; None for a model
+            without physics, whose only term is ``f``.
         rho: What the structure says of rho.
         delta: What it says of delta.
         more_terms: Further terms of a structure of your own, made by a function of the number of
             inputs (after their transform), the batch shape, and the scale of the targets.
-        center: See there.
-        likelihood: See there.
-        outcome_transform: See there.
-        input_transform: See there.
     """
 
     def __init__(
@@ -97,14 +90,14 @@ class AdjustedGP(ExactGPBase):
     ) -> None:
         data = training_data(train_X, train_Y, train_Yvar)
         m, batch_shape = data.Y.shape[-1], self.get_batch_dimensions(data.X, data.Y)[1]
-        transform = input_transform
+        transform: Any = input_transform
         if physics is not None:
             transform = PhysicsInput(as_physics(physics), data.X.shape[-1], input_transform)
         with torch.no_grad():
             X = data.X if transform is None else transform(data.X)
-        f = _values(transform, X, m)  # k physics, ... x n x m each
-        d = X.shape[-1] - len(f) * m
-        rho_means = _means(rho, len(f))
+        f = _values(transform, X, m)
+        k, d = len(f), X.shape[-1] - len(f) * m
+        rho_means = _means(rho, k)
         start = _start(data.Y, f, rho_means)
         if isinstance(outcome_transform, _DefaultType):
             mean = sum((w * v for w, v in zip(start, f, strict=True)), torch.zeros_like(data.Y))
@@ -114,36 +107,37 @@ class AdjustedGP(ExactGPBase):
         zero = torch.zeros_like(data.X[..., :1, :1]).expand(*data.X.shape[:-2], 1, m)
         shift, scale = (zero, zero + 1) if units is None else (units.means, units.stdvs)
 
-        def of_outputs(tensor: Tensor) -> Tensor:
-            """From ``batch_shape x 1 x m`` to ``batch_shape x (m) x 1``."""
-            return tensor.mT.clone() if m > 1 else tensor.squeeze(-1).clone()
+        def of_outputs(values: Tensor) -> Tensor:
+            """From ``batch_shape x 1 x m``, or what broadcasts to it, to ``... x (m) x 1``."""
+            return (values + zero).mT if m > 1 else (values + zero).squeeze(-1)
+
+        def term(
+            name: str, kernel: KernelLike | None, basis: Module | None, mean: Tensor, learn: bool
+        ) -> Term:
+            label = name if basis is not None else "delta"  # of ZeroMeanGP, too
+            if kernel is not None:
+                kernel = make_kernel(kernel, f"the kernel of {label}", d, batch_shape)
+            mean = of_outputs(mean)
+            return Term(name, kernel, d, basis, mean, torch.ones_like(mean) if learn else None)
 
         terms: list[Term] = []
-        names, given = _names(transform, len(f)), []
-        centers = [_center(center, values) for values in f]
-        kernels = _kernels(rho, len(f), names, d, batch_shape, given)
+        names = ["rho"] * k if k < 2 else [f"rho_{each}" for each in transform.physics.names]
+        centers, rho_kernels = [_center(center, values) for values in f], _kernels(rho, k)
+        columns = torch.eye(k * m, dtype=torch.float64).split(m)  # of each physics, m x (k m)
         for i, name in enumerate(names):
-            column = torch.zeros(m, len(f) * m, dtype=torch.float64)
-            column[range(m), range(i * m, (i + 1) * m)] = 1.0
-            select = column.unsqueeze(-2) if m > 1 else column
-            basis = AppendedPhysics(
-                d,
-                select.expand(*batch_shape, 1, len(f) * m),
-                of_outputs(centers[i] + zero),
-                of_outputs(scale + zero),
-            )
-            value = of_outputs(start[i] + zero)
-            vague = torch.ones_like(value) if rho_means[i] == "learn" else None
-            terms.append(Term(name, kernels[i], d, basis, value, vague))
+            select = (columns[i].unsqueeze(-2) if m > 1 else columns[i]).expand(*batch_shape, 1, -1)
+            basis = AppendedPhysics(d, select, of_outputs(centers[i]), of_outputs(scale))
+            terms.append(term(name, rho_kernels[i], basis, start[i], rho_means[i] == "learn"))
+        known = 0.0 if delta.mean == "learn" else delta.mean
+        if not isinstance(known, int | float):
+            raise ValueError(f"Expected delta_mean to be 'learn' or a number, got {known!r}.")
         # f = sum rho_i (f_i - c_i) + delta_0, so that delta_0 has the mean sum rho_i c_i.
         offset = sum((c * w for c, w in zip(centers, start, strict=True)), zero)
-        known = 0.0 if delta.mean == "learn" else delta.mean
-        value = of_outputs((known + offset - shift) / scale)
-        vague = torch.ones_like(value) if delta.mean == "learn" else None
-        kernel = _kernels(delta, 1, ["delta"], d, batch_shape, given)[0]
-        terms.append(Term("f" if physics is None else "delta", kernel, d, None, value, vague))
+        (kernel,), name = _kernels(delta, 1), "f" if physics is None else "delta"
+        mean = (known + offset - shift) / scale
+        terms.append(term(name, kernel, None, mean, delta.mean == "learn"))
         if more_terms is not None:
-            terms.extend(more_terms(d, batch_shape, of_outputs(scale + zero)))
+            terms.extend(more_terms(d, batch_shape, of_outputs(scale)))
         unknown = sum(term.learns_mean for term in terms)
         if unknown and data.X.shape[-2] < 2 + unknown:
             raise ValueError(
@@ -151,7 +145,7 @@ class AdjustedGP(ExactGPBase):
                 f"variance, got {data.X.shape[-2]}; give the means instead: rho_mean=1.0 (a number "
                 "for each physics), delta_mean=0.0."
             )
-        super().__init__(data, terms, likelihood, units, transform, given)
+        super().__init__(data, terms, likelihood, units, transform, (*rho_kernels, kernel))
 
     @property
     def physics(self) -> Physics:
@@ -185,34 +179,24 @@ class AdjustedGP(ExactGPBase):
         return self.term(self.rho_name(physics), X)
 
     def delta(self, X: ArrayLike) -> Posterior:
-        r"""The posterior of the bias :math:`\delta` at ``X``; f_p is not evaluated there.
-
-        Args:
-            X: Raw inputs, ``batch_shape x q x d``.
-
-        Returns:
-            A posterior over ``batch_shape x q x m``, in the units of the targets.
-
-        Raises:
-            ValueError: If the model has no delta.
-        """
+        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`."""
         return self.term("delta", X)
 
     def rho_name(self, physics: str | int | None = None) -> str:
         """The name of the term that scales a physics, which is given by name or number."""
         names = self.rho_names
+        if not names:
+            raise ValueError(f"{type(self).__name__} has no rho, as it has no physics.")
+        short = [name.removeprefix("rho_") for name in names]
         if physics is None and len(names) == 1:
             return names[0]
         if isinstance(physics, int) and -len(names) <= physics < len(names):
             return names[physics]
-        for name in names:
-            if physics is not None and physics in (name, name.removeprefix("rho_")):
-                return name
-        if not names:
-            raise ValueError(f"{type(self).__name__} has no rho, as it has no physics.")
+        if physics in (*names, *short):
+            return names[(*names, *short).index(physics) % len(names)]
         raise ValueError(
-            f"Expected physics to be one of {', '.join(n.removeprefix('rho_') for n in names)}, or "
-            f"a number from 0 to {len(names) - 1}, got {physics!r}."
+            f"Expected physics to be one of {', '.join(short)}, or a number from 0 to "
+            f"{len(names) - 1}, got {physics!r}."
         )
 
     def term_mean(self, name: str, output: int = 0) -> float:
@@ -221,21 +205,8 @@ class AdjustedGP(ExactGPBase):
         Of a model that holds samples of its hyper-parameters, or a batch, that of the first.
         """
         shift, scale = self._term_units(name)
-        weights = self._term_weights(name)
-        mean = sum((t.mean if w is None else w * t.mean for t, w in weights), torch.zeros(1))
-        mean = (mean * scale + shift).squeeze(-1)
-        values = mean.reshape(-1, self.num_outputs)[0]
-        return float(values[output])
-
-    @classmethod
-    def construct_inputs(cls, training_data: SupervisedDataset, **options: Any) -> dict[str, Any]:
-        """Construct keyword arguments of the model from a dataset.
-
-        Args:
-            training_data: The data.
-            options: Further arguments of the model, ``physics`` and all others.
-        """
-        return {**super().construct_inputs(training_data), **options}
+        mean = self._prior_mean(self.train_inputs[0], self._term_weights(name, or_known=True))
+        return float((mean[..., :1] * scale + shift).reshape(-1, self.num_outputs)[0, output])
 
     def _inputs_without_basis(self, X: Tensor) -> Tensor:
         transform = getattr(self, "input_transform", None)
@@ -243,11 +214,9 @@ class AdjustedGP(ExactGPBase):
             return transform.without_physics(X)
         return super()._inputs_without_basis(X)
 
-    def _term_weights(self, name: str) -> Weights:
-        weights = super()._term_weights(name)
-        if name != "delta":
-            return weights
-        for term in self.terms:
+    def _term_weights(self, name: str, or_known: bool = False) -> Weights:
+        weights = super()._term_weights(name, or_known)
+        for term in self.terms if name == "delta" else ():
             if isinstance(term.basis, AppendedPhysics) and term.basis.offset.any():
                 weights.append((term, -term.basis.offset / term.basis.scale))
         return weights
@@ -275,25 +244,14 @@ def _values(transform: Any, X: Tensor, m: int) -> list[Tensor]:
     return list(X[..., -total:].split(m, dim=-1))
 
 
-def _names(transform: Any, number: int) -> list[str]:
-    """The names of the rhos."""
-    if number < 2:
-        return ["rho"] * number
-    return [f"rho_{name}" for name in transform.physics.names]
-
-
 def _means(rho: Adjustment | None, number: int) -> list[float | Literal["learn"]]:
     """The prior means of the rhos, one for each physics."""
     mean = None if rho is None else rho.mean
     mean = (1.0 if number == 1 else "learn") if mean is None else mean
     if mean == "learn":
         return ["learn"] * number
-    means = [mean] * number if isinstance(mean, int | float) else mean
-    if (
-        isinstance(means, str)
-        or len(means) != number
-        or not all(isinstance(each, int | float) for each in means)
-    ):
+    means = [mean] * number if isinstance(mean, int | float) else [*mean]
+    if len(means) != number or not all(isinstance(each, int | float) for each in means):
         raise ValueError(
             f"Expected rho_mean to be 'learn', a number, or {number} numbers, one for each "
             f"physics, got {mean!r}."
@@ -317,43 +275,27 @@ def _start(Y: Tensor, f: list[Tensor], means: list[float | Literal["learn"]]) ->
     return [weight.unsqueeze(-2) for weight in weights.unbind(-1)]
 
 
-def _kernels(
-    adjustment: Adjustment | None,
-    number: int,
-    names: list[str],
-    num_inputs: int,
-    batch_shape: Size,
-    given: list[object],
-) -> list[Kernel | None]:
-    """The kernels of terms, made or checked; those that the user brought are added to ``given``."""
+def _kernels(adjustment: Adjustment | None, number: int) -> list[KernelLike | None]:
+    """What a structure says of the kernels of its terms, one for each."""
     kernel = None if adjustment is None else adjustment.kernel
-    each = [kernel] * number if not isinstance(kernel, Sequence) else [*kernel]
-    if len(each) != number:
-        raise ValueError(
-            f"Expected {number} kernels of rho, one for each physics, got {len(each)}."
-        )
     if number > 1 and isinstance(kernel, Module):
         raise ValueError(
             f"Expected a kernel for each of the {number} physics: pass a sequence of kernels, or a "
             "function of the number of inputs and the batch shape that makes one."
         )
-    given.extend(part for part in each if isinstance(part, Module))
-    return [
-        None
-        if part is None
-        else make_kernel(part, f"the kernel of {name}", num_inputs, batch_shape)
-        for part, name in zip(each, names, strict=True)
-    ]
+    each = [*kernel] if isinstance(kernel, Sequence) else [kernel] * number
+    if len(each) != number:
+        raise ValueError(
+            f"Expected {number} kernels of rho, one for each physics, got {len(each)}."
+        )
+    return each
 
 
 def make_kernel(kernel: KernelLike, name: str, num_inputs: int, batch_shape: Size) -> Kernel:
-    """Return a user's kernel, after checking that it fits, or make the one that a function makes.
+    """Return a user's kernel, or the one that a function makes, after checking that it fits.
 
-    Args:
-        kernel: The kernel, or a function of ``num_inputs`` and ``batch_shape`` that makes it.
-        name: What to call it in an error.
-        num_inputs: Number of inputs after their transform.
-        batch_shape: The model's batch shape, the outputs last.
+    The inputs are those after their transform, the batch shape is the model's with the outputs
+    last; the name is for errors.
     """
     if not isinstance(kernel, Kernel):
         if isinstance(kernel, Module | type) or not callable(kernel):

@@ -11,10 +11,8 @@ import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.sampling.pathwise.update_strategies import GaussianUpdate
-from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.sampling import draw_sobol_samples
 from botorch.utils.types import DEFAULT, _DefaultType
-from gpytorch.constraints import Interval
 from gpytorch.likelihoods import Likelihood
 from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.likelihoods.noise_models import MultitaskHomoskedasticNoise
@@ -25,6 +23,7 @@ from gpadjust.gp import Term
 from gpadjust.gp.gaussian import noise_variances
 from gpadjust.gp.physics_columns import check_one_to_one
 from gpadjust.models.adjusted_gp import KernelLike, PhysicsLike, make_kernel
+from gpadjust.models.cholesky_strategy import pad
 from gpadjust.models.exact_gp_base import ExactGPBase
 from gpadjust.models.hyperparameters import default_constraint, scaled_rbf
 from gpadjust.models.training_data import (
@@ -66,12 +65,16 @@ class LevelInput(InputTransform):
         """Append level 1 to ``X`` unless it has a level column."""
         if X.shape[-1] == self.num_inputs + 1:
             return X
-        if X.shape[-1] == self.num_inputs:
-            return torch.cat([X, torch.ones_like(X[..., :1])], dim=-1)
-        raise ValueError(
-            f"Expected X with {self.num_inputs} columns, the inputs that the model was built on, "
-            f"got shape {tuple(X.shape)}."
-        )
+        self.check_raw(X)
+        return torch.cat([X, torch.ones_like(X[..., :1])], dim=-1)
+
+    def check_raw(self, X: Tensor) -> None:
+        """Raise a ValueError unless ``X`` has the columns of raw inputs, without a level."""
+        if X.shape[-1] != self.num_inputs:
+            raise ValueError(
+                f"Expected X with {self.num_inputs} columns, the inputs that the model was built "
+                f"on, got shape {tuple(X.shape)}."
+            )
 
     def untransform(self, X: Tensor) -> Tensor:
         """Map ``... x n x (d' + 1)`` back to ``... x n x (d + 1)``, raw inputs with their level."""
@@ -90,8 +93,8 @@ class Level(gpytorch.Module):
 
     def __init__(self, batch_shape: Size | None = None) -> None:
         super().__init__()
-        one = None if batch_shape is None else torch.ones(*batch_shape, 1, dtype=torch.float64)
-        self.register_parameter("rho", None if one is None else torch.nn.Parameter(one))
+        rho = None if batch_shape is None else torch.ones(*batch_shape, 1, dtype=torch.float64)
+        self.register_parameter("rho", None if rho is None else torch.nn.Parameter(rho))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the basis at ``x`` (``... x n x (d + 1)``) as ``... x n``."""
@@ -114,16 +117,13 @@ class LevelLikelihood(_GaussianLikelihoodBase):
     add.
 
     Args:
-        noise_constraint: The constraint of the variances.
         batch_shape: Batch shape of the variances, ``batch_shape x 2``.
     """
 
-    def __init__(self, noise_constraint: Interval, batch_shape: Size) -> None:
-        super().__init__(
-            MultitaskHomoskedasticNoise(
-                num_tasks=2, noise_constraint=noise_constraint, batch_shape=batch_shape
-            )
-        )
+    def __init__(self, batch_shape: Size) -> None:
+        constraint = default_constraint()
+        noise = MultitaskHomoskedasticNoise(2, noise_constraint=constraint, batch_shape=batch_shape)
+        super().__init__(noise)
 
     @property
     def noise(self) -> Tensor:
@@ -137,11 +137,9 @@ class LevelLikelihood(_GaussianLikelihoodBase):
         if kwargs.get("noise") is not None:
             return DiagLinearOperator(kwargs["noise"])
         inputs = params[0] if isinstance(params[0], Tensor) else params[0][0]
-        high = inputs[..., -1]
-        low_noise, high_noise = self.noise[..., :1], self.noise[..., 1:]
-        noise = low_noise + high * (high_noise - low_noise)
-        shape = torch.broadcast_shapes(noise.shape, base_shape)
-        return DiagLinearOperator(noise.expand(shape))
+        low, high = self.noise[..., :1], self.noise[..., 1:]
+        noise = low + inputs[..., -1] * (high - low)
+        return DiagLinearOperator(noise.expand(torch.broadcast_shapes(noise.shape, base_shape)))
 
 
 class AR1(ExactGPBase):
@@ -154,11 +152,11 @@ class AR1(ExactGPBase):
     hang on the samples, and far from them it forgets the physics.
 
     Args:
-        train_X: Inputs of the high level, ``batch_shape x n x d``, float64.
-        train_Y: Targets of the high level, ``batch_shape x n x m``, float64.
+        train_X: Inputs of the high level, as in :class:`~gpadjust.CKA`, like all that are not
+            listed here.
         train_Yvar: Known observation variances of the high level, or None to learn the noise of
             both levels.
-        physics: The low level f_p, as in :class:`~gpadjust.CKA`, sampled in ``bounds``.
+        physics: The low level f_p, sampled in ``bounds``.
         bounds: ``2 x d`` lower and upper bounds of the inputs.
         num_low: Number ``N_1`` of samples of f_p.
         low_X: Instead of the three above, the inputs of the low level, ``batch_shape x n_1 x d``;
@@ -167,14 +165,11 @@ class AR1(ExactGPBase):
         delta_covar_module: The kernel of the bias. Default: likewise.
         outcome_transform: ``Standardize`` or None. Default: shift by the mean and divide by the
             standard deviation of the low level.
-        input_transform: A BoTorch input transform of the ``d`` inputs.
         seed: Seed of the (scrambled Sobol) samples.
 
     Raises:
-        TypeError: If data are not float64 tensors.
-        ValueError: If shapes disagree, data are not finite, bounds are upside down, or neither
+        ValueError: As :class:`~gpadjust.CKA`; and if bounds are upside down, or neither
             ``physics`` with ``bounds`` nor ``low_X`` with its values is given.
-        PhysicsError: If the physics fails, or returns NaN or a wrong shape.
     """
 
     def __init__(
@@ -215,9 +210,7 @@ class AR1(ExactGPBase):
             )
         batch_shape = self.get_batch_dimensions(high.X, high.Y)[1]
         transform = LevelInput(high.X.shape[-1], input_transform)
-        X = torch.cat(
-            [torch.nn.functional.pad(low.X, (0, 1)), transform.with_level(high.X)], dim=-2
-        )
+        X = torch.cat([pad(low.X, 1), transform.with_level(high.X)], dim=-2)
         Y = torch.cat([low.Y, high.Y], dim=-2)
         if isinstance(outcome_transform, _DefaultType):
             spread = low.Y.std(-2, keepdim=True)
@@ -233,36 +226,18 @@ class AR1(ExactGPBase):
             Yvar = torch.cat([low_Yvar.expand_as(low.Y), high.Yvar], dim=-2)
         d = transform(X).shape[-1] - 1
         zero = torch.zeros(*batch_shape, 1, dtype=torch.float64)
-        kernels = [
-            make_kernel(kernel or scaled_rbf, f"the kernel of {name}", d, batch_shape)
-            for name, kernel in (("low", low_covar_module), ("delta", delta_covar_module))
-        ]
-        super().__init__(
-            TrainingData(X, Y, Yvar, high.input_names, high.output_names),
-            [
-                Term("low", kernels[0], d, Level(batch_shape), zero),
-                Term("delta", kernels[1], d, Level(), zero),
-            ],
-            None,
-            units,
-            transform,
-            (low_covar_module, delta_covar_module),
-        )
+        given = {"low": low_covar_module, "delta": delta_covar_module}
+        bases = (Level(batch_shape), Level())
+        terms = []
+        for (name, kernel), basis in zip(given.items(), bases, strict=True):
+            kernel = make_kernel(kernel or scaled_rbf, f"the kernel of {name}", d, batch_shape)
+            terms.append(Term(name, kernel, d, basis, zero))
+        data = TrainingData(X, Y, Yvar, high.input_names, high.output_names)
+        super().__init__(data, terms, None, units, transform, (*given.values(),))
 
     @staticmethod
     def _learnt_noise(batch_shape: Size) -> Likelihood:
-        return LevelLikelihood(default_constraint(), batch_shape)
-
-    @classmethod
-    def construct_inputs(cls, training_data: SupervisedDataset, **options: Any) -> dict[str, Any]:
-        """Construct keyword arguments of the model from a dataset.
-
-        Args:
-            training_data: The data of the high level.
-            options: Further arguments of the model; among them the low level, ``physics`` with
-                ``bounds``, or ``low_X`` with ``low_Y``.
-        """
-        return {**super().construct_inputs(training_data), **options}
+        return LevelLikelihood(batch_shape)
 
     @property
     def rho_constant(self) -> Tensor:
@@ -272,16 +247,11 @@ class AR1(ExactGPBase):
 
     def data(self) -> dict[str, Tensor | None]:
         """As the base class, of each level."""
-        both = super().data()
-        inputs, rows = self.measured_rows(both["train_X"])
-        low = slice(None, rows.start)
+        both: dict[str, Any] = super().data()
+        both["train_X"], rows = self.measured_rows(both["train_X"])
         high = {name: None if v is None else v[..., rows, :] for name, v in both.items()}
-        return {
-            **high,
-            "train_X": inputs[..., rows, :],
-            "low_X": inputs[..., low, :],
-            "low_Y": both["train_Y"][..., low, :],
-        }
+        low = {f"low_{name}": both[f"train_{name}"][..., : rows.start, :] for name in "XY"}
+        return {**high, **low}
 
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
         """Inputs without their level, and the rows of the high level."""
@@ -294,11 +264,8 @@ class AR1(ExactGPBase):
 
     def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
         """As the base class; the level, which training inputs may bring, is refused."""
-        if isinstance(X, Tensor) and X.shape[-1] != self.input_transform.num_inputs:
-            raise ValueError(
-                f"Expected X with {self.input_transform.num_inputs} columns, the inputs that the "
-                f"model was built on, got shape {tuple(X.shape)}."
-            )
+        if isinstance(X, Tensor):
+            self.input_transform.check_raw(X)
         return super().model_inputs(X, with_basis)
 
     def _new_inputs(self, X: Tensor) -> Tensor:

@@ -18,20 +18,11 @@ from gpadjust.models.training_data import ArrayLike, to_tensor
 class ZeroMeanGP(AdjustedGP):
     r"""A Gaussian process without physics, :math:`f \sim GP(0, k)`.
 
-    Args:
-        train_X: Inputs, ``batch_shape x n x d``, float64.
-        train_Y: Targets, ``batch_shape x n x m``, float64.
-        train_Yvar: Known observation variances, or None to learn one per output.
-        covar_module: The kernel. Default: RBF with a lengthscale per input.
-        likelihood: A Gaussian likelihood. Default: learnt noise, at least 1e-6 of the targets'
-            mean square.
-        outcome_transform: ``Standardize`` or None. Default: division by the targets' root mean
-            square.
-        input_transform: A BoTorch input transform.
+    The arguments and errors are those of :class:`~gpadjust.CKA` with :math:`f_p = 0`, without
+    those about physics, rho and delta, and:
 
-    Raises:
-        TypeError: If data are not float64 tensors.
-        ValueError: If shapes disagree, data are not finite, or there are fewer than two points.
+    Args:
+        covar_module: The kernel. Default: RBF with a lengthscale per input.
     """
 
     def __init__(
@@ -65,23 +56,12 @@ class PhysicsMeanGP(AdjustedGP):
     :math:`\delta \sim GP(0, k)`, and ``delta(X)`` the posterior of the bias: the paper's GP-bias,
     :data:`~gpadjust.BiasGP`, is this model.
 
-    Args:
-        train_X: Inputs, ``batch_shape x n x d``, float64.
-        train_Y: Targets, ``batch_shape x n x m``, float64.
-        train_Yvar: Known observation variances, or None to learn one per output.
-        physics: The physics f_p, as in :class:`~gpadjust.CKA`.
-        covar_module: The kernel. Default: RBF with a lengthscale per input.
-        rho_mean: As in :class:`~gpadjust.CKA`: ``"learn"`` scales the physics by an unknown
-            constant, :math:`f \sim GP(\rho f_p, k)`.
-        delta_mean: As in :class:`~gpadjust.CKA`.
-        likelihood: As in :class:`~gpadjust.CKA`.
-        outcome_transform: As in :class:`~gpadjust.CKA`.
-        input_transform: As in :class:`~gpadjust.CKA`.
+    The arguments and errors are those of :class:`~gpadjust.CKA`, but for:
 
-    Raises:
-        TypeError: As :class:`~gpadjust.CKA`.
-        ValueError: As :class:`~gpadjust.CKA`.
-        PhysicsError: As :class:`~gpadjust.CKA`.
+    Args:
+        covar_module: The kernel k. Default: RBF with a lengthscale per input.
+        rho_mean: A constant; ``"learn"`` scales the physics by an unknown one,
+            :math:`f \sim GP(\rho f_p, k)`.
     """
 
     def __init__(
@@ -121,21 +101,13 @@ class ScaleGP(AdjustedGP):
     It cannot adjust where f_p is zero, and explodes near there: a warning says so when f_p nearly
     vanishes at a training input.
 
+    The arguments and errors are those of :class:`~gpadjust.CKA`, but for:
+
     Args:
-        train_X: Inputs, ``batch_shape x n x d``, float64.
-        train_Y: Targets, ``batch_shape x n x m``, float64.
-        train_Yvar: Known observation variances, or None to learn one per output.
-        physics: The physics f_p, as in :class:`~gpadjust.CKA`.
         covar_module: The kernel of rho. Default: RBF with a lengthscale per input.
-        rho_mean: As in :class:`~gpadjust.CKA`.
-        likelihood: As in :class:`~gpadjust.CKA`.
-        outcome_transform: As in :class:`~gpadjust.CKA`.
-        input_transform: As in :class:`~gpadjust.CKA`.
 
     Raises:
-        TypeError: As :class:`~gpadjust.CKA`.
-        ValueError: As :class:`~gpadjust.CKA`, and if f_p is zero at all training inputs.
-        PhysicsError: As :class:`~gpadjust.CKA`.
+        ValueError: Also if f_p is zero at all training inputs.
     """
 
     def __init__(

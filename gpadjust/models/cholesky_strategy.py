@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +17,10 @@ from linear_operator.utils.errors import NotPSDError
 from torch import Tensor
 
 from gpadjust.gp import SumOfTerms, Term
-from gpadjust.gp.gaussian import cholesky, noise_variances, nugget
+from gpadjust.gp.gaussian import cholesky, noise_variances, nugget, scaled
+
+_FEW = 256  # points up to which a product is faster than solving
+_SOUND = 1e-8  # least ratio of squared pivots with which an inverse costs no digit that counts
 
 Weights = list[tuple[Term, Tensor | None]]
 """Terms and what each is multiplied by, ``... x n``, or None for 1."""
@@ -67,11 +72,11 @@ class TermsOfData(NamedTuple):
         parts = []
         for term in self.terms:
             if values is None or term.name not in self.stacked:
-                parts.append(term.covariance(inputs, self.train))
-                continue
-            part = values.select(-3, self.stacked.index(term.name))
-            if term.learns_mean:
-                part = part + term.mean_variance.detach().unsqueeze(-1)
+                part = term.covariance(inputs, self.train)
+            else:
+                part = values.select(-3, self.stacked.index(term.name))
+                if term.learns_mean:
+                    part = part + term.mean_variance.detach().unsqueeze(-1)
             parts.append(part)
         return parts
 
@@ -95,12 +100,9 @@ class Factors(NamedTuple):
 
     @classmethod
     def of(cls, covariance: Tensor, residual: Tensor) -> Factors:
-        """Factorise.
+        """Factorise a covariance with noise, ``... x n x n``, which is overwritten.
 
-        Args:
-            covariance: The covariance of the targets, noise included, ``... x n x n``; it is
-                overwritten.
-            residual: Targets less their prior mean, ``... x n``; NaN where one is missing.
+        The residual is the targets less their prior mean, ``... x n``; NaN where one is missing.
         """
         observed = ~residual.isnan()
         chol, failed = cholesky(covariance, None if observed.all() else observed)
@@ -179,22 +181,8 @@ def _without(chol: Tensor, observed: Tensor) -> Tensor:
 
 def batched_solve(left: Tensor, right: Tensor, upper: bool) -> Tensor:
     """``left`` times the inverse of a triangular ``right``, as :func:`batched_product`."""
-    extra = left.dim() - right.dim()
-    if extra <= 0 or left.shape[extra:-2] != right.shape[:-2]:
-        return torch.linalg.solve_triangular(right, left, upper=upper, left=False)
-    lead, (q, n) = left.shape[:extra], left.shape[-2:]
-    stacked = left.flatten(0, extra - 1).movedim(0, -3).reshape(*right.shape[:-2], -1, n)
-    solved = torch.linalg.solve_triangular(right, stacked, upper=upper, left=False)
-    return solved.unflatten(-2, (lead.numel(), q)).movedim(-3, 0).unflatten(0, lead)
-
-
-def _scaled(matrix: Tensor, factor: Tensor) -> Tensor:
-    """Multiply a matrix, in place where its shape and autograd allow."""
-    traced = torch.is_grad_enabled() and (matrix.requires_grad or factor.requires_grad)
-    expanded = 0 in matrix.stride() or torch.broadcast_shapes(matrix.shape, factor.shape) != (
-        matrix.shape
-    )
-    return matrix * factor if traced or expanded else matrix.mul_(factor)
+    solve = partial(torch.linalg.solve_triangular, upper=upper, left=False)
+    return _stacked(lambda rows: solve(right, rows), left, right)
 
 
 def pad(tensor: Tensor, k: int) -> Tensor:
@@ -207,15 +195,31 @@ def batched_product(left: Tensor, right: Tensor) -> Tensor:
 
     Other shapes broadcast as ever.
     """
+    return _stacked(lambda rows: rows @ right, left, right)
+
+
+def _stacked(change: Callable[[Tensor], Tensor], left: Tensor, right: Tensor) -> Tensor:
+    """Change the rows of ``left``, with those that meet the same matrix of ``right`` in one."""
     extra = left.dim() - right.dim()
-    if extra <= 0 or right.dim() == 2 or left.shape[extra:-2] != right.shape[:-2]:
-        return left @ right
+    if extra <= 0 or left.shape[extra:-2] != right.shape[:-2]:
+        return change(left)
     lead, (q, n) = left.shape[:extra], left.shape[-2:]
-    batch, e = right.shape[:-2], lead.numel()
-    stacked = left.flatten(0, extra - 1).movedim(0, -3)
-    product = stacked.reshape(*batch, e * q, n) @ right
-    product = product.reshape(*batch, e, q, right.shape[-1])
-    return product.movedim(-3, 0).unflatten(0, lead)
+    rows = left.flatten(0, extra - 1).movedim(0, -3)
+    changed = change(rows.reshape(*right.shape[:-2], lead.numel() * q, n))
+    return changed.unflatten(-2, (lead.numel(), q)).movedim(-3, 0).unflatten(0, lead)
+
+
+def conditional_covariance(prior: Tensor, root: Tensor) -> Tensor:
+    """A prior covariance ``... x q x q`` less what a root ``... x q x n`` of it says is known."""
+    least = _least_variance(prior.diagonal(dim1=-1, dim2=-2), root.shape[-1])
+    covariance = prior - root @ root.mT
+    excess = (least - covariance.detach().diagonal(dim1=-1, dim2=-2)).clamp_min(0)
+    return covariance + torch.diag_embed(excess) if excess.any() else covariance
+
+
+def _least_variance(prior_variance: Tensor, n: int) -> Tensor:
+    """What rounding errors leave of a variance at a point that is known without noise."""
+    return (4 * n * torch.finfo(prior_variance.dtype).eps * prior_variance).detach()
 
 
 class CholeskyStrategy(DefaultPredictionStrategy):
@@ -258,19 +262,17 @@ class CholeskyStrategy(DefaultPredictionStrategy):
 
     def factors(self) -> Factors:
         """Return the factors, computed at the first call."""
-        if self._factors is None:
-            self._factors = self._factorise()
-        return self._factors
-
-    def _factorise(self) -> Factors:
+        if self._factors is not None:
+            return self._factors
         with torch.set_grad_enabled(torch.is_grad_enabled() and detach_test_caches.off()):
             # Not from the lazy covariances at hand, which would keep a matrix each.
-            covariance = self.noisy_covariance(self.kernel)
-            factors = Factors.of(covariance, self.train_labels - self.train_prior_dist.mean)
+            residual = self.train_labels - self.train_prior_dist.mean
+            factors = Factors.of(self.noisy_covariance(self.kernel), residual)
         for factor in (factors.base, factors.alpha):
             if factor.grad_fn is not None:
                 # A backward pass frees the graph that a later prediction would need.
                 factor.grad_fn.register_hook(self._forget)
+        self._factors = factors
         return factors
 
     def noisy_covariance(self, kernel: SumOfTerms) -> Tensor:
@@ -283,25 +285,17 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         return torch.diag_embed(noise_variances(self.likelihood, self.train_inputs[0]))
 
     def cross_covariance(self, inputs: Tensor, weights: Weights) -> Tensor:
-        """The covariance of a weighted sum of terms with the targets.
-
-        Args:
-            inputs: Transformed inputs, ``... x q x d``.
-            weights: The terms and their weights at the inputs.
-
-        Returns:
-            ``... x q x n``.
-        """
+        """The covariance of a weighted sum of terms with the targets, ``... x q x n``."""
         unknown = [(term, weight) for term, weight in weights if not term.is_known]
         if not unknown:
             return inputs.new_zeros(*inputs.shape[:-1], self.num_train)
         data = self.terms_of_data([term for term, _ in unknown])
         parts = data.covariances(inputs)
         for i, ((_, weight), basis) in enumerate(zip(unknown, data.bases, strict=True)):
-            factors = [] if basis is None else [basis.unsqueeze(-2)]
-            factors += [] if weight is None else [weight.unsqueeze(-1)]
-            for factor in factors:
-                parts[i] = _scaled(parts[i], factor)
+            if basis is not None:
+                parts[i] = scaled(parts[i], basis.unsqueeze(-2))
+            if weight is not None:
+                parts[i] = scaled(parts[i], weight.unsqueeze(-1))
         return sum(parts[1:], parts[0])
 
     def terms_of_data(self, terms: list[Term]) -> TermsOfData:
@@ -337,8 +331,7 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         self, test_mean: Tensor, test_train_covar: Tensor | LinearOperator
     ) -> Tensor:
         """Return the posterior mean, ``... x q``."""
-        mean: Tensor = (test_train_covar @ self.mean_cache.unsqueeze(-1)).squeeze(-1)
-        return test_mean + mean
+        return test_mean + (test_train_covar @ self.mean_cache.unsqueeze(-1)).squeeze(-1)
 
     def exact_predictive_covar(
         self, test_test_covar: Tensor | LinearOperator, test_train_covar: Tensor | LinearOperator
@@ -348,24 +341,12 @@ class CholeskyStrategy(DefaultPredictionStrategy):
             return ZeroLinearOperator(*test_test_covar.shape)
         prior = to_dense(test_test_covar)
         root = self.factors().whiten(to_dense(test_train_covar))
-        prior_variance = prior.diagonal(dim1=-1, dim2=-2)
-        covariance = prior - root @ root.mT
-        variance = covariance.diagonal(dim1=-1, dim2=-2).detach()
-        excess = (self._least_variance(prior_variance) - variance).clamp_min(0)
-        if excess.any():
-            covariance = covariance + torch.diag_embed(excess)
-        return to_linear_operator(covariance)
+        return to_linear_operator(conditional_covariance(prior, root))
 
     def marginals(self, inputs: Tensor, weights: Weights, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict a weighted sum of terms at each point by itself.
+        """Posterior means and variances of a weighted sum of terms at each point by itself.
 
-        Args:
-            inputs: Transformed inputs, ``... x q x d``.
-            weights: The terms and their weights at the inputs.
-            mean: The prior mean of the sum, ``... x q``.
-
-        Returns:
-            Posterior means and variances, ``... x q`` each.
+        All are ``... x q``, as the prior mean of the sum is; the inputs are ``... x q x d``.
         """
         unknown = [(term, weight) for term, weight in weights if not term.is_known]
         if not unknown:
@@ -375,14 +356,25 @@ class CholeskyStrategy(DefaultPredictionStrategy):
             part = term.covariance(inputs, inputs, diag=True) if variance is None else variance
             prior = prior + (part if weight is None else part * weight.square())
         cross = self.cross_covariance(inputs, weights)
-        known = torch.linalg.vector_norm(self.factors().whiten(cross), dim=-1).square()
-        variance = (prior - known).maximum(self._least_variance(prior))
+        known = torch.linalg.vector_norm(self._whiten(cross), dim=-1).square()
+        variance = (prior - known).maximum(_least_variance(prior, self.num_train))
         return self.exact_predictive_mean(mean, cross), variance
 
-    def _least_variance(self, prior_variance: Tensor) -> Tensor:
-        """What rounding errors leave of a variance at a point that is known without noise."""
-        eps = torch.finfo(prior_variance.dtype).eps
-        return (4 * self.num_train * eps * prior_variance).detach()
+    def _whiten(self, cross: Tensor) -> Tensor:
+        """As that of the factors; for few points with noise by the inverse, which is faster."""
+        factors = self.factors()
+        if "inverse" not in self.kept:
+            pivots = factors.base.detach().diagonal(dim1=-1, dim2=-2).square()
+            sound = (pivots.amin(-1) > _SOUND * pivots.amax(-1)).all()
+            few = factors.base.shape[-1] <= _FEW and not factors.rows.shape[-2]
+            inverse = None
+            if sound and few and not factors.base.requires_grad:
+                identity = torch.eye(factors.base.shape[-1]).to(factors.base)
+                identity = identity.expand_as(factors.base)
+                inverse = torch.linalg.solve_triangular(factors.base, identity, upper=False)
+            self.kept["inverse"] = inverse
+        inverse = self.kept["inverse"]
+        return factors.whiten(cross) if inverse is None else batched_product(cross, inverse.mT)
 
     def get_fantasy_strategy(
         self,
@@ -396,24 +388,21 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         """Return the strategy with ``k`` further observations; GPyTorch's hook for conditioning.
 
         Args:
-            inputs: Transformed new inputs, one tensor ``... x k x d``.
+            inputs: Transformed new inputs, one tensor ``... x k x d``; not used.
             targets: New targets, ``(f) x ... x k``; with a dimension of fantasies ``f`` that the
                 inputs lack, all fantasies share one factor.
-            full_inputs: All inputs, ``... x (n + k) x d``.
+            full_inputs: All inputs, one tensor ``... x (n + k) x d``.
             full_targets: All targets, ``(f) x ... x (n + k)``.
             full_output: The prior at all inputs.
             kwargs: ``noise``, the known variances of the new observations, ``... x k``.
         """
-        n = self.num_train
-        kernel = self.kernel
+        n, kernel = self.num_train, self.kernel
         train, new = full_inputs[0][..., :n, :], full_inputs[0][..., n:, :]
         likelihood = self.likelihood.get_fantasy_likelihood(**kwargs)
         cross = kernel.forward(new, train)
         noise = noise_variances(likelihood, new, **kwargs)
         corner = kernel.forward(new, new) + torch.diag_embed(noise)
-        mean = full_output.mean[..., n:]
-
-        residual = targets - self.exact_predictive_mean(mean, cross)
+        residual = targets - self.exact_predictive_mean(full_output.mean[..., n:], cross)
         factors = self.factors().append(cross, corner, residual)
         if detach_test_caches.on():
             factors = Factors(*(factor.detach() for factor in factors))

@@ -15,6 +15,7 @@ from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.settings import validate_input_scaling
+from botorch.utils.datasets import SupervisedDataset
 from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, Likelihood
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
 from linear_operator import to_dense
@@ -85,12 +86,10 @@ class ExactGPBase(SingleTaskGP):
         input_transform: InputTransform | None,
         given: Sequence[object] = (),
     ) -> None:
-        covar_module = SumOfTerms(terms)
-        if likelihood is None and data.Yvar is None:
-            made = self._learnt_noise(self.get_batch_dimensions(data.X, data.Y)[1])
-        else:
-            made = likelihood
+        covar_module, made = SumOfTerms(terms), likelihood
         Y, Yvar = data.Y, data.Yvar
+        if likelihood is None and Yvar is None:
+            made = self._learnt_noise(covar_module.batch_shape)
         if outcome_transform is not None:
             Y, Yvar = outcome_transform(Y, Yvar)
         with validate_input_scaling(False):  # ours is by the data's scales, and NaN is missing
@@ -119,8 +118,9 @@ class ExactGPBase(SingleTaskGP):
         model = super().__new__(cls)
         names = [*signature(cls.__init__).parameters][1:]
         every = {**dict(zip(names, args, strict=False)), **options}
-        kept = {n: v for n, v in every.items() if not n.startswith(("train_", "low_"))}
-        model.__dict__["options"] = kept
+        model.__dict__["options"] = {
+            name: v for name, v in every.items() if not name.startswith(("train_", "low_"))
+        }
         return model
 
     def __repr__(self) -> str:
@@ -163,15 +163,14 @@ class ExactGPBase(SingleTaskGP):
 
     def strategy(self) -> CholeskyStrategy:
         """What is remembered of the training data to predict from; made if it is not there."""
-        strategy = self.prediction_strategy
-        if strategy is None:
-            inputs = list(self.train_inputs)
+        if self.prediction_strategy is None:
+            inputs, targets = list(self.train_inputs), self.train_targets
             with lazily_evaluate_kernels():
                 prior = self._get_train_prior_distribution(inputs)
-            strategy = CholeskyStrategy(
-                inputs, prior, self.train_targets, self.likelihood, self.covar_module
+            self.prediction_strategy = CholeskyStrategy(
+                inputs, prior, targets, self.likelihood, self.covar_module
             )
-            self.prediction_strategy = strategy
+        strategy: CholeskyStrategy = self.prediction_strategy
         return strategy
 
     def posterior(
@@ -186,7 +185,7 @@ class ExactGPBase(SingleTaskGP):
             subset = self.subset_output(list(output_indices))
             return subset.posterior(X, None, observation_noise, posterior_transform)
         inputs = self.model_inputs(X)
-        mean, covariance = self._joint(inputs, [(t, t.weights(inputs)) for t in self.terms])
+        mean, covariance = self._joint(inputs, self._bases(inputs))
         noise = self._noise(inputs, observation_noise)
         if noise is not None:
             covariance = covariance + torch.diag_embed(noise.expand(mean.shape))
@@ -209,10 +208,8 @@ class ExactGPBase(SingleTaskGP):
         Raises:
             ValueError: If there is no such term.
         """
-        weights, (shift, scale) = self._term_weights(name), self._term_units(name)
-        inputs = self.model_inputs(X, with_basis=False)
-        mean, covariance = self._joint(inputs, weights)
-        return self._as_posterior(mean, covariance, shift, scale)
+        weights, inputs = self._term_weights(name), self.model_inputs(X, with_basis=False)
+        return self._as_posterior(*self._joint(inputs, weights), *self._term_units(name))
 
     def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
         """Predict each point by itself, without the covariances between them.
@@ -253,19 +250,26 @@ class ExactGPBase(SingleTaskGP):
         """Means and variances for each sample of the hyper-parameters, ``... x S x q x m``."""
         inputs = self.model_inputs(X)
         with threads_for(self.train_targets.shape[-1]):
-            mean, variance = self._marginals(inputs, [(t, t.weights(inputs)) for t in self.terms])
+            mean, variance = self._marginals(inputs, self._bases(inputs))
         noise = self._noise(inputs, observation_noise)
         variance = variance if noise is None else variance + noise
         # Fantasies share their variances.
         mean, variance = torch.broadcast_tensors(mean, variance)
         shift, scale = self._units()
-        mean, variance = mean * scale + shift, variance * scale.square()
         mean, variance = (
-            t.mT if self._num_outputs > 1 else t.unsqueeze(-1) for t in (mean, variance)
+            self._outputs_last(each) for each in (mean * scale + shift, variance * scale.square())
         )
         if self.num_samples is None:
             mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
         return mean, variance
+
+    def _outputs_last(self, values: Tensor) -> Tensor:
+        """From ``... x (m) x q`` to ``... x q x m``."""
+        return values.mT if self._num_outputs > 1 else values.unsqueeze(-1)
+
+    def _outputs_first(self, values: Tensor) -> Tensor:
+        """From ``... x q x m`` to ``... x (m) x q``."""
+        return values.mT if self._num_outputs > 1 else values.squeeze(-1)
 
     def interval(
         self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
@@ -285,9 +289,8 @@ class ExactGPBase(SingleTaskGP):
         """
         if not isinstance(level, float) or not 0 < level < 1:
             raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
-        mean, variance = self._components(X, observation_noise)
-        low, high = (mixture_quantile(mean, variance, (1 + side * level) / 2) for side in (-1, 1))
-        return low, high
+        parts = self._components(X, observation_noise)
+        return mixture_quantile(*parts, (1 - level) / 2), mixture_quantile(*parts, (1 + level) / 2)
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
@@ -327,14 +330,10 @@ class ExactGPBase(SingleTaskGP):
         return SampledFunctions.by_matheron(self, num_functions, num_features)
 
     def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
-        """What the terms read: transformed inputs with a dimension for samples and for outputs.
+        """What the terms read, ``... x (S) x (1) x q x (d + k)``, of raw ``X``, ``... x q x d``.
 
-        Args:
-            X: Raw inputs, ``... x q x d``.
-            with_basis: Whether the physics is evaluated; otherwise its columns are zero.
-
-        Returns:
-            ``... x (S) x (1) x q x (d + k)``.
+        There is a dimension for samples and one for outputs, where the model has them. Without
+        basis the physics is not evaluated, and its columns are zero.
         """
         if self.training:
             self.eval()
@@ -355,9 +354,9 @@ class ExactGPBase(SingleTaskGP):
     def _inputs_without_basis(self, X: Tensor) -> Tensor:
         return self.transform_inputs(X)
 
-    def _term_weights(self, name: str) -> Weights:
-        """A user's term as a weighted sum of the model's."""
-        found = [term for term in self.terms if term.name == name and not term.is_known]
+    def _term_weights(self, name: str, or_known: bool = False) -> Weights:
+        """A user's term as a weighted sum of the model's; of an unknown one if not said."""
+        found = [t for t in self.terms if t.name == name and (or_known or not t.is_known)]
         if not found:
             raise ValueError(
                 f"{type(self).__name__} has no unknown term {name!r}; it has "
@@ -370,10 +369,13 @@ class ExactGPBase(SingleTaskGP):
         shift, scale = self._units()
         return torch.zeros_like(shift), scale
 
+    def _bases(self, inputs: Tensor) -> Weights:
+        """The function itself as a weighted sum of the terms."""
+        return [(term, term.weights(inputs)) for term in self.terms]
+
     def _joint(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
         """Mean ``... x (m) x q`` and covariance of a weighted sum of terms, in model units."""
-        strategy = self.strategy()
-        prior: Tensor = inputs.new_zeros(())
+        strategy, prior = self.strategy(), inputs.new_zeros(())
         for term, weight in weights:
             if not term.is_known:
                 part = term.covariance(inputs, inputs)
@@ -407,28 +409,19 @@ class ExactGPBase(SingleTaskGP):
             self.eval()
         factors = self.strategy().factors()
         precision = factors.squared_columns()
-        variance = precision.where(
-            precision > 0, torch.full_like(precision, torch.nan)
-        ).reciprocal()
+        variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
         return self.train_targets - factors.alpha * variance, variance
 
     def data(self) -> dict[str, Tensor | None]:
         """The data that the model could be built on: raw inputs, targets and known variances."""
         self.eval()
-        inputs = (
-            self.train_inputs[0]
-            if self._original_train_inputs is None
-            else self._original_train_inputs
-        )
+        inputs = self._original_train_inputs
+        inputs = self.train_inputs[0] if inputs is None else inputs
+        inputs = inputs.select(-3, 0) if self._num_outputs > 1 else inputs
         shift, scale = self._units()
-        targets, noise = self.train_targets * scale + shift, known_noise(self.likelihood)
-        noise = None if noise is None else noise * scale.square()
-        if self._num_outputs > 1:
-            inputs, targets = inputs.select(-3, 0), targets.mT
-            noise = None if noise is None else noise.mT
-        else:
-            targets = targets.unsqueeze(-1)
-            noise = None if noise is None else noise.unsqueeze(-1)
+        targets = self._outputs_last(self.train_targets * scale + shift)
+        noise = known_noise(self.likelihood)
+        noise = None if noise is None else self._outputs_last(noise * scale.square())
         if self.num_samples is not None:
             inputs, targets = inputs[0], targets[0]
         return {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
@@ -458,7 +451,7 @@ class ExactGPBase(SingleTaskGP):
                     "Expected observation_noise as True, False, or variances of shape ... x "
                     f"{expected[0]} x {expected[1]}, got shape {tuple(observation_noise.shape)}."
                 )
-            return given.mT if self._num_outputs > 1 else given.squeeze(-1)
+            return self._outputs_first(given)
         if observation_noise is not True:
             raise TypeError(
                 "Expected observation_noise as True, False, or a tensor of variances, got "
@@ -478,19 +471,14 @@ class ExactGPBase(SingleTaskGP):
         if transform is None:
             zero = self.train_targets.new_zeros(*self._aug_batch_shape, 1)
             return zero, torch.ones_like(zero)
-        if self._num_outputs > 1:
-            return transform.means.mT, transform.stdvs.mT
-        return transform.means.squeeze(-1), transform.stdvs.squeeze(-1)
+        return self._outputs_first(transform.means), self._outputs_first(transform.stdvs)
 
     def _as_posterior(
         self, mean: Tensor, covariance: Tensor, shift: Tensor, scale: Tensor
     ) -> Posterior:
         """The posterior of independent outputs in the user's units."""
-        posterior = ScaleFreePosterior.of_outputs(
-            mean * scale + shift,
-            covariance * scale.square().unsqueeze(-1),
-            self._num_outputs > 1,
-        )
+        mean, covariance = mean * scale + shift, covariance * scale.square().unsqueeze(-1)
+        posterior = ScaleFreePosterior.of_outputs(mean, covariance, self._num_outputs > 1)
         return posterior if self.num_samples is None else HyperparameterMixture(posterior)
 
     def hold_samples(self, samples: dict[str, Tensor]) -> None:
@@ -530,6 +518,16 @@ class ExactGPBase(SingleTaskGP):
             raise RuntimeError(HOLDS_SAMPLES)
         return super().train(mode)
 
+    @classmethod
+    def construct_inputs(cls, training_data: SupervisedDataset, **options: Any) -> dict[str, Any]:
+        """Construct keyword arguments of the model from a dataset.
+
+        Args:
+            training_data: The data (of AR1, of the high level).
+            options: Further arguments of the model: the physics and all others.
+        """
+        return {**super().construct_inputs(training_data), **options}
+
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
     ) -> Any:
@@ -547,15 +545,13 @@ class ExactGPBase(SingleTaskGP):
     def _subset_batch_dict(self) -> dict[str, int]:
         """Where in each batched parameter and buffer the outputs lie, for ``subset_output``."""
         outputs: Size = self._aug_batch_shape
-        if self.num_outputs == 1:
-            return {}
-        dimensions = {}
-        for part in ("covar_module", "likelihood"):
-            module = getattr(self, part)
-            for name, tensor in [*module.named_parameters(), *module.named_buffers()]:
-                if tensor.shape[: len(outputs)] == outputs:
-                    dimensions[f"{part}.{name}"] = len(outputs) - 1 - tensor.dim()
-        return dimensions
+        return {
+            name: len(outputs) - 1 - tensor.dim()
+            for name, tensor in [*self.named_parameters(), *self.named_buffers()]
+            if name.startswith(("covar_module.", "likelihood."))
+            and tensor.shape[: len(outputs)] == outputs
+            and self.num_outputs > 1
+        }
 
     def subset_output(self, idcs: list[int]) -> Self:
         """Subset the model along the outputs; see BoTorch. Negative ones count from the end."""

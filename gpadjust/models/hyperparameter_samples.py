@@ -18,12 +18,7 @@ HOLDS_SAMPLES = "The model holds samples of its hyper-parameters already; build 
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
-    """Make a model a batch of itself, one for each sample; see :meth:`ExactGPBase.hold_samples`.
-
-    Args:
-        model: The model, of one data set.
-        samples: Raw parameters by their names, ``S x`` the parameter's shape.
-    """
+    """Make a model a batch of itself, one for each sample; see :meth:`ExactGPBase.hold_samples`."""
     (num_samples,) = {len(values) for values in samples.values()}
     _change(model, lambda tensor: tensor.expand(num_samples, *tensor.shape).clone())
     named = dict(model.named_parameters())

@@ -47,8 +47,8 @@ KINDS = {
     # prior is all but flat, so that near-polynomial functions, of long lengthscales and large
     # variance, are not ruled out.
     "outputscale": Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(1.0, 5.0)),
-    # v. Less noise than a millionth of the residual is not told from none.
-    "noise": Kind(initial=1e-2, bounds=(1e-12, 1e1), starts=(1e-6, 1.0), prior=(1e-4, 4.0)),
+    # v. Noise with an sd of less than three millionths of the residual is not told from none.
+    "noise": Kind(initial=1e-2, bounds=(1e-11, 1e1), starts=(1e-6, 1.0), prior=(1e-4, 4.0)),
 }
 RHO_VARIANCE = Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(0.25, 1.5))
 """The outputscale of a rho: its prior is one of rho itself, which has no units."""
@@ -103,11 +103,8 @@ def default_constraint() -> LogInterval:
 
 def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
     """An RBF kernel with one lengthscale per input and an outputscale."""
-    base = RBFKernel(
-        ard_num_dims=num_inputs,
-        batch_shape=batch_shape,
-        lengthscale_constraint=default_constraint(),
-    )
+    constraint = default_constraint()
+    base = RBFKernel(num_inputs, batch_shape=batch_shape, lengthscale_constraint=constraint)
     return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=default_constraint())
 
 
@@ -152,8 +149,7 @@ def typical_sizes(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor]:
     inputs, targets = training_set(model)
     sizes: dict[str, Tensor] = {}
     with torch.no_grad():
-        unit = (targets - model.mean_module(inputs)).square().nanmean(-1)
-        unit = unit.where(unit > 0, torch.ones_like(unit))
+        unit = _mean_square_residual(model, inputs, targets)
         ranges = inputs.amax(-2, keepdim=True) - inputs.amin(-2, keepdim=True)
         ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
         for path, kernel, num_inputs, basis in kernels_of(model):
@@ -168,9 +164,7 @@ def typical_sizes(model: BatchedMultiOutputGPyTorchModel) -> dict[str, Tensor]:
 def set_initial_values(model: BatchedMultiOutputGPyTorchModel, *given: object) -> None:
     """Set initial values, and bounds of the search, to multiples of the typical sizes.
 
-    Args:
-        model: The model to initialise.
-        given: Modules that the user brought, whose parameters stay as they are.
+    The parameters of ``given``, modules that the user brought, stay as they are.
     """
     keep = {id(p) for module in given if isinstance(module, Module) for p in module.parameters()}
     named = dict(model.named_parameters())
@@ -184,20 +178,22 @@ def set_initial_values(model: BatchedMultiOutputGPyTorchModel, *given: object) -
             constraint.upper_bound = kind.bounds[1] * size.amax()
         with torch.no_grad():
             named[name].copy_(constraint.inverse_transform(kind.initial * size))
-    if isinstance(model.covar_module, SumOfTerms):
-        _set_vague_means(model)
-
-
-def _set_vague_means(model: BatchedMultiOutputGPyTorchModel) -> None:
     inputs, targets = training_set(model)
     with torch.no_grad():
-        unit = (targets - model.mean_module(inputs)).square().nanmean(-1, keepdim=True)
-        unit = unit.where(unit > 0, torch.ones_like(unit))
-        for term in model.covar_module.terms:
+        unit = _mean_square_residual(model, inputs, targets)
+        for term in getattr(model.covar_module, "terms", ()):
             if term.learns_mean:
-                b = term.weights(inputs)
-                size = unit if b is None else _over_mean_square(unit[..., 0], b).unsqueeze(-1)
-                term.mean_variance.copy_(VAGUE_MEAN * size)
+                basis = term.weights(inputs)
+                size = unit if basis is None else _over_mean_square(unit, basis)
+                term.mean_variance.copy_(VAGUE_MEAN * size.unsqueeze(-1))
+
+
+def _mean_square_residual(
+    model: BatchedMultiOutputGPyTorchModel, inputs: Tensor, targets: Tensor
+) -> Tensor:
+    """The mean square of what the prior mean leaves of the targets, or 1 for 0: ``... x (m)``."""
+    unit = (targets - model.mean_module(inputs)).square().nanmean(-1)
+    return unit.where(unit > 0, torch.ones_like(unit))
 
 
 def training_set(model: BatchedMultiOutputGPyTorchModel) -> tuple[Tensor, Tensor]:

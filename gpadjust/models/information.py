@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from gpadjust.gp import SumOfTerms
 from gpadjust.gp.gaussian import cholesky
-from gpadjust.models.cholesky_strategy import Factors
+from gpadjust.models.cholesky_strategy import Factors, conditional_covariance
 from gpadjust.models.exact_gp_base import ExactGPBase
 
 
@@ -38,26 +40,22 @@ class UnknownCovariance:
         if names is None and not self.constants:
             self.factors = strategy.factors()
             return
+        covariance = strategy.noise_covariance()
         if self.has_kernel:
-            covariance = strategy.noisy_covariance(self.kernel)
-        else:
-            covariance = strategy.noise_covariance()
+            covariance = covariance + self.kernel.forward(self.train, self.train)
         self.factors = Factors.of(covariance, model.train_targets)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Return ``... x q x q`` without noise, at transformed inputs ``... x q x d``."""
-        q, n = inputs.shape[-2], self.train.shape[-2]
         batch = torch.broadcast_shapes(inputs.shape[:-2], self.train.shape[:-2])
         train = self.train.expand(*batch, *self.train.shape[-2:])
         if self.has_kernel:
             prior, cross = self.kernel.forward(inputs, inputs), self.kernel.forward(inputs, train)
         else:
+            q, n = inputs.shape[-2], self.train.shape[-2]
             prior, cross = inputs.new_zeros(*batch, q, q), inputs.new_zeros(*batch, q, n)
         white = self.factors.whiten(cross)
-        covariance: Tensor = prior - white @ white.mT
-        least = 4 * n * torch.finfo(prior.dtype).eps * prior.diagonal(dim1=-1, dim2=-2).detach()
-        excess = (least - covariance.detach().diagonal(dim1=-1, dim2=-2)).clamp_min(0)
-        covariance = covariance + torch.diag_embed(excess)
+        covariance = conditional_covariance(prior, white)
         if not self.constants:
             return covariance
         # In units of the constants' prior, where the matrix to invert is at least the identity.
@@ -70,10 +68,8 @@ class UnknownCovariance:
 
     def _columns(self, inputs: Tensor) -> Tensor:
         """The constants' bases, for a prior variance of one, ``... x q x k``."""
-        one = torch.ones_like(inputs[..., 0])
-        columns = [(one if t.basis is None else t.basis(inputs)) for t in self.constants]
-        roots = [term.mean_variance.sqrt() for term in self.constants]
-        return torch.stack([c * root for c, root in zip(columns, roots, strict=True)], dim=-1)
+        columns: Any = self.kernel.basis_of_means(inputs)
+        return columns * torch.stack([t.mean_variance.sqrt() for t in self.constants], dim=-1)
 
 
 def information_gain(
@@ -117,9 +113,8 @@ def information_gain(
 def _log_sds(covariance: Tensor, noise: Tensor) -> Tensor:
     """Half the log-determinant of noisy observations' covariance, in units of their noise."""
     sd = noise.sqrt()
-    scaled = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
     identity = torch.eye(sd.shape[-1], dtype=sd.dtype, device=sd.device)
-    matrix = scaled + identity
+    matrix = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2)) + identity
     chol, info = torch.linalg.cholesky_ex(matrix)
     if info.any():
         # What rounding leaves of a covariance far above the noise. Elsewhere the eigenvalues are 1

@@ -63,21 +63,12 @@ class ScaleFreePosterior(GPyTorchPosterior):
 
     @classmethod
     def of_outputs(cls, mean: Tensor, covariance: Tensor, has_outputs: bool) -> ScaleFreePosterior:
-        """The posterior of independent outputs.
-
-        Args:
-            mean: ``... x (m) x q``.
-            covariance: ``... x (m) x q x q``.
-            has_outputs: Whether the dimension ``m`` is there.
-        """
+        """Of independent outputs: moments ``... x (m) x q`` and ``... x (m) x q x q``."""
         operator = PosteriorCovariance(covariance)
         if not has_outputs:
             return cls(MultivariateNormal(mean, operator))
-        return cls(
-            MultitaskMultivariateNormal(
-                mean.mT, BlockDiagLinearOperator(operator, block_dim=-3), interleaved=False
-            )
-        )
+        blocks = BlockDiagLinearOperator(operator, block_dim=-3)
+        return cls(MultitaskMultivariateNormal(mean.mT, blocks, interleaved=False))
 
     @classmethod
     def transformed(cls, posterior: Posterior) -> Posterior:
@@ -124,14 +115,11 @@ def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
     """The quantile ``... x q x m`` of mixtures of Gaussians ``... x S x q x m``, by bisection."""
     sd = variance.sqrt()
     z = math.sqrt(2) * float(torch.erfinv(torch.tensor(2 * level - 1, dtype=torch.float64)))
-    low, high = ((mean + z * sd).amin(MCMC_DIM), (mean + z * sd).amax(MCMC_DIM))
+    low, high = (mean + z * sd).amin(MCMC_DIM), (mean + z * sd).amax(MCMC_DIM)
     for _ in range(60 if mean.shape[MCMC_DIM] > 1 else 0):
         middle = (low + high) / 2
-        share = torch.special.ndtr((middle.unsqueeze(MCMC_DIM) - mean) / sd).mean(MCMC_DIM)
-        low, high = (
-            torch.where(share < level, middle, low),
-            torch.where(share < level, high, middle),
-        )
+        below = torch.special.ndtr((middle.unsqueeze(MCMC_DIM) - mean) / sd).mean(MCMC_DIM) < level
+        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
     return (low + high) / 2
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from functools import partial
+from typing import Literal
 
 import pyro
 import pyro.distributions as dist
@@ -20,7 +21,7 @@ from gpadjust.gp.gaussian import noise_variances
 from gpadjust.models.adjusted_gp import AdjustedGP, Adjustment, Means, PhysicsLike
 from gpadjust.models.cholesky_strategy import Weights
 from gpadjust.models.hyperparameters import default_constraint
-from gpadjust.models.sampled_functions import SampledFunctions, TermFeatures
+from gpadjust.models.sampled_functions import SampledFunctions, TermFeatures, weighted
 from gpadjust.models.training_data import ArrayLike
 
 
@@ -38,24 +39,11 @@ class RRA(AdjustedGP):
     which lose no digits where there is no noise. The weights make whole *functions* that can be
     evaluated anywhere (:meth:`sample_functions`), and a Pyro model (:meth:`pyro_model`).
 
-    Args:
-        train_X: As in :class:`~gpadjust.CKA`, like all that are not listed here.
-        train_Y: See there.
-        train_Yvar: See there.
-        physics: See there.
-        num_features: Number ``D`` of features of each of rho and delta, an even one.
-        rho_mean: See there.
-        delta_mean: See there.
-        center: See there.
-        likelihood: See there.
-        outcome_transform: See there.
-        input_transform: See there.
-        seed: Seed of the features.
+    The arguments and errors are those of :class:`~gpadjust.CKA`, without kernels, and:
 
-    Raises:
-        TypeError: As :class:`~gpadjust.CKA`.
-        ValueError: As :class:`~gpadjust.CKA`.
-        PhysicsError: As :class:`~gpadjust.CKA`.
+    Args:
+        num_features: Number ``D`` of features of each of rho and delta, an even one.
+        seed: Seed of the features.
 
     Example:
         >>> import torch
@@ -91,10 +79,7 @@ class RRA(AdjustedGP):
                 f"{num_features!r}."
             )
         generator = torch.Generator().manual_seed(seed)
-
-        def kernel(num_inputs: int, batch_shape: Size) -> ScaleKernel:
-            return fourier_kernel(num_inputs, batch_shape, num_features, generator)
-
+        kernel = partial(fourier_kernel, num_features=num_features, generator=generator)
         super().__init__(
             train_X,
             train_Y,
@@ -122,8 +107,7 @@ class RRA(AdjustedGP):
             after those of its function.
         """
         self.eval()
-        mean, root = self._weights_posterior()
-        sd = self._prior_sd()
+        (mean, root), sd = self._weights_posterior(), self._prior_sd()
         return MultivariateNormal(sd * mean, RootLinearOperator(sd.unsqueeze(-1) * root))
 
     def functions(self, weights: Tensor) -> SampledFunctions:
@@ -148,8 +132,8 @@ class RRA(AdjustedGP):
             )
         self.eval()
         features = [TermFeatures(term, 2) for term in self.terms]
-        sizes = [each.num_features for each in features]
-        return SampledFunctions(self, features, (weights / sd).detach().split(sizes, dim=-1))
+        parts = (weights / sd).detach().split([each.num_features for each in features], dim=-1)
+        return SampledFunctions(self, features, parts)
 
     def _draw_functions(self, num_functions: int, num_features: int) -> SampledFunctions:
         """As the base class, but exactly; see :meth:`functions`."""
@@ -188,10 +172,9 @@ class RRA(AdjustedGP):
                 noise = noise_variances(self.likelihood, inputs)
             else:
                 inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)
-                noise = self._noise(inputs, True)
+                noise = self.observation_noise(inputs)
                 obs = None if Y is None else Y.mT if self.num_outputs > 1 else Y.squeeze(-1)
-            weights = [(term, term.weights(inputs)) for term in self.terms]
-            prior_sd = self._prior_sd()
+            weights, prior_sd = self._bases(inputs), self._prior_sd()
             design = self._design(inputs, weights) * scale.unsqueeze(-1) / prior_sd.unsqueeze(-2)
             mean = self._prior_mean(inputs, weights) * scale + shift
             noise_sd = noise.sqrt() * scale
@@ -229,34 +212,25 @@ class RRA(AdjustedGP):
 
     def _regress(self) -> tuple[Tensor, Tensor]:
         (inputs,) = self.train_inputs
-        weights = [(term, term.weights(inputs)) for term in self.terms]
+        weights, noise = self._bases(inputs), noise_variances(self.likelihood, inputs)
         residual = self.train_targets - self._prior_mean(inputs, weights)
-        return regression(
-            self._design(inputs, weights), residual, noise_variances(self.likelihood, inputs)
-        )
+        return regression(self._design(inputs, weights), residual, noise)
 
     def _design(self, inputs: Tensor, weights: Weights) -> Tensor:
         """Weighted features, of all terms of the model, for weights N(0, I): ``... x q x 2D``."""
-        by_name = {term.name: weight for term, weight in weights}
-        parts = []
-        for term in self.terms:
-            phi = TermFeatures(term, 2)(inputs)
-            if term.name not in by_name:
-                phi = torch.zeros_like(phi)
-            elif by_name[term.name] is not None:
-                phi = phi * by_name[term.name].unsqueeze(-1)
-            parts.append(phi)
-        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
+        given, zero = {term.name: w for term, w in weights}, torch.zeros_like(inputs[..., 0])
+        return weighted(
+            [TermFeatures(term, 2)(inputs) for term in self.terms],
+            [given.get(term.name, zero) for term in self.terms],
+        )
 
     def _prior_sd(self) -> Tensor:
         """Prior standard deviations of the weights in the user's units, ``... x 2D``."""
         parts = []
         with torch.no_grad():
-            for term in self.terms:
+            for term in self.covar_module.terms:
                 _, scale = self._term_units(term.name)
-                kernel: Any = term.kernel
-                sd = kernel.outputscale.sqrt().unsqueeze(-1) * scale
+                sd = term.kernel.outputscale.sqrt().unsqueeze(-1) * scale
                 parts.append(sd.expand(*sd.shape[:-1], self.num_features))
                 if term.learns_mean:
                     parts.append(term.mean_variance.sqrt() * scale)
@@ -303,9 +277,8 @@ class PaperRRA(RRA):
             input_transform=input_transform,
             seed=seed,
         )
-        for term in self.terms:
-            kernel: Any = term.kernel
-            kernel.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
+        for term in self.covar_module.terms:
+            term.kernel.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
 
     def check_can_hold_samples(self) -> None:
         """Refuse: the paper's closed form has no likelihood to sample from."""
@@ -319,7 +292,8 @@ class PaperRRA(RRA):
         mean, _ = super().left_out()
         (inputs,) = self.train_inputs
         with torch.no_grad():
-            design = self._design(inputs, [(term, term.weights(inputs)) for term in self.terms])
+            design = self._design(inputs, self._bases(inputs))
+            design = design * ~self.train_targets.isnan().unsqueeze(-1)
             identity = torch.eye(design.shape[-2], dtype=design.dtype, device=design.device)
             precision = torch.linalg.inv(design @ design.mT + identity)
             latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
@@ -328,9 +302,8 @@ class PaperRRA(RRA):
     def _regress(self) -> tuple[Tensor, Tensor]:
         mean, _ = super()._regress()
         (inputs,) = self.train_inputs
-        design = self._design(inputs, [(term, term.weights(inputs)) for term in self.terms])
-        one = torch.ones_like(design[..., 0])
-        return mean, regression(design, self.train_targets, one)[1]
+        design = self._design(inputs, self._bases(inputs))
+        return mean, regression(design, self.train_targets, torch.ones_like(design[..., 0]))[1]
 
 
 def fourier_kernel(
@@ -345,7 +318,7 @@ def fourier_kernel(
     )
     shape = (num_inputs, num_features // 2)
     frequencies = torch.randn(shape, generator=generator, dtype=torch.float64)
-    base._init_weights(randn_weights=frequencies.expand(*batch_shape, *shape).clone())
+    base._init_weights(randn_weights=frequencies.repeat(*batch_shape, 1, 1))
     return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=default_constraint())
 
 
@@ -364,14 +337,12 @@ def regression(design: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor,
     Returns:
         The mean ``... x p``, and the root :math:`R^{-1}` of the covariance, ``... x p x p``.
     """
+    n, p = design.shape[-2:]
     weight = noise.rsqrt().masked_fill(residual.isnan(), 0.0)
-    p = design.shape[-1]
     scaled = design * weight.unsqueeze(-1)
     identity = torch.eye(p, dtype=design.dtype, device=design.device)
     identity = identity.expand(*scaled.shape[:-2], p, p)
     q, r = torch.linalg.qr(torch.cat([scaled, identity], dim=-2))
     root = torch.linalg.solve_triangular(r, identity, upper=True)
     target = (residual.nan_to_num(nan=0.0) * weight).unsqueeze(-1)
-    n = design.shape[-2]
-    mean = root @ (q[..., :n, :].mT @ target)
-    return mean.squeeze(-1), root
+    return (root @ (q[..., :n, :].mT @ target)).squeeze(-1), root

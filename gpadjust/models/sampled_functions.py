@@ -40,6 +40,11 @@ class SampledFunctions(Module):
             the weights say all about.
     """
 
+    terms: Any  # modules, as those of the model
+    features: Any
+    shift: Tensor
+    scale: Tensor
+
     def __init__(
         self,
         model: Any,
@@ -48,20 +53,17 @@ class SampledFunctions(Module):
         updates: Sequence[Tensor] = (),
     ) -> None:
         super().__init__()
-        (train,) = model.train_inputs
         self.input_transform = deepcopy(getattr(model, "input_transform", None))
         self.has_outputs = model.num_outputs > 1
         self.batch_shape: Size = model.batch_shape
         # Together, as the features read the kernels of the terms.
-        copies = deepcopy([(term, each) for term, each in zip(model.terms, features, strict=True)])
-        self.terms = ModuleList(term for term, _ in copies)
-        self.features = ModuleList(each for _, each in copies)
+        self.terms, self.features = deepcopy((ModuleList(model.terms), ModuleList(features)))
         for name, tensor in zip(("shift", "scale"), model._units(), strict=True):
             self.register_buffer(name, tensor)
         self.weights, self.updates = [*weights], [*updates]
         self.requires_grad_(False).eval()
         unknown = [term for term in self.terms if not term.is_known]
-        self.data = TermsOfData.of(unknown, train.detach())
+        self.data = TermsOfData.of(unknown, model.train_inputs[0].detach())
 
     @classmethod
     def by_matheron(cls, model: Any, num_functions: int, num_features: int) -> SampledFunctions:
@@ -74,17 +76,14 @@ class SampledFunctions(Module):
                 torch.randn(*shape, each.num_features, dtype=torch.float64).to(train)
                 for each in features
             ]
-            noise = noise_variances(model.likelihood, train).sqrt()
-            noise = noise * torch.randn(num_functions, *train.shape[:-1]).to(train)
+            sd = noise_variances(model.likelihood, train).sqrt()
+            noise = sd * torch.randn(num_functions, *train.shape[:-1]).to(train)
             prior = cls(model, features, weights)._values(train)
             residual = (model.train_targets - prior - noise).nan_to_num(nan=0.0)
-            update, bases = (
-                strategy.factors().solve(residual),
-                [t.weights(train) for t in model.terms],
-            )
-            return cls(
-                model, features, weights, [update if b is None else b * update for b in bases]
-            )
+            update = strategy.factors().solve(residual)
+            bases = [term.weights(train) for term in model.terms]
+            updates = [update if basis is None else basis * update for basis in bases]
+            return cls(model, features, weights, updates)
 
     def forward(self, X: Tensor) -> Tensor:
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
@@ -122,13 +121,11 @@ class SampledFunctions(Module):
         total = inputs.new_zeros(())
         cross = iter(self.data.covariances(inputs) if self.updates else [])
         for i, (term, features) in enumerate(zip(self.terms, self.features, strict=True)):
-            phi = features(inputs)
-            part = term.mean + _product(phi, self.weights[i], extra)
+            part = term.mean + _product(features(inputs), self.weights[i], extra)
             if self.updates and not term.is_known:
                 part = part + _product(next(cross), self.updates[i], extra)
             basis = term.weights(inputs)
-            part = part if basis is None else part * basis
-            total = total + part
+            total = total + (part if basis is None else part * basis)
         return total
 
 
@@ -160,10 +157,19 @@ class TermFeatures(Module):
         if self.mean_variance is not None:
             root = self.mean_variance.sqrt().unsqueeze(-1)
             parts.append(root.expand(*root.shape[:-2], x.shape[-2], 1))
-        if not parts:
-            return x.new_zeros(*x.shape[:-1], 0)
-        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
+        return side_by_side(parts) if parts else x.new_zeros(*x.shape[:-1], 0)
+
+
+def side_by_side(parts: Sequence[Tensor]) -> Tensor:
+    """Join the last dimensions of features, ``... x n x D_t``, whose batches broadcast."""
+    shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
+
+
+def weighted(features: Sequence[Tensor], weights: Sequence[Tensor | None]) -> Tensor:
+    """Features of terms, ``... x n x D_t``, times weights ``... x n`` (None: 1), side by side."""
+    parts = zip(features, weights, strict=True)
+    return side_by_side([phi if w is None else phi * w.unsqueeze(-1) for phi, w in parts])
 
 
 class KernelFeatures(Module):
@@ -194,8 +200,8 @@ def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> 
         return [m for part in kernel.kernels for m in _feature_maps(part, num_inputs, num_features)]
     scale = kernel if isinstance(kernel, ScaleKernel) else None
     base = kernel if scale is None else scale.base_kernel
-    exact = isinstance(base, RFFKernel | ConstantKernel)
-    if exact and base.active_dims is None and kernel.active_dims is None:
+    reads_all = base.active_dims is None and kernel.active_dims is None
+    if isinstance(base, RFFKernel | ConstantKernel) and reads_all:
         return [KernelFeatures(base, scale)]
     return [gen_kernel_features(kernel, num_inputs=num_inputs, num_outputs=num_features)]
 
@@ -207,19 +213,16 @@ class SumFeatures(FeatureMap):
 
     def __init__(self, kernel: SumOfTerms, num_features: int) -> None:
         super().__init__()
-        self.terms = kernel.terms
-        self.features = ModuleList(TermFeatures(term, num_features) for term in kernel.terms)
-        self.num_outputs = sum(each.num_features for each in self.features)
+        self.terms: Any = kernel.terms
+        features = [TermFeatures(term, num_features) for term in self.terms]
+        self.features: Any = ModuleList(features)
+        self.num_outputs = sum(each.num_features for each in features)
         self.batch_shape = kernel.batch_shape
 
     def forward(self, x: Tensor) -> Tensor:
         """Return ``... x n x D``."""
-        parts = []
-        for term, features in zip(self.terms, self.features, strict=True):
-            phi, basis = features(x), term.weights(x)
-            parts.append(phi if basis is None else phi * basis.unsqueeze(-1))
-        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
+        bases = [term.weights(x) for term in self.terms]
+        return weighted([each(x) for each in self.features], bases)
 
 
 @GenKernelFeatures.register(SumOfTerms)  # type: ignore[untyped-decorator, unused-ignore]

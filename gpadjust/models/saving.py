@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from gpadjust.models.exact_gp_base import ExactGPBase
-from gpadjust.physics import JoinedPhysics, Physics, as_physics
+from gpadjust.physics import JoinedPhysics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
 _FORMAT = 1
@@ -46,13 +46,10 @@ def save(model: ExactGPBase, path: str | Path) -> None:
     missing = [name for name, value in options.items() if not _is_plain(value)]
     physics: Any = None
     if model.options.get("physics") is not None:
-        given = as_physics(model.options["physics"])
-        parts = (
-            dict(zip(given.names, given.parts, strict=True))
-            if isinstance(given, JoinedPhysics)
-            else {"": given}
-        )
-        physics = {name: import_path(part) for name, part in parts.items()}
+        given: Any = as_physics(model.options["physics"])
+        several = isinstance(given, JoinedPhysics)
+        parts = zip(given.names, given.parts, strict=True) if several else [("", given)]
+        physics = {name: import_path(part) for name, part in parts}
         if None in physics.values():
             missing.append("physics")
     content = {
@@ -65,10 +62,9 @@ def save(model: ExactGPBase, path: str | Path) -> None:
         "names": [list(model.input_names), list(model.output_names)],
         "state": model.state_dict(),
     }
-    target = Path(path)
-    part = target.with_name(f"{target.name}.part")
+    part = Path(f"{path}.part")
     torch.save(content, part)
-    part.replace(target)
+    part.replace(path)
 
 
 def load(path: str | Path, **objects: Any) -> ExactGPBase:
@@ -107,16 +103,12 @@ def load(path: str | Path, **objects: Any) -> ExactGPBase:
     if not isinstance(model_class, type) or not issubclass(model_class, ExactGPBase):
         raise ValueError(f"{path} is of {content['class']}, which is no model of gpadjust.")
     if content["physics"] is not None and "physics" not in objects:
-        objects["physics"] = _physics(content["physics"])
+        parts = {name: physics_from_path(path) for name, path in content["physics"].items()}
+        objects["physics"] = parts[""] if "" in parts else as_physics(parts)
     model = model_class(**content["data"], **{**content["options"], **objects})
     model.load_state_dict(content["state"])
     model.input_names, model.output_names = (tuple(names) for names in content["names"])
     return model.eval()
-
-
-def _physics(paths: dict[str, str]) -> Physics:
-    parts = {name: physics_from_path(path) for name, path in paths.items()}
-    return parts[""] if "" in parts else as_physics(parts)
 
 
 def _is_plain(value: Any) -> bool:

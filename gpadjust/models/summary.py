@@ -19,14 +19,10 @@ def title(model: Any) -> str:
     """One line: the structure, and of what data it is."""
     transform = getattr(model, "input_transform", None)
     of = f" of {transform.physics.name!r}" if isinstance(transform, PhysicsInput) else ""
-    counts = {
-        "point": model.train_targets.shape[-1],
-        "input": len(model.input_names),
-        "output": model.num_outputs,
-    }
-    if model.num_samples is not None:
-        counts["sample"] = model.num_samples
-    parts = [f"{n} {noun}" + ("" if n == 1 else "s") for noun, n in counts.items()]
+    counts = [model.train_targets.shape[-1], len(model.input_names), model.num_outputs]
+    counts += [] if model.num_samples is None else [model.num_samples]
+    nouns = zip(counts, ("point", "input", "output", "sample"), strict=False)
+    parts = [f"{n} {noun}" + ("" if n == 1 else "s") for n, noun in nouns]
     return f"{type(model).__name__}{of}: {', '.join(parts)}"
 
 
@@ -68,10 +64,10 @@ def _of_term(
 ) -> list[str]:
     """A line for each hyper-parameter of a term's kernel."""
     lines: list[str] = []
-    for name, _ in [] if term.kernel is None else term.kernel.named_parameters():
-        module, _, leaf = f"{path}.{name}".rpartition(".")
-        kind, size = kind_of(leaf), sizes.get(f"{path}.{name}")
-        value: Tensor = getattr(model.get_submodule(module), leaf.removeprefix("raw_"))
+    for name, _ in [] if term.kernel is None else term.kernel.named_parameters(path):
+        module, _, leaf = name.rpartition(".")
+        kind, size = kind_of(leaf), sizes.get(name)
+        value: Tensor = getattr(model.get_submodule(module), kind)
         if kind == "outputscale":
             lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, kind, size)}")
         elif kind == "lengthscale":
@@ -80,14 +76,14 @@ def _of_term(
                 at = _at_bound(part, kind, None if size is None else size[..., j])
                 lines.append(f"    lengthscale of {column}: {_text(part * length)}{at}")
         else:
-            lines.append(f"    {leaf.removeprefix('raw_')} {_text(value)}")
+            lines.append(f"    {kind} {_text(value)}")
     return lines
 
 
 def _columns(model: Any, number: int) -> list[tuple[str, float]]:
     """The names of a kernel's inputs, and what a length of one is in the user's units."""
-    transform = getattr(model, "input_transform", None)
-    base = transform.base if hasattr(transform, "base") else transform
+    base = getattr(model, "input_transform", None)
+    base = getattr(base, "base", base)
     if number == len(model.input_names):
         if isinstance(base, Normalize):
             lengths = base.coefficient.flatten()[-number:].tolist()

@@ -49,7 +49,7 @@ def training_data(
         TypeError: If one of them is neither a float64 tensor nor an array or frame of numbers.
         ValueError: If shapes disagree, there are fewer than 2 points, or values are not finite.
     """
-    input_names, output_names = column_names(train_X, "x"), column_names(train_Y, "y")
+    input_names, output_names = column_names(train_X), column_names(train_Y)
     X, Y = to_tensor(train_X, f"{prefix}_X"), to_tensor(train_Y, f"{prefix}_Y")
     for name, tensor in ((f"{prefix}_X", X), (f"{prefix}_Y", Y)):
         if tensor.dim() < 2:
@@ -114,7 +114,7 @@ def to_tensor(values: ArrayLike, name: str) -> Tensor:
     )
 
 
-def column_names(values: ArrayLike, letter: str) -> tuple[str, ...] | None:
+def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     """The names of a DataFrame's (or Series') columns, or None."""
     columns = getattr(values, "columns", None)
     if columns is not None:
@@ -136,9 +136,8 @@ def check_finite(tensor: Tensor, name: str) -> None:
 def check_observed(Y: Tensor, name: str) -> None:
     """As :func:`check_finite`, but NaN is a missing value; a row of them is an error."""
     _check_rows(Y.isinf().any(-1), name, "to be finite, found infinity")
-    _check_rows(
-        Y.isnan().all(-1), name, "to hold an observation in each row, found nothing but NaN"
-    )
+    nothing = Y.isnan().all(-1)
+    _check_rows(nothing, name, "to hold an observation in each row, found nothing but NaN")
 
 
 def _check_rows(bad: Tensor, name: str, expected: str) -> None:
@@ -153,10 +152,9 @@ def _check_rows(bad: Tensor, name: str, expected: str) -> None:
 
 def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Tensor:
     """Known variances of the shape of ``Y``; 1 where there is no observation."""
-    given = values
-    if isinstance(given, int | float | list | tuple):
-        given = torch.tensor(given, dtype=torch.float64)
-    given = to_tensor(given, name)
+    if isinstance(values, int | float | list | tuple):
+        values = torch.tensor(values, dtype=torch.float64)
+    given = to_tensor(values, name)
     if given.shape != Y.shape and given.shape not in ((), (1,), Y.shape[-1:]):
         raise ValueError(
             f"Expected {name} (known variances) as one number, {Y.shape[-1]} numbers (one for each "

@@ -1,4 +1,4 @@
-"""Judging predictions. Plots are in `gpadjust.validation.plots`, which needs matplotlib."""
+"""Judging predictions, and choosing by them. `gpadjust.validation.plots` needs matplotlib."""
 
 from gpadjust.validation.comparison import STRUCTURES, Candidate, Comparison, Structure, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
@@ -278,7 +278,8 @@ def _candidates(structures: list[Structure], physics: Physics) -> list[tuple[Str
         if not structure.uses_physics:
             candidates.append((structure, physics))
             continue
-        of = [*zip(physics.names, physics.parts, strict=True)]
+        parts = cast(Iterable[Physics], physics.parts)
+        of: list[tuple[str, Physics]] = [*zip(physics.names, parts, strict=True)]
         of += [("all", physics)] if structure.joins else []
         for name, part in of:
             named = structure._replace(name=f"{structure.name} of {name}")

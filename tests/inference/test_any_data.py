@@ -1,27 +1,22 @@
 """Whatever the data: a sensible model, or an error of our own."""
 
-import warnings
+from functools import partial
 
 import pytest
 import torch
-from botorch.exceptions.warnings import OptimizationWarning
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gpadjust import CKA, PhysicsMeanGP, fit
 
+pytestmark = pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
 FIT = {"num_screened": 16, "num_starts": 2, "max_iterations": 60}
 BUILD = {
     "CKA": CKA,
     "PhysicsMeanGP": PhysicsMeanGP,
-    "CKA, centred, rho mean": lambda *data, physics: CKA(
-        *data, physics=physics, center="mean", rho_mean="learn"
-    ),
-    "CKA, both means": lambda *data, physics: CKA(
-        *data, physics=physics, rho_mean="learn", delta_mean="learn"
-    ),
+    "CKA, centred, rho mean": partial(CKA, center="mean", rho_mean="learn"),
+    "CKA, both means": partial(CKA, rho_mean="learn", delta_mean="learn"),
 }
-
 # Points that are needed at least.
 FEWEST = dict.fromkeys(BUILD, 2) | {"CKA, centred, rho mean": 3, "CKA, both means": 4}
 
@@ -87,14 +82,12 @@ def problems(draw):
 
 def check(kind, problem):
     X, Y, physics, Z = problem
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OptimizationWarning)
-        if len(X) < FEWEST[kind]:
-            with pytest.raises(ValueError, match="constant means"):
-                BUILD[kind](X, Y, physics=physics)
-            return
-        model = BUILD[kind](X, Y, physics=physics)
-        fit(model, **FIT)
+    if len(X) < FEWEST[kind]:
+        with pytest.raises(ValueError, match="constant means"):
+            BUILD[kind](X, Y, physics=physics)
+        return
+    model = BUILD[kind](X, Y, physics=physics)
+    fit(model, **FIT)
     with torch.no_grad():
         posteriors = [model.posterior(Z)]
         if isinstance(model, CKA):
@@ -146,9 +139,7 @@ def test_the_fewest_points_are_interpolated(kind, targets, uniform):
     X = uniform(FEWEST[kind], 1)
     Y = TARGETS[targets](X)
     model = BUILD[kind](X, Y, physics=wave)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OptimizationWarning)
-        fit(model, **FIT)
+    fit(model, **FIT)
     mean = model.posterior(X).mean.detach()
     # At worst noise and function are not told from one another.
     assert ((mean - Y).abs() <= (Y - wave(X)).abs().max() + 1e-9).all()

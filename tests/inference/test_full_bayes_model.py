@@ -45,31 +45,17 @@ _QUICK = ["CKA", "AR1", "RRA", "learnt means", "Normalize", "CKA-known"]
 CASES = [pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow) for name in _NAMES]
 
 
-def mixture(posteriors):
-    """Component moments ``... x S x q x m`` of the posteriors of single models."""
-    mean = torch.stack([posterior.mean for posterior in posteriors], dim=-3)
-    variance = torch.stack([posterior.variance for posterior in posteriors], dim=-3)
-    return mean, variance
-
-
 @pytest.fixture(params=CASES)
-def case(request, num_outputs, data, held):
+def case(request, num_outputs, data, build, held):
     """The name, a model that holds three samples, and the models of each."""
     name = request.param
     X, Y = data(num_outputs=num_outputs)
     if name.endswith("-known"):
         Yvar = 1e-3 * (1 + X.sum(-1, keepdim=True)).expand_as(Y)
         return name, *held(name.removesuffix("-known"), X, Y, Yvar)
-    kind, _ = VARIANTS.get(name, (name, None))
-    if name in VARIANTS:
-        # Modules are built anew for each model.
-        return name, *_held_with_options(request, held, kind, X, Y, VARIANTS[name][1])
-    return name, *held(kind, X, Y)
-
-
-def _held_with_options(request, held, kind, X, Y, options):
-    build = request.getfixturevalue("build")
-    return held(make=lambda: build(kind, X, Y, **options(Y.shape[-1])))
+    kind, options = VARIANTS.get(name, (name, lambda m: {}))
+    # Modules are built anew for each model.
+    return name, *held(make=lambda: build(kind, X, Y, **options(num_outputs)))
 
 
 @pytest.fixture
@@ -83,7 +69,8 @@ def close():
 
 
 def check(actual, posteriors, close):
-    mean, variance = mixture(posteriors)
+    mean = torch.stack([posterior.mean for posterior in posteriors], dim=-3)
+    variance = torch.stack([posterior.variance for posterior in posteriors], dim=-3)
     assert isinstance(actual, GaussianMixturePosterior)
     close(actual.mean, mean)
     close(actual.variance, variance)
@@ -174,8 +161,7 @@ class TestObservations:
 def test_leave_one_out_is_the_posterior_without_the_observation(held, data):
     # A prior of weights 1 / p(y | sample) makes equal weights the exact posterior.
     X, Y = data()
-    make, spread = {"outcome_transform": None}, 0.02
-    model, singles = held("CKA", X, Y, spread=spread, **make)
+    model, singles = held("CKA", X, Y, spread=0.02, outcome_transform=None)
 
     def log_likelihood(single, keep):
         inputs = single.train_inputs[0][keep]
@@ -183,16 +169,12 @@ def test_leave_one_out_is_the_posterior_without_the_observation(held, data):
         return prior.log_prob(single.train_targets[keep])
 
     loo = leave_one_out(model)
-    everything = torch.ones(len(X), dtype=torch.bool)
-    for i in range(len(X)):
-        rest = everything.clone()
-        rest[i] = False
-        log_weight = torch.stack(
-            [log_likelihood(s, rest) - log_likelihood(s, everything) for s in singles]
-        )
-        weight = log_weight.softmax(0)
-        mean = torch.stack([leave_one_out(s).mean[i, 0] for s in singles])
-        torch.testing.assert_close(loo.mean[i, 0], weight @ mean, rtol=1e-8, atol=1e-8)
+    means = torch.stack([leave_one_out(single).mean[:, 0] for single in singles])
+    every = torch.arange(len(X))
+    for i in every:
+        changes = [log_likelihood(s, every != i) - log_likelihood(s, every) for s in singles]
+        expected = torch.stack(changes).softmax(0) @ means[:, i]
+        torch.testing.assert_close(loo.mean[i, 0], expected, rtol=1e-8, atol=1e-8)
 
 
 class TestFunctions:

@@ -57,22 +57,24 @@ def assert_equal_to_autograd(model, seed, spread=0.5, tolerance=1e-6, **options)
     torch.testing.assert_close(by_hand(vectors), values, rtol=1e-10, atol=1e-10)
 
 
+def of(cls, **options):
+    return lambda X, Y, m: cls(X, Y, physics=physics(m), **options)
+
+
 MODELS = {
-    "CKA": lambda X, Y, m: CKA(X, Y, physics=physics(m)),
-    "PhysicsMeanGP": lambda X, Y, m: PhysicsMeanGP(X, Y, physics=physics(m)),
-    "ScaleGP": lambda X, Y, m: ScaleGP(X, Y, physics=physics(m)),
+    "CKA": of(CKA),
+    "PhysicsMeanGP": of(PhysicsMeanGP),
+    "ScaleGP": of(ScaleGP),
     "ZeroMeanGP": lambda X, Y, m: ZeroMeanGP(X, Y),
     "known noise": lambda X, Y, m: CKA(X, Y, torch.full_like(Y, 0.01), physics=physics(m)),
-    "centred": lambda X, Y, m: CKA(X, Y, physics=physics(m), center="mean"),
-    "rho mean": lambda X, Y, m: CKA(X, Y, physics=physics(m), rho_mean="learn"),
-    "delta mean": lambda X, Y, m: CKA(X, Y, physics=physics(m), delta_mean="learn"),
-    "both means": lambda X, Y, m: CKA(
-        X, Y, physics=physics(m), rho_mean="learn", delta_mean="learn"
-    ),
+    "centred": of(CKA, center="mean"),
+    "rho mean": of(CKA, rho_mean="learn"),
+    "delta mean": of(CKA, delta_mean="learn"),
+    "both means": of(CKA, rho_mean="learn", delta_mean="learn"),
     "two physics": lambda X, Y, m: CKA(
         X, Y, physics=[physics(m), lambda X: X[..., :1] + physics(m)(X).sin()]
     ),
-    "rho mean alone": lambda X, Y, m: PhysicsMeanGP(X, Y, physics=physics(m), rho_mean="learn"),
+    "rho mean alone": of(PhysicsMeanGP, rho_mean="learn"),
 }
 
 
@@ -147,23 +149,17 @@ def test_inputs_far_from_zero(offset):
 
 BOUNDS = torch.tensor([[0.0] * D, [1.0] * D], dtype=torch.float64)
 OTHERS = {
-    "periodic": lambda X, Y: CKA(
-        X, Y, physics=physics(1), delta_covar_module=ScaleKernel(PeriodicKernel()).double()
-    ),
-    "product": lambda X, Y: CKA(
-        X, Y, physics=physics(1), delta_covar_module=(RBFKernel() * RBFKernel()).double()
-    ),
-    "active_dims": lambda X, Y: CKA(
-        X, Y, physics=physics(1), delta_covar_module=RBFKernel(active_dims=[0]).double()
-    ),
-    "RRA": lambda X, Y: RRA(X, Y, physics=physics(1), num_features=8),
-    "AR1": lambda X, Y: AR1(X, Y, physics=physics(1), num_low=8, bounds=BOUNDS),
+    "periodic": of(CKA, delta_covar_module=ScaleKernel(PeriodicKernel()).double()),
+    "product": of(CKA, delta_covar_module=(RBFKernel() * RBFKernel()).double()),
+    "active_dims": of(CKA, delta_covar_module=RBFKernel(active_dims=[0]).double()),
+    "RRA": of(RRA, num_features=8),
+    "AR1": of(AR1, num_low=8, bounds=BOUNDS),
 }
 
 
 @pytest.mark.parametrize("name", list(OTHERS))
 def test_other_forms_fall_back_to_autograd(name):
-    objective = Objective(OTHERS[name](*draw(0)))
+    objective = Objective(OTHERS[name](*draw(0), 1))
     assert isinstance(objective._distribution, ModuleDistribution)
     value, gradient = objective.value_and_gradient(objective.parameters.current())
     assert value.isfinite().all()

@@ -71,18 +71,6 @@ def test_weights_of_two_modes(seed):
     assert draws.positions[..., 1].std() == pytest.approx(1, abs=0.1)
 
 
-def test_seed_and_global_state(gaussians):
-    potential = gaussian(*gaussians)
-    start = gaussians[0].expand(4, 2, 3)
-    torch.manual_seed(5)
-    expected = torch.rand(1)
-    torch.manual_seed(5)
-    first, again = (hmc(potential, start, 8, 5, generator(3)).positions for _ in range(2))
-    assert torch.equal(torch.rand(1), expected)
-    assert torch.equal(first, again)
-    assert not torch.equal(first, hmc(potential, start, 8, 5, generator(4)).positions)
-
-
 def test_infinite_potentials_are_never_accepted():
     def half_line(x):
         value = 0.5 * x.square().sum(-1)

@@ -30,9 +30,10 @@ class Gain(torch.nn.Module):
         return self.gain * crude(X)
 
 
-def with_prior(X, Y):
-    base = RBFKernel(batch_shape=torch.Size([2]), lengthscale_prior=LogNormalPrior(0.0, 1.0))
-    kernel = ScaleKernel(base, batch_shape=torch.Size([2])).double()
+def with_priors(X, Y, first, second=None):
+    batch = torch.Size([2])
+    base = RBFKernel(batch_shape=batch, lengthscale_prior=first)
+    kernel = ScaleKernel(base, batch_shape=batch, outputscale_prior=second).double()
     return CKA(X, Y, physics=crude, delta_covar_module=kernel)
 
 
@@ -48,7 +49,8 @@ BUILD = {
     "learnt physics and means": lambda X, Y: CKA(
         X, Y, physics=Gain(), rho_mean="learn", delta_mean="learn"
     ),
-    "prior": with_prior,
+    "prior": lambda X, Y: with_priors(X, Y, LogNormalPrior(0.0, 1.0)),
+    "other priors": lambda X, Y: with_priors(X, Y, GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5)),
     "AR1": lambda X, Y: AR1(X, Y, physics=crude, bounds=torch.tensor([[0.0, 0], [1, 1]])),
     "RRA": lambda X, Y: RRA(X, Y, physics=crude, num_features=16),
     "PaperRRA": lambda X, Y: PaperRRA(X, Y, physics=crude, num_features=16),
@@ -148,28 +150,6 @@ def test_rows_are_those_of_a_model_of_them(XY):
     torch.testing.assert_close(part(vectors), alone(vectors), rtol=1e-9, atol=1e-9)
 
 
-def test_priors_are_added(XY):
-    X, Y = XY[0], XY[1][:, :1]
-
-    def build(*prior):
-        base = RBFKernel(ard_num_dims=2, lengthscale_prior=prior[0] if prior else None)
-        kernel = ScaleKernel(base, outputscale_prior=prior[1] if prior else None).double()
-        return CKA(X, Y, physics=lambda X: crude(X)[:, :1], delta_covar_module=kernel)
-
-    priors = GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5)
-    plain, penalised = Objective(build(), True), Objective(build(*priors), True)
-    vectors = neighbours(plain)
-    difference = penalised(vectors) - plain(vectors)
-    for vector, value in zip(vectors, difference, strict=True):
-        penalised.assign(vector)
-        kernel = penalised.model.terms[1].kernel
-        density = priors[0].log_prob(kernel.base_kernel.lengthscale).sum()
-        density = density + priors[1].log_prob(kernel.outputscale).sum()
-        torch.testing.assert_close(value, -density.detach().reshape(1))
-        expected = exact(penalised.model).reshape(1)
-        torch.testing.assert_close(penalised(vector[None])[0], expected)
-
-
 def test_a_covariance_that_is_not_positive_definite_is_infinitely_bad(XY):
     X = XY[0][:, :1]
     objective = Objective(CKA(X, crude(X), torch.full_like(X, 1e-6), physics=crude), marginal=True)
@@ -205,7 +185,7 @@ class TestConcentration:
         expected = torch.full_like(change, math.log(factor))
         torch.testing.assert_close(change, expected, rtol=0, atol=1e-6)
 
-    @pytest.mark.parametrize("name", ["known noise", "prior", "learnt physics"])
+    @pytest.mark.parametrize("name", ["known noise", "prior", "other priors", "learnt physics"])
     def test_it_is_not_for_models_with_a_scale_of_their_own(self, XY, name):
         assert not Objective(BUILD[name](*XY)).concentrated
 
@@ -259,8 +239,3 @@ class TestVectors:
         assert drawn.isfinite().all()
         for vectors in (parameters.current(), drawn):
             assert torch.equal(parameters.clipped(vectors), vectors)
-
-    def test_nothing_to_learn(self, XY):
-        model = CKA(*XY, physics=crude).requires_grad_(False)
-        with pytest.raises(ValueError, match="no learnable parameter"):
-            Objective(model, marginal=True)

@@ -25,28 +25,21 @@ def test_densities(build, data, num_outputs):
     )
     register_priors(model)
     found = priors(model)
-    ranges = X.amax(0) - X.amin(0)
-    f_p = 3 + X[:, :1].expand_as(Y)
-    v = (Y - f_p).square().mean(0)
-    d = 2
+    v = (Y - 3 - X[:, :1]).square().mean(0)
+    length = (X.amax(0) - X.amin(0)) * math.sqrt(2) * math.exp(math.sqrt(2) - 1)
+    lengths, rho, delta = length.repeat(num_outputs), "terms.0.kernel", "terms.1.kernel"
     medians = {
-        "likelihood.noise_covar.noise_prior": (1e-4 * v.unsqueeze(-1), 4),
-        "covar_module.terms.1.kernel.outputscale_prior": (v, 5),
-        "covar_module.terms.0.kernel.outputscale_prior": (v * 0 + 0.25, 1.5),
+        "likelihood.noise_covar.noise_prior": (1e-4 * v, 4),
+        f"covar_module.{delta}.outputscale_prior": (v, 5),
+        f"covar_module.{rho}.outputscale_prior": (v * 0 + 0.25, 1.5),
+        f"covar_module.{delta}.base_kernel.lengthscale_prior": (lengths, math.sqrt(3)),
+        f"covar_module.{rho}.base_kernel.lengthscale_prior": (lengths, math.sqrt(3)),
     }
-    median = ranges * math.sqrt(d) * math.exp(math.sqrt(2) - 1)
-    for name in (
-        "covar_module.terms.1.kernel.base_kernel.lengthscale_prior",
-        "covar_module.terms.0.kernel.base_kernel.lengthscale_prior",
-    ):
-        medians[name] = (median.expand(num_outputs, 1, 2), math.sqrt(3))
     assert set(found) == set(medians)
     for name, (middle, sd) in medians.items():
-        value = torch.full_like(middle, 0.7)
-        actual = found[name].log_prob(value.reshape(found[name].loc.shape))
-        torch.testing.assert_close(
-            actual.flatten(), LogNormal(middle.log(), sd).log_prob(value).flatten()
-        )
+        actual = found[name].log_prob(torch.full_like(found[name].loc, 0.7)).flatten()
+        expected = LogNormal(middle.log(), sd).log_prob(torch.full_like(middle, 0.7))
+        torch.testing.assert_close(actual, expected)
 
 
 def test_constant_rho_of_ar1(build, data):

@@ -8,7 +8,9 @@ from botorch.utils.datasets import SupervisedDataset
 
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
-def test_a_model_from_a_dataset(data, build, kind, num_outputs, crude_physics, uniform, known_noise):
+def test_a_model_from_a_dataset(
+    data, build, kind, num_outputs, crude_physics, uniform, known_noise
+):
     X, Y = data(num_outputs=num_outputs)
     Yvar = uniform(*Y.shape, low=0.01, high=0.1) if known_noise else None
     dataset = SupervisedDataset(

@@ -38,7 +38,9 @@ def test_state_dict(make, shuffle, uniform, tmp_path, same):
 
 
 @pytest.mark.parametrize(
-    "copied", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))], ids=["deep", "pickle"]
+    "copied",
+    [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))],
+    ids=["deep", "pickle"],
 )
 def test_copy(make, shuffle, uniform, copied, same):
     model = shuffle(make())

@@ -109,7 +109,10 @@ def test_the_physics_mean_gp_is_a_gp_of_the_residual(
     residual = ZeroMeanGP(X, Y - crude_physics(X)[:, :num_outputs])
     posterior = give(residual, model, f="delta").posterior(Z)
     f_p = crude_physics(Z)[:, :num_outputs]
-    for mean, ours in ((posterior.mean + f_p, model.posterior(Z)), (posterior.mean, model.delta(Z))):
+    for mean, ours in (
+        (posterior.mean + f_p, model.posterior(Z)),
+        (posterior.mean, model.delta(Z)),
+    ):
         close(ours.mean, mean)
         close(ours.variance, posterior.variance)
 

@@ -38,7 +38,8 @@ def test_each_output_is_the_model_of_its_own_rows(
     new_X, new_Y = uniform(3, 2, high=2.0, seed=5), 5 + uniform(3, 2, seed=6)
     new_Y[0, 0] = new_Y[2, 1] = torch.nan
     noise = uniform(3, 2, low=0.01, high=0.1, seed=7)
-    more = model.condition_on_observations(new_X, new_Y, **({"noise": noise} if known_noise else {}))
+    known = {"noise": noise} if known_noise else {}
+    more = model.condition_on_observations(new_X, new_Y, **known)
     loo = leave_one_out(model)
     for j in range(2):
         single, rows = single_of(build, kind, model, X, Y, Yvar, crude_physics, j)
@@ -47,9 +48,8 @@ def test_each_output_is_the_model_of_its_own_rows(
         own = leave_one_out(single)
         close(loo.mean[rows][:, [j]], own.mean)
         close(loo.variance[rows][:, [j]], own.variance)
-        assert loo.mean[~rows, j].isnan().all()
         new = ~new_Y[:, j].isnan()
-        one = {"noise": noise[new][:, [j]]} if known_noise else {}
+        one = {name: values[new][:, [j]] for name, values in known.items()}
         later = single.condition_on_observations(new_X[new], new_Y[new][:, [j]], **one)
         same(later, more, Z, 1e-7, [j])
 
@@ -72,7 +72,6 @@ def test_samples_of_hyper_parameters(gaps, held, uniform, same):
     for i, single in enumerate(singles):
         torch.testing.assert_close(model.posterior(Z).mean[i], single.posterior(Z).mean)
         torch.testing.assert_close(model.rho(Z).variance[i], single.rho(Z).variance)
-    assert leave_one_out(model).mean.isnan().equal(gaps[1].isnan())
 
 
 def test_units_are_of_what_was_observed(gaps, build):

@@ -19,9 +19,7 @@ def covariance(kernel, A, B):
     if not hasattr(base, "randn_weights"):
         return mp.matrix([[scale * mp.exp(-(((a - b) / length) ** 2) / 2) for b in B] for a in A])
     w = [mp.mpf(v) / length for v in base.randn_weights.flatten().tolist()]
-    return mp.matrix(
-        [[scale / len(w) * sum(mp.cos(v * (a - b)) for v in w) for b in B] for a in A]
-    )
+    return mp.matrix([[scale / len(w) * sum(mp.cos(v * (a - b)) for v in w) for b in B] for a in A])
 
 
 def variances(model, X, Z):
@@ -53,7 +51,8 @@ def variances(model, X, Z):
 def test_variances(cls, n, length):
     X = torch.linspace(0, 1, n, dtype=torch.float64).unsqueeze(-1)
     Y = 1.5 * physics(X) + X.square()
-    model = cls(X, Y, physics=physics, **({"num_features": 40} if cls is RRA else {})).eval()
+    options = {"num_features": 40} if cls is RRA else {}
+    model = cls(X, Y, physics=physics, **options).eval()
     noise = model.likelihood.noise_covar
     with torch.no_grad():
         noise.raw_noise.fill_(1.0001 * noise.raw_noise_constraint.lower_bound.log())
@@ -61,16 +60,17 @@ def test_variances(cls, n, length):
             term.kernel.base_kernel.lengthscale = length
     Z = torch.tensor([[-0.2], [0.013], [0.31], [0.517], [0.99], [1.1]], dtype=torch.float64)
     with torch.no_grad(), mp.workdps(60):
-        expected = list(variances(model, X, Z))
-        whole = expected[0]
+        whole, rho, delta = variances(model, X, Z)
         assert whole.min() < 1e-8 * Y.var()
-        predicted = [model.posterior(Z).variance, model.rho(Z).variance, model.delta(Z).variance]
-        for actual, exact in zip([model.predict(Z).variance, *predicted], [whole, *expected], strict=True):
-            torch.testing.assert_close(actual.squeeze(-1), exact, rtol=0.02, atol=0.0)
-        # Half of the data come later.
-        half = cls(
-            X[::2], Y[::2], physics=physics, **({"num_features": 40} if cls is RRA else {})
-        )
+        for posterior, exact in (
+            (model.posterior(Z), whole),
+            (model.predict(Z), whole),
+            (model.rho(Z), rho),
+            (model.delta(Z), delta),
+        ):
+            torch.testing.assert_close(posterior.variance.squeeze(-1), exact, rtol=0.02, atol=0.0)
+        # Half of the data come later; the nugget of the first half is another one.
+        half = cls(X[::2], Y[::2], physics=physics, **options)
         half.load_state_dict(model.state_dict())
         later = half.eval().condition_on_observations(X[1::2], Y[1::2])
         ratio = later.posterior(Z).variance.squeeze(-1) / whole

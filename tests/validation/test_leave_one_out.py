@@ -163,20 +163,16 @@ def test_missing_observations_are_those_of_models_of_each_output(
     X, Y = data(num_outputs=2)
     Y[2, 0] = Y[4:6, 1] = torch.nan
     Yvar = torch.full_like(Y, 0.02) if known_noise else None
-    both = shuffle(CKA(X, Y, Yvar, physics=crude_physics, **options))
+    options = {**options, "physics": crude_physics}
+    both = shuffle(CKA(X, Y, Yvar, **options))
     found, parameters = leave_one_out(both), dict(both.named_parameters())
     assert torch.equal(found.Y.isnan(), Y.isnan())
     assert found.mean.isfinite().all()
     for j in range(2):
         seen = ~Y[:, j].isnan()
         noise = None if Yvar is None else Yvar[seen][:, [j]]
-        model = CKA(
-            X[seen],
-            Y[seen][:, [j]],
-            noise,
-            physics=lambda X, j=j: crude_physics(X)[..., [j]],
-            **options,
-        )
+        options["physics"] = lambda X, j=j: crude_physics(X)[..., [j]]
+        model = CKA(X[seen], Y[seen][:, [j]], noise, **options)
         with torch.no_grad():
             for name, parameter in model.named_parameters():
                 parameter.copy_(parameters[name][j].reshape(parameter.shape))

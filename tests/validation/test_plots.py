@@ -11,8 +11,8 @@ from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from gpytorch.distributions import MultivariateNormal
 from matplotlib.figure import Figure
 
-from gpadjust import CKA
-from gpadjust.validation import LeaveOneOut, leave_one_out, score
+from gpadjust import CKA, ZeroMeanGP
+from gpadjust.validation import leave_one_out, score
 from gpadjust.validation.plots import (
     adjustments,
     plot_adjustment,
@@ -293,11 +293,8 @@ def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
 
 
 def test_names_of_outputs_in_leave_one_out(line, plane):
-    class Named(LeaveOneOut):
-        output_names = ("force [N]", "flow")
-
     loo = leave_one_out(plane)
-    named = Named(loo.X, loo.Y, loo.mean, loo.variance)
+    named = replace(loo, output_names=("force [N]", "flow"))
     assert plot_leave_one_out(named, output=1)[0].get_xlabel() == "observed flow"
     assert plot_leave_one_out(loo, output=1)[0].get_xlabel() == "observed $y_{2}$"
     assert plot_leave_one_out(leave_one_out(line))[0].get_xlabel() == "observed"
@@ -305,34 +302,30 @@ def test_names_of_outputs_in_leave_one_out(line, plane):
     assert plot_pit(named).get_title() == "force [N]"
 
 
-def test_a_row_for_each_physics(plane):
-    def term(name, X):
-        return (plane.delta if name == "delta" else plane.rho)(X)
-
-    names = ("f", "rho_coarse", "rho_fine", "delta")
-    several = Wrapped(plane, term_names=names, term=term)
-    axes = plot_adjustment(several, num_points=4)
-    assert [ax.get_ylabel() for ax in axes[:, 0]] == [
-        "$\\rho$ of coarse\nfor $y_{1}$",
-        "$\\rho$ of fine\nfor $y_{1}$",
-        "$\\delta$\nfor $y_{1}$",
-    ]
-    np.testing.assert_allclose([row[0].lines[0].get_ydata()[0] for row in axes], [1, 1, 0])
-    means = {"rho_coarse": 0.5, "rho_fine": 0.25, "delta": -1.0}
-    several.term_mean = lambda name, output: means[name] + output
+def test_a_row_for_each_physics(uniform):
+    X = uniform(9, 2)
+    Y = torch.cat([X.prod(-1, keepdim=True), X[:, :1]], dim=-1)
+    physics = {"coarse": lambda X: X, "fine": lambda X: X.square()}
+    several = CKA(X, Y, physics=physics, rho_mean=(0.5, 0.25), delta_mean=-1.0)
     axes = plot_adjustment(several, output=1, num_points=4)
-    drawn = [row[1].lines[0].get_ydata()[0] for row in axes]
-    np.testing.assert_allclose(drawn, [1.5, 1.25, 0.0])
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == [
+        "$\\rho$ of coarse\nfor $y_{2}$",
+        "$\\rho$ of fine\nfor $y_{2}$",
+        "$\\delta$\nfor $y_{2}$",
+    ]
+    drawn = [row[0].lines[0].get_ydata()[0] for row in axes]
+    np.testing.assert_allclose(drawn, [0.5, 0.25, -1.0])
     axes = plot_adjustment_pair(several, num_points=4)
     assert axes.shape == (3, 2)
     assert axes[0, 1].get_title() == "sd of $\\rho$ of coarse\nfor $y_{1}$"
     with pytest.raises(TypeError, match="has neither rho nor delta to draw"):
-        plot_adjustment(Wrapped(plane, term_names=("f",)))
+        plot_adjustment(ZeroMeanGP(X, Y))
 
 
-def test_several_physics_behind_a_prediction(line, forrester):
+def test_several_physics_behind_a_prediction(forrester):
     both = {"coarse": forrester.crude, "fine": forrester.truth}
-    ax = plot_prediction(Wrapped(line, physics=both), forrester.test_X)
+    model = CKA(*forrester.data(0), physics=both)
+    ax = plot_prediction(model, forrester.test_X)
     for name, f_p in both.items():
         drawn = curve(ax, f"physics {name}").get_ydata()
         np.testing.assert_allclose(drawn, f_p(forrester.test_X)[:, 0])

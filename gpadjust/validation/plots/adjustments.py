@@ -82,7 +82,7 @@ def plot_adjustment(
         X[:, i] = x
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
-                mean, half = mean_and_half_width(_term(model, name, X), output, level)
+                mean, half = mean_and_half_width(model.term(name, X), output, level)
             ax.axhline(_unadjusted(model, name, output), color=GREY, lw=1, ls="--")
             band(ax, x, mean, half, level)
             bottom = ax.get_xaxis_transform()
@@ -151,7 +151,7 @@ def plot_adjustment_pair(
     for row, name in zip(axes, names, strict=True):
         with torch.no_grad():
             one_sd = 0.6826894921370859
-            mean, sd = mean_and_half_width(_term(model, name, X), output, one_sd)
+            mean, sd = mean_and_half_width(model.term(name, X), output, one_sd)
         for ax, values, title, colors in zip(
             row, (mean, sd), ("mean", "sd"), ("viridis", "cividis"), strict=True
         ):
@@ -165,19 +165,13 @@ def plot_adjustment_pair(
 
 def _adjustments(model: Any) -> list[str]:
     """The names of the rhos and deltas of a model."""
-    own = [name for name in ("rho", "delta") if callable(getattr(model, name, None))]
-    names = [name for name in getattr(model, "term_names", own) if name != "f"]
+    names = [name for name in getattr(model, "term_names", ()) if name != "f"]
     if not names:
         raise TypeError(
             f"{type(model).__name__} has neither rho nor delta to draw; CKA, RRA, ScaleGP and "
-            "BiasGP have."
+            "PhysicsMeanGP have."
         )
     return names
-
-
-def _term(model: Any, name: str, X: Tensor) -> Any:
-    """The posterior of a rho or a delta at raw ``n x d``."""
-    return model.term(name, X) if hasattr(model, "term") else getattr(model, name)(X)
 
 
 def _unadjusted(model: Any, name: str, output: int) -> float:

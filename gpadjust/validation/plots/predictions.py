@@ -9,6 +9,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
+from gpadjust.physics import JoinedPhysics
 from gpadjust.validation.leave_one_out import LeaveOneOut, training_data
 from gpadjust.validation.plots.drawing import (
     BAND,
@@ -157,10 +158,12 @@ def plot_leave_one_out(
 
 
 def _physics(model: Any) -> list[tuple[str, Any]]:
-    """The physics of a model with their names; of one that has several, those of a mapping."""
+    """The physics of a model with their names."""
     physics: Any = getattr(model, "physics", None)
-    if hasattr(physics, "items"):
-        return [(f"physics {name}", one) for name, one in physics.items()]
+    if isinstance(physics, JoinedPhysics):
+        return [
+            (f"physics {n}", part) for n, part in zip(physics.names, physics.parts, strict=True)
+        ]
     return [("physics", physics)] if callable(physics) else []
 
 

@@ -1,0 +1,55 @@
+"""Data as NumPy arrays, DataFrames and numbers."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from gpadjust import CKA
+
+
+def test_arrays_and_frames(data, build, kind, uniform, same):
+    X, Y = data(num_outputs=2)
+    Z, Yvar = uniform(5, 2, high=2.0), uniform(*Y.shape, low=0.01, high=0.1)
+    model = build(kind, X, Y, Yvar)
+    assert (model.input_names, model.output_names) == (("x1", "x2"), ("y1", "y2"))
+    arrays = build(kind, X.numpy(), Y.numpy(), Yvar.numpy())
+    frame = pd.DataFrame(X.numpy(), columns=["speed", "load"])
+    frames = build(kind, frame, pd.DataFrame(Y.numpy(), columns=["u", "v"]), Yvar.numpy())
+    assert (frames.input_names, frames.output_names) == (("speed", "load"), ("u", "v"))
+    assert frames.subset_output([1]).output_names == ("v",)
+    for other in (arrays, frames):
+        same(other, model, Z)
+        for asked in (Z.numpy(), pd.DataFrame(Z.numpy())):
+            torch.testing.assert_close(other.posterior(asked).mean, model.posterior(Z).mean)
+            torch.testing.assert_close(other.predict(asked).mean, model.predict(Z).mean)
+        new = other.condition_on_observations(Z.numpy(), Z.numpy(), noise=torch.ones_like(Z))
+        expected = model.condition_on_observations(Z, Z, noise=torch.ones_like(Z))
+        same(new, expected, Z)
+
+
+def test_integers_and_series(data, build, uniform):
+    X, Y = data()
+    whole = (10 * X).round()
+    series = pd.Series(Y.squeeze(-1).numpy(), name="u")
+    with pytest.raises(ValueError, match=r"train_Y with at least 2 dimensions.*reshape\(-1, 1\)"):
+        CKA(whole.numpy().astype(int), series, physics=lambda X: 2 + X.sum(-1))
+    model = CKA(whole.numpy().astype(int), series.to_frame(), physics=lambda X: 2 + X.sum(-1))
+    assert model.output_names == ("u",)
+    expected = CKA(whole, Y, physics=lambda X: 2 + X.sum(-1))
+    Z = uniform(5, 2)
+    torch.testing.assert_close(model.posterior(Z).mean, expected.posterior(Z).mean)
+
+
+@pytest.mark.parametrize("noise", [0.04, 4, [0.04, 0.3], np.array([0.04, 0.3])], ids=str)
+def test_known_noise(data, build, kind, uniform, same, noise):
+    X, Y = data(num_outputs=2)
+    every = torch.as_tensor(noise, dtype=torch.float64).expand(Y.shape).clone()
+    same(build(kind, X, Y, noise), build(kind, X, Y, every), uniform(5, 2, high=2.0), 1e-12)
+
+
+def test_missing_values_of_a_frame(data, build, uniform, same):
+    X, Y = data(num_outputs=2)
+    Y[3, 1] = torch.nan
+    frame = pd.DataFrame(Y.numpy().astype(object)).where(~Y.isnan().numpy(), None)
+    same(build("CKA", X, frame), build("CKA", X, Y), uniform(5, 2), 1e-12)

@@ -1,0 +1,185 @@
+"""Models of several physics at once."""
+
+import pickle
+from collections import Counter
+
+import pytest
+import torch
+
+from gpadjust import CKA, RRA, FunctionPhysics, PhysicsError, PhysicsMeanGP, ScaleGP, fit
+
+CLASSES = [CKA, RRA, PhysicsMeanGP, ScaleGP]
+
+
+def swing(X):
+    return torch.stack([2 + (3 * X[..., 0]).sin(), 3 + X[..., 1]], dim=-1)
+
+
+def drift(X):
+    return torch.stack([10 + X[..., 0] * X[..., 1], 20 - X[..., 0].exp()], dim=-1)
+
+
+def truth(X):
+    return 1.5 * swing(X) - 0.2 * drift(X) + X[..., :1].square() / 4
+
+
+def problem(uniform, n=14):
+    X = uniform(n, 2, high=2.0)
+    return X, truth(X), uniform(5, 2, high=2.0, seed=4)
+
+
+class Dense:
+    """Sums of terms in plain linear algebra, for one output in the user's units."""
+
+    def __init__(self, model, j, X, y, rbf):
+        scale = model.outcome_transform.stdvs.reshape(-1)[j]
+        self.terms, self.X = {}, X
+        for term in model.terms:
+            unit = 1.0 if term.name.startswith("rho") else scale**2
+            base = term.kernel.base_kernel
+            k = rbf(base.lengthscale[j].detach(), term.kernel.outputscale[j].detach() * unit)
+            basis = {"rho_swing": swing, "rho_drift": drift}.get(term.name)
+            column = (lambda X: torch.ones_like(X[:, 0])) if basis is None else None
+            column = column or (lambda X, basis=basis: basis(X)[:, j])
+            kappa = term.mean_variance[j].detach() * unit
+            self.terms[term.name] = column, k, kappa, model.term_mean(term.name, j)
+        noise = model.likelihood.noise[j].detach() * scale**2
+        K = self.cross(X, X, *self.terms) + noise * torch.eye(len(X), dtype=X.dtype)
+        self.inverse = torch.linalg.inv(K)
+        self.weights = self.inverse @ (y - self.mean(X))
+
+    def mean(self, X):
+        return sum(column(X) * mean for column, _, _, mean in self.terms.values())
+
+    def cross(self, A, B, *names):
+        parts = [self.terms[name] for name in names]
+        return sum(c(A)[:, None] * (k(A, B) + v) * c(B)[None, :] for c, k, v, _ in parts)
+
+    def posterior(self, Z):
+        cross = self.cross(Z, self.X, *self.terms)
+        prior = self.cross(Z, Z, *self.terms)
+        return self.mean(Z) + cross @ self.weights, prior - cross @ self.inverse @ cross.mT
+
+    def term(self, name, Z):
+        column, k, kappa, mean = self.terms[name]
+        cross = (k(Z, self.X) + kappa) * column(self.X)
+        return mean + cross @ self.weights, k(Z, Z) + kappa - cross @ self.inverse @ cross.mT
+
+
+@pytest.mark.parametrize("rho_mean", [None, [1.2, -0.3]], ids=["learnt", "given"])
+def test_the_formulas(uniform, shuffle, rbf, close, rho_mean):
+    X, Y, Z = problem(uniform)
+    physics = {"swing": swing, "drift": drift}
+    model = shuffle(CKA(X, Y, physics=physics, rho_mean=rho_mean))
+    with torch.no_grad():
+        model.likelihood.noise = 0.3
+        for term in model.terms[:2]:
+            term.mean_variance *= 0.1
+    assert model.term_names == ("rho_swing", "rho_drift", "delta")
+    for j in range(2):
+        dense = Dense(model, j, X, Y[:, j], rbf)
+        for name in (None, *model.term_names):
+            posterior = model.posterior(Z) if name is None else model.term(name, Z)
+            mean, covariance = dense.posterior(Z) if name is None else dense.term(name, Z)
+            close(posterior.mean[:, j], mean)
+            close(posterior.variance[:, j], covariance.diagonal())
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("center", [0.0, "mean"])
+def test_the_parts_make_the_whole(uniform, shuffle, close, cls, center):
+    X, Y, Z = problem(uniform)
+    options = {"center": center} if cls in (CKA, RRA) else {}
+    model = shuffle(cls(X, Y, physics=[swing, drift], **options))
+    parts = sum(model.rho(Z, i).mean * f(Z) for i, f in enumerate((swing, drift)))
+    parts = parts + (model.delta(Z).mean if "delta" in model.term_names else 0)
+    close(parts, model.posterior(Z).mean)
+    close(model.predict(Z).mean, model.posterior(Z).mean)
+
+
+def test_names(uniform, close):
+    X, Y, Z = problem(uniform)
+    model = CKA(X, Y, physics=[swing, drift]).eval()
+    for named in (1, -1, "drift", "rho_drift"):
+        close(model.rho(Z, physics=named).mean, model.term("rho_drift", Z).mean)
+    for wrong in (None, 2, "weight"):
+        with pytest.raises(ValueError, match=r"physics to be one of swing, drift, or a number"):
+            model.rho(Z, physics=wrong)
+    assert CKA(X, Y, physics=[swing]).term_names == ("rho", "delta")
+    assert CKA(X, Y, physics=[lambda X: swing(X), drift]).rho_names == ("rho_f_1", "rho_drift")
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_far_from_the_data_their_weighted_sum_remains(uniform, cls):
+    X = problem(uniform, 24)[0]
+    model = cls(X, 1.5 * swing(X) - 0.2 * drift(X), physics=[swing, drift])
+    fit(model, num_screened=16, num_starts=2)
+    for j in range(2):
+        weights = [model.term_mean(name, j) for name in model.rho_names]
+        torch.testing.assert_close(weights, [1.5, -0.2], rtol=1e-3, atol=0)
+    far = torch.tensor([[9.0, -9.0]], dtype=torch.float64)
+    expected = 1.5 * swing(far) - 0.2 * drift(far)
+    torch.testing.assert_close(model.posterior(far).mean, expected, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_each_is_evaluated_once_a_call(uniform, cls):
+    X, Y, Z = problem(uniform)
+    counts = Counter()
+
+    def counted(f):
+        def physics(X):
+            counts[f.__name__] += len(X)
+            return f(X)
+
+        return FunctionPhysics(physics, memo=0, name=f.__name__)
+
+    model = cls(X, Y, physics=[counted(swing), counted(drift)]).eval()
+    functions = model.sample_functions(2)
+    model.posterior(Z)
+    calls = [model.posterior, model.predict, functions]
+    calls.append(lambda Z: model.condition_on_observations(Z, truth(Z)))
+    for call in calls:
+        counts.clear()
+        call(Z)
+        assert counts == {"swing": 5, "drift": 5}
+    counts.clear()
+    model.rho(Z, physics=0)
+    assert not counts
+
+
+def test_errors_name_the_one_that_failed(uniform):
+    X, Y, _ = problem(uniform)
+
+    def broken(X):
+        return swing(X) / (X[:, :1] < 5)
+
+    model = CKA(X, Y, physics={"good": swing, "bad": broken}).eval()
+    with pytest.raises(PhysicsError, match=r"'bad'.* returned NaN or inf in 1 of 2"):
+        model.posterior(torch.tensor([[0.0, 0.5], [9.0, 0.5]], dtype=torch.float64))
+    with pytest.raises(ValueError, match="Expected rho_mean to be 'learn', a number, or 2 numbers"):
+        CKA(X, Y, physics=[swing, drift], rho_mean=[1.0])
+    with pytest.raises(ValueError, match="Expected 2 kernels of rho, one for each physics, got 1"):
+        CKA(X, Y, physics=[swing, drift], rho_covar_module=[None])
+    with pytest.raises(PhysicsError, match="differ in their number of outputs"):
+        CKA(X, Y, physics=[swing, lambda X: X[:, 0]])
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_conditioning_and_copies(uniform, shuffle, same, cls):
+    X, Y, Z = problem(uniform)
+    model = shuffle(cls(X, Y, physics=[swing, drift]))
+    more = torch.cat([X, Z + 0.1]), torch.cat([Y, truth(Z + 0.1)])
+    rebuilt = cls(*more, physics=[swing, drift])
+    rebuilt.load_state_dict(model.state_dict())
+    conditioned = model.condition_on_observations(Z + 0.1, truth(Z + 0.1))
+    same(conditioned, rebuilt.eval(), Z, 1e-6)
+    same(pickle.loads(pickle.dumps(model)), model, Z, 1e-12)
+    same(model.subset_output([1]), model, Z, 1e-9, [1])
+    functions = model.sample_functions(2000, seed=0)(Z)
+    error = functions.mean(0) - model.posterior(Z).mean
+    assert (error.abs() < 0.15 * model.posterior(Z).variance.sqrt()).all()
+    learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
+    model.hold_samples({n: torch.stack([p, p + 0.2]) for n, p in learnt.items()})
+    assert model.posterior(Z).mean.shape == (2, 5, 2)
+    assert model.rho(Z, physics="drift").mixture_mean.shape == (5, 2)
