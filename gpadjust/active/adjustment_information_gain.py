@@ -12,8 +12,8 @@ from botorch.utils.transforms import (
 )
 from torch import Tensor
 
+from gpadjust.active.information import UnknownCovariance, information_gain
 from gpadjust.models import AdjustedGP, PaperRRA
-from gpadjust.models.information import UnknownCovariance, information_gain
 
 About = Literal["rho", "delta", "both"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gpadjust.active.information import UnknownCovariance, information_gain
 from gpadjust.dynamics.adjusted_dynamics import RRADynamics
 from gpadjust.dynamics.base import Dynamics
 from gpadjust.dynamics.model_dynamics import ModelDynamics
 from gpadjust.dynamics.state_spec import check_columns
-from gpadjust.models.information import UnknownCovariance, information_gain
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
 

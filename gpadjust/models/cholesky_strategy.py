@@ -26,7 +26,7 @@ Weights = list[tuple[Term, Tensor | None]]
 """Terms and what each is multiplied by, ``... x n``, or None for 1."""
 
 
-class TermsOfData(NamedTuple):
+class PreparedTerms(NamedTuple):
     """What is remembered of some unknown terms and the training data, to predict from.
 
     Attributes:
@@ -49,36 +49,36 @@ class TermsOfData(NamedTuple):
     bases: list[Tensor | None]
     variances: list[Tensor | None]
 
-    @classmethod
-    def of(cls, terms: list[Term], train: Tensor, with_graph: bool = False) -> TermsOfData:
-        """Prepare some terms, at training inputs ``... x n x (d + k)``, by autograd or faster."""
-        d = max(term.num_inputs for term in terms)
-        origin = train[..., :d].mean(-2, keepdim=True)
-        found = [] if with_graph else terms
-        matrices = {term.name: term.log_covariance_with(train, origin) for term in found}
-        stacked = {name: matrix for name, matrix in matrices.items() if matrix is not None}
-        stack = torch.stack(torch.broadcast_tensors(*stacked.values()), -3) if stacked else None
-        bases = [term.weights(train) for term in terms]
-        variances = [None if with_graph else term.variance() for term in terms]
-        return cls(terms, train, origin, stack, [*stacked], bases, variances)
 
-    def covariances(self, inputs: Tensor) -> list[Tensor]:
-        """The covariances of the terms with those at the data, without bases, ``... x q x n``."""
-        values: Tensor | None = None
-        if self.stack is not None:
-            x = inputs[..., : self.origin.shape[-1]] - self.origin
-            left = torch.cat([x, x.square(), torch.ones_like(x[..., :1])], dim=-1)
-            values = (left.unsqueeze(-3) @ self.stack).exp_()
-        parts = []
-        for term in self.terms:
-            if values is None or term.name not in self.stacked:
-                part = term.covariance(inputs, self.train)
-            else:
-                part = values.select(-3, self.stacked.index(term.name))
-                if term.learns_mean:
-                    part = part + term.mean_variance.detach().unsqueeze(-1)
-            parts.append(part)
-        return parts
+def prepare(terms: list[Term], train: Tensor, with_graph: bool = False) -> PreparedTerms:
+    """Prepare some terms, at training inputs ``... x n x (d + k)``, by autograd or faster."""
+    origin = train[..., : max(term.num_inputs for term in terms)].mean(-2, keepdim=True)
+    found = [] if with_graph else terms
+    matrices = {term.name: term.log_covariance_with(train, origin) for term in found}
+    stacked = {name: matrix for name, matrix in matrices.items() if matrix is not None}
+    stack = torch.stack(torch.broadcast_tensors(*stacked.values()), -3) if stacked else None
+    bases = [term.weights(train) for term in terms]
+    variances = [None if with_graph else term.variance() for term in terms]
+    return PreparedTerms(terms, train, origin, stack, [*stacked], bases, variances)
+
+
+def covariances(data: PreparedTerms, inputs: Tensor) -> list[Tensor]:
+    """The covariances of terms with those at the data, without bases, ``... x q x n`` each."""
+    values: Tensor | None = None
+    if data.stack is not None:
+        x = inputs[..., : data.origin.shape[-1]] - data.origin
+        left = torch.cat([x, x.square(), torch.ones_like(x[..., :1])], dim=-1)
+        values = (left.unsqueeze(-3) @ data.stack).exp_()
+    parts = []
+    for term in data.terms:
+        if values is None or term.name not in data.stacked:
+            part = term.covariance(inputs, data.train)
+        else:
+            part = values.select(-3, data.stacked.index(term.name))
+            if term.learns_mean:
+                part = part + term.mean_variance.detach().unsqueeze(-1)
+        parts.append(part)
+    return parts
 
 
 class Factors(NamedTuple):
@@ -258,7 +258,7 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         self._train_shape = train_prior_dist.event_shape
         self._factors: Factors | None = None
         self.kept: dict[str, Any] = {}  # what else a model makes of the same data
-        self._terms: dict[tuple[str, ...], TermsOfData] = {}
+        self._terms: dict[tuple[str, ...], PreparedTerms] = {}
 
     def factors(self) -> Factors:
         """Return the factors, computed at the first call."""
@@ -289,8 +289,8 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         unknown = [(term, weight) for term, weight in weights if not term.is_known]
         if not unknown:
             return inputs.new_zeros(*inputs.shape[:-1], self.num_train)
-        data = self.terms_of_data([term for term, _ in unknown])
-        parts = data.covariances(inputs)
+        data = self.prepared([term for term, _ in unknown])
+        parts = covariances(data, inputs)
         for i, ((_, weight), basis) in enumerate(zip(unknown, data.bases, strict=True)):
             if basis is not None:
                 parts[i] = scaled(parts[i], basis.unsqueeze(-2))
@@ -298,15 +298,15 @@ class CholeskyStrategy(DefaultPredictionStrategy):
                 parts[i] = scaled(parts[i], weight.unsqueeze(-1))
         return sum(parts[1:], parts[0])
 
-    def terms_of_data(self, terms: list[Term]) -> TermsOfData:
+    def prepared(self, terms: list[Term]) -> PreparedTerms:
         """What is remembered of some unknown terms, and of the data."""
         (train,) = self.train_inputs
         if self.has_graph:
-            return TermsOfData.of(terms, train, with_graph=True)
+            return prepare(terms, train, with_graph=True)
         names = tuple(term.name for term in terms)
         if names not in self._terms:
             with torch.no_grad():
-                self._terms[names] = TermsOfData.of(terms, train)
+                self._terms[names] = prepare(terms, train)
         return self._terms[names]
 
     @property
@@ -351,7 +351,7 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         unknown = [(term, weight) for term, weight in weights if not term.is_known]
         if not unknown:
             return mean, torch.zeros_like(mean)
-        data, prior = self.terms_of_data([term for term, _ in unknown]), inputs.new_zeros(())
+        data, prior = self.prepared([term for term, _ in unknown]), inputs.new_zeros(())
         for (term, weight), variance in zip(unknown, data.variances, strict=True):
             part = term.covariance(inputs, inputs, diag=True) if variance is None else variance
             prior = prior + (part if weight is None else part * weight.square())

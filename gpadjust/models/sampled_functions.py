@@ -16,7 +16,7 @@ from torch.nn import Module, ModuleList
 
 from gpadjust.gp import SumOfTerms, Term
 from gpadjust.gp.gaussian import noise_variances
-from gpadjust.models.cholesky_strategy import TermsOfData
+from gpadjust.models.cholesky_strategy import covariances, prepare
 from gpadjust.models.hyperparameter_samples import take_samples
 
 
@@ -63,7 +63,7 @@ class SampledFunctions(Module):
         self.weights, self.updates = [*weights], [*updates]
         self.requires_grad_(False).eval()
         unknown = [term for term in self.terms if not term.is_known]
-        self.data = TermsOfData.of(unknown, model.train_inputs[0].detach())
+        self.data = prepare(unknown, model.train_inputs[0].detach())
 
     @classmethod
     def by_matheron(cls, model: Any, num_functions: int, num_features: int) -> SampledFunctions:
@@ -119,7 +119,7 @@ class SampledFunctions(Module):
             extra: How many dimensions of them lead those of the model.
         """
         total = inputs.new_zeros(())
-        cross = iter(self.data.covariances(inputs) if self.updates else [])
+        cross = iter(covariances(self.data, inputs) if self.updates else [])
         for i, (term, features) in enumerate(zip(self.terms, self.features, strict=True)):
             part = term.mean + _product(features(inputs), self.weights[i], extra)
             if self.updates and not term.is_known:

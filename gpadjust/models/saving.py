@@ -33,10 +33,10 @@ def save(model: ExactGPBase, path: str | Path) -> None:
         >>> import tempfile, torch
         >>> from gpadjust import CKA, load, save
         >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-        >>> model = CKA(X, 2 * X.sin() + X, physics=torch.sin)
+        >>> model = CKA(X, 2 * X.sin() + X, physics=lambda X: X.sin())
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(model, f"{folder}/model.pt")
-        ...     again = load(f"{folder}/model.pt")
+        ...     again = load(f"{folder}/model.pt", physics=lambda X: X.sin())
         >>> torch.equal(again.posterior(X).mean, model.posterior(X).mean)
         True
     """

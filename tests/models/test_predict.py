@@ -11,7 +11,7 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.settings import detach_test_caches
 
 from gpadjust import ZeroMeanGP, fit
-from gpadjust.models.cholesky_strategy import TermsOfData
+from gpadjust.models.cholesky_strategy import covariances, prepare
 
 
 def reference(model, Z, **options):
@@ -86,7 +86,7 @@ def test_remembered_covariances(data, build, shuffle, uniform, num_outputs, mean
     model.requires_grad_(False)
     inputs.requires_grad_()
     fast, direct = (
-        torch.cat(TermsOfData.of(model.terms, train, slowly).covariances(inputs))
+        torch.cat(covariances(prepare(model.terms, train, slowly), inputs))
         for slowly in (False, True)
     )
     torch.testing.assert_close(fast, direct)
