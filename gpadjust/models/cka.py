@@ -64,7 +64,7 @@ class CKA(AdjustedGP):
             (``"mean"``: its mean at ``train_X``). The literal model has 0. Take ``"mean"`` where
             f_p varies little about a large constant, which rho and delta would dispute otherwise.
         likelihood: A Gaussian likelihood. Default: learnt noise, with a standard deviation of at
-            least a millionth of the root mean square of ``train_Y - f_p``.
+            least three millionths of the root mean square of ``train_Y - f_p``.
         outcome_transform: ``Standardize`` or None. Default: division by the root mean square of
             ``train_Y - f_p``. Hyper-parameters are in the units after it.
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.

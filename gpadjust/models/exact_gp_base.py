@@ -118,9 +118,10 @@ class ExactGPBase(SingleTaskGP):
         model = super().__new__(cls)
         names = [*signature(cls.__init__).parameters][1:]
         every = {**dict(zip(names, args, strict=False)), **options}
-        model.__dict__["options"] = {
-            name: v for name, v in every.items() if not name.startswith(("train_", "low_"))
-        }
+        every = {n: v for n, v in every.items() if not n.startswith(("train_", "low_", "physics"))}
+        # Others than plain values are told by name alone, or they would have to pickle.
+        model.__dict__["options"] = {n: v for n, v in every.items() if _is_plain(v)}
+        model.__dict__["objects"] = [n for n, v in every.items() if not _is_plain(v)]
         return model
 
     def __repr__(self) -> str:
@@ -624,3 +625,10 @@ class ExactGPBase(SingleTaskGP):
         # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
         with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
             return super().condition_on_observations(X, Y, **kwargs)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a file can hold an option."""
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return isinstance(value, bool | int | float | str | Tensor | None)

@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
+from gpadjust.gp import PhysicsInput
 from gpadjust.models.exact_gp_base import ExactGPBase
 from gpadjust.physics import JoinedPhysics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
 _FORMAT = 1
-_PLAIN = bool | int | float | str | torch.Tensor | None
 
 
 def save(model: ExactGPBase, path: str | Path) -> None:
@@ -42,11 +42,10 @@ def save(model: ExactGPBase, path: str | Path) -> None:
     """
     if not isinstance(model, ExactGPBase):
         raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
-    options = {n: v for n, v in model.options.items() if n != "physics"}
-    missing = [name for name, value in options.items() if not _is_plain(value)]
-    physics: Any = None
-    if model.options.get("physics") is not None:
-        given: Any = as_physics(model.options["physics"])
+    missing, physics = [*model.objects], None
+    transform: Any = getattr(model, "input_transform", None)
+    if isinstance(transform, PhysicsInput):
+        given: Any = transform.physics
         several = isinstance(given, JoinedPhysics)
         parts = zip(given.names, given.parts, strict=True) if several else [("", given)]
         physics = {name: import_path(part) for name, part in parts}
@@ -55,7 +54,7 @@ def save(model: ExactGPBase, path: str | Path) -> None:
     content = {
         "format": _FORMAT,
         "class": f"{type(model).__module__}:{type(model).__qualname__}",
-        "options": {name: v for name, v in options.items() if name not in missing},
+        "options": model.options,
         "missing": missing,
         "physics": physics,
         "data": model.data(),
@@ -109,9 +108,3 @@ def load(path: str | Path, **objects: Any) -> ExactGPBase:
     model.load_state_dict(content["state"])
     model.input_names, model.output_names = (tuple(names) for names in content["names"])
     return model.eval()
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
-    return isinstance(value, _PLAIN)

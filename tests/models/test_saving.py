@@ -1,0 +1,97 @@
+"""Models as files."""
+
+import pickle
+
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+from torch.nn.functional import relu, tanhshrink
+
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ZeroMeanGP, load, save
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "model.pt"
+
+
+def problem(uniform):
+    X = uniform(8, 2) - 0.3
+    Y = relu(X) * 1.2 + X.square()
+    Y[2, 1] = torch.nan
+    return X, Y, uniform(5, 2, seed=1)
+
+
+def same(model, other, Z):
+    for ours, theirs in zip(model.predict(Z), other.predict(Z), strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+BUILDS = {
+    "CKA": lambda X, Y: CKA(X, Y, physics=relu, center="mean", delta_mean="learn"),
+    "several": lambda X, Y: CKA(X, Y, 0.01, physics={"a": relu, "b": tanhshrink}),
+    "RRA": lambda X, Y: RRA(X, Y, physics=relu, num_features=16, seed=3),
+    "physics mean": lambda X, Y: PhysicsMeanGP(X, Y, physics=relu, rho_mean=0.9),
+    "zero mean": lambda X, Y: ZeroMeanGP(X, Y, outcome_transform=None),
+    "AR1": lambda X, Y: AR1(X, Y, physics=relu, low_X=X + 0.1),
+}
+
+
+@pytest.mark.parametrize("name", list(BUILDS))
+def test_a_model_comes_back(name, uniform, path):
+    X, Y, Z = problem(uniform)
+    model = BUILDS[name](X, Y)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1 * torch.randn_like(parameter) * parameter.requires_grad
+    model.input_names = ("left [m]", "right [m]")
+    save(model, path)
+    assert torch.load(path, weights_only=True)["missing"] == []
+    assert [each.name for each in path.parent.iterdir()] == ["model.pt"]
+    again = load(path)
+    assert type(again) is type(model)
+    assert again.input_names == model.input_names
+    same(model, again, Z)
+
+
+def test_one_that_was_conditioned_and_holds_samples(uniform, path):
+    X, Y, Z = problem(uniform)
+    model = CKA(X, Y, physics=relu)
+    named = {n: p for n, p in model.named_parameters() if p.requires_grad}
+    model.hold_samples({n: torch.stack([p.detach(), p.detach() + 0.5]) for n, p in named.items()})
+    model = model.condition_on_observations(Z, relu(Z))
+    save(model, path)
+    again = load(path)
+    assert again.num_samples == 2
+    same(model, again, Z)
+
+
+def test_what_has_no_name_is_given_again(uniform, path):
+    X, Y, Z = problem(uniform)
+    options = {"physics": lambda X: relu(X), "input_transform": Normalize(2)}
+    model = CKA(X, Y, **options)
+    save(model, path)
+    with pytest.raises(ValueError, match="could not hold input_transform and physics"):
+        load(path)
+    same(model, load(path, **options), Z)
+
+
+def test_files_that_are_no_models(path):
+    with pytest.raises(FileNotFoundError):
+        load(path)
+    path.write_bytes(b"no model")
+    with pytest.raises(ValueError, match="is not a model that gpadjust saved"):
+        load(path)
+    torch.save({"format": 99}, path)
+    with pytest.raises(ValueError, match="expected format 1"):
+        load(path)
+    with pytest.raises(TypeError, match="Expected a model of gpadjust, got Linear"):
+        save(torch.nn.Linear(1, 1), path)
+
+
+def test_pickle(uniform):
+    X, Y, Z = problem(uniform)
+    model = CKA(X, Y, physics=relu)
+    same(model, pickle.loads(pickle.dumps(model)), Z)
+    with pytest.raises(pickle.PicklingError, match="a function at the top level of a module"):
+        pickle.dumps(CKA(X, Y, physics=lambda X: relu(X)))

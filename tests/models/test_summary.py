@@ -1,0 +1,88 @@
+"""What a model says of itself, and its intervals."""
+
+import re
+
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+from torch.distributions import MultivariateNormal, Normal
+
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+
+
+def crude(X):
+    return X.sum(-1, keepdim=True) + 1
+
+
+def numbers(text, label):
+    return [float(found) for found in re.findall(label + r" (-?[\d.e+-]+)", text)]
+
+
+def test_numbers_are_in_the_users_units(uniform):
+    X = torch.stack([100 * uniform(8, 2)[:, 0], uniform(8, 2)[:, 1]], dim=-1)
+    Y = 1e3 * (crude(X) + uniform(8, 1))
+    model = CKA(X, Y, physics=crude, input_transform=Normalize(2))
+    rho, delta = (term.kernel for term in model.terms)
+    scale = model.outcome_transform.stdvs.item()
+    text = model.summary()
+    assert repr(model) in text
+    assert repr(model) == "CKA of 'crude': 8 points, 2 inputs, 1 output"
+    with torch.no_grad():
+        ranges = (X.amax(0) - X.amin(0)).tolist()
+        lengths = [f"lengthscale of x{i + 1}: {0.5 * ranges[i]:.4g}" for i in range(2)]
+        assert all(text.count(length) == 2 for length in lengths)
+        sds = [rho.outputscale.sqrt().item(), scale * delta.outputscale.sqrt().item()]
+        assert numbers(text, "\n    sd") == pytest.approx(sds, rel=1e-3)
+        noise = scale * model.likelihood.noise.sqrt().item()
+        assert numbers(text, "noise: sd") == pytest.approx([noise], rel=1e-3)
+        inputs = model.train_inputs[0]
+        covariance = model.covar_module(inputs).to_dense() + model.likelihood.noise * torch.eye(8)
+        targets = MultivariateNormal(crude(X)[:, 0], scale**2 * covariance)
+        expected = targets.log_prob(Y[:, 0]).item()
+    assert numbers(text, "log likelihood") == pytest.approx([expected], rel=1e-3)
+
+
+def test_bounds_and_learnt_means_are_told(uniform):
+    X = uniform(8, 1)
+    model = CKA(X, crude(X) + X.square(), physics=crude, rho_mean="learn")
+    assert "rho: learnt mean 1" in model.summary()
+    assert "at its" not in model.summary()
+    model.terms[0].kernel.base_kernel.lengthscale = 1e3 * (X.max() - X.min()).item()
+    assert model.summary().count("(at its upper bound)") == 1
+
+
+@pytest.mark.parametrize("kind", [AR1, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP])
+def test_every_model_has_one(kind, uniform):
+    X = uniform(8, 2)
+    Y = torch.cat([crude(X), 2 * crude(X)], dim=-1) + X
+    options = {} if kind is ZeroMeanGP else {"physics": lambda X: crude(X).expand(-1, 2)}
+    options |= {"low_X": uniform(9, 2, seed=1)} if kind is AR1 else {}
+    text = kind(X, Y, **options).summary()
+    assert "y1:" in text
+    assert "y2:" in text
+    assert text.count("noise: sd") == 2
+
+
+def test_intervals(uniform):
+    X, Z = uniform(8, 1), uniform(5, 1, seed=1)
+    model = CKA(X, crude(X) + X.sin(), physics=crude)
+    mean, variance = model.predict(Z, observation_noise=True)
+    low, high = model.interval(Z, 0.9, observation_noise=True)
+    torch.testing.assert_close(low, mean - 1.6448536269514722 * variance.sqrt())
+    torch.testing.assert_close(high, mean + 1.6448536269514722 * variance.sqrt())
+    for level in (0.0, 1.0, 95, "95 %"):
+        with pytest.raises(ValueError, match="between 0 and 1"):
+            model.interval(Z, level)
+
+
+def test_intervals_of_a_mixture(uniform):
+    X, Z = uniform(8, 1), uniform(5, 1, seed=1)
+    model = CKA(X, crude(X) + X.sin(), physics=crude)
+    named = {n: p for n, p in model.named_parameters() if p.requires_grad}
+    model.hold_samples({n: torch.stack([p.detach(), p.detach() + 1]) for n, p in named.items()})
+    assert "2 samples" in repr(model)
+    assert " to " in model.summary()
+    posterior = model.posterior(Z)
+    for end, level in zip(model.interval(Z), (0.025, 0.975), strict=True):
+        share = Normal(posterior.mean, posterior.variance.sqrt()).cdf(end.unsqueeze(-3)).mean(-3)
+        torch.testing.assert_close(share, torch.full_like(share, level))
