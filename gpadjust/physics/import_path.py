@@ -74,7 +74,7 @@ def physics_from_path(path: str) -> Physics:
 
 
 def _settings(physics: FunctionPhysics) -> tuple[Any, ...]:
-    return physics.name, physics.inputs, physics._memo.capacity
+    return physics.inputs, physics._memo.capacity
 
 
 def _path_of(thing: Any) -> str | None:

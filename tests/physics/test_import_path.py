@@ -82,7 +82,6 @@ def test_wrapped_function_has_the_path_of_the_function(plant: Any) -> None:
         lambda plant: plant.local(),
         lambda plant: FunctionPhysics(plant.double, inputs=[0]),
         lambda plant: FunctionPhysics(plant.double, memo=7),
-        lambda plant: FunctionPhysics(plant.double, name="twice"),
         lambda plant: BlackBoxPhysics(plant.double),
         lambda plant: JoinedPhysics([plant.double, plant.drag]),
         lambda plant: plant.Drag(),
