@@ -8,6 +8,7 @@ from gpadjust.dynamics.adjusted_dynamics import (
     RRADynamics,
     ScaleDynamics,
 )
+from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
@@ -16,6 +17,7 @@ from gpadjust.dynamics.trajectory_information import TrajectoryInformation
 from gpadjust.dynamics.transition_scores import TransitionScores
 
 __all__ = [
+    "AngleInput",
     "BiasDynamics",
     "CKADynamics",
     "Dynamics",

@@ -20,7 +20,7 @@ from gpadjust.dynamics.refitting import refit, search_rows
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transition_physics import Target, TransitionPhysics
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.gp import AngleInput
+from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.inference import FitResult, fit
 from gpadjust.inference.fitting import FitOptions
 from gpadjust.models import ExactGPBase

@@ -1,13 +1,11 @@
 """The GPyTorch pieces: terms of a model, and what they are made of."""
 
-from gpadjust.gp.angle_input import AngleInput
 from gpadjust.gp.physics_columns import AppendedPhysics, PhysicsInput
 from gpadjust.gp.physics_mean import PhysicsMean
 from gpadjust.gp.physics_scaled_kernel import PhysicsScaledKernel
 from gpadjust.gp.term import SumOfTerms, Term, TermsMean
 
 __all__ = [
-    "AngleInput",
     "AppendedPhysics",
     "PhysicsInput",
     "PhysicsMean",
