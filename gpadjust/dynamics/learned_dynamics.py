@@ -13,6 +13,7 @@ from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 from torch.nn import Module
 
+from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.identity import check_identity, identity
 from gpadjust.dynamics.model_dynamics import ModelDynamics
 from gpadjust.dynamics.next_state_physics import check_physics, parts_of, warn_of_differences
@@ -20,7 +21,6 @@ from gpadjust.dynamics.refitting import refit, search_rows
 from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transition_physics import Target, TransitionPhysics
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.inference import FitResult, fit
 from gpadjust.inference.fitting import FitOptions
 from gpadjust.models import ExactGPBase

@@ -175,6 +175,15 @@ class SumOfTerms(Kernel):
 
     def __init__(self, terms: Sequence[Term], known_means: bool = False) -> None:
         super().__init__()
+        names = [term.name for term in terms]
+        if len({*names}) < len(names):
+            raise ValueError(f"Expected terms of different names, got {names}.")
+        own = [{id(p) for p in term.parameters()} for term in terms]
+        if len(set().union(*own)) < sum(map(len, own)):
+            raise ValueError(
+                f"Expected kernels of their own for the terms {names}, but some share parameters; "
+                "pass each a kernel of its own (copy.deepcopy makes one)."
+            )
         self.terms = ModuleList(terms)
         self.known_means = known_means
 

@@ -48,9 +48,9 @@ class LogPriors:
         densities: list[Tensor] = self._parameters.call_at(values, self._densities)
         batch = (len(vectors), *self._parameters.batch_shape)
         total = vectors.new_zeros(batch)
-        for density in densities:
+        for density, own in zip(densities, self._densities(), strict=True):
             # That of a parameter which is not learnt has no dimension of vectors.
-            shape = batch if density.dim() >= len(batch) else batch[1:]
+            shape = batch if density.dim() > own.dim() else batch[1:]
             shape = shape if density.dim() >= len(shape) else ()
             total = total + density.reshape(*shape, -1).sum(-1)
         return total.reshape(len(vectors), -1) + between

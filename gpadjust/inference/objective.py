@@ -71,9 +71,10 @@ class Objective:
         self._learns_constants = basis is not None
         self._inputs, self._basis, targets = inputs, basis, None
         if self.parameters.learns_inputs:
-            self._inputs, self._basis = raw[..., kept, :], None
-            # The basis changes with the physics: the distribution has it in its mean.
-            targets = None if basis is None else self.targets
+            self._inputs = raw[..., kept, :]
+        if basis is not None and (self.parameters.learns_inputs or _learns_basis(model)):
+            # The basis changes with what is learnt: the distribution has it in its mean.
+            self._basis, targets = None, self.targets
         closed = self.parameters.is_batched and not autograd
         self._distribution = (
             self._closed_form(inputs, noise, marginal) if closed else None
@@ -205,8 +206,9 @@ class Objective:
         values = self.parameters.unflatten(vector.unsqueeze(0))
         _, covariance = self._distribution({name: value[0] for name, value in values.items()})
         inputs, basis = self._inputs, self._basis
-        if basis is None:
+        if self.parameters.learns_inputs:
             inputs = self.model.transform_inputs(inputs)
+        if basis is None:
             basis = self.model.covar_module.basis_of_means(inputs)
         residual = self.targets - self.model.mean_module(inputs)
         shift, vague = constant_means(residual, covariance, basis)
@@ -255,8 +257,8 @@ class Objective:
     def _is_homogeneous(self) -> bool:
         """Whether a factor of all variances is one of the covariance, and no prior minds."""
         parameters = self.parameters
-        several_noises = bool((parameters.noise.sum(-1) > 1).any())
-        if not parameters.is_batched or self._log_priors is not None or several_noises:
+        one_noise = bool((parameters.noise.sum(-1) == 1).all())
+        if not parameters.is_batched or self._log_priors is not None or not one_noise:
             return False
         vector = parameters.current()
         mean, covariance = self._distribution(parameters.unflatten(vector))
@@ -271,6 +273,11 @@ def _basis_of_means(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> T
     """The bases of unknown constant means, ``... x n x q``; None for models of other libraries."""
     kernel = model.covar_module
     return kernel.basis_of_means(inputs) if isinstance(kernel, SumOfTerms) else None
+
+
+def _learns_basis(model: BatchedMultiOutputGPyTorchModel) -> bool:
+    bases = [term.basis for term in model.covar_module.terms if term.basis is not None]
+    return any(p.requires_grad for basis in bases for p in basis.parameters())
 
 
 def _terms_of_means(model: BatchedMultiOutputGPyTorchModel) -> list[Term]:

@@ -88,6 +88,8 @@ class AdjustedGP(ExactGPBase):
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
     ) -> None:
+        if physics is None and rho is not None:
+            raise TypeError("Expected a physics, got None; ZeroMeanGP is the model without one.")
         data = training_data(train_X, train_Y, train_Yvar)
         m, batch_shape = data.Y.shape[-1], self.get_batch_dimensions(data.X, data.Y)[1]
         transform: Any = input_transform

@@ -31,6 +31,7 @@ from gpadjust.models.training_data import (
     TrainingData,
     estimated,
     standardize,
+    to_tensor,
     training_data,
 )
 from gpadjust.physics import as_physics
@@ -194,6 +195,7 @@ class AR1(ExactGPBase):
             raise ValueError("Got `low_Y` without `low_X`, the inputs that it belongs to.")
         if low_X is None:
             low_X = _samples(high.X, bounds, num_low, seed)
+        low_X = to_tensor(low_X, "low_X")
         if low_Y is None:
             if physics is None:
                 raise ValueError(

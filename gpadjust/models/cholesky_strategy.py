@@ -16,10 +16,11 @@ from linear_operator.operators import LinearOperator, ZeroLinearOperator
 from linear_operator.utils.errors import NotPSDError
 from torch import Tensor
 
-from gpadjust.gp import SumOfTerms, Term
+from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import cholesky, noise_variances, nugget, scaled
 
 _FEW = 256  # points up to which a product is faster than solving
+_INFINITE = 1e200  # the standard deviation of a target that is missing
 _SOUND = 1e-8  # least ratio of squared pivots with which an inverse costs no digit that counts
 
 Weights = list[tuple[Term, Tensor | None]]
@@ -176,7 +177,7 @@ def _without(chol: Tensor, observed: Tensor) -> Tensor:
     """A Cholesky factor with an infinite variance of what is not observed, ``... x n``."""
     if observed.all():
         return chol
-    return chol + torch.diag_embed((~observed).to(chol) * 1e200)
+    return chol + torch.diag_embed((~observed).to(chol) * _INFINITE)
 
 
 def batched_solve(left: Tensor, right: Tensor, upper: bool) -> Tensor:
@@ -262,11 +263,14 @@ class CholeskyStrategy(DefaultPredictionStrategy):
 
     def factors(self) -> Factors:
         """Return the factors, computed at the first call."""
-        if self._factors is not None:
-            return self._factors
+        found = self._factors
+        if found is not None and (
+            not self.has_graph or found.alpha.requires_grad or found.rows.shape[-2]
+        ):
+            return found
         with torch.set_grad_enabled(torch.is_grad_enabled() and detach_test_caches.off()):
             # Not from the lazy covariances at hand, which would keep a matrix each.
-            residual = self.train_labels - self.train_prior_dist.mean
+            residual = self.train_labels - TermsMean(self.kernel)(self.train_inputs[0])
             factors = Factors.of(self.noisy_covariance(self.kernel), residual)
         for factor in (factors.base, factors.alpha):
             if factor.grad_fn is not None:
@@ -364,16 +368,17 @@ class CholeskyStrategy(DefaultPredictionStrategy):
         """As that of the factors; for few points with noise by the inverse, which is faster."""
         factors = self.factors()
         if "inverse" not in self.kept:
-            pivots = factors.base.detach().diagonal(dim1=-1, dim2=-2).square()
-            sound = (pivots.amin(-1) > _SOUND * pivots.amax(-1)).all()
-            few = factors.base.shape[-1] <= _FEW and not factors.rows.shape[-2]
+            base = factors.base.detach()
+            pivots = base.diagonal(dim1=-1, dim2=-2).square()
+            largest = pivots.where(pivots < _INFINITE, torch.zeros_like(pivots)).amax(-1)
+            sound = (pivots.amin(-1) > _SOUND * largest).all()
+            few = base.shape[-1] <= _FEW and not factors.rows.shape[-2]
             inverse = None
-            if sound and few and not factors.base.requires_grad:
-                identity = torch.eye(factors.base.shape[-1]).to(factors.base)
-                identity = identity.expand_as(factors.base)
-                inverse = torch.linalg.solve_triangular(factors.base, identity, upper=False)
+            if sound and few:
+                identity = torch.eye(base.shape[-1]).to(base).expand_as(base)
+                inverse = torch.linalg.solve_triangular(base, identity, upper=False)
             self.kept["inverse"] = inverse
-        inverse = self.kept["inverse"]
+        inverse = None if factors.base.requires_grad else self.kept["inverse"]
         return factors.whiten(cross) if inverse is None else batched_product(cross, inverse.mT)
 
     def get_fantasy_strategy(

@@ -38,6 +38,7 @@ from gpadjust.models.summary import summary, title
 from gpadjust.models.training_data import (
     ArrayLike,
     TrainingData,
+    check_columns,
     check_finite,
     check_observed,
     to_tensor,
@@ -86,6 +87,8 @@ class ExactGPBase(SingleTaskGP):
         input_transform: InputTransform | None,
         given: Sequence[object] = (),
     ) -> None:
+        if likelihood is not None and data.Yvar is not None:
+            raise ValueError("Expected train_Yvar or a likelihood, got both: give one of them.")
         covar_module, made = SumOfTerms(terms), likelihood
         Y, Yvar = data.Y, data.Yvar
         if likelihood is None and Yvar is None:
@@ -338,6 +341,7 @@ class ExactGPBase(SingleTaskGP):
         """
         if self.training:
             self.eval()
+        check_columns(X, self.input_names)
         X = to_tensor(X, "X")
         if X.dim() < 2:
             raise ValueError(
@@ -538,7 +542,21 @@ class ExactGPBase(SingleTaskGP):
             for name, parameter in self.named_parameters()
             if name in state_dict and state_dict[name].dim() > parameter.dim()
         }
+        own = self.state_dict()
+        other = {n for n in own.keys() & state_dict.keys() if own[n].shape != state_dict[n].shape}
+        if (other and not samples) or (strict and own.keys() != state_dict.keys()):
+            wrong = sorted(own.keys() ^ state_dict.keys()) or sorted(other)
+            raise RuntimeError(
+                f"The state is of another model than this {type(self).__name__}, which is left as "
+                f"it was; they differ in {', '.join(wrong[:5])}."
+            )
         if samples:
+            self.train()
+            # Before samples are held, for which inputs are transformed once and for all.
+            prefix = "input_transform."
+            own = {n.removeprefix(prefix): v for n, v in state_dict.items() if prefix in n}
+            if own:
+                self.input_transform.load_state_dict(own, strict)
             self.hold_samples(samples)
         return super().load_state_dict(state_dict, strict, *args, **kwargs)
 
@@ -593,6 +611,7 @@ class ExactGPBase(SingleTaskGP):
             ValueError: If ``X`` is not finite, ``Y`` is missing in a whole row, or their numbers
                 of rows or of outputs disagree.
         """
+        check_columns(X, self.input_names)
         X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
         check_finite(X, "X")
         X = self._new_inputs(X)
@@ -612,6 +631,9 @@ class ExactGPBase(SingleTaskGP):
                 "The model was built with known noise (train_Yvar), so that of new observations is "
                 "needed, too: pass `noise`, variances of the shape of Y."
             )
+        noise = kwargs.get("noise")
+        if noise is not None and (~(noise.isfinite() & (noise >= 0)) & ~Y.isnan()).any():
+            raise ValueError("Expected noise (variances) to be finite and not negative.")
         if self.num_samples is not None:
             # All samples see the same observations, unless these have a dimension for them, as
             # fantasies have.

@@ -28,6 +28,7 @@ def save(model: ExactGPBase, path: str | Path) -> None:
 
     Raises:
         TypeError: If it is no model of this library.
+        ValueError: If its class is not in its module, or it is a subset of a model's outputs.
 
     Example:
         >>> import tempfile, torch
@@ -42,7 +43,10 @@ def save(model: ExactGPBase, path: str | Path) -> None:
     """
     if not isinstance(model, ExactGPBase):
         raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
-    missing, physics = [*model.objects], None
+    name = f"{type(model).__module__}:{type(model).__qualname__}"
+    if getattr(import_module(type(model).__module__), type(model).__qualname__, None) is None:
+        raise ValueError(f"{name} cannot be imported again: define the class in a module.")
+    missing, physics, f_p = [*model.objects], None, None
     transform: Any = getattr(model, "input_transform", None)
     if isinstance(transform, PhysicsInput):
         given: Any = transform.physics
@@ -51,12 +55,17 @@ def save(model: ExactGPBase, path: str | Path) -> None:
         physics = {name: import_path(part) for name, part in parts}
         if None in physics.values():
             missing.append("physics")
+        with torch.no_grad():
+            f_p = given(model.data()["train_X"])
+        if f_p.shape[-1] != model.num_outputs * len(physics):
+            raise ValueError("Expected a model of all outputs of its physics, got a subset.")
     content = {
         "format": _FORMAT,
-        "class": f"{type(model).__module__}:{type(model).__qualname__}",
+        "class": name,
         "options": model.options,
         "missing": missing,
         "physics": physics,
+        "physics_values": f_p,
         "data": model.data(),
         "names": [list(model.input_names), list(model.output_names)],
         "state": model.state_dict(),
@@ -78,14 +87,15 @@ def load(path: str | Path, **objects: Any) -> ExactGPBase:
             says which.
 
     Raises:
-        ValueError: If it is no such file, if objects are missing, or a physics cannot be imported.
+        ValueError: If it is no such file, if objects are missing, or a physics cannot be imported
+            or is another than the model was built with.
     """
     try:
         content = torch.load(path, weights_only=True)
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(f"{path} is not a model that gpadjust saved: {error}") from error
+        raise ValueError(f"{path} is not a model that gpadjust saved, or is damaged.") from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise ValueError(
             f"{path} is not a model that this version of gpadjust saved; expected format {_FORMAT}."
@@ -106,5 +116,14 @@ def load(path: str | Path, **objects: Any) -> ExactGPBase:
         objects["physics"] = parts[""] if "" in parts else as_physics(parts)
     model = model_class(**content["data"], **{**content["options"], **objects})
     model.load_state_dict(content["state"])
+    expected: Any = content["physics_values"]
+    if expected is not None:
+        with torch.no_grad():
+            found = model.input_transform.physics(content["data"]["train_X"])
+        if found.shape != expected.shape or not torch.allclose(found, expected, rtol=1e-6):
+            raise ValueError(
+                f"{path} was saved with another physics: its values at the training inputs differ. "
+                "Give the one that the model was built with (of several, in the same order)."
+            )
     model.input_names, model.output_names = (tuple(names) for names in content["names"])
     return model.eval()

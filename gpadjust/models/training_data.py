@@ -123,6 +123,13 @@ def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     return None if name is None or isinstance(values, Tensor) else (str(name),)
 
 
+def check_columns(values: ArrayLike, names: tuple[str, ...]) -> None:
+    """Raise a ValueError if a frame has columns of these names in another order."""
+    found = column_names(values)
+    if found is not None and found != names and sorted(found) == sorted(names):
+        raise ValueError(f"Expected the columns {names}, in this order, got {found}.")
+
+
 def default_names(letter: str, number: int) -> tuple[str, ...]:
     """``x``, or ``x1`` and so on."""
     return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))

@@ -232,13 +232,17 @@ def compare(
         unknowns = structure.unknowns + (parts - 1 if parts > 1 else 0)
         if unknowns and len(data.X) < 2 + unknowns and len(candidates) > 1:
             continue  # too few points for its unknown constants
-        model = structure.build(
-            train_X,
-            train_Y,
-            train_Yvar,
-            physics=deepcopy(part),
-            input_transform=deepcopy(input_transform),
-        )
+        try:
+            model = structure.build(
+                train_X,
+                train_Y,
+                train_Yvar,
+                physics=deepcopy(part),
+                input_transform=deepcopy(input_transform),
+            )
+        except Exception as error:
+            error.add_note(f"This is of the structure {structure.name!r}.")
+            raise
         with warnings.catch_warnings(), threads_for(len(data.X), others=True):
             warnings.simplefilter("ignore", OptimizationWarning)
             result = fit(model, num_starts=num_starts, num_screened=num_screened, seed=seed)
@@ -266,7 +270,10 @@ def _known(structures: Sequence[str | Structure]) -> list[Structure]:
             "Structure of your own."
         )
     found = [s if isinstance(s, Structure) else names[s] for s in given]
-    return list({structure.name: structure for structure in found}.values())
+    named = {structure.name: structure for structure in found}
+    if any(named[structure.name] != structure for structure in found):
+        raise ValueError("Expected structures of different names; give yours a name of its own.")
+    return list(named.values())
 
 
 def _candidates(structures: list[Structure], physics: Physics) -> list[tuple[Structure, Physics]]:

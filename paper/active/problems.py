@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gpadjust import CKA, BlackBoxPhysics, ZeroMeanGP
+from gpadjust.dynamics import AngleInput
 from gpadjust.envs import REAL_CART_POLE, CartPoleEquation, random_cart_pole_physics
 from gpadjust.envs.cart_pole import SUBSTEPS, TIME_STEP
-from gpadjust.dynamics import AngleInput
 from gpadjust.physics import ODEPhysics
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
 from paper.multifidelity.problem import pair

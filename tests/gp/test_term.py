@@ -89,13 +89,21 @@ def test_known_means(terms, uniform):
 
 def test_terms_without_kernels(uniform):
     one, X = constant(1.0), uniform(5, 2)
-    known, unknown = Term("f", None, 2, None, one), Term("f", None, 2, None, one, 2 * one)
+    known, unknown = Term("known", None, 2, None, one), Term("f", None, 2, None, one, 2 * one)
     assert known.is_known
     assert not unknown.is_known
     expected = torch.full((5, 5), 2.0, dtype=torch.float64)
     torch.testing.assert_close(SumOfTerms([known, unknown])(X).to_dense(), expected)
     with pytest.raises(ValueError, match="at least one term with a kernel or an unknown mean"):
         SumOfTerms([known]).covariance(X)
+
+
+def test_terms_that_are_not_their_own():
+    one, kernel = constant(1.0), RBFKernel()
+    with pytest.raises(ValueError, match="different names"):
+        SumOfTerms([Term("f", kernel, 2, None, one), Term("f", RBFKernel(), 2, None, one)])
+    with pytest.raises(ValueError, match="share parameters"):
+        SumOfTerms([Term("f", kernel, 2, None, one), Term("g", kernel, 2, None, one)])
 
 
 def test_inputs_without_the_physics(terms, uniform):

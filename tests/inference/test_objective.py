@@ -37,7 +37,31 @@ def with_priors(X, Y, first, second=None):
     return CKA(X, Y, physics=crude, delta_covar_module=kernel)
 
 
+def prior_of_what_is_fixed(X, Y):
+    model = with_priors(X, Y, GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5))
+    model.terms[1].kernel.raw_outputscale.requires_grad_(False)
+    return model
+
+
+def fixed_noise(X, Y):
+    model = CKA(X, Y, physics=crude)
+    model.likelihood.requires_grad_(False).noise = 1e-11
+    return model
+
+
+def learnt_basis(X, Y):
+    model = CKA(X, Y, physics=crude, rho_mean="learn")
+    term = model.terms[0]
+    scale = torch.nn.Parameter(term.basis.scale.clone())
+    del term.basis.scale
+    term.basis.register_parameter("scale", scale)
+    return model
+
+
 BUILD = {
+    "prior of what is fixed": prior_of_what_is_fixed,
+    "fixed noise": fixed_noise,
+    "learnt basis": learnt_basis,
     "ZeroMeanGP": ZeroMeanGP,
     "PhysicsMeanGP": lambda X, Y: PhysicsMeanGP(X, Y, physics=crude),
     "ScaleGP": lambda X, Y: ScaleGP(X, Y, physics=crude),

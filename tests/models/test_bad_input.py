@@ -6,6 +6,7 @@ import torch
 from botorch.models.transforms import Log
 from botorch.models.transforms.input import AppendFeatures
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
+from gpytorch.likelihoods import GaussianLikelihood
 
 from gpadjust import AR1, CKA, BlackBoxPhysics, PhysicsError, ScaleGP
 
@@ -42,6 +43,11 @@ class TestData:
         for noise in (torch.full_like(XY[1], -0.1), -0.1, [-0.1]):
             with pytest.raises(ValueError, match=r"not to be negative, got -0\.1"):
                 build(kind, *XY, noise)
+
+    @pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "RRA"])
+    def test_noise_and_a_likelihood(self, build, kind, XY):
+        with pytest.raises(ValueError, match="train_Yvar or a likelihood, got both"):
+            build(kind, *XY, 0.1, likelihood=GaussianLikelihood().double())
 
     @pytest.mark.parametrize("name", ["train_X", "train_Y", "train_Yvar"])
     def test_not_finite(self, build, kind, XY, name):
@@ -93,6 +99,11 @@ class TestPhysics:
     def _only_models_with_physics(self, kind):
         if kind == "ZeroMeanGP":
             pytest.skip("has no physics")
+
+    def test_none(self, build, kind, XY):
+        if kind != "AR1":
+            with pytest.raises(TypeError, match="Expected a physics, got None; ZeroMeanGP is"):
+                build(kind, *XY, physics=None)
 
     def test_wrong_number_of_outputs(self, build, kind, XY, crude_physics):
         pattern = "outputs as the high one has, got 2 and 2" if kind == "AR1" else "returned 2 col"

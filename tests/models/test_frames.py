@@ -28,6 +28,16 @@ def test_arrays_and_frames(data, build, kind, uniform, same):
         same(new, expected, Z)
 
 
+def test_columns_in_another_order(data, build):
+    X, Y = data()
+    frame = pd.DataFrame(X.numpy(), columns=["speed", "load"])
+    model, other = build("CKA", frame, Y), frame[["load", "speed"]]
+    with pytest.raises(ValueError, match=r"columns \('speed', 'load'\), in this order"):
+        model.predict(other)
+    with pytest.raises(ValueError, match=r"columns \('speed', 'load'\), in this order"):
+        model.condition_on_observations(other, Y)
+
+
 def test_integers_and_series(data, build, uniform):
     X, Y = data()
     whole = (10 * X).round()

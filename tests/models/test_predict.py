@@ -73,6 +73,12 @@ def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, unifor
 
     with detach_test_caches(False):
         assert torch.autograd.gradcheck(predict, learnt, atol=1e-4)
+    model.predict(Z)
+    with detach_test_caches(False):  # after a prediction whose factors had no graph
+        found = torch.autograd.grad(model.predict(Z).mean.sum(), learnt)
+        model.prediction_strategy = None
+        expected = torch.autograd.grad(model.predict(Z).mean.sum(), learnt)
+    torch.testing.assert_close(found, expected)
     # What is remembered has no graph that one backward pass would free.
     for _ in range(2):
         model.predict(Z.requires_grad_()).mean.sum().backward()

@@ -76,6 +76,38 @@ def test_what_has_no_name_is_given_again(uniform, path):
     same(model, load(path, **options), Z)
 
 
+def test_another_physics_is_refused(uniform, path):
+    X, Y, _ = problem(uniform)
+    save(CKA(X, Y, physics={"a": relu, "b": silu}), path)
+    with pytest.raises(ValueError, match=r"saved with another physics.*same order"):
+        load(path, physics={"a": silu, "b": relu})
+    subset = CKA(X, Y, physics=relu).subset_output([1])
+    with pytest.raises(ValueError, match="all outputs of its physics, got a subset"):
+        save(subset, path)
+
+
+def test_a_class_that_cannot_be_imported_is_refused(uniform, path):
+    class Local(CKA):
+        pass
+
+    X, Y, _ = problem(uniform)
+    with pytest.raises(ValueError, match=r"Local cannot be imported again"):
+        save(Local(X, Y, physics=relu), path)
+    assert not path.exists()
+
+
+def test_a_state_of_another_model_changes_nothing(uniform):
+    X, Y, Z = problem(uniform)
+    model = CKA(X, Y, physics=relu)
+    before = model.predict(Z)
+    state = {name: value + 1 for name, value in model.state_dict().items()}
+    state["covar_module.terms.0.kernel.base_kernel.raw_lengthscale"] = torch.ones(2, 1, 3)
+    for wrong in (state, ZeroMeanGP(X, Y).state_dict()):
+        with pytest.raises(RuntimeError, match=r"left as it was; they differ in .*terms\.0"):
+            model.load_state_dict(wrong)
+    torch.testing.assert_close(model.predict(Z), before)
+
+
 def test_files_that_are_no_models(path):
     with pytest.raises(FileNotFoundError):
         load(path)
