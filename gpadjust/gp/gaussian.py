@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from functools import cache
+from threading import Lock
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,7 @@ from linear_operator.operators import DiagLinearOperator
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+_limiting = Lock()  # held by the thread that limits those of other libraries
 _TRIES = 8  # each with ten times the nugget of the one before
 _SMALL = 256  # points of a covariance up to which a second thread costs more than it brings
 
@@ -227,12 +229,13 @@ def threads_for(num_points: int, others: bool = False) -> Iterator[None]:
     if num_points > _SMALL or (before == 1 and not others):
         yield
         return
-    with _controller().limit(limits=1) if others else nullcontext():
+    with ExitStack() as stack:
+        if others and _limiting.acquire(blocking=False):
+            stack.callback(_limiting.release)
+            stack.enter_context(_controller().limit(limits=1))
+        stack.callback(torch.set_num_threads, before)
         torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(before)
+        yield
 
 
 @cache

@@ -72,7 +72,8 @@ class Objective:
         self._inputs, self._basis, targets = inputs, basis, None
         if self.parameters.learns_inputs:
             self._inputs = raw[..., kept, :]
-        if basis is not None and (self.parameters.learns_inputs or _learns_basis(model)):
+        learns_basis = any(".basis." in name for name in self.parameters.names)
+        if basis is not None and (self.parameters.learns_inputs or learns_basis):
             # The basis changes with what is learnt: the distribution has it in its mean.
             self._basis, targets = None, self.targets
         closed = self.parameters.is_batched and not autograd
@@ -273,11 +274,6 @@ def _basis_of_means(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> T
     """The bases of unknown constant means, ``... x n x q``; None for models of other libraries."""
     kernel = model.covar_module
     return kernel.basis_of_means(inputs) if isinstance(kernel, SumOfTerms) else None
-
-
-def _learns_basis(model: BatchedMultiOutputGPyTorchModel) -> bool:
-    bases = [term.basis for term in model.covar_module.terms if term.basis is not None]
-    return any(p.requires_grad for basis in bases for p in basis.parameters())
 
 
 def _terms_of_means(model: BatchedMultiOutputGPyTorchModel) -> list[Term]:
