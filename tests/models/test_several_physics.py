@@ -254,6 +254,8 @@ def test_the_right_one_of_three_has_the_weight(name):
         ratios.append(error(model, Z, truth) / error(alone, Z, truth))
     print(name, "shares", [f"{s:.2f}" for s in shares], "RMSE", [f"{r:.2f}" for r in ratios])
     assert sum(share >= 0.9 for share in shares) >= 9
+    # Errors are 1e-4 to 1e-6 of the targets here, so that those of the other two rhos show.
+    assert torch.tensor(ratios).median() <= 4
 
 
 @pytest.mark.slow
