@@ -186,7 +186,7 @@ def resume(path: str | Path, env: GymEnv, task: Task, algorithm: type[Dyna] = Dy
     return agent
 
 
-def _locked(path: Path) -> AcquireReturnProxy:
+def _locked(path: Path) -> AcquireReturnProxy[Any]:
     """Acquire the lock of a file, which a process may have more than once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path.absolute().with_name(f"{path.name}.lock"), is_singleton=True)

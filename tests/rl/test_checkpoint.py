@@ -252,9 +252,7 @@ def test_other_files_are_refused(point_agent, point_task, point_env, tmp_path):
     other.write_bytes(pickle.dumps(agent.replay_buffer))
     agent.save(saved)
     for path in (cut, other, saved):
-        with pytest.raises(
-            ValueError, match=f"{path.name} is not a checkpoint of"
-        ):
+        with pytest.raises(ValueError, match=f"{path.name} is not a checkpoint of"):
             resume(path, point_env(), point_task())
     with pytest.raises(FileNotFoundError):
         resume(tmp_path / "none", point_env(), point_task())
