@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import time
 import warnings
 from collections.abc import Iterator
@@ -202,6 +203,8 @@ class Dyna(OffPolicyAlgorithm):
                 metrics |= {f"rmse/{n}": float(e) for n, e in zip(names, score.rmse, strict=True)}
             dynamics.update(*transitions)
         metrics["fit_seconds"] = self.wall_time["fit"] - before
+        # Dynamics without variances have no NLPD.
+        metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         for name, value in metrics.items():
             self.logger.record(f"model/{name}", value)
         for hook in self.model_hooks:
@@ -245,7 +248,7 @@ class Dyna(OffPolicyAlgorithm):
                 hook.on_model_episodes(returns)
         self.logger.record("model/ep_rew_mean", float(np.concatenate(all_returns).mean()))
         self.logger.record("model/left_bounds", num_left)
-        if num_steps == num_left == num_episodes:
+        if num_steps == num_left == self.replay_buffer.model_buffer.size():
             warnings.warn(
                 "All model episodes left the bounds of the states at once, so the agent has learnt "
                 "nothing of use from the model. Check the task's initial_states, or pass "
@@ -276,30 +279,30 @@ class Dyna(OffPolicyAlgorithm):
         """The task, with what environment and real episodes tell where it says nothing.
 
         Raises:
-            ValueError: If there are neither real episodes nor ``initial_states``, or nobody says
-                how long an episode is.
+            ValueError: If nobody says how long an episode is.
         """
         task = self._ready_task()
         recorded = self.recorded_episodes()
         found: dict[str, Any] = {"episode_length": self._episode_length()}
         if recorded.num_transitions:
             found |= {"initial_states": recorded.draw_starts, "state_bounds": recorded.bounds()}
-        elif task.initial_states is None:
-            raise ValueError(
-                "There are no real episodes yet that particles could start from; give the task "
-                "initial_states, or call learn() first."
-            )
         return replace(task, **{k: v for k, v in found.items() if getattr(task, k) is None})
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
         """The dynamics, as they stand, as an environment of ``num_envs`` particles.
 
         Raises:
-            ValueError: As :meth:`model_task`.
+            ValueError: If there are neither real episodes nor ``initial_states``, or nobody says
+                how long an episode is.
         """
-        recorded = self.recorded_episodes()
+        task, recorded = self.model_task(), self.recorded_episodes()
+        if task.initial_states is None:
+            raise ValueError(
+                "There are no real episodes yet that particles could start from; give the task "
+                "initial_states, or call learn() first."
+            )
         return ModelVecEnv(
-            self.model_task(),
+            task,
             num_envs,
             self.observation_space,
             self.action_space,

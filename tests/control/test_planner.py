@@ -125,7 +125,8 @@ def test_episodes_end_where_the_physics_fails(origin):
     sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
     steps = Rollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
     assert steps.made[0].tolist() == [[True, True, False, False, False], [True] * 5]
-    assert steps.states.max() <= 0.9
+    assert steps.states[steps.made].max() <= 0.9
+    assert steps.left_bounds.tolist() == [[True, False]] * 2
 
 
 def test_all_episodes_may_end_at_once_but_not_at_the_start(origin):
@@ -180,7 +181,7 @@ def test_a_plan_may_be_the_policys(known_left, origin):
 
 
 def test_the_rest_of_an_episode_counts_what_the_episode_told(known_left):
-    """Of what only the first steps can tell, the rest of an episode that repeats them tells less."""
+    """Of what only the first steps can tell, a rest that repeats them tells less."""
     state = torch.zeros(1, dtype=torch.float64)
     held = torch.full((2, 1), 1.5, dtype=torch.float64)
     options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
