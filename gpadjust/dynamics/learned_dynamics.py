@@ -11,7 +11,7 @@ from torch import Tensor
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
 from gpadjust.dynamics.incremental_fit import checked_fit_options, refit, search_rows
-from gpadjust.dynamics.learnt import Learnt
+from gpadjust.dynamics.learnt import Learnt, LearntState
 from gpadjust.dynamics.model_recipe import ModelRecipe
 from gpadjust.dynamics.next_state_physics import check_physics
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
@@ -259,26 +259,37 @@ class LearnedDynamics(Dynamics):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
 
+        An empty state, that of dynamics that have learnt nothing, lets them forget. The physics is
+        asked about at most three of the transitions, whether it is the one that they were learnt
+        with; a physics that is costly runs for these.
+
         Args:
             state: Of dynamics of the same class, options, spec and physics.
 
         Raises:
-            RuntimeError: If it is of dynamics of another class, spec, target or model options.
+            TypeError: If it is no dictionary.
+            RuntimeError: If it is of dynamics of another class, spec, target, model, options or
+                physics, or damaged.
+            PhysicsError: If the physics fails.
         """
         check_fingerprint(state, self.describe())
         if not state:
             self._learnt = self.fit_result = None
             return
-        data, known = Transitions(**state["transitions"]), state["physics"]
-        chunks = tuple(state["chunks"])
-        self._recipe.tell_physics(data, known)
-        model = self._recipe.build(data.rows(0, chunks[0]), quiet=True)
-        model.load_state_dict(state["model"])
-        fitted, start = model.eval(), chunks[0]
-        for size in chunks[1:]:
-            model = self._recipe.condition(model, data.rows(start, start + size))
-            start += size
-        self._learnt = Learnt(data, known, chunks, state["searched_at"], fitted, model)
+        num_known = len(self._recipe.parts) * len(self.spec.predicted)
+        data, known, chunks, searched_at, parameters = LearntState.checked(
+            state, self.spec, num_known
+        )
+        with self._recipe.restored_on_error():
+            self._recipe.tell_physics(data, known)
+            model = self._recipe.build(data.rows(0, chunks[0]), quiet=True)
+            model.load_state_dict(parameters)
+            self._recipe.check_same_physics(data, known)
+            fitted, start = model.eval(), chunks[0]
+            for size in chunks[1:]:
+                model = self._recipe.condition(model, data.rows(start, start + size))
+                start += size
+        self._learnt = Learnt(data, known, chunks, searched_at, fitted, model)
         self.fit_result = None
 
     def _learn(self, data: Transitions, known: Tensor | None, previous: Learnt | None) -> None:
@@ -291,20 +302,23 @@ class LearnedDynamics(Dynamics):
                 f"Expected at least 2 transitions to learn from, got {least}{of}: there is no "
                 "scale in fewer. Collect more before the first update."
             )
-        if previous is None and not self._compared:
-            self._recipe.compare_physics(data, known)
-            self._compared = True
-        self._recipe.tell_physics(data, known)
-        model = self._recipe.build(data, quiet=previous is not None)
         searched_at = n if previous is None else previous.searched_at
-        if previous is None:
-            result = fit(model, **self.fit_options)
-        else:
-            searches = n >= 2 * searched_at
-            rows = search_rows(observed) if searches else None
-            part = None if rows is None else self._recipe.build(data.some(rows), quiet=True)
-            result = refit(model, previous.model, searches, part)
-            searched_at = n if searches else searched_at
+        with self._recipe.restored_on_error():
+            if previous is None and not self._compared:
+                self._recipe.compare_physics(data, known)
+            self._recipe.tell_physics(data, known)
+            model = self._recipe.build(data, quiet=previous is not None)
+            if previous is None:
+                result = fit(model, **self.fit_options)
+            else:
+                searches = n >= 2 * searched_at
+                rows = search_rows(observed) if searches else None
+                part = None if rows is None else self._recipe.build(data.some(rows), quiet=True)
+                result = refit(model, previous.model, searches, part)
+                searched_at = n if searches else searched_at
+            if self._recipe.physics_learns:
+                known = self._recipe.physics_at(data)
+        self._compared = self._compared or previous is None
         self.fit_result = result
         self._learnt = Learnt(data, known, (n,), searched_at, model, model)
 
