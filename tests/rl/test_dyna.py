@@ -27,7 +27,6 @@ from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_phy
 from gpadjust.models import Prediction, ZeroMeanGP
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC, DynaTD3, ModelVecEnv
-from gpadjust.rl.buffer import CompactReplayBuffer
 
 
 @pytest.fixture
@@ -589,7 +588,9 @@ def test_a_wrong_reward_is_mended_and_nothing_is_lost(point_agent, point_task, l
     assert all(torch.equal(*pair) for pair in zip(before, agent.policy.parameters(), strict=True))
     agent.task = point_task(dynamics=dynamics)
     agent.learn(5, reset_num_timesteps=False)
-    assert torch.equal(dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states)
+    assert torch.equal(
+        dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
+    )
     assert agent.num_episodes == 2
     assert model_rows(agent) == 2 * 2 * 5
 
@@ -619,7 +620,9 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(
     broken.clear()
     monkeypatch.undo()
     agent.learn(5, reset_num_timesteps=False)
-    assert torch.equal(dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states)
+    assert torch.equal(
+        dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
+    )
     assert agent.num_episodes == 3
 
 
