@@ -114,12 +114,12 @@ class TestMeasuring:
 
     def test_warm_started_fits(self, laboratory, monkeypatch):
         started = []
-        from gpadjust.active import refitting
+        from gpadjust.active import warm_refit
 
         def watch(model, previous):
             started.append((len(model.train_targets), len(previous.train_targets)))
 
-        monkeypatch.setattr(refitting, "warm_start", watch)
+        monkeypatch.setattr(warm_refit, "warm_start", watch)
         collect(**laboratory(budget=7)).model  # noqa: B018
         assert started == [(5, 4), (6, 5), (7, 6)]
 
