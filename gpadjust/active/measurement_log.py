@@ -115,6 +115,7 @@ class MeasurementLog:
             with self.path.open("r+b", buffering=0) as file:
                 size = file.seek(0, os.SEEK_END)
                 if size != self._size and not (self._torn and size > self._size):
+                    self.close()
                     raise LogError(
                         f"Expected {self._size} bytes in the log {self.path}, found {size}: "
                         "something else has written to it. Make a new collection with it."
