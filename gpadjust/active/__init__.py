@@ -2,7 +2,7 @@
 
 from gpadjust.active.adjustment_information_gain import qAdjustmentInformationGain
 from gpadjust.active.collection import Collection, MeasurementWarning
-from gpadjust.active.collection_error import CollectionError
+from gpadjust.active.loop import CollectionError
 from gpadjust.active.measurement_log import LogError
 from gpadjust.active.one_call import collect
 

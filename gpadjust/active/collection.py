@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from copy import copy
 from typing import Any, Self
 
@@ -13,7 +12,6 @@ import torch
 from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
-from tqdm import tqdm
 
 from gpadjust.active.arguments import (
     as_bounds,
@@ -23,10 +21,10 @@ from gpadjust.active.arguments import (
     as_points_within,
 )
 from gpadjust.active.best_points import best_points
-from gpadjust.active.collection_error import CollectionError
 from gpadjust.active.design import among, sobol_points
-from gpadjust.active.measurement_log import LogError, MeasurementLog, Record
-from gpadjust.active.measurements import Measurements, measurement, refusal
+from gpadjust.active.loop import measure_on
+from gpadjust.active.measurement_log import MeasurementLog, Record
+from gpadjust.active.measurements import Measurements, measurement
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
 from gpadjust.models.sampled_functions import check_number, seeded
 
@@ -38,19 +36,19 @@ class MeasurementWarning(UserWarning):
 class Collection(Measurements):
     """Chooses where to measure, for a laboratory that measures when it can.
 
-    :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points;
-    :meth:`run` does both where a program can measure. The
-    first points are a scrambled Sobol design; later ones maximise the acquisition function of a
-    model of all data so far, which is fitted from the last one's hyper-parameters. Points that were
-    asked for and not yet told are pending: acquisition functions that take ``X_pending`` count on
-    them.
+    :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points; where
+    a program can measure, :meth:`run` does both. The first points are a scrambled Sobol design;
+    later ones maximise the acquisition function of a model of all data so far, which is fitted from
+    the last one's hyper-parameters. Points that were asked for and not yet told are pending:
+    acquisition functions that take ``X_pending`` count on them.
 
     With a log, each measurement is on the disk before :meth:`tell` does anything else, as a line of
     JSON; so are the points asked for, before :meth:`ask` returns them. A new collection with the
     same log goes on where the last one stopped, asks for the same points (with the same seed), and
-    has the same points pending. One collection at a time holds a log: until it is closed (leave
-    :meth:`close` to ``with Collection(...) as collection:``), out of scope, or its process ends. A
-    log is JSON, of which nothing is executed or unpickled.
+    has the same points pending. One collection at a time holds a log, until :meth:`close` (or the
+    end of ``with Collection(...) as collection:``), until it is out of scope, or until its process
+    ends. Nothing in a log is executed or unpickled: one from a stranger can be wrong, but does no
+    harm.
 
     Args:
         model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64, with
@@ -295,6 +293,7 @@ class Collection(Measurements):
         Raises:
             TypeError: If the oracle is not callable.
             ValueError: If a number is out of range.
+            LogError: If the log cannot be written.
             CollectionError: If the oracle fails too often, or what it returns can be no measured
                 values or cannot be logged: it is in the error's ``result`` then, and the points
                 are still pending.
@@ -302,67 +301,13 @@ class Collection(Measurements):
         Warns:
             MeasurementWarning: If a measurement fails.
         """
-        if not callable(oracle):
-            raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
-        check_number(budget, "budget")
-        check_number(max_failures, "max_failures")
-        done, failures = min(budget, self.num_measured), 0
-        with tqdm(total=budget, initial=done, unit="measurement", disable=not progress) as bar:
-            while (left := budget - self.num_measured) > 0:
-                q = min(self.batch_size, left)
-                # After a resumption the points that it was killed at come first.
-                X = self.pending[:q] if len(self.pending) else self.ask(q)
-                known = len(self.X)
-                error = self._measure(oracle, X)
-                bar.update(len(X))
-                bar.set_postfix(failed=len(self.failed_X))
-                failures = 0 if len(self.X) > known else failures + 1
-                if failures >= max_failures:
-                    raise CollectionError(
-                        f"The oracle failed {failures} times in a row, the last time at "
-                        f"{X.tolist()}: {error or 'NaN or infinity'}. {len(self.X)} measurements "
-                        f"are in the error's `.collection`; {self._place()}.",
-                        self,
-                        X,
-                    ) from error
+        measure_on(self, oracle, budget, progress, max_failures)
         return self
 
     def close(self) -> None:
         """Let another collection have the log; :meth:`tell` takes it again, if none has written."""
         if self.log is not None:
             self.log.close()
-
-    def _measure(self, oracle: Callable[[Tensor], Any], X: Tensor) -> Exception | None:
-        """Measure points and tell them; return what went wrong."""
-        try:
-            result = oracle(X.clone())
-        except Exception as error:
-            self.fail(X, error)
-            return error
-        try:
-            Y = as_outcomes(result, len(X), self.num_outputs)
-        except (TypeError, ValueError) as error:
-            with suppress(LogError):
-                self._enter([refusal(X, result, error)])
-            raise CollectionError(
-                f"The oracle returned no measured values of the points {X.tolist()}: {error} It is "
-                f"in this error's `.result`; {self._place()}. The points are still pending: tell() "
-                "`.collection` their values, mend the oracle, and run it again. To say that a "
-                "measurement failed, it may raise an exception or return NaN.",
-                self,
-                X,
-                result,
-            ) from error
-        try:
-            self.tell(X, Y)
-        except LogError as error:
-            message = f"The values measured are in this error's `.result`. {error}"
-            raise CollectionError(message, self, X, result) from error
-        return None
-
-    def _place(self) -> str:
-        """Where the log is."""
-        return "no log was kept" if self.log is None else f"the log is at {self.log.path}"
 
     def _design(self, q: int) -> Tensor | None:
         """The next points that need no model, ``q x d``, or None if a model is to choose."""

@@ -44,10 +44,14 @@ def collect(
         ``ask``, ``tell`` and ``run`` to go on with.
 
     Raises:
-        TypeError: As :class:`Collection` and :meth:`Collection.run`; so the others.
-        ValueError: If an argument is out of range, or the log is of another problem.
-        LogError: If the log cannot be held, read or written.
-        CollectionError: If the oracle fails too often, or returns no measured values.
+        TypeError: As :class:`Collection` and :meth:`Collection.run`.
+        ValueError: As both.
+        LogError: As both.
+        CollectionError: As :meth:`Collection.run`; the points in it can be told to its
+            ``collection``.
+
+    Warns:
+        MeasurementWarning: If a measurement fails.
 
     Example:
         >>> import torch

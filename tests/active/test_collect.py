@@ -296,11 +296,16 @@ class TestResultsThatCannotBeTaken:
         (record,) = [r for r in map(json.loads, path.read_text().splitlines()) if "refused" in r]
         assert record["refused"] == logged
         assert record["of"] == error.X.tolist()
-        # It goes on, by hand or by another run, as if nothing had been.
-        whole = collect(**laboratory())
-        error.collection.tell(error.X, truth(error.X))
-        assert same(error.collection.run(truth, 4), collect(**laboratory(budget=4)))
-        error.collection.close()
+
+    def test_it_goes_on_by_hand_or_anew(self, laboratory, tmp_path):
+        path = tmp_path / "log.jsonl"
+        with pytest.raises(CollectionError) as caught:
+            collect(**laboratory(oracle=Oracle(n3=lambda Y: None), log=path))
+        error, whole = caught.value, collect(**laboratory())
+        with error.collection as collection:
+            collection.tell(error.X, truth(error.X))
+            collection.run(truth, 5)
+        assert collection.num_measured == 5
         assert same(collect(**laboratory(log=path)), whole)
 
     def test_a_full_disk(self, laboratory, tmp_path, monkeypatch):
