@@ -82,6 +82,20 @@ class Dynamics(ABC):
         data = Transitions.checked(self.spec, states, actions, next_states)
         return score_transitions(self.spec, self.predict(data.states, data.actions), data)
 
+    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+        """Find what is wrong with the physics before there are transitions, if it can be told.
+
+        Args:
+            states: ``N x state_dim``.
+            actions: ``N x action_dim``.
+
+        Raises:
+            ValueError: If the physics returns another number of states.
+            PhysicsError: If the physics fails.
+        """
+        if self.is_fitted:
+            self.predict(states, actions)
+
     @abstractmethod
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text; of objects, the class."""

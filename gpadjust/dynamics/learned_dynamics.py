@@ -165,6 +165,10 @@ class LearnedDynamics(Dynamics):
             data, known = self._learnt.with_rows(data, known)
         self._learn(data, known, self._learnt)
 
+    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+        """Call the physics once, to find what is wrong with it before there are transitions."""
+        self._recipe.physics_at(Transitions(states, actions, states))
+
     def condition(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Condition on further transitions with the hyper-parameters as they are.
 

@@ -20,8 +20,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from gpadjust.control import Task
+from gpadjust.rl.agents import DynaSAC
 from gpadjust.rl.buffer import CompactReplayBuffer
-from gpadjust.rl.dyna import Dyna, DynaSAC
+from gpadjust.rl.dyna import Dyna
 from gpadjust.rl.random_state import RandomState
 
 _FORMAT = "gpadjust episode checkpoint, version 2"

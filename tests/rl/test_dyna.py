@@ -28,6 +28,8 @@ from gpadjust.models import Prediction, ZeroMeanGP
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC, DynaTD3, ModelVecEnv
 
+POINT_SPEC = StateSpec(["x"], ["v"])
+
 
 @pytest.fixture
 def normalised(point_env):
@@ -264,7 +266,7 @@ def test_cart_pole(cart_pole):
     ).learn(50)
     assert dynamics.num_transitions == 50
     assert 2 <= model_rows(agent) <= 50
-    assert all(seconds > 0 for seconds in agent.wall_time.values())
+    assert all(agent.wall_time[part] > 0 for part in ("fit", "rollout", "update"))
 
 
 def pendulum_step(X):
@@ -610,12 +612,12 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(
     dynamics = LearnedDynamics(point_dynamics.spec, physics)
     agent = point_agent(dynamics=dynamics)
     agent.learn(5)
-    if fails == "fit":
-        broken.append(True)
-    else:
-        monkeypatch.setattr(ModelVecEnv, "reset", lambda env: broken.append(True) or env._states)
     with pytest.raises(PhysicsError, match="licence"):
-        agent.learn(5, reset_num_timesteps=False)
+        if fails == "fit":
+            agent.learn(5, BreaksAt(8, broken), reset_num_timesteps=False)
+        else:
+            monkeypatch.setattr(ModelVecEnv, "reset", lambda env: broken.append(1) or env._states)
+            agent.learn(5, reset_num_timesteps=False)
     assert dynamics.num_transitions == (5 if fails == "fit" else 10)
     broken.clear()
     monkeypatch.undo()
@@ -624,6 +626,18 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(
         dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
     )
     assert agent.num_episodes == 3
+
+
+class BreaksAt(BaseCallback):
+    """At a step, what was empty is not any more."""
+
+    def __init__(self, step, broken):
+        super().__init__()
+        self.step, self.broken = step, broken
+
+    def _on_step(self):
+        self.broken += [True] * (self.num_timesteps == self.step)
+        return True
 
 
 class Jams(gymnasium.Wrapper):
@@ -685,6 +699,10 @@ class Counts(gymnasium.Wrapper):
         ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
         ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(1,\)"),
         ({"terminated": lambda s: s}, r"terminated must return one value per row"),
+        (
+            {"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)},
+            "next values of the 1 states .* got 2 columns",
+        ),
     ],
 )
 def test_wrong_functions_are_found_before_the_first_real_step(
@@ -692,7 +710,7 @@ def test_wrong_functions_are_found_before_the_first_real_step(
 ):
     Counts.num_steps = 0
     agent = point_agent(Counts(point_env()), **parts)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, PhysicsError), match=message):
         agent.learn(5)
     assert Counts.num_steps == 0
 
