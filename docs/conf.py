@@ -31,15 +31,15 @@ default_role = "py:obj"  # single backticks link where they can, and are code el
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", r"(?!gpadjust\.).*")]  # links to other libraries need the network
 nitpick_ignore = [  # what signatures name, but users do not call by name
-    ("py:class", "gpadjust.envs.arm_view.ArmView"),
-    ("py:class", "gpadjust.envs.cart_pole_view.CartPoleView"),
+    ("py:class", "gpadjust.envs.arm.view.ArmView"),
+    ("py:class", "gpadjust.envs.cart_pole.view.CartPoleView"),
     ("py:class", "gpadjust.envs.viewed_env.ViewedEnv"),
     ("py:class", "gpadjust.inference.fitting.FitOptions"),
     ("py:class", "gpadjust.models.cholesky_strategy.CholeskyStrategy"),
     ("py:class", "gpadjust.models.sampled_functions.TermFeatures"),
-    ("py:class", "gpadjust.rl.mixed_replay_buffer.CompactReplayBuffer"),
+    ("py:class", "gpadjust.rl.buffer.CompactReplayBuffer"),
     ("py:class", "gpadjust.rl.model_vec_env.ModelStep"),
-    ("py:class", "gpadjust.rl.recorded_trials.RecordedTrials"),
+    ("py:class", "gpadjust.rl.recorded_episodes.RecordedEpisodes"),
 ]
 
 autodoc_default_options = {"members": True, "show-inheritance": True}
@@ -55,7 +55,7 @@ html_title = f"gpadjust {release}"
 html_show_sourcelink = False
 
 PAGES = {page.stem for page in Path(__file__).parent.glob("*.rst")} - {"index"}
-ROOMS = [import_module(f"gpadjust.{name}") for name in (*PAGES, "validation.plots")]
+ROOMS = [import_module(f"gpadjust.{name}") for name in (*sorted(PAGES), "validation.plots")]
 ENTRIES = {id(getattr(room, n)): f"{room.__name__}.{n}" for room in ROOMS for n in room.__all__}
 SOURCES = [ModuleAnalyzer.for_module(n) for n in list(sys.modules) if n.startswith("gpadjust.")]
 CONSTANTS = {  # the docstrings that follow assignments
