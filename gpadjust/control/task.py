@@ -14,8 +14,13 @@ from gpadjust.control.step_or_nan import step_or_nan
 from gpadjust.dynamics import Dynamics
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Rewards ``N`` of states, actions and next states, ``N`` rows each."""
+
 Termination = Callable[[Tensor], Tensor]
+"""Whether states ``N x state_dim`` end an episode, ``N`` booleans."""
+
 InitialStates = Callable[[int], Tensor]
+"""Draws ``n`` states at which episodes start, ``n x state_dim``."""
 
 
 class Step(NamedTuple):
