@@ -7,11 +7,11 @@ import opensim
 import pytest
 
 from gpadjust.envs import REAL_ARM, MuscleArmEnv
-from gpadjust.envs.opensim_model import build_muscle_arm, controls
+from gpadjust.envs.arm.opensim_model import build_muscle_arm, controls
 
 START = np.radians([35.0, 65.0, 0.0, 0.0])
 ACCURACY = 1e-5
-STEPS = 15  # of a trial
+STEPS = 15  # of an episode
 ROUNDS = 20
 EXCITATIONS = {
     "held, moderate": np.tile([0.2, 0.1, 0.3, 0.1], (ROUNDS, STEPS, 1)),
@@ -21,8 +21,8 @@ EXCITATIONS = {
 
 
 @pytest.fixture
-def bare_trial():
-    """A trial by OpenSim alone: no observations, rewards or checks."""
+def bare_episode():
+    """An episode by OpenSim alone: no observations, rewards or checks."""
     model = build_muscle_arm(REAL_ARM, strength=0.5)
     start = model.initSystem()
     for joint, angle in zip(("shoulder", "elbow"), START[:2], strict=True):
@@ -46,7 +46,7 @@ def bare_trial():
 
 
 @pytest.fixture
-def env_trial():
+def env_episode():
     env = MuscleArmEnv(accuracy=ACCURACY)
 
     def run(excitations):
@@ -57,22 +57,22 @@ def env_trial():
     return run
 
 
-def milliseconds(trials, excitations):
+def milliseconds(episodes, excitations):
     """Median times of a step by each, by turns; of the processor, which other processes share."""
-    times = [[] for _ in trials]
+    times = [[] for _ in episodes]
     for rows in excitations:
-        for trial, record in zip(trials, times, strict=True):
+        for episode, record in zip(episodes, times, strict=True):
             start = time.process_time()
-            trial(rows)
+            episode(rows)
             record.append((time.process_time() - start) / len(rows))
     return 1e3 * np.median(times, axis=1)
 
 
 @pytest.mark.parametrize("name", EXCITATIONS)
-def test_muscle_arm_beside_opensim(benchmark, env_trial, bare_trial, name):
+def test_muscle_arm_beside_opensim(benchmark, env_episode, bare_episode, name):
     benchmark.group = "Muscle arm, step of 0.2 s"
-    trials, excitations = (env_trial, bare_trial), EXCITATIONS[name]
-    milliseconds(trials, excitations[:1])
-    ours, bare = benchmark.pedantic(milliseconds, args=(trials, excitations), rounds=1)
+    episodes, excitations = (env_episode, bare_episode), EXCITATIONS[name]
+    milliseconds(episodes, excitations[:1])
+    ours, bare = benchmark.pedantic(milliseconds, args=(episodes, excitations), rounds=1)
     benchmark.extra_info |= {"ms a step": round(ours, 2), "beside OpenSim": round(ours / bare, 3)}
     print(f"{name}: {ours:.2f} ms a step, {ours / bare:.3f} times bare OpenSim ({bare:.2f} ms)")
