@@ -1,5 +1,6 @@
 """What the documents speak of exists: files, extras, commands, versions, pages of the reference."""
 
+import doctest
 import re
 import shlex
 import tomllib
@@ -101,3 +102,17 @@ def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
     assert set(tree[2:]) == rooms | {page.stem for page in (ROOT / "docs").glob("*.md")}
     listed = re.search(r"autosummary::\n\n(.*?)\n\n", index, flags=re.DOTALL)[1].split()
     assert sorted(listed) == sorted(gpadjust.__all__)
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.rst")), ids=lambda page: page.stem)
+def test_the_examples_of_the_reference_run(page):
+    assert not doctest.testfile(str(page), module_relative=False).failed
+
+
+def test_the_examples_of_the_architecture_run():
+    blocks = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "architecture.md").read_text(), flags=re.DOTALL
+    )
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(block, {})
