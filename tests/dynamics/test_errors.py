@@ -246,8 +246,7 @@ def test_an_error_while_learning_changes_nothing(learnt, monkeypatch, where):
         if where == "model":
             patch.setattr(CKA, "__init__", fail)
         if where == "fit":
-            patch.setattr("gpadjust.dynamics.learned_dynamics.fit", fail)
-            patch.setattr("gpadjust.dynamics.learned_dynamics.refit", fail)
+            patch.setattr("gpadjust.dynamics.incremental_fit.fit", fail)
         if where != "physics":
             patch.setattr(CKA, "condition_on_observations", fail)
         for call in (dynamics.fit, dynamics.update, dynamics.condition):

@@ -257,9 +257,10 @@ def test_a_failed_step_is_no_data_and_still_an_observation(arm, monkeypatch):
     def fail(*arguments):
         raise RuntimeError("no convergence")
 
-    with monkeypatch.context() as patch, pytest.warns(UserWarning, match="no convergence"):
+    with monkeypatch.context() as patch:
         patch.setattr(arm.simulation, "step", fail)
-        observation, _, terminated, truncated, info = arm.step(GENTLE)
+        with pytest.warns(UserWarning, match="no convergence"):
+            observation, _, terminated, truncated, info = arm.step(GENTLE)
     assert info["step_failed"] is True
     assert truncated
     assert not terminated
