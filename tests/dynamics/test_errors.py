@@ -204,6 +204,21 @@ def test_a_physics_may_differ_by_rounding(learnt):
     assert again.num_transitions == 12
 
 
+def test_a_whole_turn_is_no_difference():
+    spec = StateSpec(["theta"], ["rate"], angles=["theta"])
+    states = torch.linspace(0, 6, 9, dtype=torch.float64).unsqueeze(-1)
+    turn = torch.full_like(states, torch.pi)
+
+    def physics(sign):
+        return lambda X: X[:, :1] + sign * (torch.pi - 1e-12)
+
+    seen = PhysicsDynamics(spec, physics(1))
+    seen.update(states, turn, states + turn)
+    PhysicsDynamics(spec, physics(-1)).load_state_dict(seen.state_dict())
+    with pytest.raises(RuntimeError, match="another physics"):
+        PhysicsDynamics(spec, physics(0.9)).load_state_dict(seen.state_dict())
+
+
 def test_a_loaded_state_is_a_copy(learnt):
     state = learnt().state_dict()
     dynamics = LearnedDynamics(SPEC, push)
