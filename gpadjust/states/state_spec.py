@@ -288,6 +288,6 @@ def check_columns(tensor: Tensor, columns: int, name: str) -> None:
         )
     if tensor.dim() < 1 or tensor.shape[-1] != columns:
         raise ValueError(
-            f"Expected {name} of shape ... x {columns}, as the spec says, got "
+            f"Expected {name} of shape ... x {columns}, got "
             f"{tuple(tensor.shape)}."
         )
