@@ -632,6 +632,32 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(
     assert agent.num_episodes == 3
 
 
+class Falls(gymnasium.Wrapper):
+    """A robot that has to be set up again after its eighth step."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 8:
+            raise OSError("the robot fell")
+        return super().step(action)
+
+
+def test_an_environment_that_fails_within_an_episode(point_agent, point_env, learnt_dynamics):
+    dynamics = learnt_dynamics()
+    agent = point_agent(Falls(point_env()), dynamics=dynamics)
+    with pytest.raises(OSError, match="fell"):
+        agent.learn(10)
+    agent.learn(5, reset_num_timesteps=False)
+    recorded = agent.recorded_episodes()
+    assert dynamics.num_transitions == recorded.num_transitions == 5 + 2 + 5
+    follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
+    assert follows.logical_not().nonzero().flatten().tolist() == [4, 6]
+    starts = recorded.draw_starts(100).unique().tolist()
+    assert starts == recorded.states[[0, 5, 7], 0].sort().values.tolist()
+
+
 class BreaksAt(BaseCallback):
     """At a step, what was empty is not any more."""
 
