@@ -90,7 +90,7 @@ def main() -> int:
     print("| fault | found by | s |\n|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
-        unneeded = shutil.ignore_patterns(".*", "__pycache__", "_build", "dist", "build")
+        unneeded = shutil.ignore_patterns(".git", ".*_cache", "__pycache__", "_build")
         shutil.copytree(ROOT, copy, ignore=unneeded)
         for fault in chosen:
             start = time.perf_counter()
