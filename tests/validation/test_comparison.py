@@ -81,6 +81,13 @@ def test_ranking(scaled, criterion, field):
     assert comparison.criterion == criterion
     assert comparison.chosen == comparison.table[0].structure == "CKA"
     assert comparison.best is comparison.models["CKA"]
+    assert comparison.advice[0] == "Best: CKA."
+    assert not says(comparison, "no better")
+    lines = str(comparison).splitlines()
+    assert lines[0].split()[:2] == ["structure", "evidence"]
+    ranked = [row.structure for row in comparison.table]
+    assert [line.split("  ")[0] for line in lines[1:4]] == ranked
+    assert len({len(line) for line in lines[:4]}) == 1
 
 
 def test_evidence_is_in_the_users_units(scaled):
@@ -102,12 +109,6 @@ def test_all_structures_by_default(scaled):
 
 
 class TestAdvice:
-    @pytest.mark.parametrize("structures", [THREE, ["CKA"]])
-    def test_none_where_cka_is_clearly_better_or_alone(self, scaled, structures):
-        comparison = compare(*scaled, crude, structures=structures, **QUICK)
-        assert comparison.advice[0] == "Best: CKA."
-        assert not says(comparison, "no better")
-
     def test_a_physics_of_zero_does_not_help(self, X, noise):
         comparison = compare(X, X.exp().sin() + noise, lambda X: 0 * X, **QUICK)
         assert says(comparison, "does not help")
@@ -222,38 +223,15 @@ def test_known_noise(scaled):
     assert row(comparison, "CKA").num_parameters == 4
 
 
-def test_printing(scaled):
-    comparison = compare(*scaled, crude, structures=THREE, **QUICK)
-    lines = str(comparison).splitlines()
-    assert lines[0].split()[:2] == ["structure", "evidence"]
-    assert [line.split("  ")[0] for line in lines[1:4]] == [
-        f"{row.structure:12}".strip() for row in comparison.table
-    ]
-    assert lines[5] == "Best: CKA."
-    assert len({len(line) for line in lines[:4]}) == 1
-
-
-class TestBadInput:
-    @pytest.mark.parametrize("structures", [[], ["CKA", "kriging"]])
-    def test_structures(self, scaled, structures):
-        with pytest.raises(ValueError, match="structures"):
-            compare(*scaled, crude, structures=structures)
-
-    def test_criterion(self, scaled):
-        with pytest.raises(ValueError, match="leave-one-out"):
-            compare(*scaled, crude, criterion="BIC")
-
-    def test_batches(self, scaled):
-        X, Y = (t.expand(2, -1, -1) for t in scaled)
-        with pytest.raises(ValueError, match="one data set"):
-            compare(X, Y, crude)
-
-    def test_data(self, scaled):
-        X, Y = scaled
-        with pytest.raises(ValueError, match="train_Y"):
-            compare(X, Y[:5], crude)
-
-    @pytest.mark.parametrize("option", ["num_starts", "num_screened", "seed"])
-    def test_options_of_the_fits(self, scaled, option):
-        with pytest.raises(ValueError, match=f"Expected {option}"):
-            compare(*scaled, crude, structures=["CKA"], **{option: -1})
+def test_bad_input(scaled):
+    X, Y = scaled
+    for data, options, says in (
+        ((X, Y), {"structures": []}, "structures"),
+        ((X, Y), {"structures": ["CKA", "kriging"]}, "structures"),
+        ((X, Y), {"criterion": "BIC"}, "leave-one-out"),
+        ((X.expand(2, -1, -1), Y.expand(2, -1, -1)), {}, "one data set"),
+        ((X, Y[:5]), {}, "train_Y"),
+        *(((X, Y), {n: -1}, f"Expected {n}") for n in ("num_starts", "num_screened", "seed")),
+    ):
+        with pytest.raises(ValueError, match=says):
+            compare(*data, crude, **{"structures": ["CKA"], **options})
