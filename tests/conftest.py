@@ -178,6 +178,27 @@ def build():
 
 
 @pytest.fixture
+def gradient_is_right():
+    """Asserts the gradient of a function of few numbers, by central differences."""
+
+    def gradient_is_right(function, X):
+        leaf = X.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(function(leaf).sum(), leaf)
+        steps = 1e-5 * torch.eye(X.numel(), dtype=torch.float64)
+        with torch.no_grad():
+            changes = [
+                (function(X + h) - function(X - h)).item() / 2e-5
+                for h in (step.reshape(X.shape) for step in steps)
+            ]
+        expected = torch.tensor(changes, dtype=torch.float64).reshape(X.shape)
+        size = expected.abs().max().item()
+        assert size > 0
+        torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-4 * size)
+
+    return gradient_is_right
+
+
+@pytest.fixture
 def crude_physics():
     return crude
 

@@ -166,36 +166,6 @@ def test_sampled_functions_have_the_posteriors_moments(rra, uniform):
         assert (error.abs() < 0.05 * sd[:, j].outer(sd[:, j])).all()
 
 
-def test_functions_are_deterministic_and_take_any_batch(rra, uniform):
-    functions = rra.sample_functions(3)
-    Z = uniform(4, 5, 6, 2, high=2.0)
-    values = functions(Z)
-    assert values.shape == (3, 4, 5, 6, rra.num_outputs)
-    assert torch.equal(values, functions(Z))
-    torch.testing.assert_close(functions(Z[1, 2]), values[:, 1, 2])
-    torch.testing.assert_close(functions(Z[:, :, 2:3]), values[:, :, :, 2:3])
-
-
-def test_functions_outlive_a_change_of_the_model(rra, uniform, shuffle):
-    functions = rra.sample_functions(3)
-    Z = uniform(6, 2)
-    before = functions(Z)
-    shuffle(rra.train(), seed=5)
-    assert torch.equal(functions(Z), before)
-
-
-def test_functions_have_gradients_in_x(rra, uniform):
-    functions = rra.sample_functions(3)
-    Z = uniform(6, 2).requires_grad_()
-    assert torch.autograd.gradcheck(lambda Z: functions(Z), (Z,), atol=1e-4)
-
-
-def test_functions_of_a_batch_of_data_sets(data, build, uniform):
-    model = build("RRA", *data(batch_shape=(3,), num_outputs=2))
-    values = model.sample_functions(4)(uniform(3, 6, 2))
-    assert values.shape == (4, 3, 6, 2)
-
-
 def test_evidence_is_that_of_the_weights_marginalised(data, build, shuffle):
     X, Y = data()
     model = shuffle(build("RRA", X, Y, num_features=6))
