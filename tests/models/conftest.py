@@ -121,20 +121,6 @@ def rbf():
 
 
 @pytest.fixture
-def close():
-    """Asserts equality to 1e-8 of the largest number expected."""
-
-    def close(actual, expected, tolerance=1e-8):
-        assert actual.shape == expected.shape
-        size = expected.abs().max().item() if expected.numel() else 0.0
-        torch.testing.assert_close(
-            actual.detach(), expected.detach(), rtol=tolerance, atol=tolerance * size
-        )
-
-    return close
-
-
-@pytest.fixture
 def same(close):
     """Asserts that two models say the same at `Z`: joint, one by one, and of each term."""
 
