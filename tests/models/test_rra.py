@@ -16,7 +16,7 @@ def _clear_pyro():
     pyro.set_rng_seed(0)
 
 
-@pytest.fixture(params=["plain", "centred", "transformed", "known-noise"])
+@pytest.fixture(params=["plain", "centred", "transformed", "known-noise", "learnt mean"])
 def rra(request, data, build, num_outputs, shuffle):
     """An RRA with few features."""
     X, Y = data(num_outputs=num_outputs)
@@ -28,8 +28,21 @@ def rra(request, data, build, num_outputs, shuffle):
             "input_transform": Normalize(2),
             "outcome_transform": Standardize(num_outputs),
         }
+    if request.param == "learnt mean":
+        options["rho_mean"] = "learn"  # one weight more
     Yvar = torch.full_like(Y, 0.02) if request.param == "known-noise" else None
-    return shuffle(build("RRA", X, Y, Yvar, **options))
+    model = shuffle(build("RRA", X, Y, Yvar, **options))
+    model.terms[0].mean_variance *= 4
+    return model
+
+
+def design_of(model, Z):
+    """Functions are affine in the weights: that of none, and a design ``m x q x p``."""
+    p, m = model.weights().mean.shape[-1], model.num_outputs
+    unit = torch.eye(p, dtype=torch.float64)
+    unit = unit if m == 1 else unit.unsqueeze(1).expand(p, m, p)
+    zero = model.functions(torch.zeros_like(unit[:1]))(Z)
+    return zero, (model.functions(unit)(Z) - zero).permute(2, 1, 0)
 
 
 def test_weights_are_pyros_laplace_approximation(rra):
@@ -61,7 +74,8 @@ def test_weights_are_pyros_laplace_approximation(rra):
     covariance = laplace.get_posterior().covariance_matrix.detach()
     scale = weights.variance.sqrt().mean().item()
     torch.testing.assert_close(weights.mean.detach(), mean, rtol=1e-3, atol=1e-3 * scale)
-    expected = torch.block_diag(*weights.covariance_matrix.detach().reshape(m, 8, 8))
+    p = weights.mean.shape[-1]
+    expected = torch.block_diag(*weights.covariance_matrix.detach().reshape(m, p, p))
     torch.testing.assert_close(covariance, expected, rtol=1e-6, atol=1e-8 * scale**2)
 
 
@@ -92,8 +106,8 @@ def test_the_pyro_model_is_the_prior_in_the_users_units(rra, close, uniform):
     Z = uniform(5, 2, high=2.0, seed=3)
     sites = pyro.poutine.trace(rra.pyro_model).get_trace(Z).nodes
     weights, prior_sd = sites["weights"]["value"], sites["weights"]["fn"].base_dist.scale
-    m = rra.num_outputs
-    assert weights.shape == (8,) if m == 1 else (m, 8)
+    m, p = rra.num_outputs, weights.shape[-1]
+    assert weights.shape == rra.weights().mean.shape
     assert (sites["weights"]["fn"].base_dist.loc == 0).all()
     values = rra.functions(weights.unsqueeze(0))(Z)[0].mT.reshape(sites["Y"]["value"].shape)
     close(sites["Y"]["fn"].base_dist.loc.detach(), values.detach())
@@ -102,11 +116,8 @@ def test_the_pyro_model_is_the_prior_in_the_users_units(rra, close, uniform):
     noise_sd = sites["Y"]["fn"].base_dist.scale.reshape(m, -1)
     close(noise_sd.detach(), noise.expand_as(noise_sd).detach())
     # Its marginal variance is that of the Gaussian process.
-    unit = torch.eye(8, dtype=torch.float64)
-    unit = unit if m == 1 else unit.unsqueeze(1).expand(8, m, 8)
-    zero = rra.functions(torch.zeros_like(unit[:1]))(Z)
-    design = (rra.functions(unit)(Z) - zero).permute(2, 1, 0)
-    variance = (design * prior_sd.reshape(m, 1, 8)).square().sum(-1)
+    _, design = design_of(rra, Z)
+    variance = (design * prior_sd.reshape(m, 1, p)).square().sum(-1)
     inputs = rra.transform_inputs(Z).expand(*rra._aug_batch_shape, 5, -1)
     prior = rra.covar_module(inputs).to_dense().diagonal(dim1=-1, dim2=-2).reshape(m, 5)
     close(variance.detach(), (prior * scale**2).detach())
@@ -135,44 +146,20 @@ def test_functions_of_the_weights_have_the_posterior(rra, close, uniform):
     posterior = rra.posterior(Z)
     mean = rra.functions(weights.mean.unsqueeze(0))(Z)[0]
     close(mean.detach(), posterior.mean.detach())
-    # The functions are affine in the weights: the images of a basis make the design.
-    m = rra.num_outputs
-    unit = torch.eye(8, dtype=torch.float64)
-    unit = unit if m == 1 else unit.unsqueeze(1).expand(8, m, 8)
-    zero = rra.functions(torch.zeros_like(unit[:1]))(Z)
-    design = (rra.functions(unit)(Z) - zero).permute(2, 1, 0)
-    covariance = weights.covariance_matrix.reshape(m, 8, 8)
+    zero, design = design_of(rra, Z)
+    m, _, p = design.shape
+    covariance = weights.covariance_matrix.reshape(m, p, p)
     for j in range(m):
         expected = design[j] @ covariance[j] @ design[j].mT
         close(posterior.variance[:, j].detach(), expected.diagonal().detach())
     close(zero[0].detach(), rra.physics(Z))
 
 
-def test_sampled_functions_have_the_posteriors_moments(rra, uniform):
-    Z = uniform(6, 2, high=2.0, seed=3)
-    values = rra.sample_functions(20_000)(Z).detach()
-    posterior = rra.posterior(Z)
-    sd = posterior.variance.sqrt().detach()
-    assert ((values.mean(0) - posterior.mean).abs() < 5 * sd / 20_000**0.5).all()
-    for j in range(rra.num_outputs):
-        covariance = posterior.distribution.covariance_matrix.detach()
-        if rra.num_outputs > 1:
-            covariance = (
-                covariance[j::2, j::2]
-                if posterior._interleaved
-                else covariance[6 * j : 6 * (j + 1), 6 * j : 6 * (j + 1)]
-            )
-        error = values[..., j].mT.cov() - covariance
-        assert (error.abs() < 0.05 * sd[:, j].outer(sd[:, j])).all()
-
-
 def test_evidence_is_that_of_the_weights_marginalised(data, build, shuffle):
     X, Y = data()
     model = shuffle(build("RRA", X, Y, num_features=6))
     scale = model.outcome_transform.stdvs.item()
-    unit = torch.eye(12, dtype=torch.float64)
-    zero = model.functions(torch.zeros_like(unit[:1]))(X)
-    design = (model.functions(unit)(X) - zero).squeeze(-1).mT
+    zero, (design,) = design_of(model, X)
     s_rho, s_delta = (term.kernel.outputscale for term in model.terms)
     prior = torch.cat([s_rho.expand(6), (s_delta * scale**2).expand(6)])
     noise = model.likelihood.noise * scale**2
