@@ -64,12 +64,6 @@ class TestValues:
         X = torch.randn(*batch, n, 2, dtype=torch.float64)
         assert torch.allclose(BlackBoxPhysics(waves, batched=batched)(X), torch_waves(X))
 
-    def test_scalar_per_row(self, points):
-        X = points(3, 2)
-        expected = X.sum(-1, keepdim=True)
-        assert torch.allclose(BlackBoxPhysics(lambda x: x.sum(), batched=False)(X), expected)
-        assert torch.allclose(BlackBoxPhysics(lambda X: X.sum(-1))(X), expected)
-
     def test_function_sees_float64_columns(self):
         seen = []
 
@@ -137,13 +131,11 @@ class TestGradients:
 
     def test_finite_differences_stay_out_of_the_memo(self, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter)
-        physics(points(3, 2).requires_grad_()).sum().backward()
-        assert len(numpy_counter.rows) == 3 + 2 * 2 * 3
-        assert len(physics._memo) == 3
-
-    def test_only_a_backward_pass_pays_for_the_gradient(self, numpy_counter, points):
-        BlackBoxPhysics(numpy_counter)(points(3, 2).requires_grad_())
-        assert len(numpy_counter.rows) == 3
+        for number in (1, 2):
+            Y = physics(points(3, 2).requires_grad_())
+            assert len(numpy_counter.rows) == 3 + (number - 1) * 2 * 2 * 3
+            Y.sum().backward()
+            assert len(numpy_counter.rows) == 3 + number * 2 * 2 * 3
 
     @pytest.mark.parametrize("fd_step", [0.5, [0.5, 0.25]])
     def test_step(self, fd_step, numpy_counter):
@@ -198,24 +190,20 @@ class TestGradients:
 
 
 class TestSettings:
-    @pytest.mark.parametrize("gradient", ["autograd", 1, True])
-    def test_unknown_gradient(self, gradient):
-        with pytest.raises(ValueError, match=f"Jacobian.*None for no gradient; found {gradient!r}"):
-            BlackBoxPhysics(waves, gradient=gradient)
-
-    @pytest.mark.parametrize("fd_step", [0.0, -1.0, float("nan"), [0.1, 0.0], []])
-    def test_step_is_not_positive(self, fd_step):
-        with pytest.raises(ValueError, match="fd_step must be positive"):
-            BlackBoxPhysics(waves, fd_step=fd_step)
+    def test_bad_ones(self):
+        for gradient in ("autograd", 1, True):
+            with pytest.raises(ValueError, match=f"None for no gradient; found {gradient!r}"):
+                BlackBoxPhysics(waves, gradient=gradient)
+        for fd_step in (0.0, -1.0, float("nan"), [0.1, 0.0], []):
+            with pytest.raises(ValueError, match="fd_step must be positive"):
+                BlackBoxPhysics(waves, fd_step=fd_step)
+        with pytest.raises(TypeError, match="function must be callable; found list"):
+            BlackBoxPhysics([])
 
     def test_steps_for_other_columns(self, points):
         physics = BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
         with pytest.raises(ValueError, match=r"fd_step of physics 'waves' has 3 entries.*1 or 2"):
             physics(points(4, 2).requires_grad_())
-
-    def test_not_callable(self):
-        with pytest.raises(TypeError, match="function must be callable; found list"):
-            BlackBoxPhysics([])
 
 
 class TestFailures:
@@ -253,11 +241,6 @@ class TestFailures:
         assert isinstance(caught.value.__cause__, ArithmeticError)
         assert physics(X[[0, 2]]).flatten().tolist() == [2.0, 3.0]
         assert asked == [4.0, -1.0, 9.0, -2.0]
-
-    def test_every_row_failed(self, points):
-        physics = BlackBoxPhysics(lambda x: 1 // 0, batched=False)
-        with pytest.raises(PhysicsError, match=r"ZeroDivisionError.*3 failed row\(s\) of 3"):
-            physics(points(3, 2))
 
     def test_rows_of_different_length(self):
         physics = BlackBoxPhysics(lambda x: np.zeros(int(x[0])), batched=False, name="tape")
@@ -333,11 +316,7 @@ class TestCopies:
     def test_deep_copy_keeps_a_handle(self, points):
         physics = BlackBoxPhysics(Handle())
         assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
-
-    def test_shallow_copy_keeps_a_handle(self, points):
-        physics = BlackBoxPhysics(Handle())
-        X = points(3, 2)
-        assert torch.allclose(copy.copy(physics)(X), torch_waves(X))
+        assert torch.allclose(copy.copy(physics)(points(3, 2)), torch_waves(points(3, 2)))
 
     def test_pickle_of_a_function(self, points):
         physics = BlackBoxPhysics(waves, gradient=waves_jacobian)

@@ -34,11 +34,6 @@ def test_parameters_of_a_module_are_learnt(points):
     assert torch.allclose(physics.function.bias, torch.ones(2, dtype=torch.float64), atol=1e-4)
 
 
-def test_not_callable():
-    with pytest.raises(TypeError, match="function must be callable; found float"):
-        FunctionPhysics(1.0)
-
-
 @pytest.mark.parametrize("grad", [False, True])
 @pytest.mark.parametrize(
     "function", [lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()]
@@ -93,11 +88,6 @@ class Owner:
         return X + 1
 
 
-def test_pickle_of_a_function_with_a_name(points):
-    models = torch.nn.ModuleList([FunctionPhysics(double)])
-    assert torch.equal(pickle.loads(pickle.dumps(models))[0](points(3, 2)), 2 * points(3, 2))
-
-
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
 @pytest.mark.parametrize("dumps", [pickle.dumps, pickle._dumps])
 def test_pickle_of_a_lambda_says_what_to_do(dumps, protocol):
@@ -134,15 +124,13 @@ def test_pickle_of_a_method_that_holds_its_physics(dumps, points):
 
 
 def test_as_physics_wraps_callables(points):
-    X = points(3, 2)
+    X, physics = points(3, 2), BlackBoxPhysics(np.sin)
+    assert as_physics(physics) is physics
+    with pytest.raises(TypeError, match="function must be callable; found float"):
+        FunctionPhysics(1.0)
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
     assert torch.equal(as_physics(torch.sin)(X), X.sin())
     assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
-
-
-def test_as_physics_takes_a_physics_as_it_is():
-    physics = BlackBoxPhysics(np.sin)
-    assert as_physics(physics) is physics
 
 
 def test_as_physics_joins_several(points):

@@ -53,13 +53,11 @@ class TestShapes:
 
     def test_no_rows_after_a_first_call(self, counter, points):
         physics = FunctionPhysics(counter)
+        with pytest.raises(PhysicsError, match=r"'RowCounter' was given no rows.*at least one row"):
+            physics(points(0, 3))
         physics(points(2, 3))
         assert physics(points(4, 0, 3)).shape == (4, 0, 2)
         assert len(counter.rows) == 2
-
-    def test_no_rows_before_the_first_call(self, points):
-        with pytest.raises(PhysicsError, match=r"'square' was given no rows.*at least one row"):
-            FunctionPhysics(square)(points(0, 3))
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_result_has_the_dtype_of_X(self, grad):
@@ -98,14 +96,25 @@ class TestColumns:
         with pytest.raises(ValueError, match=message):
             FunctionPhysics(square, inputs=[0, column])(points(5, 2))
 
-    def test_no_columns(self):
-        with pytest.raises(ValueError, match="inputs is empty"):
-            FunctionPhysics(square, inputs=[])
 
-    @pytest.mark.parametrize("inputs", [[0.5], 1, 0.5, "a"])
-    def test_columns_that_are_not_whole_numbers(self, inputs):
-        with pytest.raises(TypeError, match=re.escape(f"such as [0, 2]; found {inputs!r}")):
-            FunctionPhysics(square, inputs=inputs)
+def test_bad_settings_and_inputs(points):
+    for options, error, says in (
+        ({"inputs": []}, ValueError, "inputs is empty"),
+        *(
+            ({"inputs": i}, TypeError, re.escape(f"such as [0, 2]; found {i!r}"))
+            for i in ([0.5], 1, 0.5, "a")
+        ),
+        ({"memo": -1}, ValueError, r"memo must be a number of rows.*found -1"),
+        ({"memo": 1.5}, TypeError, r"memo must be a whole number; found 1\.5"),
+    ):
+        with pytest.raises(error, match=says):
+            FunctionPhysics(square, **options)
+    for X in ([[1.0]], torch.tensor([[1]])):
+        with pytest.raises(TypeError, match=r"takes a floating-point.*found (list|torch.int64)"):
+            FunctionPhysics(square)(X)
+    for shape in ((3,), (3, 0)):
+        with pytest.raises(ValueError, match=re.escape(f"batch_shape x n x d; found {shape}")):
+            FunctionPhysics(square)(points(*shape))
 
 
 class TestMemo:
@@ -129,26 +138,12 @@ class TestMemo:
         assert torch.equal(physics(X), physics(X))
         assert len(counter.rows) == 8
 
-    def test_negative(self):
-        with pytest.raises(ValueError, match=r"memo must be a number of rows.*found -1"):
-            FunctionPhysics(square, memo=-1)
-
-    def test_no_whole_number(self):
-        with pytest.raises(TypeError, match=r"memo must be a whole number; found 1\.5"):
-            FunctionPhysics(square, memo=1.5)
-
     def test_more_rows_than_it_can_hold(self, counter, points):
         physics = FunctionPhysics(counter, memo=3)
         X = points(10, 2)
         physics(X[:2])
         assert torch.equal(physics(X), counter.formula(X))
         assert torch.equal(physics(X), counter.formula(X))
-
-    def test_result_is_not_the_function_s_own_tensor(self, points):
-        X = points(3, 2)
-        kept = X.clone()
-        FunctionPhysics(lambda X: X)(X).zero_()
-        assert torch.equal(X, kept)
 
     def test_rows_that_are_known_new_and_repeated(self, counter, points):
         physics = FunctionPhysics(counter)
@@ -166,10 +161,13 @@ class TestMemo:
         assert len(counter.rows) == 4
 
     def test_result_can_be_changed_in_place(self, points):
-        physics = FunctionPhysics(square)
         X = points(3, 2)
-        physics(X).zero_()
-        assert torch.equal(physics(X), X**2)
+        for physics, expected in ((FunctionPhysics(square), X**2), (FunctionPhysics(abs), X.abs())):
+            physics(X).zero_()
+            assert torch.equal(physics(X), expected)
+        kept = X.clone()
+        FunctionPhysics(lambda X: X)(X).zero_()
+        assert torch.equal(X, kept)
 
     @pytest.mark.parametrize(
         "change",
@@ -275,17 +273,6 @@ class TestGradients:
 
 
 class TestChecks:
-    @pytest.mark.parametrize("X", [[[1.0]], torch.tensor([[1]])])
-    def test_X_is_no_floating_point_tensor(self, X):
-        with pytest.raises(TypeError, match=r"takes a floating-point.*found (list|torch.int64)"):
-            FunctionPhysics(square)(X)
-
-    @pytest.mark.parametrize("shape", [(3,), (3, 0)])
-    def test_X_is_no_batch_of_rows(self, shape, points):
-        message = re.escape(f"batch_shape x n x d; found {shape}")
-        with pytest.raises(ValueError, match=message):
-            FunctionPhysics(square)(points(*shape))
-
     @pytest.mark.parametrize(
         ("result", "message"),
         [
@@ -354,10 +341,10 @@ class TestChecks:
 
 
 class TestCopies:
-    def test_deep_copy_without_state_is_itself(self):
-        physics = FunctionPhysics(square)
-        assert copy.deepcopy(physics) is physics
+    def test_copies_without_state(self, points):
+        physics, X = FunctionPhysics(square), points(3, 2)
         assert copy.deepcopy({"model": [physics]})["model"][0] is physics
+        assert torch.equal(copy.copy(physics)(X), physics(X))
 
     def test_deep_copy_with_state_is_apart(self, points):
         physics = FunctionPhysics(Scale(), name="spring")
@@ -382,11 +369,6 @@ class TestCopies:
         duplicate = copy.deepcopy(physics)
         assert duplicate.owners[0] is duplicate
 
-    def test_shallow_copy(self, points):
-        physics = FunctionPhysics(square)
-        X = points(3, 2)
-        assert torch.equal(copy.copy(physics)(X), physics(X))
-
     def test_pickle_brings_the_memo(self, points):
         physics = FunctionPhysics(Scale())
         X = points(3, 1)
@@ -402,10 +384,6 @@ class TestCopies:
         physics = FunctionPhysics(Scale())
         physics(points(3, 1))
         assert set(physics.state_dict()) == {"function.gain", "function.offset"}
-
-    def test_repr(self):
-        text = repr(FunctionPhysics(square, inputs=[2], memo=5))
-        assert text == "FunctionPhysics(name='square', inputs=(2,), num_outputs=None, memo=5)"
 
 
 class TestThreads:
@@ -443,7 +421,9 @@ class TestThreads:
             physics.forget()
             go.set()
             assert torch.equal(result.result(), points(3, 1))
-        assert len(physics._memo) == 0
+        inside.clear()
+        physics(points(3, 1))
+        assert inside.is_set()
 
 
 class TestSubclass:
