@@ -57,12 +57,6 @@ def test_given_noise(data, build, kind, num_outputs, uniform):
     torch.testing.assert_close(actual, (noise * scale).expand_as(actual))
 
 
-def test_gradients(data, build, kind, num_outputs, uniform):
-    model = build(kind, *data(num_outputs=num_outputs)).eval().requires_grad_(False)
-    Z = uniform(3, 2, high=2.0, seed=5).requires_grad_()
-    assert torch.autograd.gradcheck(lambda Z: model.predict(Z), Z)
-
-
 def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, uniform):
     model, Z = build(kind, *data(num_outputs=num_outputs)).eval(), uniform(3, 2)
     learnt = [p for p in model.parameters() if p.requires_grad]
@@ -149,19 +143,14 @@ def test_nothing_stale_is_kept(data, build, costly_kind, uniform, close, change)
         close(actual, expected, tolerance)
 
 
-def test_a_copy_of_a_conditioned_model(data, build, kind, num_outputs, uniform, close):
-    model, Z = build(kind, *data(num_outputs=num_outputs)), uniform(5, 2)
-    model = model.condition_on_observations(Z[:2] + 1, torch.ones(2, num_outputs).double())
-    for actual, expected in zip(copy.deepcopy(model).predict(Z), model.predict(Z), strict=True):
-        close(actual, expected, 1e-7)
-
-
 def test_factors_are_left_out_of_a_pickle(data, uniform):
-    model, Z = ZeroMeanGP(*data(n=150)), uniform(5, 2)
-    size = len(pickle.dumps(model))
+    model, Z = ZeroMeanGP(*data(n=148)), uniform(5, 2)
+    model = model.condition_on_observations(Z[:2] + 1, torch.ones(2, 1).double())
+    size = len(pickle.dumps(ZeroMeanGP(*data(n=150))))
     before = model.predict(Z).mean
     assert len(pickle.dumps(model)) < size + 10_000
-    torch.testing.assert_close(pickle.loads(pickle.dumps(model)).predict(Z).mean, before)
+    for again in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        torch.testing.assert_close(again.predict(Z).mean, before)
 
 
 def test_a_kernel_with_its_own_way(data, uniform, close):
