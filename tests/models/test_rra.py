@@ -4,7 +4,6 @@ import pyro
 import pytest
 import torch
 from botorch.models.transforms import Normalize, Standardize
-from pyro.infer import MCMC, NUTS, Predictive
 from pyro.infer.autoguide import AutoLaplaceApproximation
 
 from gpadjust.models import PaperRRA
@@ -79,29 +78,6 @@ def test_weights_are_pyros_laplace_approximation(rra):
     torch.testing.assert_close(covariance, expected, rtol=1e-6, atol=1e-8 * scale**2)
 
 
-@pytest.mark.slow
-def test_weights_are_what_nuts_samples(data, build):
-    X, Y = data()
-    model = build("RRA", X, Y, num_features=4).eval()
-    mcmc = MCMC(
-        NUTS(model.pyro_model, jit_compile=False),
-        num_samples=600,
-        warmup_steps=200,
-        disable_progbar=True,
-    )
-    mcmc.run()
-    samples = mcmc.get_samples()["weights"]
-    weights = model.weights()
-    sd = weights.variance.sqrt()
-    assert ((samples.mean(0) - weights.mean).abs() < 0.25 * sd).all()
-    assert ((samples.std(0) / sd - 1).abs() < 0.25).all()
-    Z = X[:4] + 0.05
-    with torch.no_grad():
-        values = model.functions(samples)(Z)
-        posterior = model.posterior(Z)
-    assert ((values.mean(0) - posterior.mean).abs() < 0.25 * posterior.variance.sqrt()).all()
-
-
 def test_the_pyro_model_is_the_prior_in_the_users_units(rra, close, uniform):
     Z = uniform(5, 2, high=2.0, seed=3)
     sites = pyro.poutine.trace(rra.pyro_model).get_trace(Z).nodes
@@ -129,15 +105,6 @@ def test_the_pyro_model_has_the_known_noise_of_each_point(data, build):
     model = build("RRA", X, Y, Yvar)
     site = pyro.poutine.trace(model.pyro_model).get_trace().nodes["Y"]
     torch.testing.assert_close(site["fn"].base_dist.scale.square(), Yvar.squeeze(-1))
-
-
-def test_prior_predictive(data, build, uniform, close):
-    model = build("RRA", *data(), num_features=4)
-    Z = uniform(5, 2, high=2.0, seed=3)
-    samples = Predictive(model.pyro_model, num_samples=400)(Z)["Y"].squeeze()
-    assert samples.shape == (400, 5)
-    mean = model.physics(Z).squeeze(-1)
-    assert ((samples.mean(0) - mean).abs() < 5 * samples.std(0) / 20).all()
 
 
 def test_functions_of_the_weights_have_the_posterior(rra, close, uniform):
