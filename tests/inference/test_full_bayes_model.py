@@ -1,6 +1,5 @@
 """A model that holds samples of its hyper-parameters is the mixture of the samples' models."""
 
-import pickle
 from copy import deepcopy
 
 import pytest
@@ -211,13 +210,6 @@ class TestCopies:
             other.load_state_dict(model.state_dict())
             assert other.num_samples == 3
             close(other.posterior(Z).mean, expected.mean)
-
-    def test_pickle(self, held, data, uniform, close):
-        model, _ = held("ZeroMeanGP", *data(num_outputs=2))
-        again = pickle.loads(pickle.dumps(model))
-        Z = uniform(4, 2, high=2.0)
-        assert again.num_samples == 3
-        close(again.posterior(Z).mean, model.posterior(Z).mean)
 
 
 class TestRefusals:

@@ -135,22 +135,6 @@ def test_rra_tends_to_cka_as_features_grow(data, build, shuffle, Z):
     assert (many < 0.1 * Y.std()).all()
 
 
-@pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "RRA"])
-def test_standardised_is_raw_with_matched_hyper_parameters(
-    data, build, shuffle, close, kind, kernel_of, Z
-):
-    X, Y = data()
-    model = shuffle(build(kind, X, Y, outcome_transform=Standardize(1)))
-    raw = build(kind, X, Y, outcome_transform=None)
-    give(raw, model, **{name: name for name in model.term_names})
-    squared = model.outcome_transform.stdvs.square().log().squeeze()
-    with torch.no_grad():
-        raw.likelihood.noise_covar.raw_noise += squared
-        if "delta" in raw.term_names:
-            kernel_of(raw, "delta").raw_outputscale += squared
-    agree(close, model, raw.eval(), Z)
-
-
 @pytest.mark.parametrize("cls", [PhysicsMeanGP, ScaleGP, CKA, RRA])
 def test_a_perfect_physics_is_left_alone(data, close, Z, cls):
     X, _ = data()

@@ -11,7 +11,6 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.settings import detach_test_caches
 
 from gpadjust import ZeroMeanGP, fit
-from gpadjust.models.cholesky_strategy import covariances, prepare
 
 
 def reference(model, Z, **options):
@@ -76,22 +75,6 @@ def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, unifor
     # What is remembered has no graph that one backward pass would free.
     for _ in range(2):
         model.predict(Z.requires_grad_()).mean.sum().backward()
-
-
-@pytest.mark.parametrize("mean", [1.0, "learn"])
-def test_remembered_covariances(data, build, shuffle, uniform, num_outputs, mean):
-    X, Y = data(num_outputs=num_outputs)
-    model = shuffle(build("CKA", X, Y, rho_mean=mean, center="mean"))
-    (train,), inputs = model.train_inputs, model.model_inputs(uniform(4, 2, low=-1.0, high=3.0))
-    model.requires_grad_(False)
-    inputs.requires_grad_()
-    fast, direct = (
-        torch.cat(covariances(prepare(model.terms, train, slowly), inputs))
-        for slowly in (False, True)
-    )
-    torch.testing.assert_close(fast, direct)
-    gradients = (torch.autograd.grad(k.square().sum(), inputs)[0] for k in (fast, direct))
-    torch.testing.assert_close(*gradients)
 
 
 def test_no_points(data, build, kind, num_outputs):

@@ -207,14 +207,6 @@ class TestSettings:
 
 
 class TestFailures:
-    def test_batch_names_its_rows(self, points):
-        def broken(X):
-            raise OSError("no licence")
-
-        with pytest.raises(PhysicsError, match="raised OSError: no licence") as caught:
-            BlackBoxPhysics(broken)(points(3, 2))
-        assert caught.value.rows == (0, 1, 2)
-
     def test_row_function_taken_for_a_batch_function(self, points):
         with pytest.raises(PhysicsError, match="single row pass batched=False"):
             BlackBoxPhysics(lambda x: x[0] + x[1])(points(3, 2))
@@ -317,13 +309,6 @@ class TestCopies:
         physics = BlackBoxPhysics(Handle())
         assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
         assert torch.allclose(copy.copy(physics)(points(3, 2)), torch_waves(points(3, 2)))
-
-    def test_pickle_of_a_function(self, points):
-        physics = BlackBoxPhysics(waves, gradient=waves_jacobian)
-        loaded = pickle.loads(pickle.dumps(physics))
-        X = points(3, 2)
-        assert torch.allclose(loaded(X), torch_waves(X))
-        assert loaded.gradient is waves_jacobian
 
     @pytest.mark.parametrize("batched", [True, False])
     def test_pickle_of_a_handle_keeps_the_memo(self, batched, points):

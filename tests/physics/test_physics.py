@@ -77,19 +77,6 @@ class TestColumns:
         physics = FunctionPhysics(lambda X: X, inputs=[-1, 0, -4, 3])
         assert torch.equal(physics(X), X[..., [3, 0, 0, 3]])
 
-    def test_other_columns_do_not_matter_to_the_memo(self, counter, points):
-        X = points(5, 2)
-        physics = FunctionPhysics(counter, inputs=[0])
-        physics(X)
-        X[:, 1] += 1
-        physics(X)
-        assert len(counter.rows) == 5
-
-    def test_gradient_of_an_unread_column_is_zero(self, points):
-        X = points(3, 2).requires_grad_()
-        FunctionPhysics(square, inputs=[1])(X).sum().backward()
-        assert torch.equal(X.grad, torch.stack([torch.zeros(3), 2 * X[:, 1].detach()], -1))
-
     @pytest.mark.parametrize("column", [2, -3])
     def test_too_few_columns(self, column, points):
         message = rf"inputs=\(0, {column}\).*\(5, 2\).*2 column.*no column \[{column}\]"
@@ -131,34 +118,6 @@ class TestMemo:
             X = torch.tensor(rows, dtype=torch.float64)
             assert torch.equal(physics(X), X.sum(-1, keepdim=True))
         assert len(asked) == len(set(asked)) == len({tuple(row) for rows in calls for row in rows})
-
-    def test_off(self, counter, points):
-        physics = FunctionPhysics(counter, memo=0)
-        X = points(2, 2).repeat(2, 1)
-        assert torch.equal(physics(X), physics(X))
-        assert len(counter.rows) == 8
-
-    def test_more_rows_than_it_can_hold(self, counter, points):
-        physics = FunctionPhysics(counter, memo=3)
-        X = points(10, 2)
-        physics(X[:2])
-        assert torch.equal(physics(X), counter.formula(X))
-        assert torch.equal(physics(X), counter.formula(X))
-
-    def test_rows_that_are_known_new_and_repeated(self, counter, points):
-        physics = FunctionPhysics(counter)
-        X = points(5, 2)
-        physics(X[[3, 1]])
-        mixed = X[[0, 3, 0, 4, 1, 4, 2]]
-        assert torch.equal(physics(mixed), counter.formula(mixed))
-        assert counter.rows == [tuple(row) for row in X[[3, 1, 0, 4, 2]].tolist()]
-
-    def test_forget(self, counter, points):
-        physics = FunctionPhysics(counter)
-        physics(points(2, 2))
-        physics.forget()
-        physics(points(2, 2))
-        assert len(counter.rows) == 4
 
     def test_result_can_be_changed_in_place(self, points):
         X = points(3, 2)
@@ -356,12 +315,6 @@ class TestCopies:
             assert torch.equal(duplicate(X), 7.0 * X)
             assert torch.equal(physics(X), expected)
         assert (duplicate.name, duplicate.num_outputs) == ("spring", 1)
-
-    def test_deep_copy_keeps_shared_modules_shared(self):
-        scale = Scale()
-        physics, kept = copy.deepcopy((FunctionPhysics(scale), scale))
-        assert physics.function is kept
-        assert kept is not scale
 
     def test_deep_copy_of_a_cycle(self):
         physics = FunctionPhysics(Scale())
