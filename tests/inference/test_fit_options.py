@@ -50,11 +50,9 @@ class TestBadInput:
             with pytest.raises(error, match=says):
                 fit(model, method, **{option: value})
 
-    def test_another_kind_of_model(self):
+    def test_models(self, model):
         with pytest.raises(TypeError, match=r"Expected a model of gpadjust.*got Linear"):
             fit(torch.nn.Linear(2, 1))
-
-    def test_nothing_to_learn(self, model):
         with pytest.raises(ValueError, match="no learnable parameter"):
             fit(model.requires_grad_(False))
 
@@ -111,15 +109,11 @@ class TestThreads:
         torch.set_num_threads(before)
 
     @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
-    @pytest.mark.parametrize("method", ["map", "hmc"])
-    def test_a_small_fit_takes_one(self, model, seen, method):
-        fit(model, method, **QUICK, **({"num_samples": 8} if method == "hmc" else {}))
-        assert set(seen) == {1}
-        assert torch.get_num_threads() == 2
-
-    def test_a_comparison_takes_one(self, model, seen):
+    def test_a_small_problem_takes_one(self, model, seen):
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
+        fit(model, **QUICK)
         compare(X, Y, crude, structures=["physics mean", "CKA"], **QUICK)
+        fit(model, "hmc", num_samples=8, **QUICK)
         assert set(seen) == {1}
         assert torch.get_num_threads() == 2
 

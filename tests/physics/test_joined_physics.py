@@ -39,10 +39,6 @@ class TestNames:
     def test_are_unique(self, parts, names):
         assert JoinedPhysics(parts).names == names
 
-    def test_wrappers_take_them_and_physics_keep_theirs(self):
-        joined = JoinedPhysics({"low": torch.sin, "high": FunctionPhysics(torch.sin)})
-        assert [part.name for part in joined.parts] == ["low", "sin"]
-
 
 class TestValues:
     def test_columns_of_the_parts_in_order(self, points):
@@ -72,13 +68,6 @@ class TestValues:
         assert len(numpy_counter.rows) == 3
         assert linear.weight.grad is not None
 
-    def test_no_rows(self):
-        joined = JoinedPhysics([total, lambda X: X[:, 0]])
-        with pytest.raises(PhysicsError, match="'total' was given no rows"):
-            joined(torch.zeros(0, 2))
-        joined(torch.zeros(1, 2))
-        assert joined(torch.zeros(0, 2)).shape == (0, 2)
-
     def test_gradients_through_every_kind(self, points):
         joined = JoinedPhysics(
             [
@@ -96,6 +85,17 @@ class TestValues:
 
 
 class TestErrors:
+    def test_names(self):
+        joined = JoinedPhysics({"low": total, "high": FunctionPhysics(first_log)})
+        assert [part.name for part in joined.parts] == ["low", "first_log"]
+        with pytest.raises(PhysicsError, match="'low' was given no rows"):
+            joined(torch.zeros(0, 2))
+        with pytest.raises(PhysicsError, match="'first_log'") as caught:
+            joined(torch.zeros(1, 1))
+        assert caught.value.__notes__ == ["This physics is 'high' of ('low', 'high')."]
+        joined(torch.ones(1, 2))
+        assert joined(torch.zeros(0, 2)).shape == (0, 2)
+
     def test_differ_in_their_number_of_outputs(self, points):
         joined = JoinedPhysics([torch.sin, total], name="pair")
         with pytest.raises(PhysicsError, match=r"'pair'.*found 2 of 'sin', 1 of 'total'; expected"):
@@ -122,12 +122,6 @@ class TestErrors:
                 joined(torch.tensor([[1.0], [-1.0]]))
             assert caught.value.rows == (1,)
             assert joined(torch.tensor([[4.0]])).tolist() == [[4.0, 2.0]]
-
-    def test_of_a_part_under_another_name_has_a_note(self):
-        joined = JoinedPhysics({"low": total, "high": FunctionPhysics(first_log)})
-        with pytest.raises(PhysicsError, match="'first_log'") as caught:
-            joined(torch.zeros(1, 1))
-        assert caught.value.__notes__ == ["This physics is 'high' of ('low', 'high')."]
 
     @pytest.mark.parametrize(
         ("parts", "message"),
