@@ -7,21 +7,25 @@ except ImportError as error:
         'gpadjust.rl needs Stable-Baselines3 and Gymnasium; run `pip install "gpadjust[rl]"`.'
     ) from error
 
+from gpadjust.rl.agents import DynaSAC, DynaTD3
+from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
-from gpadjust.rl.checkpoint import TrialCheckpoint, resume, save_checkpoint
-from gpadjust.rl.dyna_sac import DynaSAC
-from gpadjust.rl.informative_trials import InformativeTrials, TrialPlan
-from gpadjust.rl.mixed_replay_buffer import MixedReplayBuffer
+from gpadjust.rl.checkpoint import EpisodeCheckpoint, resume, save_checkpoint
+from gpadjust.rl.dyna import Dyna
 from gpadjust.rl.model_vec_env import ModelVecEnv
+from gpadjust.rl.options import DynaOptions
+from gpadjust.rl.task_learner import TaskLearner
 
 __all__ = [
+    "Dyna",
     "DynaCallback",
+    "DynaOptions",
     "DynaSAC",
-    "InformativeTrials",
+    "DynaTD3",
+    "EpisodeCheckpoint",
     "MixedReplayBuffer",
     "ModelVecEnv",
-    "TrialCheckpoint",
-    "TrialPlan",
+    "TaskLearner",
     "resume",
     "save_checkpoint",
 ]

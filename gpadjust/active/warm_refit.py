@@ -1,0 +1,75 @@
+"""Fitting a model of more data from the hyper-parameters of the one before it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from botorch.exceptions.warnings import OptimizationWarning
+
+from gpadjust.inference import fit as fit_model
+from gpadjust.inference.warm_start import warm_start
+from gpadjust.models import ExactGPBase
+
+
+def refit(model: Any, previous: Any, fit: Callable[[Any], Any] | None) -> None:
+    """Fit a model, in place, from where an earlier one of the same structure was.
+
+    Args:
+        model: The model.
+        previous: The model fitted last, or None.
+        fit: Fits it. Default: :func:`gpadjust.fit`, with fewer starts where there is an earlier
+            model.
+    """
+    warm = previous is not None and _alike(model, previous)
+    if warm:
+        warm_start(model, previous)
+    if fit is not None:
+        fit(model)
+    elif not warm:
+        fit_model(model)
+    else:
+        with warnings.catch_warnings():
+            # The next fit goes on from where this one stops.
+            warnings.simplefilter("ignore", OptimizationWarning)
+            fit_model(model, num_screened=64, num_starts=4)
+
+
+def parameter_values(model: Any) -> dict[str, Any]:
+    """All parameters of a model as lists; none of one that no fit can begin from."""
+    if not isinstance(model, ExactGPBase) or model.num_samples is not None:
+        return {}
+    return {name: parameter.tolist() for name, parameter in model.named_parameters()}
+
+
+def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
+    """Give a model parameters, unless it has others; tell whether it was done."""
+    if not isinstance(model, ExactGPBase):
+        return False
+    named = dict(model.named_parameters())
+    try:
+        tensors = {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()}
+    except (AttributeError, TypeError, ValueError):  # a log may have been edited
+        return False
+    if {name: p.shape for name, p in named.items()} != {n: t.shape for n, t in tensors.items()}:
+        return False
+    with torch.no_grad():
+        for name, parameter in named.items():
+            parameter.copy_(tensors[name])
+    model.eval()
+    return True
+
+
+def _alike(model: Any, previous: Any) -> bool:
+    """Whether a warm start of one model from another makes sense."""
+    if type(model) is not type(previous) or not isinstance(model, ExactGPBase):
+        return False
+    if model.num_samples is not None or previous.num_samples is not None:
+        return False
+
+    def shapes(model: Any) -> dict[str, torch.Size]:
+        return {name: p.shape for name, p in model.named_parameters() if p.requires_grad}
+
+    return shapes(model) == shapes(previous)

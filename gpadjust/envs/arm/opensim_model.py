@@ -1,0 +1,218 @@
+"""The arm as a model of OpenSim, with muscles or with torques."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from types import ModuleType
+from typing import Any
+
+from gpadjust.envs.arm.torque_arm import ArmEquation
+
+JOINTS = ("shoulder", "elbow")
+LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow
+SLACK_POSE = (math.radians(35), math.radians(65))  # where each fibre is at its optimum
+REST_ACTIVATION = 0.01
+MAX_STRENGTH = 2.0  # beyond, the arm breaks through its joint limits
+
+
+@dataclass(frozen=True)
+class Muscle:
+    r"""A muscle of the arm; its path is as long as :math:`a + s (\theta_s - \pi/2) + e_1 \theta_e
+    + e_2 \theta_e^2`.
+
+    Args:
+        name: In the model.
+        force: The isometric force at full strength, in N.
+        fibre: The optimal length of its fibres, in m.
+        path: ``(a, s, e_1, e_2)``, in m, rad and rad².
+    """  # noqa: D205
+
+    name: str
+    force: float
+    fibre: float
+    path: tuple[float, float, float, float]
+
+    def length(self, shoulder: float, elbow: float) -> float:
+        """The length of the path, in m, at angles in rad."""
+        a, s, e_1, e_2 = self.path
+        return a + s * (shoulder - math.pi / 2) + e_1 * elbow + e_2 * elbow**2
+
+
+MUSCLES = (
+    Muscle("biceps", 414, 0.137, (0.3329, -0.03, -0.016, -0.0057)),
+    Muscle("triceps_long", 603, 0.127, (0.2989, 0.03, 0.030, -0.0032)),
+    Muscle("deltoid_anterior", 838, 0.134, (0.1510, -0.03, 0.0, 0.0)),
+    Muscle("deltoid_posterior", 1207, 0.140, (0.2322, 0.03, 0.0, 0.0)),
+    Muscle("brachialis", 1422, 0.092, (0.2859, 0.0, -0.014, -0.0040)),
+    Muscle("triceps_lateral", 1549, 0.093, (0.2355, 0.0, 0.025, -0.0022)),
+)
+"""Forces, fibres and moment arms after Nijhof and Kouwenhoven (2000).
+
+Actions excite the first four, in this order; the last two are passive.
+"""
+NUM_EXCITED = 4
+
+
+@lru_cache(maxsize=1)
+def load_opensim() -> ModuleType:
+    """OpenSim, silenced: else it prints, and writes ``opensim.log`` to the working directory.
+
+    The first call switches the logger off, which is the process's own; later ones leave it alone,
+    so that ``opensim.Logger.setLevelString("info")`` after the first arm was built lets it speak.
+
+    Raises:
+        ImportError: If it is missing. One that is installed but broken raises its own error.
+    """
+    try:
+        import opensim
+    except ModuleNotFoundError as error:
+        if error.name != "opensim":
+            raise
+        raise ImportError(
+            'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
+        ) from error
+    opensim.Logger.setLevelString("off")
+    return opensim
+
+
+def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
+    """The arm with six muscles, of which four are excited.
+
+    Args:
+        equation: The links; its gains do not matter.
+        strength: The factor on the forces of the muscles.
+
+    Returns:
+        An ``opensim.Model``, whose state is angles, velocities and six activations, and whose
+        inputs are the excitations, see :func:`controls`.
+
+    Raises:
+        ImportError: If ``opensim`` is missing.
+        ValueError: If strength is not in (0, 2].
+    """
+    if not 0 < strength <= MAX_STRENGTH:
+        raise ValueError(
+            f"strength must be in (0, {MAX_STRENGTH:g}], where 1 is a healthy arm's; found "
+            f"{strength}."
+        )
+    opensim = load_opensim()
+    model = _skeleton(opensim, equation)
+    for joint, (low, high) in zip(JOINTS, LIMITS, strict=True):
+        limit = opensim.CoordinateLimitForce(joint, high, 1.0, low, 1.0, 0.05, 10.0)
+        limit.setName(f"{joint}_limit")
+        model.addForce(limit)
+    muscles = [_muscle(opensim, muscle, strength) for muscle in MUSCLES]
+    for muscle in muscles:
+        model.addForce(muscle)
+    _add_controller(opensim, model, muscles[:NUM_EXCITED])
+    return model
+
+
+def build_torque_arm(equation: ArmEquation) -> Any:
+    """The arm whose inputs are torques at shoulder and elbow, in N m; without limits.
+
+    Args:
+        equation: The links; its gains do not matter.
+
+    Returns:
+        An ``opensim.Model``, whose state is angles and velocities.
+
+    Raises:
+        ImportError: If ``opensim`` is missing.
+    """
+    opensim = load_opensim()
+    model = _skeleton(opensim, equation)
+    torques = []
+    for joint in JOINTS:
+        torque = opensim.CoordinateActuator(joint)
+        torque.setName(f"{joint}_torque")
+        torque.setOptimalForce(1.0)
+        model.addForce(torque)
+        torques.append(torque)
+    _add_controller(opensim, model, torques)
+    return model
+
+
+def controls(model: Any) -> list[Any]:
+    """The ``opensim.Constant`` of each input of an arm that was built here, in their order.
+
+    To be asked for after ``initSystem``: the controller holds copies of what it was given.
+    """
+    opensim = load_opensim()
+    controller = opensim.PrescribedController.safeDownCast(model.getControllerSet().get(0))
+    functions = controller.get_ControlFunctions()
+    constant = opensim.Constant
+    return [constant.safeDownCast(functions.get(i)) for i in range(functions.getSize())]
+
+
+def _skeleton(opensim: ModuleType, equation: ArmEquation) -> Any:
+    model = opensim.Model()
+    model.setGravity(opensim.Vec3(0))  # the plane is level
+    parent, origin = model.getGround(), opensim.Vec3(0)
+    for i, joint_name in enumerate(JOINTS):
+        inertia = equation.inertias[i]
+        body = opensim.Body(
+            f"link_{i}",
+            equation.masses[i],
+            opensim.Vec3(equation.centres[i], 0, 0),
+            opensim.Inertia(inertia, inertia, inertia),
+        )
+        zero = opensim.Vec3(0)
+        joint = opensim.PinJoint(f"{joint_name}_joint", parent, origin, zero, body, zero, zero)
+        joint.updCoordinate().setName(joint_name)
+        model.addBody(body)
+        model.addJoint(joint)
+        damping = opensim.SpringGeneralizedForce(joint_name)
+        damping.setName(f"{joint_name}_damping")
+        damping.setStiffness(0.0)
+        damping.setViscosity(equation.damping)
+        model.addForce(damping)
+        parent, origin = body, opensim.Vec3(equation.lengths[i], 0, 0)
+    return model
+
+
+def _muscle(opensim: ModuleType, muscle: Muscle, strength: float) -> Any:
+    force = opensim.DeGrooteFregly2016Muscle()
+    force.setName(muscle.name)
+    force.set_max_isometric_force(strength * muscle.force)
+    force.set_optimal_fiber_length(muscle.fibre)
+    force.set_tendon_slack_length(muscle.length(*SLACK_POSE) - muscle.fibre)
+    force.set_pennation_angle_at_optimal(0.0)
+    force.set_max_contraction_velocity(10.0)
+    force.set_fiber_damping(0.0)
+    force.set_passive_fiber_strain_at_one_norm_force(0.6)
+    force.set_ignore_tendon_compliance(True)  # compliant tendons fail with Runge-Kutta-Merson
+    # OpenSim holds the time constants of the first muscle of a process for all others in it.
+    force.set_activation_time_constant(0.015)
+    force.set_deactivation_time_constant(0.060)
+    force.set_activation_dynamics_smoothing(10.0)  # the default, 0.1, makes muscles sluggish
+    force.set_default_activation(REST_ACTIVATION)
+    force.set_path(_path(opensim, muscle))
+    return force
+
+
+def _path(opensim: ModuleType, muscle: Muscle) -> Any:
+    """A path as a polynomial: wrapping surfaces flip sides at large angles."""
+    a, s, e_1, e_2 = muscle.path
+    coefficients = opensim.Vector(6, 0.0)
+    # of 1, e, e^2, s, s e, s^2
+    for i, value in enumerate((a - s * math.pi / 2, e_1, e_2, s, 0.0, 0.0)):
+        coefficients.set(i, value)
+    names = opensim.StdVectorString()
+    for joint in JOINTS:
+        names.append(f"/jointset/{joint}_joint/{joint}")
+    path = opensim.FunctionBasedPath()
+    path.setName(f"{muscle.name}_path")
+    path.setCoordinatePaths(names)
+    path.setLengthFunction(opensim.MultivariatePolynomialFunction(coefficients, 2, 2))
+    return path
+
+
+def _add_controller(opensim: ModuleType, model: Any, actuators: list[Any]) -> None:
+    controller = opensim.PrescribedController()
+    for actuator in actuators:
+        controller.addActuator(actuator)
+        controller.prescribeControlForActuator(actuator.getName(), opensim.Constant(0.0))
+    model.addController(controller)

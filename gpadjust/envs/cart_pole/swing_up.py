@@ -1,0 +1,150 @@
+"""Swinging up the pole of a cart-pole, as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gpadjust.envs.cart_pole.system import (
+    CART_POLE_RAW_SPEC,
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    START_MEAN,
+    START_STD,
+    TIME_STEP,
+    CartPoleEquation,
+    cart_pole_cost,
+    equation_physics,
+)
+from gpadjust.envs.cart_pole.view import CartPoleView
+from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv, checked_options
+
+MAX_FORCE = 10.0
+
+
+class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
+    r"""Swing up the pole of a cart-pole and balance it, by pushing the cart.
+
+    The pole hangs at first. The action, a force in [-10, 10] N, is held for 0.1 s; stronger forces
+    are clipped. The observation is :math:`[x, \sin\theta, \cos\theta, \dot{x}, \dot\theta]`, with
+    the angle from upright; ``state`` has the true state in float64. The reward is minus the cost
+    of :func:`~gpadjust.envs.cart_pole_cost` of the state that was reached, in [-1, 0]; the
+    ``info`` of a step has the ``"cost"``. An episode does not terminate; ``gym.make`` truncates it
+    after 25 steps.
+
+    ``reset(options={"state": [x, theta, x_dot, theta_dot]})`` starts from this state.
+
+    Environments can be pickled at any time and go on as they were, with their random state; the
+    window of a copy opens anew.
+
+    Args:
+        render_mode: ``"human"`` shows a window, ``"rgb_array"`` lets ``render`` return a frame.
+            Both need the package ``pygame-ce``.
+        encode_angle: Whether the observation has sine and cosine in place of the angle. Without,
+            it is the state :math:`[x, \theta, \dot{x}, \dot\theta]`, the angle not wrapped.
+        equation: The system. Default: the real one.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make("gpadjust.envs:gpadjust/CartPoleSwingUp-v0")
+        >>> observation, info = env.reset(options={"state": [0.0, 0.0, 0.0, 0.0]})
+        >>> observation
+        array([0., 0., 1., 0., 0.], dtype=float32)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.high)
+        >>> round(reward, 3)
+        -0.004
+    """
+
+    metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / TIME_STEP)}  # noqa: RUF012
+
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        *,
+        encode_angle: bool = True,
+        equation: CartPoleEquation = REAL_CART_POLE,
+    ) -> None:
+        super().__init__(render_mode)
+        self.equation = equation
+        self.physics = equation_physics(equation)
+        self.state_spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
+        high = [np.inf, 1.0, 1.0, np.inf, np.inf] if encode_angle else [np.inf] * 4
+        bound = np.array(high, dtype=np.float32)
+        self.observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
+        self.action_space = gym.spaces.Box(-MAX_FORCE, MAX_FORCE, (1,), dtype=np.float32)
+        self._force = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: For the random start, and those that follow.
+            options: ``{"state": ...}``, the four entries of the state to start from. Default: drawn
+                around the hanging pole at rest, with standard deviation 0.2.
+
+        Returns:
+            The observation and an empty ``info``.
+
+        Raises:
+            ValueError: If ``options`` has another key, or the state is not four finite numbers.
+        """
+        super().reset(seed=seed)
+        options = checked_options(options, ("state",))
+        if "state" in options:
+            state = np.array(options["state"], dtype=np.float64)
+            if state.shape != (4,) or not np.isfinite(state).all():
+                raise ValueError(
+                    "options['state'] must be four finite numbers, x, theta, x_dot and theta_dot; "
+                    f"found {options['state']}."
+                )
+        else:
+            state = self.np_random.normal(START_MEAN, START_STD)
+        self.state = state
+        self._force = 0.0
+        self._show()
+        return self._observe(state), {}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Push the cart for 0.1 s.
+
+        Args:
+            action: The force in N, of shape ``(1,)``; clipped to [-10, 10].
+
+        Returns:
+            Observation, reward, False, False and ``{"cost": ...}``.
+
+        Raises:
+            ValueError: If the action is not one finite number.
+            gymnasium.error.ResetNeeded: If no episode was started.
+        """
+        if self.state is None:
+            raise gym.error.ResetNeeded("Call reset before the first step.")
+        force = np.array(action, dtype=np.float64)
+        if force.shape != (1,) or not np.isfinite(force).all():
+            raise ValueError(f"The action must be one finite force, of shape (1,); found {action}.")
+        force = force.clip(-MAX_FORCE, MAX_FORCE)
+        with torch.no_grad():
+            row = torch.from_numpy(np.concatenate([self.state, force]))
+            state = self.physics(row.unsqueeze(0)).squeeze(0)
+            cost = cart_pole_cost(state, self.equation.pole_length).item()
+        self.state = state.numpy()
+        self._force = float(force[0])
+        self._show()
+        return self._observe(self.state), -cost, False, False, {"cost": cost}
+
+    def _open_view(self, frames_per_second: int | None) -> CartPoleView:
+        return CartPoleView(self.equation.pole_length, MAX_FORCE, frames_per_second)
+
+    def _draw(self, view: CartPoleView, state: NDArray[np.float64]) -> NDArray[np.uint8] | None:
+        return view.draw(state[0], state[1], self._force)
+
+    def _observe(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
+        return self.state_spec.observe(torch.from_numpy(state)).numpy().astype(np.float32)

@@ -1,0 +1,233 @@
+"""Real and model experience in one replay buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+
+class CompactReplayBuffer(ReplayBuffer):
+    """A ``ReplayBuffer`` that takes many rows at once, and saves only those that are filled."""
+
+    rows: ClassVar[tuple[str, ...]] = (
+        "observations",
+        "next_observations",
+        "actions",
+        "rewards",
+        "dones",
+        "timeouts",
+    )
+
+    def add_rows(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        dones: np.ndarray,
+        timeouts: np.ndarray,
+    ) -> None:
+        """Add ``N`` transitions of one environment at once.
+
+        Args:
+            obs: Observations, ``N x d``.
+            next_obs: The observations after them, ``N x d``, also where an episode ended.
+            actions: Actions scaled to [-1, 1], as SB3 stores them, ``N x a``.
+            rewards: ``N`` rewards.
+            dones: Whether the episode ended, ``N``.
+            timeouts: Whether it ended by a time limit alone, ``N``.
+        """
+        if self.n_envs != 1:
+            raise ValueError(f"add_rows() is for buffers of one environment; found {self.n_envs}.")
+        columns = (obs, next_obs, actions, rewards, dones, timeouts)
+        n = min(len(obs), self.buffer_size)
+        places = (self.pos + np.arange(n)) % self.buffer_size
+        for name, values in zip(self.rows, columns, strict=True):
+            getattr(self, name)[places, 0] = values[len(values) - n :]
+        self.full = self.full or self.pos + n >= self.buffer_size
+        self.pos = (self.pos + n) % self.buffer_size
+
+    def filled(self) -> dict[str, np.ndarray]:
+        """The rows that are filled and where the next one goes, as arrays."""
+        rows = {name: getattr(self, name)[: self.size()] for name in self.rows}
+        return {**rows, "next": np.array([self.pos, self.full])}
+
+    def fill(self, content: Mapping[str, np.ndarray]) -> None:
+        """Take back what :meth:`filled` gave, with space for the other rows.
+
+        Raises:
+            ValueError: If it is of a buffer of other shapes.
+        """
+        for name in self.rows:
+            found, own = content[name], getattr(self, name)
+            if found.shape[1:] != own.shape[1:] or len(found) > len(own):
+                raise ValueError(
+                    f"Expected {name} of at most {len(own)} rows of shape {own.shape[1:]}, found "
+                    f"{found.shape}."
+                )
+        for name in self.rows:
+            rows = np.zeros_like(getattr(self, name))
+            rows[: len(content[name])] = content[name]
+            setattr(self, name, rows)
+        self.pos, self.full = int(content["next"][0]), bool(content["next"][1])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes, of the rows those that are filled."""
+        return {**self.__dict__, **{name: getattr(self, name)[: self.size()] for name in self.rows}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the attributes back, with space for the other rows."""
+        self.__dict__.update(state)
+        for name in self.rows:
+            filled = state[name]
+            rows = np.zeros((self.buffer_size, *filled.shape[1:]), dtype=filled.dtype)
+            rows[: len(filled)] = filled
+            setattr(self, name, rows)
+
+
+class MixedReplayBuffer(CompactReplayBuffer):
+    """The replay buffer of Dyna: real experience D_R, and beside it model experience D_M.
+
+    To Stable-Baselines3 it is the buffer of the real transitions. The attribute ``model_buffer`` is
+    one of the others. Every batch is drawn from both: of ``batch_size`` samples,
+    ``batch_size * real_fraction`` are real, a fractional number being rounded up or down at random
+    so that the mean is exact. As long as one of the buffers is empty, or ``mix`` is False, batches
+    come from the real one, or from the model's if that is all there is.
+
+    A real step whose ``info["step_failed"]`` is true did not happen, as where a simulator failed.
+    It is not kept: the step before it is the last one of its episode, truncated. (Where other
+    environments made theirs, its place in the row repeats another transition.)
+
+    Args:
+        buffer_size: Capacity of the real buffer.
+        observation_space: A one-dimensional ``Box``.
+        action_space: A ``Box``.
+        device: Device of the samples.
+        n_envs: Number of real environments.
+        optimize_memory_usage: Must be False.
+        handle_timeout_termination: See Stable-Baselines3.
+        real_fraction: Share of real samples in a batch, in [0, 1].
+        model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
+
+    Attributes:
+        model_buffer: The model's transitions.
+        failed: Which places repeat another transition, ``buffer_size x n_envs`` booleans.
+        mix: Whether batches hold model transitions.
+        num_new: Steps that were added since this was last set to zero, by whom reads them.
+        real_fraction: Share of real samples in a batch.
+
+    Raises:
+        ValueError: If the fraction or the size is out of range, or ``optimize_memory_usage`` is
+            asked for.
+    """
+
+    rows = (*CompactReplayBuffer.rows, "failed")
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: torch.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        *,
+        real_fraction: float = 1 / 11,
+        model_buffer_size: int | None = None,
+    ) -> None:
+        if not 0 <= real_fraction <= 1:
+            raise ValueError(f"real_fraction must lie in [0, 1]; found {real_fraction}.")
+        if model_buffer_size is not None and model_buffer_size < 1:
+            raise ValueError(f"model_buffer_size must be at least 1; found {model_buffer_size}.")
+        if optimize_memory_usage:
+            raise ValueError(
+                "MixedReplayBuffer does not support optimize_memory_usage=True: model transitions "
+                "do not lie in the order of a trajectory."
+            )
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device,
+            n_envs,
+            handle_timeout_termination=handle_timeout_termination,
+        )
+        self.real_fraction = real_fraction
+        self.mix = True
+        self.num_new = 0
+        self.failed = np.zeros((self.buffer_size, n_envs), dtype=bool)
+        self.model_buffer = CompactReplayBuffer(
+            buffer_size if model_buffer_size is None else model_buffer_size,
+            observation_space,
+            action_space,
+            device,
+        )
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Add a real step of each environment, see Stable-Baselines3."""
+        failed = np.array([bool(info.get("step_failed")) for info in infos])
+        if failed.any():
+            self._end_episodes(failed)
+        if failed.all():
+            return
+        pos = self.pos
+        super().add(obs, next_obs, action, reward, done, infos)
+        self.num_new += 1
+        self.failed[pos] = failed
+        for i in failed.nonzero()[0]:
+            # Its place in the row is taken by a transition that is sampled once more.
+            row, env = (pos - 1, i) if self.size() > 1 else (pos, int(failed.argmin()))
+            for name in CompactReplayBuffer.rows:
+                getattr(self, name)[pos, i] = getattr(self, name)[row, env]
+
+    def _end_episodes(self, failed: np.ndarray) -> None:
+        """Let the newest steps of some environments be the last ones of their episodes."""
+        if not self.size():
+            return
+        ended = failed & (self.dones[self.pos - 1] == 0)
+        self.dones[self.pos - 1][ended] = self.timeouts[self.pos - 1][ended] = 1
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """Draw a batch from both buffers; the real samples come first.
+
+        Args:
+            batch_size: Number of samples.
+            env: Normalises observations and rewards, see Stable-Baselines3.
+        """
+        if not self.mix or not self.model_buffer.size():
+            return super().sample(batch_size, env)
+        if not self.size():
+            return self.model_buffer.sample(batch_size, env)
+        expected = batch_size * self.real_fraction
+        num_real = int(expected) + int(np.random.random() < expected % 1)  # noqa: NPY002
+        parts = []
+        if num_real:
+            parts.append(super().sample(num_real, env))
+        if num_real < batch_size:
+            parts.append(self.model_buffer.sample(batch_size - num_real, env))
+        names = ReplayBufferSamples._fields[:-1]  # the last is for n-step returns
+        columns = [torch.cat([getattr(part, name) for part in parts]) for name in names]
+        return ReplayBufferSamples(*columns)
+
+    def reset(self) -> None:
+        """Empty both buffers."""
+        super().reset()
+        self.model_buffer.reset()
+        self.failed[:] = False
+        self.num_new = 0

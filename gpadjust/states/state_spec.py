@@ -1,0 +1,293 @@
+"""What the entries of a system's state are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from numbers import Real
+
+import torch
+from torch import Tensor
+
+from gpadjust.states.spec_checks import (
+    check_exogenous,
+    check_integrated,
+    check_previous,
+    checked_mapping,
+    checked_names,
+)
+
+
+@dataclass(frozen=True)
+class StateSpec:
+    r"""What the entries of a system's state and action are, said once.
+
+    A *state* is a row of physical quantities; an *observation* is what a policy sees: the state
+    with each angle :math:`\theta` replaced, in its place, by :math:`\sin\theta, \cos\theta`.
+
+    Args:
+        states: The names of the state's entries.
+        actions: The names of the action's entries.
+        angles: The states that are angles in rad. Policy and model see their sine and cosine, and
+            changes are the shortest way round the circle.
+        exogenous: The states that stay as they are during a trial, such as a target. The policy
+            sees them; models and physics do not.
+        integrated: For states that a model need not predict, the states that are their
+            velocities: :math:`q' = q + h (v + v') / 2`.
+        step: The time step :math:`h`, in the time unit of the velocities; needed by ``integrated``.
+        previous: For states that hold the previous action, the entries of the action that they
+            will hold next. What a system does may depend on them, as where it follows its actions
+            with a delay: policy and models see them, models need not predict them, and the physics
+            knows nothing of them.
+
+    Raises:
+        TypeError: If names are not strings, ``integrated`` or ``previous`` is no mapping or
+            ``step`` no number.
+        ValueError: If a name is unknown, repeated, or stands for two things that exclude each
+            other, no state is left to predict, or ``step`` is missing or not positive.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.states import StateSpec
+        >>> spec = StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"])
+        >>> spec.observe(torch.tensor([[0.0, 2.0]]))
+        tensor([[0., 1., 2.]])
+    """
+
+    states: Sequence[str]
+    actions: Sequence[str]
+    angles: Sequence[str] = ()
+    exogenous: Sequence[str] = ()
+    integrated: Mapping[str, str] = field(default_factory=dict, hash=False)
+    step: float | None = None
+    previous: Mapping[str, str] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        """Check the names."""
+        for name in ("states", "actions", "angles", "exogenous"):
+            object.__setattr__(self, name, checked_names(getattr(self, name), name))
+        for name, other, example in (
+            ("integrated", "its velocity", {"x": "x_dot"}),
+            ("previous", "an action", {"last_force": "force"}),
+        ):
+            mapping = checked_mapping(getattr(self, name), name, other, example)
+            object.__setattr__(self, name, mapping)
+        for name in ("states", "actions"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} must be one or more different names; found none.")
+        if isinstance(self.step, bool) or not isinstance(self.step, Real | None):
+            raise TypeError(f"step must be a number or None; found {self.step!r}.")
+        named = (*self.angles, *self.exogenous, *self.integrated, *self.integrated.values())
+        named = (*named, *self.previous)
+        unknown = [name for name in named if name not in self.states]
+        if unknown:
+            raise ValueError(f"There is no state {unknown[0]!r}; the states are {self.states}.")
+        unknown = [name for name in self.previous.values() if name not in self.actions]
+        if unknown:
+            raise ValueError(
+                f"previous names an action {unknown[0]!r}; the actions are {self.actions}."
+            )
+        fixed = (*self.exogenous, *self.integrated, *self.previous)
+        twice = [name for name in fixed if fixed.count(name) > 1]
+        twice += [name for name in self.integrated.values() if name in fixed]
+        twice += [name for name in self.angles if name in self.previous]
+        if twice:
+            raise ValueError(
+                f"State {twice[0]!r} is said to be two things: exogenous, integrated, a "
+                "velocity and a previous action exclude each other, as do an angle and a previous "
+                "action."
+            )
+        if set(fixed) == set(self.states):
+            raise ValueError(
+                "No state is left to predict; all are exogenous, integrated or previous actions."
+            )
+        if self.integrated and self.step is None:
+            raise ValueError("step must be the duration of a step, as some states are integrated.")
+        if self.step is not None and not 0 < self.step < math.inf:
+            raise ValueError(f"step must be positive and finite; found {self.step}.")
+        object.__setattr__(self, "step", None if self.step is None else float(self.step))
+
+    @property
+    def state_dim(self) -> int:
+        """Number of entries of a state."""
+        return len(self.states)
+
+    @property
+    def action_dim(self) -> int:
+        """Number of entries of an action."""
+        return len(self.actions)
+
+    @property
+    def observation_dim(self) -> int:
+        """Number of entries of an observation."""
+        return len(self.states) + len(self.angles)
+
+    @property
+    def moving(self) -> list[int]:
+        """The states that the physics reads, before the action, and says the next values of.
+
+        They are those neither exogenous nor previous actions.
+        """
+        still = (*self.exogenous, *self.previous)
+        return [i for i, name in enumerate(self.states) if name not in still]
+
+    @property
+    def predicted(self) -> list[int]:
+        """The states that a model predicts, those that move and are not integrated."""
+        return [i for i in self.moving if self.states[i] not in self.integrated]
+
+    @property
+    def previous_columns(self) -> list[int]:
+        """The states that hold previous actions, read by models beside moving ones and action."""
+        return [i for i, name in enumerate(self.states) if name in self.previous]
+
+    @property
+    def angle_columns(self) -> list[int]:
+        """The states that are angles."""
+        return [i for i, name in enumerate(self.states) if name in self.angles]
+
+    def observe(self, states: Tensor) -> Tensor:
+        """Observations ``... x observation_dim`` of states ``... x state_dim``."""
+        check_columns(states, self.state_dim, "states")
+        columns = []
+        for name, column in zip(self.states, states.unbind(-1), strict=True):
+            columns += [column.sin(), column.cos()] if name in self.angles else [column]
+        return torch.stack(columns, dim=-1)
+
+    def decode(self, observations: Tensor) -> Tensor:
+        r"""States ``... x state_dim`` of observations; angles are in :math:`(-\pi, \pi]`."""
+        check_columns(observations, self.observation_dim, "observations")
+        rest = iter(observations.unbind(-1))
+        columns = [
+            torch.atan2(next(rest), next(rest)) if name in self.angles else next(rest)
+            for name in self.states
+        ]
+        return torch.stack(columns, dim=-1)
+
+    def change(self, states: Tensor, next_states: Tensor) -> Tensor:
+        """The change ``... x state_dim``, of angles the shortest way round."""
+        change = next_states - states
+        for i in self.angle_columns:
+            angle = change[..., i]
+            change[..., i] = torch.atan2(angle.sin(), angle.cos())
+        return change
+
+    def check_transitions(
+        self, states: Tensor, next_states: Tensor, actions: Tensor | None = None
+    ) -> None:
+        r"""Check what is declared against transitions of the system.
+
+        An exogenous state may change by no more than the rounding of single precision.
+
+        An integrated one must follow its velocity as :math:`q' - q = b\, h (v + v') / 2` with
+        :math:`b = 1`. With the way :math:`w = \sum h (|v| + |v'|) / 2`, or :math:`\sum |q' - q|`
+        where that is more,
+
+        - it does not, as with a wrong ``step``, if the least squares estimate of :math:`b` is so
+          far from 1 that this makes up more than :math:`0.1\, w` beside three of its standard
+          errors;
+        - there is a warning if the discrepancies sum up to more than :math:`0.5\, w`, as those of
+          another state's velocity do, or of noisy sensors while nothing moves.
+
+        The trapezoid itself errs by :math:`h^3 |\ddot v| / 12` a step: of an oscillation by less
+        than a tenth if it is sampled six times a period or more. Discrepancies in angles are taken
+        the shortest way round.
+
+        A previous action must be the action to a thousandth of the largest of that action.
+
+        Args:
+            states: ``N x state_dim``.
+            next_states: ``N x state_dim``; NaN where an entry was not measured, which is not
+                checked.
+            actions: ``N x action_dim``; may be left out if no state is a previous action.
+
+        Raises:
+            ValueError: If a state is not what it is said to be. It is named, with what was found.
+                If there are previous actions, but no ``actions``.
+
+        Warns:
+            UserWarning: If an integrated state is far from what its velocity says.
+        """
+        check_columns(states, self.state_dim, "states")
+        check_columns(next_states, self.state_dim, "next_states")
+        if states.shape != next_states.shape:
+            raise ValueError(
+                "Expected states and next_states with as many rows, got shapes "
+                f"{tuple(states.shape)} and {tuple(next_states.shape)}."
+            )
+        change = self.change(states, next_states)
+        size = torch.maximum(states.abs(), next_states.abs())
+        size[..., self.angle_columns] = size[..., self.angle_columns].clamp_min(1)
+        rounding = 4 * torch.finfo(torch.float32).eps * size
+        for name in self.exogenous:
+            i = self.states.index(name)
+            check_exogenous(name, change[..., i], rounding[..., i])
+        if self.previous:
+            self._check_previous(next_states, actions)
+        for name, velocity in self.integrated.items():
+            i, v = self.states.index(name), self.states.index(velocity)
+            assert self.step is not None, "checked at the start"
+            discrepancy = change[..., i] - self.step * (states[..., v] + next_states[..., v]) / 2
+            if name in self.angles:
+                discrepancy = torch.atan2(discrepancy.sin(), discrepancy.cos())
+            known = ~discrepancy.isnan()
+            velocities = (states[..., v][known], next_states[..., v][known])
+            found, unavoidable = discrepancy[known], rounding[..., i][known]
+            check_integrated(name, velocity, self.step, velocities, found, unavoidable)
+
+    def _check_previous(self, next_states: Tensor, actions: Tensor | None) -> None:
+        if actions is None:
+            raise ValueError(
+                f"States {tuple(self.previous)} are said to be previous actions, which cannot be "
+                "checked without actions; pass `actions`."
+            )
+        check_columns(actions, self.action_dim, "actions")
+        for name, action in self.previous.items():
+            found, taken = next_states[..., self.states.index(name)], self._taken(actions, action)
+            check_previous(name, action, found, taken, 1e-3 * taken.abs().amax())
+
+    def _taken(self, actions: Tensor, name: str) -> Tensor:
+        return actions[..., self.actions.index(name)]
+
+    def remember(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Let states ``... x state_dim`` hold these actions as the previous ones, in place."""
+        for name, action in self.previous.items():
+            states[..., self.states.index(name)] = self._taken(actions, action)
+        return states
+
+    def complete(self, states: Tensor, actions: Tensor, predicted: Tensor) -> Tensor:
+        """The next states, of which a model knows ``predicted``, ``... x len(spec.predicted)``."""
+        following = states.expand(*predicted.shape[:-1], self.state_dim).clone()
+        following[..., self.predicted] = predicted
+        self.remember(following, actions)
+        for name, velocity in self.integrated.items():
+            i, v = self.states.index(name), self.states.index(velocity)
+            assert self.step is not None, "checked at the start"
+            following[..., i] += self.step * (states[..., v] + following[..., v]) / 2
+        return following
+
+    def complete_variance(self, variance: Tensor) -> Tensor:
+        """The variance of all states, from that of the predicted ones; see :meth:`complete`."""
+        full = variance.new_zeros(*variance.shape[:-1], self.state_dim)
+        full[..., self.predicted] = variance
+        for name, velocity in self.integrated.items():
+            i, v = self.states.index(name), self.states.index(velocity)
+            assert self.step is not None, "checked at the start"
+            full[..., i] = (self.step / 2) ** 2 * full[..., v]
+        return full
+
+
+def check_columns(tensor: Tensor, columns: int, name: str) -> None:
+    """Raise an error unless a tensor is floating-point and has the last dimension expected."""
+    if not torch.is_tensor(tensor) or not tensor.is_floating_point():
+        found = tensor.dtype if torch.is_tensor(tensor) else type(tensor).__name__
+        raise TypeError(
+            f"Expected {name} as a floating-point tensor, got {found}; convert with "
+            f"`torch.as_tensor({name}, dtype=torch.float64)`."
+        )
+    if tensor.dim() < 1 or tensor.shape[-1] != columns:
+        raise ValueError(
+            f"Expected {name} of shape ... x {columns}, as the spec says, got "
+            f"{tuple(tensor.shape)}."
+        )

@@ -1,0 +1,288 @@
+"""Plans of episodes that teach, and the search that makes them."""
+
+import pickle
+
+import pytest
+import torch
+
+from gpadjust.control import CrossEntropyPlanner, Information, Return, Rollouts, Task
+from gpadjust.control.action_sequences import cross_entropy, random_sequences
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec, TrajectoryInformation
+from gpadjust.models import ZeroMeanGP
+from gpadjust.physics import PhysicsError
+
+pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
+BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
+SPEC = StateSpec(["x"], ["v"])
+QUICK = {"num_starts": 1, "num_screened": 0, "max_iterations": 15}
+
+
+@pytest.fixture
+def known_left():
+    """Dynamics of x' = x + v / 2 that were measured, often, where v is negative."""
+    x = torch.linspace(-3, 3, 40, dtype=torch.float64).unsqueeze(-1)
+    v = -torch.rand(40, 1, dtype=torch.float64)
+    dynamics = LearnedDynamics(SPEC, model=ZeroMeanGP, fit_options=QUICK)
+    dynamics.update(x, v, x + 0.5 * v + 0.01 * torch.randn_like(x))
+    return dynamics
+
+
+@pytest.fixture
+def origin():
+    return torch.zeros(1, dtype=torch.float64)
+
+
+# Sequences
+
+
+def test_random_sequences_hold_their_actions():
+    sequences = random_sequences(200, 12, BOUNDS, max_hold=4)
+    assert sequences.shape == (200, 12, 1)
+    assert ((sequences >= BOUNDS[0]) & (sequences <= BOUNDS[1])).all()
+    assert sequences.min() < -0.95
+    assert sequences.max() > 1.95
+    changes = (sequences.diff(dim=1) != 0).squeeze(-1)
+    holds = {tuple(row.nonzero().flatten().tolist()) for row in changes}
+    assert holds == {tuple(range(h - 1, 11, h)) for h in (1, 2, 3, 4)}
+
+
+def test_the_cross_entropy_method_finds_an_optimum():
+    best = torch.tensor([[0.5], [-1.0], [2.0], [0.0]], dtype=torch.float64)
+    calls = []
+
+    def score(sequences):
+        calls.append(len(sequences))
+        return -(sequences - best).square().sum((-2, -1))
+
+    first = random_sequences(60, 4, BOUNDS, max_hold=1)
+    found, value = cross_entropy(score, first, BOUNDS, rounds=12, num_elites=8)
+    assert calls == [60] * 13
+    assert value == pytest.approx(score(found.unsqueeze(0)).item())
+    assert value > -1e-2
+    chosen, before = cross_entropy(score, first, BOUNDS, rounds=0, num_elites=8)
+    assert before == score(first).max()
+    assert (first == chosen).flatten(1).all(1).any()
+    assert before < value
+
+
+def test_a_single_sequence_is_taken():
+    only = torch.ones(1, 3, 1, dtype=torch.float64)
+    found, _ = cross_entropy(lambda s: s.sum((-2, -1)), only, BOUNDS, rounds=1, num_elites=8)
+    assert torch.equal(found, only[0])
+
+
+# Trials in functions
+
+
+def reward(states, actions, next_states):
+    return -(next_states[:, 0] - 1).abs()
+
+
+def task_of(dynamics, **parts):
+    return Task(dynamics, reward, **parts)
+
+
+def half_steps(fails_beyond=None, **parts):
+    def physics(X):
+        if fails_beyond is not None and (X[:, 0] > fails_beyond).any():
+            bad = (X[:, 0] > fails_beyond).nonzero().flatten().tolist()
+            raise PhysicsError("too far", rows=bad)
+        return X[:, :1] + 0.5 * X[:, 1:]
+
+    return task_of(PhysicsDynamics(SPEC, physics), **parts)
+
+
+def test_sequences_are_followed(origin):
+    sequences = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
+    steps = Rollouts(half_steps(), 3).follow(origin, sequences)
+    assert steps.made.all()
+    assert torch.equal(steps.actions, sequences.expand(3, 2, 3, 1))
+    expected = torch.tensor([[0, 0.5, 1.5], [0, 0, -0.5]], dtype=torch.float64)
+    torch.testing.assert_close(steps.states.squeeze(-1), expected.expand(3, 2, 3))
+    torch.testing.assert_close(steps.next_states[:, :, :-1], steps.states[:, :, 1:])
+    torch.testing.assert_close(steps.rewards, -(steps.next_states.squeeze(-1) - 1).abs())
+
+
+@pytest.mark.parametrize(
+    ("options", "made"),
+    [
+        ({"terminated": lambda states: states[:, 0] > 1.2}, [True, True, True, False, False]),
+        (
+            {"state_bounds": torch.tensor([[-9.0], [1.2]], dtype=torch.float64)},
+            [True, True, False, False, False],
+        ),
+    ],
+)
+def test_episodes_end_in_the_model(origin, options, made):
+    sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
+    steps = Rollouts(half_steps(**options), 2).follow(origin, sequences)
+    assert steps.made[:, 1].all()
+    assert steps.made[:, 0].tolist() == [made] * 2
+    assert steps.left_bounds.tolist() == [["state_bounds" in options, False]] * 2
+
+
+def test_episodes_end_where_the_physics_fails(origin):
+    sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
+    steps = Rollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
+    assert steps.made[0].tolist() == [[True, True, False, False, False], [True] * 5]
+    assert steps.states[steps.made].max() <= 0.9
+    assert steps.left_bounds.tolist() == [[True, False]] * 2
+
+
+def test_all_episodes_may_end_at_once_but_not_at_the_start(origin):
+    sequences = torch.ones(2, 5, 1).double()
+    steps = Rollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
+    assert steps.made.tolist() == [[[True, True, False, False, False]] * 2] * 2
+    with pytest.raises(PhysicsError, match="too far"):
+        Rollouts(half_steps(fails_beyond=-1), 2).follow(origin, sequences)
+
+
+def test_the_policy_proposes(origin):
+    rollouts = Rollouts(half_steps(), 2)
+    sequences = rollouts.propose(origin, 4, lambda states: 1 + states, 3)
+    assert sequences.shape == (3, 4, 1)
+    expected = torch.tensor([1.0, 1.5, 2.25, 3.375], dtype=torch.float64)
+    torch.testing.assert_close(sequences.squeeze(-1), expected.expand(3, 4))
+
+
+# Plans
+
+
+def test_a_plan_goes_where_little_is_known(known_left, origin):
+    plan = CrossEntropyPlanner(Information(), num_random=24, rounds=1).plan(
+        task_of(known_left), origin, BOUNDS, 4
+    )
+    assert plan.actions.shape == (4, 1)
+    assert ((plan.actions >= BOUNDS[0]) & (plan.actions <= BOUNDS[1])).all()
+    assert plan.actions.max() > 1
+    information = TrajectoryInformation(known_left)
+    actions = torch.full((4, 1), -0.5, dtype=torch.float64)
+    states = actions.cumsum(0) / 2 - actions / 2
+    assert plan.value > 3 * information(states, actions)
+
+
+def test_more_rounds_teach_more(known_left, origin):
+    values = []
+    for rounds in (0, 4):
+        torch.manual_seed(0)
+        options = CrossEntropyPlanner(Information(), num_random=16, num_policy=0, rounds=rounds)
+        values.append(options.plan(task_of(known_left), origin, BOUNDS, 4).value)
+    assert values[1] > values[0]
+
+
+def test_a_plan_may_be_the_policys(known_left, origin):
+    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=4, rounds=0)
+    plan = options.plan(
+        task_of(known_left), origin, BOUNDS, 3, policy=lambda s: torch.full_like(s, 9.0)
+    )
+    assert (plan.actions == 2).all()
+    without = options.plan(task_of(known_left), origin, BOUNDS, 3)
+    assert without.actions.unique().numel() > 1
+
+
+def test_the_rest_of_an_episode_counts_what_the_episode_told(known_left):
+    """Of what only the first steps can tell, a rest that repeats them tells less."""
+    state = torch.zeros(1, dtype=torch.float64)
+    held = torch.full((2, 1), 1.5, dtype=torch.float64)
+    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
+    alone = options.plan(task_of(known_left), state, BOUNDS, 2, policy=lambda s: s * 0 + 1.5)
+    states = torch.tensor([[0.0], [0.75]], dtype=torch.float64)
+    both = options.plan(
+        task_of(known_left), state, BOUNDS, 2, policy=lambda s: s * 0 + 1.5, past=(states, held)
+    )
+    first = TrajectoryInformation(known_left)(states, held)
+    assert first < both.value < alone.value + 0.7 * first
+
+
+def test_a_known_sequence_is_kept_if_nothing_is_better(known_left, origin):
+    known = torch.full((4, 1), 2.0, dtype=torch.float64)
+    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
+    plan = options.plan(
+        task_of(known_left), origin, BOUNDS, 4, policy=lambda s: s * 0 - 0.5, known=known
+    )
+    assert torch.equal(plan.actions, known)
+
+
+def test_a_state_from_which_every_step_leaves_the_bounds(known_left, origin):
+    bounds = torch.tensor([[5.0], [6.0]], dtype=torch.float64)
+    plan = CrossEntropyPlanner(Information(), num_random=4).plan(
+        task_of(known_left, state_bounds=bounds), origin, BOUNDS, 3
+    )
+    assert plan.value == 0
+
+
+def test_plans_are_those_of_the_generator(known_left, origin):
+    options = pickle.loads(pickle.dumps(CrossEntropyPlanner(Information(), num_random=8, rounds=1)))
+    plans = []
+    for seed in (0, 0, 1):
+        torch.manual_seed(seed)
+        plans.append(options.plan(task_of(known_left), origin, BOUNDS, 3).actions)
+    assert torch.equal(plans[0], plans[1])
+    assert not torch.equal(plans[0], plans[2])
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"num_random": -1}, ValueError, "num_random must be at least 0; found -1"),
+        ({"num_functions": 0}, ValueError, "num_functions must be at least 1; found 0"),
+        ({"replan_every": 0}, ValueError, "replan_every must be at least 1; found 0"),
+        ({"rounds": 1.5}, TypeError, "rounds must be a whole number; found 1.5"),
+        ({"max_hold": True}, TypeError, "max_hold must be a whole number; found True"),
+        ({"num_random": 0, "num_policy": 0}, ValueError, "no sequence of actions to choose"),
+    ],
+)
+def test_bad_options_are_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        CrossEntropyPlanner(Information(), **options)
+
+
+def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
+    options = CrossEntropyPlanner(Information())
+    with pytest.raises(ValueError, match=r"state of shape 1, found \(2,\)"):
+        options.plan(task_of(known_left), origin.repeat(2), BOUNDS, 3)
+    with pytest.raises(ValueError, match=r"finite action_bounds of shape 2 x 1, found .*inf"):
+        options.plan(task_of(known_left), origin, BOUNDS * torch.inf, 3)
+    with pytest.raises(TypeError, match="found PhysicsDynamics"):
+        options.plan(half_steps(), origin, BOUNDS, 3)
+    with pytest.raises(RuntimeError, match="has not learnt"):
+        options.plan(task_of(LearnedDynamics(SPEC, model=ZeroMeanGP)), origin, BOUNDS, 3)
+    with pytest.raises(ValueError, match="num_steps as a number of steps >= 1, found None"):
+        options.plan(task_of(known_left), origin, BOUNDS)
+
+
+def test_an_objective_is_asked_for():
+    with pytest.raises(TypeError, match=r"Information\(\) or Return\(\); found 'return'"):
+        CrossEntropyPlanner("return")
+
+
+# Returns
+
+
+def test_a_plan_of_the_greatest_return(origin):
+    """From x = 0 the way to x = 1 and to stay there, by steps of v / 2 with v at most 2."""
+    planner = CrossEntropyPlanner(Return(), num_random=200, rounds=12, max_hold=1)
+    plan = planner.plan(half_steps(), origin, BOUNDS, 4)
+    assert plan.value > -0.1
+    reached = (plan.actions[:, 0] / 2).cumsum(0)
+    torch.testing.assert_close(reached, torch.ones(4).double(), atol=0.05, rtol=0)
+
+
+def test_a_return_is_the_sum_of_the_rewards_that_are_made(origin):
+    sequences = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
+    for parts, expected in [
+        ({}, [-0.5 - 0.5 - 0.5, -1.0 - 1.5 - 1.0]),
+        ({"terminated": lambda states: states[:, 0] > 1.2}, [-0.5 - 0.5, -1.0 - 1.5 - 1.0]),
+        ({"state_bounds": torch.tensor([[-9.0], [1.2]])}, [-0.5 - 2 * 1.5, -1.0 - 1.5 - 1.0]),
+    ]:
+        task = half_steps(**parts)
+        score = Return().of(task)(Rollouts(task, 2).follow(origin, sequences), None)
+        torch.testing.assert_close(score, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_leaving_the_bounds_never_pays(origin):
+    """Rewards are negative: an episode that ended early would have the greatest sum of them."""
+    task = half_steps(state_bounds=torch.tensor([[-0.3], [0.9]]))
+    plan = CrossEntropyPlanner(Return(), num_random=100, rounds=6).plan(task, origin, BOUNDS, 5)
+    rollout = Rollouts(task, 1).follow(origin, plan.actions.unsqueeze(0))
+    assert rollout.made.all()

@@ -1,0 +1,191 @@
+"""Real and model experience in one buffer."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from gpadjust.rl import MixedReplayBuffer
+
+OBSERVATIONS = spaces.Box(-np.inf, np.inf, (2,))
+ACTIONS = spaces.Box(-1, 1, (1,))
+
+
+@pytest.fixture
+def buffer():
+    """Makes a buffer with so many rows; real rewards are 1, 2, ..., those of the model -1, ..."""
+
+    def make(num_real=0, num_model=0, buffer_size=50, n_envs=1, **options):
+        made = MixedReplayBuffer(buffer_size, OBSERVATIONS, ACTIONS, "cpu", n_envs, **options)
+        for i in range(1, num_real + 1):
+            made.add(*real_row(i, n_envs))
+        if num_model:
+            made.model_buffer.add_rows(*rows(np.arange(-1, -num_model - 1, -1)))
+        return made
+
+    return make
+
+
+def real_row(i, n_envs=1):
+    obs = np.full((n_envs, 2), i)
+    return obs, obs + 0.5, obs[:, :1] / 100, np.full(n_envs, i), np.zeros(n_envs), [{}] * n_envs
+
+
+def rows(values):
+    obs = np.repeat(values[:, None], 2, axis=1)
+    none = np.zeros(len(values), dtype=bool)
+    return obs, obs + 0.5, obs[:, :1] / 100, values, none, none
+
+
+@pytest.mark.parametrize(("batch_size", "fraction"), [(10, 0.25), (11, 1 / 11), (3, 0.5), (8, 0.1)])
+def test_batches_hold_the_promised_share(buffer, batch_size, fraction):
+    np.random.seed(0)  # noqa: NPY002 - the generator that SB3 uses
+    made = buffer(20, 20, real_fraction=fraction)
+    counts = [int((made.sample(batch_size).rewards > 0).sum()) for _ in range(400)]
+    expected = batch_size * fraction
+    assert set(counts) == {int(np.floor(expected)), int(np.ceil(expected))}
+    part = expected % 1
+    assert abs(np.mean(counts) - expected) <= 4 * np.sqrt(part * (1 - part) / 400)
+
+
+@pytest.mark.parametrize(("fraction", "share"), [(0.0, 0), (1.0, 1)])
+def test_batches_of_one_kind(buffer, fraction, share):
+    made = buffer(20, 20, real_fraction=fraction)
+    rewards = made.sample(16).rewards
+    assert (rewards > 0).float().mean() == share
+    assert rewards.shape == (16, 1)
+
+
+def test_a_sample_is_a_whole_row(buffer):
+    batch = buffer(20, 20, real_fraction=0.5).sample(32)
+    for part, expected in [
+        (batch.observations, batch.rewards.expand(-1, 2)),
+        (batch.next_observations, batch.rewards.expand(-1, 2) + 0.5),
+        (batch.actions, batch.rewards / 100),
+    ]:
+        np.testing.assert_allclose(part, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("num_real", "num_model", "mix", "sign"),
+    [(5, 0, True, 1), (0, 5, True, -1), (5, 5, False, 1), (5, 0, False, 1)],
+)
+def test_one_buffer_serves_where_the_other_does_not(buffer, num_real, num_model, mix, sign):
+    made = buffer(num_real, num_model, real_fraction=0.5)
+    made.mix = mix
+    assert (made.sample(16).rewards * sign > 0).all()
+
+
+def test_terminations_by_the_time_limit_are_not_dones(buffer):
+    made = buffer(0, 0)
+    obs, following, actions, rewards, _, _ = rows(np.arange(1, 4))
+    dones, timeouts = np.array([0, 1, 1], dtype=bool), np.array([0, 0, 1], dtype=bool)
+    made.model_buffer.add_rows(obs, following, actions, rewards, dones, timeouts)
+    batch = made.sample(64)
+    np.testing.assert_array_equal(batch.dones, batch.rewards == 2)
+
+
+@pytest.mark.parametrize("chunks", [[3, 4], [7, 2, 5], [10], [4, 10], [3, 23], [25, 1], [0, 2]])
+def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
+    many, one = buffer(model_buffer_size=10).model_buffer, buffer(buffer_size=10)
+    start = 1
+    for size in chunks:
+        many.add_rows(*rows(np.arange(start, start + size)))
+        start += size
+    for i in range(1, start):
+        one.add(*real_row(i))
+
+    def in_order(buffer):
+        first = buffer.pos if buffer.full else 0
+        places = (first + np.arange(buffer.size())) % buffer.buffer_size
+        return {
+            name: getattr(buffer, name)[places, 0].tolist()
+            for name in ("observations", "next_observations", "actions", "rewards", "dones")
+        }
+
+    assert many.size() == one.size()
+    assert in_order(many) == in_order(one)
+
+
+def test_add_rows_is_for_one_environment(buffer):
+    with pytest.raises(ValueError, match="one environment; found 2"):
+        buffer(n_envs=2).add_rows(*rows(np.arange(3)))
+
+
+def test_extend_is_that_of_stable_baselines(buffer):
+    made = buffer()
+    steps = [real_row(i) for i in range(1, 4)]
+    made.extend(*zip(*steps, strict=True))
+    assert made.size() == 3
+    np.testing.assert_array_equal(made.rewards[:3, 0], [1, 2, 3])
+
+
+def test_several_real_environments(buffer):
+    made = buffer(6, 6, n_envs=2, buffer_size=20, real_fraction=0.5)
+    assert made.model_buffer.n_envs == 1
+    assert int((made.sample(10).rewards > 0).sum()) == 5
+
+
+@pytest.mark.parametrize("num_rows", [0, 4, 50, 70])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
+def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows, copied):
+    made = buffer(num_rows, num_rows, real_fraction=0.3)
+    again = copied(made)
+    for side in (made, again):
+        side.add(*real_row(99))
+        side.model_buffer.add_rows(*rows(np.array([-98, -99])))
+        np.random.seed(1)  # noqa: NPY002
+        side.batch = side.sample(40)
+    for one, other in zip(made.batch[:-1], again.batch[:-1], strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in [(made, again), (made.model_buffer, again.model_buffer)]:
+        assert (one.pos, one.full) == (other.pos, other.full)
+        np.testing.assert_array_equal(one.observations, other.observations)
+
+
+def test_pickles_are_as_small_as_what_they_hold(buffer):
+    small = len(pickle.dumps(buffer(10, 10, buffer_size=100_000)))
+    assert small < 20_000
+    assert len(pickle.dumps(buffer(10, 1010, buffer_size=100_000))) > small + 1000 * 6 * 4
+
+
+def test_samples_are_normalised(buffer, point_env):
+    normalizer = VecNormalize(DummyVecEnv([point_env]))
+    normalizer.observation_space = OBSERVATIONS
+    normalizer.obs_rms.mean, normalizer.obs_rms.var = np.array([1.0, 2.0]), np.array([4.0, 4.0])
+    normalizer.ret_rms.var = np.array(100.0)
+    made = buffer(5, 5, real_fraction=0.5)
+    np.random.seed(2)  # noqa: NPY002
+    plain = made.sample(20)
+    np.random.seed(2)  # noqa: NPY002
+    batch = made.sample(20, normalizer)
+    shift = np.array([1.0, 2.0])
+    np.testing.assert_allclose(batch.observations, (plain.observations - shift) / 2, rtol=1e-4)
+    np.testing.assert_allclose(
+        batch.next_observations, (plain.next_observations - shift) / 2, rtol=1e-4
+    )
+    np.testing.assert_allclose(batch.rewards, plain.rewards / 10, rtol=1e-4)
+
+
+def test_reset_empties_both(buffer):
+    made = buffer(5, 5)
+    made.reset()
+    assert made.size() == made.model_buffer.size() == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"real_fraction": 1.5}, "real_fraction must lie in .* found 1.5"),
+        ({"real_fraction": -0.1}, "real_fraction"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage"),
+        ({"model_buffer_size": 0}, "model_buffer_size must be at least 1; found 0"),
+        ({"model_buffer_size": -3}, "model_buffer_size must be at least 1; found -3"),
+    ],
+)
+def test_bad_arguments_are_refused(buffer, options, message):
+    with pytest.raises(ValueError, match=message):
+        buffer(**options)

@@ -1,0 +1,171 @@
+"""What states and actions are said to be, and whether they are."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpadjust.states import StateSpec
+
+ARM = StateSpec(
+    ["goal", "q", "v"],
+    ["torque"],
+    angles=["q"],
+    exogenous=["goal"],
+    integrated={"q": "v"},
+    step=0.1,
+)
+
+
+MEMORY = StateSpec(["last", "x", "goal"], ["b", "a"], exogenous=["goal"], previous={"last": "a"})
+
+
+def swing(num_steps, step=0.1, rate=2.0, goal=0.3):
+    """A pendulum's states at equal times: goal, angle and its velocity."""
+    t = step * torch.arange(num_steps + 1, dtype=torch.float64)
+    path = torch.stack([goal + 0 * t, 3 * (rate * t).sin(), 3 * rate * (rate * t).cos()], -1)
+    return path[:-1], path[1:]
+
+
+def test_columns():
+    assert ARM.state_dim == 3
+    assert ARM.action_dim == 1
+    assert ARM.observation_dim == 4
+    assert ARM.predicted == [2]
+    assert ARM.moving == [1, 2]
+    assert ARM.angle_columns == [1]
+
+
+@settings(deadline=None, derandomize=True)
+@given(angle=st.floats(-50, 50), position=st.floats(-1e3, 1e3))
+def test_observations_are_decoded(angle, position):
+    spec = StateSpec(["x", "theta"], ["a"], angles=["theta"])
+    state = torch.tensor([[position, angle]], dtype=torch.float64)
+    seen = spec.observe(state)
+    expected = [position, math.sin(angle), math.cos(angle)]
+    torch.testing.assert_close(seen, torch.tensor([expected], dtype=torch.float64))
+    decoded = spec.decode(seen)
+    torch.testing.assert_close(spec.observe(decoded), seen)
+    assert -math.pi <= decoded[0, 1] <= math.pi
+    change = spec.change(state, decoded)
+    torch.testing.assert_close(change, torch.zeros(1, 2).double(), rtol=0, atol=1e-9)
+
+
+def test_equal_specs_are_equal_and_hashable():
+    again = StateSpec(
+        ["goal", "q", "v"], ("torque",), angles=("q",), exogenous=["goal"], integrated={"q": "v"},
+        step=0.1,
+    )  # fmt: skip
+    assert again == ARM
+    assert hash(again) == hash(ARM)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"states": "xv"}, TypeError, "states must be a sequence of names; found 'xv'"),
+        ({"states": 3}, TypeError, "states must be a sequence of names; found 3"),
+        ({"states": [1, 2]}, TypeError, "states must hold names, as strings; found 1"),
+        ({"states": []}, ValueError, "states must be one or more"),
+        ({"states": ["x", "x"]}, ValueError, r"states must be different names; found \('x', 'x'\)"),
+        ({"actions": []}, ValueError, "actions must be one or more"),
+        ({"angles": ["y"]}, ValueError, "'y'"),
+        ({"exogenous": ["x", "v"]}, ValueError, "No state is left to predict"),
+        ({"integrated": ["x"]}, TypeError, r"such as {'x': 'x_dot'}; found \['x'\]"),
+        ({"integrated": {"x": "v"}}, ValueError, "step must be the duration of a step"),
+        ({"integrated": {"x": 2}, "step": 0.1}, TypeError, "as strings; found 2"),
+        ({"previous": ["x"]}, TypeError, r"such as {'last_force': 'force'}; found \['x'\]"),
+        ({"previous": {"y": "a"}}, ValueError, "There is no state 'y'"),
+        ({"previous": {"x": "b"}}, ValueError, r"an action 'b'; the actions are \('a',\)"),
+        ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' is said to be two things"),
+        ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is said to be two things"),
+        ({"previous": {"x": "a", "v": "a"}}, ValueError, "No state is left to predict"),
+        ({"step": "fast"}, TypeError, "step must be a number or None; found 'fast'"),
+        ({"step": 0}, ValueError, "step must be positive and finite; found 0"),
+        ({"step": math.inf}, ValueError, "step must be positive and finite; found inf"),
+    ],
+)
+def test_bad_declarations_are_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        StateSpec(**{"states": ["x", "v"], "actions": ["a"], **options})
+
+
+# Against transitions
+
+
+@pytest.mark.parametrize("num_steps", [1, 2, 25])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_as_declared_passes(num_steps, dtype):
+    states, following = swing(num_steps)
+    ARM.check_transitions(states.to(dtype).double(), following.to(dtype).double())
+    turn = torch.tensor([0, 2 * math.pi, 0], dtype=torch.float64)
+    ARM.check_transitions(states, following - turn)
+
+
+def test_what_does_not_move_passes():
+    states = torch.tensor([[0.3, 1.0, 0.0]], dtype=torch.float64).repeat(5, 1)
+    ARM.check_transitions(states, states)
+
+
+def test_an_exogenous_state_that_moves_is_named():
+    states, following = swing(10)
+    following[4, 0] += 0.01
+    with pytest.raises(ValueError, match=r"'goal' .* changes by 0.01 in row 4"):
+        ARM.check_transitions(states, following)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.8, 1.25, 2.0, -1.0])
+def test_a_wrong_step_is_found(factor):
+    states, following = swing(25, step=0.1 * abs(factor))
+    if factor < 0:
+        states[:, 2], following[:, 2] = -states[:, 2], -following[:, 2]
+    with pytest.raises(ValueError, match=rf"step=0.1, but moves {factor:.2g}"):
+        ARM.check_transitions(states, following)
+
+
+def test_the_velocity_of_another_state_is_warned_of():
+    states, following = swing(25)
+    other = swing(25, rate=5.0)
+    states[:, 2], following[:, 2] = 0.3 * other[0][:, 2], 0.3 * other[1][:, 2]
+    with pytest.warns(UserWarning, match="'q' is said to be integrated"):
+        ARM.check_transitions(states, following)
+
+
+def test_noise_in_motion_passes_and_at_rest_is_no_error():
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.01 * torch.randn(2, 25, 3, generator=generator, dtype=torch.float64)
+    noise[..., 0] = 0
+    states, following = swing(25)
+    ARM.check_transitions(states + noise[0], following + noise[1])
+    with pytest.warns(UserWarning, match="Noisy sensors look the same"):
+        ARM.check_transitions(noise[0], noise[1])
+
+
+# Previous actions
+
+
+def test_previous_actions_are_neither_moved_nor_predicted():
+    assert MEMORY.moving == MEMORY.predicted == [1]
+    assert MEMORY.previous_columns == [0]
+    states, actions = torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([[4.0, 5.0]])
+    following = MEMORY.complete(states, actions, torch.tensor([[0.9]]))
+    assert torch.equal(following, torch.tensor([[5.0, 0.9, 0.3]]))
+    variance = MEMORY.complete_variance(torch.tensor([[0.5]]))
+    assert torch.equal(variance, torch.tensor([[0.0, 0.5, 0.0]]))
+
+
+def test_what_is_no_previous_action_is_named():
+    generator = torch.Generator().manual_seed(0)
+    states, actions = torch.rand(5, 3, generator=generator), torch.rand(5, 2, generator=generator)
+    following = MEMORY.complete(states, actions, states[:, 1:2])
+    MEMORY.check_transitions(states, following + 1e-7 * (following == actions[:, 1:]), actions)
+    following[3, 0] += 0.1
+    with pytest.raises(ValueError, match=r"'last' .* previous action 'a', but is .* in row 3"):
+        MEMORY.check_transitions(states, following, actions)
+    scales = torch.tensor([1e4, 1.0])  # another action's does not matter
+    with pytest.raises(ValueError, match=r"'last' .* in row 3"):
+        MEMORY.check_transitions(states, following, scales * actions)
+    with pytest.raises(ValueError, match="without actions; pass `actions`"):
+        MEMORY.check_transitions(states, following)
