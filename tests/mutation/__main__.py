@@ -92,6 +92,9 @@ def main() -> int:
         copy = Path(folder) / "copy"
         unneeded = shutil.ignore_patterns(".git", ".*_cache", "__pycache__", "_build")
         shutil.copytree(ROOT, copy, ignore=unneeded)
+        broken = first_failure(copy, ["--collect-only"], 0)
+        if broken:
+            raise RuntimeError(f"The tests cannot be collected, without any fault: {broken}")
         for fault in chosen:
             start = time.perf_counter()
             test = found_by(copy, fault, arguments.numprocesses)
