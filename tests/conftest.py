@@ -1,5 +1,8 @@
 """Settings, data and the models under test, shared by all tests."""
 
+from collections import defaultdict
+from itertools import combinations
+
 import pytest
 import torch
 
@@ -7,6 +10,32 @@ from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.models import PaperRRA
 
 torch.set_num_threads(1)
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Leave benchmarks alone unless they are asked for."""
+    if collection_path.name == "benchmarks" and not config.getoption("benchmark_only"):
+        return True
+    return None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Of tests with three parameters or more, leave to the slow run what has no new pair."""
+    cases = defaultdict(list)
+    for item in items:
+        if len(getattr(getattr(item, "callspec", None), "params", ())) > 2:
+            cases[item.nodeid.partition("[")[0]].append(item)
+    for several in cases.values():
+        quick = [item for item in several if item.get_closest_marker("slow") is None]
+        values = {item: [(n, id(v)) for n, v in item.callspec.params.items()] for item in quick}
+        rest = {item: {*combinations(pairs, 2)} for item, pairs in values.items()}
+        while any(rest.values()):
+            best = max(rest, key=lambda item: len(rest[item]))  # the first of them
+            found = rest.pop(best)
+            rest = {item: pairs - found for item, pairs in rest.items()}
+        for item in rest:
+            item.add_marker("slow")
 
 
 @pytest.fixture(autouse=True)
@@ -146,6 +175,41 @@ def build():
         return _CLASSES[kind](X, Y, Yvar, **options)
 
     return build
+
+
+@pytest.fixture
+def close():
+    """Asserts equality to 1e-8 of the largest number expected."""
+
+    def close(actual, expected, tolerance=1e-8):
+        assert actual.shape == expected.shape
+        size = expected.abs().max().item() if expected.numel() else 0.0
+        torch.testing.assert_close(
+            actual.detach(), expected.detach(), rtol=tolerance, atol=tolerance * size
+        )
+
+    return close
+
+
+@pytest.fixture
+def gradient_is_right():
+    """Asserts the gradient of a function of few numbers, by central differences."""
+
+    def gradient_is_right(function, X):
+        leaf = X.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(function(leaf).sum(), leaf)
+        steps = 1e-5 * torch.eye(X.numel(), dtype=torch.float64)
+        with torch.no_grad():
+            changes = [
+                (function(X + h) - function(X - h)).item() / 2e-5
+                for h in (step.reshape(X.shape) for step in steps)
+            ]
+        expected = torch.tensor(changes, dtype=torch.float64).reshape(X.shape)
+        size = expected.abs().max().item()
+        assert size > 0
+        torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-4 * size)
+
+    return gradient_is_right
 
 
 @pytest.fixture

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
-from gpadjust.dynamics.incremental_fit import checked_fit_options, refit, search_rows
+from gpadjust.dynamics.incremental_fit import check_observed, checked_fit_options, fit_all
 from gpadjust.dynamics.learnt import Learnt, LearntState
 from gpadjust.dynamics.model_recipe import ModelRecipe
 from gpadjust.dynamics.next_state_physics import check_physics
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.inference import FitOptions, FitResult, fit
+from gpadjust.inference import FitOptions, FitResult
 from gpadjust.models import CKA, ExactGPBase, Prediction
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.states import StateSpec
@@ -297,34 +297,17 @@ class LearnedDynamics(Dynamics):
         self.fit_result = None
 
     def _learn(self, data: Transitions, known: Tensor | None, previous: Learnt | None) -> None:
-        n = len(data.states)
-        observed = ~data.next_states[:, self.spec.predicted].isnan()
-        least, i = observed.sum(0).min(0)
-        if least < 2:
-            of = "" if n < 2 else f" with a measured {self.spec.states[self.spec.predicted[i]]!r}"
-            raise ValueError(
-                f"Expected at least 2 transitions to learn from, got {least}{of}: there is no "
-                "scale in fewer. Collect more before the first update."
-            )
-        searched_at = n if previous is None else previous.searched_at
+        check_observed(self.spec, data)
         with self._recipe.restored_on_error():
             if previous is None and not self._compared:
                 self._recipe.compare_physics(data, known)
             self._recipe.tell_physics(data, known)
-            model = self._recipe.build(data, quiet=previous is not None)
-            if previous is None:
-                result = fit(model, **self.fit_options)
-            else:
-                searches = n >= 2 * searched_at
-                rows = search_rows(observed) if searches else None
-                part = None if rows is None else self._recipe.build(data.some(rows), quiet=True)
-                result = refit(model, previous.model, searches, part)
-                searched_at = n if searches else searched_at
+            model, result, searched_at = fit_all(self._recipe, data, previous, self.fit_options)
             if self._recipe.physics_learns:
                 known = self._recipe.physics_at(data)
         self._compared = self._compared or previous is None
         self.fit_result = result
-        self._learnt = Learnt(data, known, (n,), searched_at, model, model)
+        self._learnt = Learnt(data, known, (len(data.states),), searched_at, model, model)
 
     def _known_so_far(self) -> Learnt:
         if self._learnt is None:

@@ -102,13 +102,12 @@ class ModelRecipe:
 
     def check_same_physics(self, data: Transitions, known: Tensor | None) -> None:
         """Raise a RuntimeError if the physics says something else at 3 of the transitions."""
-        columns = self.targets.spec.predicted
-        names = [self.targets.spec.states[i] for i in columns]
+        spec, columns = self.targets.spec, self.targets.spec.predicted
         for part, own in self._of_parts(known):
             probes = PhysicsProbes.of(data.states, data.actions, own, columns)
             with torch.no_grad():
                 found = part.anew(self.targets.inputs(probes.states, probes.actions))
-            probes.check(found, part.name, names)
+            probes.check(found, part.name, spec, columns)
 
     @contextmanager
     def restored_on_error(self) -> Iterator[None]:

@@ -128,9 +128,10 @@ class PhysicsDynamics(Dynamics):
         given = state.get("probes")
         if given is None:
             return
-        names = [self.spec.states[i] for i in self.spec.moving]
-        probes = PhysicsProbes.checked(given, self.spec, len(names))
-        probes.check(self._change(probes.states, probes.actions), self.physics.name, names)
+        moving = self.spec.moving
+        probes = PhysicsProbes.checked(given, self.spec, len(moving))
+        found = self._change(probes.states, probes.actions)
+        probes.check(found, self.physics.name, self.spec, moving)
         self._probes = probes
 
     def _change(self, states: Tensor, actions: Tensor) -> Tensor:

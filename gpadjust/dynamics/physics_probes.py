@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -69,22 +68,27 @@ class PhysicsProbes(NamedTuple):
             )
         return cls(*(tensor.clone() for tensor in given))
 
-    def check(self, found: Tensor, physics: str, columns: Sequence[str]) -> None:
+    def check(self, found: Tensor, physics: str, spec: StateSpec, columns: list[int]) -> None:
         """Raise a RuntimeError, as PyTorch does of a state, if a physics says something else.
 
         Args:
             found: What it says, ``k x m``.
             physics: Its name.
-            columns: The names of the columns, ``m``.
+            spec: What the entries of the state are.
+            columns: Which states these are, ``m``.
         """
-        excess = (found - self.values).abs() - self.tolerance
+        names = [spec.states[i] for i in columns]
+        gap = found - self.values
+        for i in (i for i, name in enumerate(names) if name in spec.angles):
+            gap[:, i] = torch.atan2(gap[:, i].sin(), gap[:, i].cos())
+        excess = gap.abs() - self.tolerance
         if (excess <= 0).all():
             return
         row, column = divmod(int(excess.argmax()), excess.shape[-1])
         raise RuntimeError(
             f"The state is of dynamics with another physics than {physics!r} here. In the state "
             f"{self.states[row].tolist()}, after the action {self.actions[row].tolist()}, that "
-            f"one said {float(self.values[row, column]):.6g} of {columns[column]!r}, this one says "
+            f"one said {float(self.values[row, column]):.6g} of {names[column]!r}, this one says "
             f"{float(found[row, column]):.6g}. Load the state into dynamics of the physics that it "
             "was learnt with, or learn from its transitions again. A physics that is not "
             "deterministic looks the same: dynamics need one that says the same each time."

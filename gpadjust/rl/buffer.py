@@ -183,7 +183,7 @@ class MixedReplayBuffer(CompactReplayBuffer):
         """Add a real step of each environment, see Stable-Baselines3."""
         failed = np.array([bool(info.get("step_failed")) for info in infos])
         if failed.any():
-            self._end_episodes(failed)
+            self.end_episodes(failed)
         if failed.all():
             return
         pos = self.pos
@@ -196,11 +196,15 @@ class MixedReplayBuffer(CompactReplayBuffer):
             for name in CompactReplayBuffer.rows:
                 getattr(self, name)[pos, i] = getattr(self, name)[row, env]
 
-    def _end_episodes(self, failed: np.ndarray) -> None:
-        """Let the newest steps of some environments be the last ones of their episodes."""
+    def end_episodes(self, environments: np.ndarray) -> None:
+        """Let the newest steps of some environments be the last ones of episodes, truncated.
+
+        Args:
+            environments: Which of them, ``n_envs`` booleans.
+        """
         if not self.size():
             return
-        ended = failed & (self.dones[self.pos - 1] == 0)
+        ended = environments & (self.dones[self.pos - 1] == 0)
         self.dones[self.pos - 1][ended] = self.timeouts[self.pos - 1][ended] = 1
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:

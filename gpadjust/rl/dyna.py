@@ -363,6 +363,7 @@ class Dyna(TaskLearner):
 
     def environments_reset(self) -> None:
         """No plan holds any more."""
+        super().environments_reset()
         self.planned.forget()
 
     def ready_task(self) -> Task:

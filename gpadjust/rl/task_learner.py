@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -192,8 +192,17 @@ class TaskLearner(OffPolicyAlgorithm):
         random_state.restore()
         return result
 
+    def learn(self, *args: Any, **kwargs: Any) -> Self:
+        """As in SB3; after an error the next call resets the environments, wherever they are."""
+        try:
+            return super().learn(*args, **kwargs)
+        except BaseException:
+            self._last_obs = None
+            raise
+
     def environments_reset(self) -> None:
-        """Called when all environments are reset, wherever they were."""
+        """Called before all environments are reset, wherever they are."""
+        self.replay_buffer.end_episodes(np.ones(self.n_envs, dtype=bool))
 
     def _middle_actions(self) -> Tensor:
         """An action for each environment, in the middle of the action space."""

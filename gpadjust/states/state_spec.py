@@ -287,7 +287,4 @@ def check_columns(tensor: Tensor, columns: int, name: str) -> None:
             f"`torch.as_tensor({name}, dtype=torch.float64)`."
         )
     if tensor.dim() < 1 or tensor.shape[-1] != columns:
-        raise ValueError(
-            f"Expected {name} of shape ... x {columns}, as the spec says, got "
-            f"{tuple(tensor.shape)}."
-        )
+        raise ValueError(f"Expected {name} of shape ... x {columns}, got {tuple(tensor.shape)}.")

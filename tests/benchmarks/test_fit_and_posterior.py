@@ -58,14 +58,6 @@ def test_fit(benchmark, record_ratio, uniform, n, m):
     record_ratio("fit of CKA / BoTorch's of a SingleTaskGP", ours, theirs, 3 if n < 1000 else 1)
 
 
-@pytest.mark.parametrize("name", ["CKA", "SingleTaskGP"])
-def test_posterior(benchmark, data, uniform, name):
-    model = build_cka(data) if name == "CKA" else SingleTaskGP(*data)
-    Z = uniform(200, 2, seed=1)
-    benchmark.group = f"posterior at 200 points, n = {len(data[0])}"
-    benchmark(predict, model, Z)
-
-
 def test_ratio_of_posterior(benchmark, record_ratio, data, uniform):
     Z = uniform(200, 2, seed=1)
     ours, theirs = build_cka(data), SingleTaskGP(*data)

@@ -1,7 +1,5 @@
 """Time of predicting and of conditioning beside the ways around them; `--benchmark-only`."""
 
-import time
-
 import pytest
 import torch
 from botorch.models import SingleTaskGP
@@ -9,6 +7,12 @@ from botorch.models import SingleTaskGP
 from gpadjust import CKA
 
 NUM_INPUTS = 6
+
+
+@pytest.fixture(autouse=True)
+def _without_gradients():
+    with torch.no_grad():
+        yield
 
 
 @pytest.fixture(params=[1, 4], ids=["1-output", "4-outputs"])
@@ -40,28 +44,8 @@ def moments(posterior):
     return posterior.mean, posterior.variance
 
 
-def ratio(slow, fast, rounds=9):
-    """The ratio of the median times of two actions, timed by turns without gradients."""
-    times = ([], [])
-    with torch.no_grad():
-        for _ in range(rounds):
-            for action, record in zip((slow, fast), times, strict=True):
-                start = time.perf_counter()
-                action()
-                record.append(time.perf_counter() - start)
-    slow_time, fast_time = (torch.tensor(record[1:]).median().item() for record in times)
-    return slow_time / fast_time
-
-
-def record(benchmark, ratio_of, slow, fast):
-    fast()
-    value = benchmark.pedantic(ratio, args=(slow, fast), rounds=1)
-    benchmark.extra_info[ratio_of] = round(value, 2)
-    print(f"{ratio_of}: {value:.1f}")
-
-
 @pytest.mark.parametrize("other", ["posterior(Z[:, None])", "posterior(Z)", "SingleTaskGP"])
-def test_predict(benchmark, data, m, other):
+def test_predict(benchmark, record_ratio, data, m, other):
     X, Y, Z = data
     model, stock = build(X[:500], Y[:500]), SingleTaskGP(X[:500], Y[:500])
     slow = {
@@ -70,11 +54,11 @@ def test_predict(benchmark, data, m, other):
         "SingleTaskGP": lambda: moments(stock.posterior(Z.unsqueeze(-2))),
     }
     benchmark.group = f"predict at 200 points, n = 500, {m} outputs"
-    record(benchmark, f"time of {other} / predict", slow[other], lambda: model.predict(Z))
+    record_ratio(f"time of {other} / predict", slow[other], lambda: model.predict(Z))
 
 
 @pytest.mark.parametrize("n", [20, 100, 500])
-def test_predict_beside_its_products(benchmark, uniform, n):
+def test_predict_beside_its_products(benchmark, record_ratio, uniform, n):
     """Of 200 points, each time new ones: at most 1.6 times the two products at n = 500."""
     X = uniform(n, NUM_INPUTS)
     model = build(X, 1.3 * crude(X) + X[:, :4].square())
@@ -88,10 +72,10 @@ def test_predict_beside_its_products(benchmark, uniform, n):
         return model.predict(torch.rand(200, NUM_INPUTS, dtype=torch.float64))
 
     benchmark.group = f"predict at 200 points, n = {n}, 4 outputs"
-    record(benchmark, "predict / two products", predict, products)
+    record_ratio("predict / two products", predict, products)
 
 
-def test_append(benchmark, data, m):
+def test_append(benchmark, record_ratio, data, m):
     X, Y, Z = data
     model, whole = build(X[:500], Y[:500]), build(X, Y)
     model.predict(Z)
@@ -101,8 +85,7 @@ def test_append(benchmark, data, m):
         return whole.strategy().factors()
 
     benchmark.group = f"factors with one more point, n = 500, {m} outputs"
-    record(
-        benchmark,
+    record_ratio(
         "time of refactorising / conditioning",
         refactorise,
         lambda: model.condition_on_observations(X[500:], Y[500:]),
@@ -110,7 +93,7 @@ def test_append(benchmark, data, m):
 
 
 @pytest.mark.parametrize("other", ["rebuild", "SingleTaskGP"])
-def test_condition(benchmark, data, m, other):
+def test_condition(benchmark, record_ratio, data, m, other):
     X, Y, Z = data
     model, stock = build(X[:500], Y[:500]), SingleTaskGP(X[:500], Y[:500])
     stock.posterior(Z)
@@ -128,8 +111,7 @@ def test_condition(benchmark, data, m, other):
         ),
     }
     benchmark.group = f"condition on one point and predict, n = 500, {m} outputs"
-    record(
-        benchmark,
+    record_ratio(
         f"time of {other} / conditioning",
         slow[other],
         lambda: model.condition_on_observations(X[500:], Y[500:]).predict(z),

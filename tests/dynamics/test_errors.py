@@ -204,6 +204,21 @@ def test_a_physics_may_differ_by_rounding(learnt):
     assert again.num_transitions == 12
 
 
+def test_a_whole_turn_is_no_difference():
+    spec = StateSpec(["theta"], ["rate"], angles=["theta"])
+    states = torch.linspace(0, 6, 9, dtype=torch.float64).unsqueeze(-1)
+    turn = torch.full_like(states, torch.pi)
+
+    def physics(sign):
+        return lambda X: X[:, :1] + sign * (torch.pi - 1e-12)
+
+    seen = PhysicsDynamics(spec, physics(1))
+    seen.update(states, turn, states + turn)
+    PhysicsDynamics(spec, physics(-1)).load_state_dict(seen.state_dict())
+    with pytest.raises(RuntimeError, match="another physics"):
+        PhysicsDynamics(spec, physics(0.9)).load_state_dict(seen.state_dict())
+
+
 def test_a_loaded_state_is_a_copy(learnt):
     state = learnt().state_dict()
     dynamics = LearnedDynamics(SPEC, push)
@@ -246,8 +261,7 @@ def test_an_error_while_learning_changes_nothing(learnt, monkeypatch, where):
         if where == "model":
             patch.setattr(CKA, "__init__", fail)
         if where == "fit":
-            patch.setattr("gpadjust.dynamics.learned_dynamics.fit", fail)
-            patch.setattr("gpadjust.dynamics.learned_dynamics.refit", fail)
+            patch.setattr("gpadjust.dynamics.incremental_fit.fit", fail)
         if where != "physics":
             patch.setattr(CKA, "condition_on_observations", fail)
         for call in (dynamics.fit, dynamics.update, dynamics.condition):

@@ -19,11 +19,11 @@ def model(uniform):
     return CKA(X, 1.5 * crude(X) + X.flip(-1) + 0.1 * uniform(9, 2, seed=5), physics=crude)
 
 
-class TestBadInput:
-    @pytest.mark.parametrize("method", ["map", "hmc"])
-    @pytest.mark.parametrize(
-        ("option", "value", "error", "says"),
-        [
+BAD = [
+    *(
+        (method, option, value, error, says)
+        for method in ("map", "hmc")
+        for option, value, error, says in (
             ("num_starts", 0, ValueError, "Expected num_starts >= 1, got 0"),
             ("num_starts", 1.5, TypeError, r"Expected num_starts .* whole number, got 1\.5"),
             ("num_screened", -1, ValueError, "Expected num_screened >= 0, got -1"),
@@ -32,32 +32,27 @@ class TestBadInput:
             ("seed", None, TypeError, "Expected seed .* whole number, got None"),
             ("seed", -1, ValueError, "Expected seed >= 0, got -1"),
             ("nmu_starts", 2, ValueError, "no option 'nmu_starts'; expected num_starts, "),
-        ],
-    )
-    def test_values(self, model, method, option, value, error, says):
-        with pytest.raises(error, match=says):
-            fit(model, method, **{option: value})
+        )
+    ),
+    *(
+        ("map", option, 64, ValueError, f"'map' has no option '{option}'; .* method 'hmc'")
+        for option in ("num_samples", "num_warmup", "progress")
+    ),
+    ("hmc", "num_samples", 0, ValueError, "Expected num_samples >= 1"),
+    ("hmc", "num_warmup", 7, ValueError, "Expected num_warmup >= 8"),
+    ("gibbs", "seed", 0, ValueError, "expected 'map' or 'hmc'"),
+]
 
-    @pytest.mark.parametrize("option", ["num_samples", "num_warmup", "progress"])
-    def test_options_of_the_other_method(self, model, option):
-        with pytest.raises(ValueError, match=f"'map' has no option '{option}'; .* method 'hmc'"):
-            fit(model, **{option: 64})
 
-    @pytest.mark.parametrize(("option", "least"), [("num_samples", 1), ("num_warmup", 8)])
-    def test_options_of_sampling(self, model, option, least):
-        with pytest.raises(ValueError, match=f"Expected {option} >= {least}"):
-            fit(model, "hmc", **{option: least - 1})
+class TestBadInput:
+    def test_values(self, model):
+        for method, option, value, error, says in BAD:
+            with pytest.raises(error, match=says):
+                fit(model, method, **{option: value})
 
-    @pytest.mark.parametrize("method", ["gibbs", "nuts"])
-    def test_method(self, model, method):
-        with pytest.raises(ValueError, match="expected 'map' or 'hmc'"):
-            fit(model, method)
-
-    def test_another_kind_of_model(self):
+    def test_models(self, model):
         with pytest.raises(TypeError, match=r"Expected a model of gpadjust.*got Linear"):
             fit(torch.nn.Linear(2, 1))
-
-    def test_nothing_to_learn(self, model):
         with pytest.raises(ValueError, match="no learnable parameter"):
             fit(model.requires_grad_(False))
 
@@ -114,15 +109,11 @@ class TestThreads:
         torch.set_num_threads(before)
 
     @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
-    @pytest.mark.parametrize("method", ["map", "hmc"])
-    def test_a_small_fit_takes_one(self, model, seen, method):
-        fit(model, method, **QUICK, **({"num_samples": 8} if method == "hmc" else {}))
-        assert set(seen) == {1}
-        assert torch.get_num_threads() == 2
-
-    def test_a_comparison_takes_one(self, model, seen):
+    def test_a_small_problem_takes_one(self, model, seen):
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
+        fit(model, **QUICK)
         compare(X, Y, crude, structures=["physics mean", "CKA"], **QUICK)
+        fit(model, "hmc", num_samples=8, **QUICK)
         assert set(seen) == {1}
         assert torch.get_num_threads() == 2
 

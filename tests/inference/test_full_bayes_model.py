@@ -1,6 +1,5 @@
 """A model that holds samples of its hyper-parameters is the mixture of the samples' models."""
 
-import pickle
 from copy import deepcopy
 
 import pytest
@@ -58,16 +57,6 @@ def case(request, num_outputs, data, build, held):
     return name, *held(make=lambda: build(kind, X, Y, **options(num_outputs)))
 
 
-@pytest.fixture
-def close():
-    def close(actual, expected, tolerance=1e-8):
-        assert actual.shape == expected.shape
-        scale = tolerance * expected.abs().max().item()
-        torch.testing.assert_close(actual, expected, rtol=tolerance, atol=scale)
-
-    return close
-
-
 def check(actual, posteriors, close):
     mean = torch.stack([posterior.mean for posterior in posteriors], dim=-3)
     variance = torch.stack([posterior.variance for posterior in posteriors], dim=-3)
@@ -80,32 +69,20 @@ def check(actual, posteriors, close):
 
 
 @pytest.mark.parametrize("shape", [(4,), (5, 4), (2, 3, 1)])
-class TestPosterior:
-    @pytest.mark.parametrize("noise", [False, True])
-    def test_components(self, case, uniform, close, shape, noise):
-        _, model, singles = case
-        Z = uniform(*shape, 2, high=2.0)
+def test_posteriors(case, uniform, close, shape):
+    _, model, singles = case
+    Z, m = uniform(*shape, 2, high=2.0), model.num_outputs
+    for noise in (False, True):
         expected = [single.posterior(Z, observation_noise=noise) for single in singles]
         check(model.posterior(Z, observation_noise=noise), expected, close)
-
-    def test_predict(self, case, uniform, close, shape):
-        _, model, _ = case
-        Z = uniform(*shape, 2, high=2.0)
-        own_noise = uniform(*shape, model.num_outputs)
-        for noise in (False, True, own_noise):
-            per_point = noise.unsqueeze(-2) if isinstance(noise, torch.Tensor) else noise
-            expected = model.posterior(Z.unsqueeze(-2), observation_noise=per_point)
-            mean, variance = model.predict(Z, observation_noise=noise)
-            close(mean, expected.mixture_mean.squeeze(-2))
-            close(variance, expected.mixture_variance.squeeze(-2))
-
-    @pytest.mark.parametrize("component", ["rho", "delta"])
-    def test_adjustments(self, case, uniform, close, shape, component):
-        _, model, singles = case
-        if component not in model.term_names:
-            pytest.skip("the model has no such component")
-        Z = uniform(*shape, 2, high=2.0)
-        check(model.term(component, Z), [single.term(component, Z) for single in singles], close)
+    for name in {"rho", "delta"} & {*model.term_names}:
+        check(model.term(name, Z), [single.term(name, Z) for single in singles], close)
+    for noise in (False, True, uniform(*shape, m)):
+        per_point = noise.unsqueeze(-2) if isinstance(noise, torch.Tensor) else noise
+        expected = model.posterior(Z.unsqueeze(-2), observation_noise=per_point)
+        mean, variance = model.predict(Z, observation_noise=noise)
+        close(mean, expected.mixture_mean.squeeze(-2))
+        close(variance, expected.mixture_variance.squeeze(-2))
 
 
 class TestObservations:
@@ -233,13 +210,6 @@ class TestCopies:
             other.load_state_dict(model.state_dict())
             assert other.num_samples == 3
             close(other.posterior(Z).mean, expected.mean)
-
-    def test_pickle(self, held, data, uniform, close):
-        model, _ = held("ZeroMeanGP", *data(num_outputs=2))
-        again = pickle.loads(pickle.dumps(model))
-        Z = uniform(4, 2, high=2.0)
-        assert again.num_samples == 3
-        close(again.posterior(Z).mean, model.posterior(Z).mean)
 
 
 class TestRefusals:

@@ -63,14 +63,10 @@ def of(cls, **options):
 
 MODELS = {
     "CKA": of(CKA),
-    "PhysicsMeanGP": of(PhysicsMeanGP),
     "ScaleGP": of(ScaleGP),
     "ZeroMeanGP": lambda X, Y, m: ZeroMeanGP(X, Y),
     "known noise": lambda X, Y, m: CKA(X, Y, torch.full_like(Y, 0.01), physics=physics(m)),
-    "centred": of(CKA, center="mean"),
-    "rho mean": of(CKA, rho_mean="learn"),
-    "delta mean": of(CKA, delta_mean="learn"),
-    "both means": of(CKA, rho_mean="learn", delta_mean="learn"),
+    "both means": of(CKA, center="mean", rho_mean="learn", delta_mean="learn"),
     "two physics": lambda X, Y, m: CKA(
         X, Y, physics=[physics(m), lambda X: X[..., :1] + physics(m)(X).sin()]
     ),
@@ -101,15 +97,13 @@ def test_every_kernel(smoothness, ard, seed, m, learn):
     assert_equal_to_autograd(model, seed)
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
-@given(seed=SEEDS, m=st.sampled_from([1, 3]), frozen=st.sets(st.integers(0, 4), max_size=4))
-def test_some_parameters_frozen(seed, m, frozen):
-    model = CKA(*draw(seed, m=m), physics=physics(m))
+@pytest.mark.parametrize("free", range(5))
+def test_one_parameter_alone(free):
+    model = CKA(*draw(free, m=3), physics=physics(3))
     learnt = [p for p in model.parameters() if p.requires_grad]
-    assert len(learnt) == 5
-    for i in frozen:
-        learnt[i].requires_grad_(False)
-    assert_equal_to_autograd(model, seed)
+    for i, parameter in enumerate(learnt):
+        parameter.requires_grad_(i == free)
+    assert_equal_to_autograd(model, free)
 
 
 @pytest.mark.parametrize("marginal", [False, True])
@@ -161,7 +155,6 @@ OTHERS = {
 def test_other_forms_fall_back_to_autograd(name):
     objective = Objective(OTHERS[name](*draw(0), 1))
     assert isinstance(objective._distribution, ModuleDistribution)
-    value, gradient = objective.value_and_gradient(objective.parameters.current())
-    assert value.isfinite().all()
+    _, gradient = objective.value_and_gradient(objective.parameters.current())
     assert gradient.isfinite().all()
     assert gradient.abs().max() > 0

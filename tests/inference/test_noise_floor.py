@@ -51,8 +51,16 @@ def assert_above(model, Y):
     assert (noise >= floors(model, Y) * (1 - 1e-9)).all()
 
 
-@pytest.mark.parametrize("kind", BUILD)
-@pytest.mark.parametrize("targets", TARGETS)
+CASES = [(kind, targets) for kind in BUILD for targets in TARGETS]
+QUICKLY = [("CKA", "the physics"), ("ZeroMeanGP", "constant"), ("ScaleGP", "a shifted physics")]
+QUICKLY += [(kind, "of outputs of many sizes") for kind in BUILD]
+QUICKLY += [(kind, "in the class") for kind in ("CKA", "learnt means", "RRA")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "targets"),
+    [pytest.param(*case, marks=() if case in QUICKLY else pytest.mark.slow) for case in CASES],
+)
 def test_one_fit_after_the_other(kind, targets):
     Y = TARGETS[targets]
     model = BUILD[kind](X, Y)

@@ -146,24 +146,6 @@ def test_its_gradient_is_that_of_finite_differences(model, marginal):
     assert_gradient(objective, neighbours(objective, 2))
 
 
-@pytest.mark.parametrize("name", ["CKA", "learnt means", "known noise", "RRA", "learnt physics"])
-def test_missing_targets_are_those_of_models_without_them(name, XY):
-    X, Y = XY
-    Y = Y.clone()
-    Y[2, 0] = Y[5:7, 1] = torch.nan
-    options = {"physics": crude, "outcome_transform": None}
-    objective = Objective(CKA(X, Y, **options), marginal=True)
-    vectors = neighbours(objective)
-    for j in range(2):
-        rows = ~Y[:, j].isnan()
-        options["physics"] = lambda X, j=j: crude(X)[..., [j]]
-        single = CKA(X[rows], Y[rows][:, [j]], **options)
-        expected = Objective(single, marginal=True)(vectors[:, [j]])
-        torch.testing.assert_close(objective(vectors)[:, [j]], expected, rtol=1e-9, atol=1e-9)
-    objective = Objective(BUILD[name](X, Y))
-    assert_gradient(objective, neighbours(objective, 2))
-
-
 def test_rows_are_those_of_a_model_of_them(XY):
     X, Y = XY
     rows = torch.tensor([0, 2, 3, 6, 8])

@@ -4,49 +4,109 @@ import pytest
 import torch
 
 
-class Dense:
-    """Section 2.1.2 of the paper for one output, with kernels given as functions of two inputs.
+def rbf_kernel(lengthscale, variance):
+    """The squared exponential covariance as a function of two inputs."""
 
-    With f_p centred at c in the kernel, the prior covariance of rho f_p + delta is
-    (f_p - c) k_rho (f_p' - c) + k_delta, so that delta's own kernel is k_delta + c^2 k_rho,
-    and its covariance with rho is -c k_rho.
+    def k(A, B):
+        distance = ((A[:, None, :] - B[None, :, :]) / lengthscale).square().sum(-1)
+        return variance * torch.exp(-distance / 2)
+
+    return k
+
+
+def ones(X):
+    return torch.ones_like(X[:, 0])
+
+
+class Dense:
+    """Section 2.1.2 of the paper for one output of a model, in the user's units.
+
+    f = sum rho_i f_i + delta, with RBF kernels and noise of the model, and with centers c_i in the
+    kernels: a priori rho_i is independent of delta + sum c_i rho_i, which has the kernel of delta.
+    Where a term's prior mean has a variance, that adds to its kernel.
+
+    Args:
+        model: The model.
+        X: Inputs.
+        Y: Targets, all columns.
+        physics: Functions of inputs that make as many columns.
+        output: Which of the columns.
+        center: The number c, or "mean".
+        noise: Known variances, or None for the model's.
+        ranges: What the inputs' transform divides them by.
+        means: The prior means of the rhos and of delta. Default: the model's.
+        vague: The variance of unknown means. Default: the model's.
     """
 
-    def __init__(self, X, y, physics, k_rho, k_delta, noise, center=0.0):
-        self.X, self.y, self.physics = X, y, physics
-        self.k_rho, self.k_delta, self.c = k_rho, k_delta, center
-        self.noise = noise
-        eye = torch.eye(len(y), dtype=y.dtype)
-        self.K = self.prior(X, X) + noise * eye
-        self.weights = torch.linalg.solve(self.K, y - physics(X))
+    def __init__(
+        self,
+        model,
+        X,
+        Y,
+        *physics,
+        output=0,
+        center=0.0,
+        noise=None,
+        ranges=1.0,
+        means=None,
+        vague=None,
+    ):
+        m = Y.shape[-1]
 
-    def prior(self, A, B):
-        f_a, f_b = self.physics(A) - self.c, self.physics(B) - self.c
-        return f_a[:, None] * self.k_rho(A, B) * f_b[None, :] + self.k_delta(A, B)
+        def pick(values):
+            return values.detach().reshape(m, -1)[output]
 
-    def condition(self, prior_mean, prior, cross):
-        """`cross` is the covariance of the quantity with the observations."""
-        mean = prior_mean + cross @ self.weights
+        transform = getattr(model, "outcome_transform", None)
+        scale = 1.0 if transform is None else transform.stdvs.flatten()[output]
+        columns = [lambda X, f=f: f(X).reshape(len(X), m)[:, output] for f in physics]
+        centers = [column(X).mean() if center == "mean" else center for column in columns]
+        means = means or [model.term_mean(term.name, output) for term in model.terms]
+        self.physics, self.means = [*columns, ones], means
+        self.bases = [lambda X, f=f, c=c: f(X) - c for f, c in zip(columns, centers, strict=True)]
+        self.bases, self.centers = [*self.bases, ones], [*centers, -1.0]
+        self.kernels = []
+        for term in model.terms:
+            unit = 1.0 if term.name.startswith("rho") else scale**2
+            base, kappa = term.kernel.base_kernel, pick(term.mean_variance) * unit
+            kappa = vague if vague and term.learns_mean else kappa
+            k = rbf_kernel(pick(base.lengthscale) * ranges, pick(term.kernel.outputscale) * unit)
+            self.kernels.append(lambda A, B, k=k, kappa=kappa: k(A, B) + kappa)
+        known = noise is not None
+        self.noise = noise[:, output] if known else pick(model.likelihood.noise) * scale**2
+        self.X, eye = X, torch.eye(len(X), dtype=X.dtype)
+        self.K = self.cross(self.bases, X, self.bases, X) + self.noise * eye
+        self.residual = Y[:, output] - self.mean(X)
+
+    def mean(self, X):
+        return sum(mean * f(X) for mean, f in zip(self.means, self.physics, strict=True))
+
+    def cross(self, left, A, right, B):
+        """The prior covariance of two sums of terms, for the weights of each."""
+        parts = zip(left, self.kernels, right, strict=True)
+        return sum(a(A)[:, None] * k(A, B) * b(B)[None, :] for a, k, b in parts if a and b)
+
+    def condition(self, weights, mean, Z):
+        """Mean and covariance of a sum of terms at Z."""
+        cross = self.cross(weights, Z, self.bases, self.X)
+        mean = mean + cross @ torch.linalg.solve(self.K, self.residual)
+        prior = self.cross(weights, Z, weights, Z)
         return mean, prior - cross @ torch.linalg.solve(self.K, cross.mT)
 
     def posterior(self, Z):
-        return self.condition(self.physics(Z), self.prior(Z, Z), self.prior(Z, self.X))
+        return self.condition(self.bases, self.mean(Z), Z)
 
-    def rho(self, Z):
-        cross = self.k_rho(Z, self.X) * (self.physics(self.X) - self.c)
-        return self.condition(1.0, self.k_rho(Z, Z), cross)
+    def rho(self, Z, i=0):
+        weights = [ones if j == i else None for j in range(len(self.bases))]
+        return self.condition(weights, self.means[i], Z)
 
     def delta(self, Z):
-        cross = self.k_delta(Z, self.X) - self.c * self.k_rho(Z, self.X) * (
-            self.physics(self.X) - self.c
-        )
-        return self.condition(0.0, self.k_delta(Z, Z) + self.c**2 * self.k_rho(Z, Z), cross)
+        weights = [lambda X, c=c: -c * ones(X) for c in self.centers]
+        return self.condition(weights, self.means[-1], Z)
 
     def nlml(self):
-        residual = self.y - self.physics(self.X)
-        n = len(residual)
-        constant = n * torch.log(torch.tensor(2 * torch.pi, dtype=residual.dtype))
-        return 0.5 * (residual @ self.weights + torch.logdet(self.K) + constant)
+        n, inverse = len(self.residual), torch.linalg.solve(self.K, self.residual)
+        constant = n * torch.log(torch.tensor(2 * torch.pi, dtype=torch.float64))
+        return 0.5 * (self.residual @ inverse + torch.logdet(self.K) + constant)
 
 
 @pytest.fixture
@@ -57,29 +117,7 @@ def dense():
 @pytest.fixture
 def rbf():
     """`rbf(lengthscale, variance)` is the squared exponential covariance as a function."""
-
-    def make(lengthscale, variance):
-        def k(A, B):
-            distance = ((A[:, None, :] - B[None, :, :]) / lengthscale).square().sum(-1)
-            return variance * torch.exp(-distance / 2)
-
-        return k
-
-    return make
-
-
-@pytest.fixture
-def close():
-    """Asserts equality to 1e-8 of the largest number expected."""
-
-    def close(actual, expected, tolerance=1e-8):
-        assert actual.shape == expected.shape
-        size = expected.abs().max().item() if expected.numel() else 0.0
-        torch.testing.assert_close(
-            actual.detach(), expected.detach(), rtol=tolerance, atol=tolerance * size
-        )
-
-    return close
+    return rbf_kernel
 
 
 @pytest.fixture

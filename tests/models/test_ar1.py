@@ -131,37 +131,15 @@ def test_low_values_are_computed_where_only_inputs_are_given(levels, crude_physi
     torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
 
 
-def test_without_bias_and_noise_it_follows_the_scaled_low_level(levels, crude_physics, kernel_of):
-    X, _, low_X, low_Y = levels
-    Y = 2 * crude_physics(X)[:, :1]
-    model = AR1(X, Y, low_X=low_X, low_Y=low_Y, outcome_transform=None)
-    with torch.no_grad():
-        model.rho_constant.fill_(2.0)
-        kernel_of(model, "delta").raw_outputscale.fill_(np.log(1e-9))
-        model.likelihood.noise_covar.raw_noise.fill_(np.log(1e-9))
-    posterior = model.eval().posterior(low_X)
-    torch.testing.assert_close(posterior.mean, 2 * low_Y, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("num_outputs", [1, 2])
-def test_known_noise_in_raw_units(data, build, num_outputs):
-    X, Y = data(num_outputs=num_outputs)
-    small = 0.1 if num_outputs == 1 else 1.0
-    build(
-        "AR1",
-        X,
-        small * Y,
-        0.01 * torch.ones_like(Y),
-        outcome_transform=None,
-        physics=lambda X: small * (2 + X[..., :1].sin()).expand(*X.shape[:-1], num_outputs),
-    )
-
-
 @pytest.mark.parametrize("transform", [{}, {"outcome_transform": None}])
-def test_known_noise_of_a_prediction_is_the_high_levels(data, build, uniform, transform):
-    X, Y = data()
-    Yvar = torch.linspace(0.01, 0.03, len(Y), dtype=torch.float64).unsqueeze(-1)
-    model = build("AR1", X, Y, Yvar, **transform)
+@pytest.mark.parametrize("small", [1.0, 0.1])
+def test_known_noise_of_a_prediction_is_the_high_levels(
+    data, build, uniform, crude_physics, num_outputs, transform, small
+):
+    X, Y = data(num_outputs=num_outputs)
+    Yvar = torch.linspace(0.01, 0.03, len(Y), dtype=torch.float64).unsqueeze(-1).expand_as(Y)
+    physics = {"physics": lambda X: small * crude_physics(X)[..., :num_outputs]}
+    model = build("AR1", X, small * Y, Yvar, **physics, **transform)
     Z = uniform(4, 2, high=2.0, seed=3)
     added = model.posterior(Z, observation_noise=True).variance - model.posterior(Z).variance
     torch.testing.assert_close(added, Yvar.mean().expand_as(added))

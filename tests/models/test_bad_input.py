@@ -16,122 +16,79 @@ def XY(data):
     return data()
 
 
-class TestData:
-    def test_numbers_of_points_disagree(self, build, kind, XY):
-        X, Y = XY
-        with pytest.raises(
-            ValueError, match=r"to agree in all but the last.*\(9, 2\) and \(8, 1\)"
-        ):
-            build(kind, X, Y[:8], bounds=None) if kind == "AR1" else build(kind, X, Y[:8])
-
-    def test_batches_disagree(self, build, kind, data):
-        X, Y = data(batch_shape=(2,))
-        with pytest.raises(ValueError, match="to agree in all but the last"):
-            build(kind, X, Y[0])
-
-    def test_a_vector_of_targets(self, build, kind, XY):
-        X, Y = XY
-        with pytest.raises(ValueError, match=r"train_Y with at least 2 dim.*reshape\(-1, 1\)"):
-            build(kind, X, Y.squeeze(-1))
-
-    def test_noise_of_another_shape(self, build, kind, XY):
-        X, Y = XY
-        with pytest.raises(ValueError, match=r"train_Yvar .* shape \(9, 1\), got \(9, 2\)"):
-            build(kind, X, Y, Y.expand(9, 2))
-
-    def test_negative_noise(self, build, kind, XY):
-        for noise in (torch.full_like(XY[1], -0.1), -0.1, [-0.1]):
-            with pytest.raises(ValueError, match=r"not to be negative, got -0\.1"):
-                build(kind, *XY, noise)
-
-    @pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "RRA"])
-    def test_noise_and_a_likelihood(self, build, kind, XY):
-        with pytest.raises(ValueError, match="train_Yvar or a likelihood, got both"):
-            build(kind, *XY, 0.1, likelihood=GaussianLikelihood().double())
-
-    @pytest.mark.parametrize("name", ["train_X", "train_Y", "train_Yvar"])
-    def test_not_finite(self, build, kind, XY, name):
-        tensors = {"train_X": XY[0], "train_Y": XY[1], "train_Yvar": torch.ones_like(XY[1])}
-        for bad in (float("nan"), float("inf")):
-            missing = name == "train_Y" and bad != bad
-            found = "to hold an observation in each row" if missing else "to be finite"
-            tensors[name][4, 0] = bad
-            with pytest.raises(ValueError, match=rf"{name} {found}.* 1 of 9 rows \(row 4\)"):
-                build(kind, *tensors.values())
-
-    def test_an_output_that_is_hardly_observed(self, build, kind, data):
-        X, Y = data(num_outputs=2)
-        Y[1:, 1] = torch.nan
-        with pytest.raises(ValueError, match=r"at least 2 observations .* column\(s\) \[1\]"):
-            build(kind, X, Y)
-
-    @pytest.mark.parametrize("n", [0, 1])
-    def test_too_few_points(self, build, kind, XY, n):
-        X, Y = XY
-        with pytest.raises(ValueError, match=f"at least 2 points in train_X, got {n}"):
-            build(kind, X[:n], Y[:n])
-
-    @pytest.mark.parametrize("name", ["train_X", "train_Y"])
-    def test_float32(self, build, kind, XY, name):
-        tensors = {"train_X": XY[0], "train_Y": XY[1]}
-        tensors[name] = tensors[name].float()
-        with pytest.raises(TypeError, match=rf"{name} in float64, got torch.float32.*double\(\)"):
-            build(kind, *tensors.values())
-
-    @pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "RRA"])
-    def test_what_is_no_data(self, build, kind, XY):
-        X, Y = XY
-        with pytest.raises(TypeError, match="train_X to be a torch tensor, a NumPy array"):
-            build(kind, X.tolist(), Y)
-        with pytest.raises(TypeError, match="train_X to hold numbers only"):
-            build(kind, np.array([["a", "b"]] * 9), Y)
-
-    def test_no_columns(self, build, kind, XY):
-        X, Y = XY
-        with pytest.raises(ValueError, match="at least one input column and one output column"):
-            build(kind, X, Y[:, :0], physics=lambda X: X) if kind != "ZeroMeanGP" else build(
-                kind, X, Y[:, :0]
-            )
+NAN, INF = float("nan"), float("inf")
+# What is done to inputs, targets and variances of nine points; the error, and what it says.
+BAD_DATA = [
+    (lambda X, Y: (X, Y[:8]), ValueError, r"agree in all but the last.*\(9, 2\) and \(8, 1\)"),
+    (lambda X, Y: (X.expand(2, 9, 2), Y), ValueError, "to agree in all but the last"),
+    (lambda X, Y: (X, Y[:, 0]), ValueError, r"train_Y with at least 2 dim.*reshape\(-1, 1\)"),
+    (lambda X, Y: (X, Y[:, :0]), ValueError, "one input column and one output column"),
+    (lambda X, Y: (X[:0], Y[:0]), ValueError, "at least 2 points in train_X, got 0"),
+    (lambda X, Y: (X[:1], Y[:1]), ValueError, "at least 2 points in train_X, got 1"),
+    (lambda X, Y: (X.float(), Y), TypeError, r"train_X in float64, got torch.float32.*double\("),
+    (lambda X, Y: (X, Y.float()), TypeError, r"train_Y in float64, got torch.float32.*double\("),
+    (lambda X, Y: (X.tolist(), Y), TypeError, "train_X to be a torch tensor, a NumPy array"),
+    (lambda X, Y: (np.array([["a", "b"]] * 9), Y), TypeError, "train_X to hold numbers only"),
+    (lambda X, Y: (X, Y, Y.expand(9, 2)), ValueError, r"Yvar .* shape \(9, 1\), got \(9, 2\)"),
+    (lambda X, Y: (X, Y, 0 * Y - 0.1), ValueError, r"not to be negative, got -0\.1"),
+    (lambda X, Y: (X, Y, -0.1), ValueError, r"not to be negative, got -0\.1"),
+    (lambda X, Y: (X, Y, [-0.1]), ValueError, r"not to be negative, got -0\.1"),
+    (lambda X, Y: (spoilt(X, NAN), Y), ValueError, r"train_X to be finite.* 1 of 9 .*\(row 4\)"),
+    (lambda X, Y: (spoilt(X, INF), Y), ValueError, r"train_X to be finite.* 1 of 9 .*\(row 4\)"),
+    (lambda X, Y: (X, spoilt(Y, INF)), ValueError, r"train_Y to be finite.* 1 of 9 .*\(row 4\)"),
+    (lambda X, Y: (X, spoilt(Y, NAN)), ValueError, r"train_Y to hold an observation.*\(row 4\)"),
+    (lambda X, Y: (X, Y, spoilt(Y, NAN)), ValueError, r"train_Yvar to be finite.*\(row 4\)"),
+    (lambda X, Y: (X, Y, spoilt(Y, INF)), ValueError, r"train_Yvar to be finite.*\(row 4\)"),
+]
 
 
-class TestPhysics:
-    @pytest.fixture(autouse=True)
-    def _only_models_with_physics(self, kind):
-        if kind == "ZeroMeanGP":
-            pytest.skip("has no physics")
+def spoilt(tensor, value):
+    tensor = tensor.clone()
+    tensor[4, 0] = value
+    return tensor
 
-    def test_none(self, build, kind, XY):
-        if kind != "AR1":
-            with pytest.raises(TypeError, match="Expected a physics, got None; ZeroMeanGP is"):
-                build(kind, *XY, physics=None)
 
-    def test_wrong_number_of_outputs(self, build, kind, XY, crude_physics):
-        pattern = "outputs as the high one has, got 2 and 2" if kind == "AR1" else "returned 2 col"
-        with pytest.raises(ValueError, match=pattern):
-            build(kind, *XY, physics=crude_physics)
+def test_data(build, kind, XY):
+    cls, options = type(build(kind, *XY)), {"physics": lambda X: X.sum(-1)}
+    options |= {"bounds": torch.tensor([[0.0] * 2, [2.0] * 2])} if kind == "AR1" else {}
+    for change, error, says in BAD_DATA:
+        with pytest.raises(error, match=says):
+            cls(*change(*XY), **(options if kind != "ZeroMeanGP" else {}))
 
-    def test_wrong_shape(self, build, kind, XY):
-        with pytest.raises(PhysicsError, match="returned shape"):
-            build(kind, *XY, physics=lambda X: X.sum())
 
-    def test_nan(self, build, kind, XY):
-        with pytest.raises(PhysicsError, match="returned NaN or inf"):
-            build(kind, *XY, physics=lambda X: X.sum(-1) / 0)
+def test_an_output_that_is_hardly_observed(build, kind, data):
+    X, Y = data(num_outputs=2)
+    Y[1:, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"at least 2 observations .* column\(s\) \[1\]"):
+        build(kind, X, Y)
 
-    def test_an_exception(self, build, kind, XY):
-        def simulator(X):
-            raise RuntimeError("licence expired")
 
-        with pytest.raises(PhysicsError, match="'simulator' raised RuntimeError: licence expired"):
-            build(kind, *XY, physics=simulator)
+@pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "RRA"])
+def test_noise_and_a_likelihood(build, kind, XY):
+    with pytest.raises(ValueError, match="train_Yvar or a likelihood, got both"):
+        build(kind, *XY, 0.1, likelihood=GaussianLikelihood().double())
 
-    def test_numpy(self, build, kind, XY):
-        with pytest.raises(PhysicsError, match=r"BlackBoxPhysics\(function\)"):
-            build(kind, *XY, physics=lambda X: np.sin(X.numpy()).sum(-1))
 
-    def test_not_callable(self, build, kind, XY):
-        with pytest.raises(TypeError, match="physics must be a Physics or a callable"):
-            build(kind, *XY, physics=3.0)
+def expired(X):
+    raise RuntimeError("licence expired")
+
+
+@pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA", "RRA-paper"])
+def test_physics(build, kind, XY, crude_physics):
+    wrong = "outputs as the high one has, got 2 and 2" if kind == "AR1" else "returned 2 col"
+    for physics, error, says in (
+        (crude_physics, ValueError, wrong),
+        (lambda X: X.sum(), PhysicsError, "returned shape"),
+        (lambda X: X.sum(-1) / 0, PhysicsError, "returned NaN or inf"),
+        (expired, PhysicsError, "'expired' raised RuntimeError: licence expired"),
+        (lambda X: np.sin(X.numpy()).sum(-1), PhysicsError, r"BlackBoxPhysics\(function\)"),
+        (3.0, TypeError, "physics must be a Physics or a callable"),
+    ):
+        with pytest.raises(error, match=says):
+            build(kind, *XY, physics=physics)
+    if kind != "AR1":
+        with pytest.raises(TypeError, match="Expected a physics, got None; ZeroMeanGP is"):
+            build(kind, *XY, physics=None)
 
 
 def test_a_physics_that_fails_at_a_prediction(XY):
@@ -159,135 +116,97 @@ class TestScaleGP:
             ScaleGP(X, Y, physics=lambda X: X[:, 0] - zero)
 
 
-class TestOptions:
-    @pytest.mark.parametrize("kind", ["CKA", "RRA"])
-    @pytest.mark.parametrize("center", ["median", float("nan"), torch.ones(3)])
-    def test_center(self, build, kind, XY, center):
-        with pytest.raises(ValueError, match=r"Expected center to be 'mean' \(.*, a finite number"):
-            build(kind, *XY, center=center)
-
-    @pytest.mark.parametrize("num_features", [0, -3, 10.5, 7])
-    def test_num_features(self, build, XY, num_features):
-        with pytest.raises(ValueError, match=f"an even whole number >= 2 .* got {num_features}"):
-            build("RRA", *XY, num_features=num_features)
-
-    @pytest.mark.parametrize("mean", ["learnt", [1.0, 2.0]])
-    def test_rho_mean(self, build, XY, mean):
-        with pytest.raises(ValueError, match="Expected rho_mean to be 'learn', a number, or 1 num"):
-            build("CKA", *XY, rho_mean=mean)
-
-    def test_too_few_points_for_unknown_means(self, build, XY):
-        with pytest.raises(ValueError, match=r"at least 4 points to learn 2 constant means"):
-            build("CKA", XY[0][:3], XY[1][:3], rho_mean="learn", delta_mean="learn")
-
-    def test_kernel_class(self, build, XY):
-        with pytest.raises(TypeError, match="the kernel of rho to be a GPyTorch kernel"):
-            build("CKA", *XY, rho_covar_module=RBFKernel)
-
-    def test_values_of_the_low_level_without_inputs(self, XY):
-        with pytest.raises(ValueError, match="`low_Y` without `low_X`"):
-            AR1(*XY, low_Y=XY[1])
-
-    def test_outcome_transform_that_is_not_linear(self, build, kind, XY):
-        if kind == "RRA-paper":
-            pytest.skip("takes none")
-        with pytest.raises(ValueError, match="The outcome transform Log is not supported"):
-            build(kind, *XY, outcome_transform=Log())
-
-    @pytest.mark.parametrize("kind", ["CKA", "RRA", "AR1"])
-    def test_input_transform_that_is_one_to_many(self, build, kind, XY):
-        several = AppendFeatures(torch.zeros(3, 1, dtype=torch.float64), transform_on_train=True)
-        with pytest.raises(ValueError, match="AppendFeatures makes several points of one"):
-            build(kind, *XY, input_transform=several)
-
-    def test_kernel_that_is_none(self, XY, crude_physics):
-        with pytest.raises(TypeError, match="the kernel of rho to be a GPyTorch kernel"):
-            CKA(*XY, physics=lambda X: crude_physics(X)[:, :1], rho_covar_module=torch.nn.ReLU())
-
-    @pytest.mark.parametrize("name", ["rho", "delta"])
-    def test_batch_shape_of_a_kernel(self, build, data, name):
-        X, Y = data(num_outputs=2)
-        pattern = rf"the kernel of {name} with batch_shape \(2,\).*torch.Size\(\[2\]\)"
-        with pytest.raises(ValueError, match=pattern):
-            build("CKA", X, Y, **{f"{name}_covar_module": ScaleKernel(MaternKernel())})
-
-    def test_batch_shape_of_a_plain_kernel(self, build, data):
-        with pytest.raises(ValueError, match=r"the kernel of delta with batch_shape \(2,\)"):
-            build("ZeroMeanGP", *data(num_outputs=2), covar_module=RBFKernel())
+BAD_OPTIONS = [
+    *(
+        (kind, {"center": center}, ValueError, r"Expected center to be 'mean' \(.*, a finite num")
+        for kind in ("CKA", "RRA")
+        for center in ("median", NAN, torch.ones(3))
+    ),
+    *(
+        ("RRA", {"num_features": n}, ValueError, f"an even whole number >= 2 .* got {n}")
+        for n in (0, -3, 10.5, 7)
+    ),
+    ("CKA", {"rho_mean": "learnt"}, ValueError, "rho_mean to be 'learn', a number, or 1 num"),
+    ("CKA", {"rho_mean": [1.0, 2.0]}, ValueError, "rho_mean to be 'learn', a number, or 1 num"),
+    ("CKA", {"rho_covar_module": RBFKernel}, TypeError, "kernel of rho to be a GPyTorch kernel"),
+    ("CKA", {"rho_covar_module": torch.nn.ReLU()}, TypeError, "of rho to be a GPyTorch kernel"),
+    *(
+        (kind, {"outcome_transform": Log()}, ValueError, "outcome transform Log is not supported")
+        for kind in ("ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA")
+    ),
+    *(
+        (kind, {"input_transform": several}, ValueError, "AppendFeatures makes several points of")
+        for several in [AppendFeatures(torch.zeros(3, 1).double(), transform_on_train=True)]
+        for kind in ("CKA", "RRA", "AR1")
+    ),
+    ("AR1", {"bounds": None}, ValueError, r"in `bounds` \(2 x d\)"),
+    ("AR1", {"bounds": torch.zeros(2, 1)}, ValueError, r"bounds of shape \(2, 2\), got \(2, 1\)"),
+    *(
+        ("AR1", {"bounds": [[0.0, 0.0], upper]}, ValueError, "each lower one .* below the upper")
+        for upper in ([1.0, -1.0], [1.0, INF], [1.0, NAN])
+    ),
+    ("AR1", {"num_low": 1}, ValueError, "num_low >= 2 samples of f_p, got 1"),
+]
 
 
-class TestAR1:
-    def test_no_low_level(self, XY):
-        with pytest.raises(ValueError, match=r"in `bounds` \(2 x d\)"):
-            AR1(*XY, physics=lambda X: X.sum(-1))
-
-    def test_no_physics(self, XY):
-        with pytest.raises(ValueError, match="AR1 needs a low level"):
-            AR1(*XY, low_X=XY[0])
-
-    def test_bounds_of_another_shape(self, build, XY):
-        with pytest.raises(ValueError, match=r"bounds of shape \(2, 2\), got \(2, 1\)"):
-            build("AR1", *XY, bounds=torch.tensor([[0.0], [1.0]]))
-
-    @pytest.mark.parametrize("upper", [[1.0, -1.0], [1.0, float("inf")], [1.0, float("nan")]])
-    def test_bounds_upside_down(self, build, XY, upper):
-        with pytest.raises(ValueError, match=r"each lower one .* below the upper one"):
-            build("AR1", *XY, bounds=torch.tensor([[0.0, 0.0], upper]))
-
-    def test_num_low(self, build, XY):
-        with pytest.raises(ValueError, match="num_low >= 2 samples of f_p, got 1"):
-            build("AR1", *XY, num_low=1)
-
-    def test_levels_disagree(self, XY):
-        X, Y = XY
-        with pytest.raises(ValueError, match="the low level with 2 inputs and 1 outputs"):
-            AR1(X, Y, low_X=X[:, :1], low_Y=Y)
-
-    def test_values_of_the_low_level_disagree(self, XY):
-        X, Y = XY
-        with pytest.raises(ValueError, match="to agree in all but the last"):
-            AR1(X, Y, low_X=X, low_Y=Y[:5])
+@pytest.mark.parametrize(("kind", "option", "error", "says"), BAD_OPTIONS)
+def test_options(build, XY, kind, option, error, says):
+    with pytest.raises(error, match=says):
+        build(kind, *XY, **option)
 
 
-class TestPredictions:
-    @pytest.mark.parametrize("method", ["posterior", "rho", "delta"])
-    def test_inputs_of_another_type(self, build, XY, uniform, method):
-        model = build("CKA", *XY)
+def test_too_few_points_for_unknown_means(build, XY):
+    with pytest.raises(ValueError, match=r"at least 4 points to learn 2 constant means"):
+        build("CKA", XY[0][:3], XY[1][:3], rho_mean="learn", delta_mean="learn")
+
+
+def test_the_batch_shape_of_a_kernel(build, data):
+    for kind, option, name in (
+        ("CKA", "rho_covar_module", "rho"),
+        ("CKA", "delta_covar_module", "delta"),
+        ("ZeroMeanGP", "covar_module", "delta"),
+    ):
+        says = rf"the kernel of {name} with batch_shape \(2,\).*torch.Size\(\[2\]\)"
+        with pytest.raises(ValueError, match=says):
+            build(kind, *data(num_outputs=2), **{option: ScaleKernel(MaternKernel())})
+
+
+def test_levels_of_ar1(XY):
+    X, Y = XY
+    for levels, says in (
+        ({"low_Y": Y}, "`low_Y` without `low_X`"),
+        ({"low_X": X}, "AR1 needs a low level"),
+        ({"low_X": X[:, :1], "low_Y": Y}, "the low level with 2 inputs and 1 outputs"),
+        ({"low_X": X, "low_Y": Y[:5]}, "to agree in all but the last"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            AR1(X, Y, **levels)
+
+
+@pytest.mark.parametrize("kind", ["CKA", "RRA", "AR1"])
+def test_predictions(build, kind, XY, uniform):
+    model, Z = build(kind, *XY), uniform(4, 2)
+    methods = [model.posterior, model.predict]
+    if kind != "AR1":
+        methods += [model.rho, model.delta]
+    for method in methods:
         with pytest.raises(TypeError, match=r"in float64, got torch\.float32"):
-            getattr(model, method)(uniform(4, 2).float())
+            method(Z.float())
         with pytest.raises(TypeError, match="a NumPy array or a DataFrame, got list"):
-            getattr(model, method)(uniform(4, 2).tolist())
-
-    @pytest.mark.parametrize("kind", ["CKA", "RRA", "AR1"])
-    def test_wrong_number_of_columns(self, build, kind, XY, uniform):
-        model = build(kind, *XY)
+            method(Z.tolist())
         with pytest.raises(ValueError, match=r"Expected X with 2 columns.*got shape \(4, 5\)"):
-            model.posterior(uniform(4, 5))
-
-    @pytest.mark.parametrize("name", ["rho", "delta"])
-    def test_wrong_number_of_columns_in_a_part(self, build, XY, uniform, name):
-        with pytest.raises(ValueError, match=r"Expected X with 2 columns.*got shape \(4, 3\)"):
-            getattr(build("CKA", *XY), name)(uniform(4, 3))
-
-    @pytest.mark.parametrize("kind", ["CKA", "RRA"])
-    def test_raw_inputs_to_the_model_itself(self, build, kind, XY, uniform):
-        model = build(kind, *XY).eval()
+            method(uniform(4, 5))
+    if kind != "AR1":
         with pytest.raises(ValueError, match=r"model.posterior\(X\)"):
-            model(uniform(4, 2))
+            model.eval()(Z)
 
 
-class TestRRA:
-    def test_pyro_model_of_a_batch(self, build, data):
-        model = build("RRA", *data(batch_shape=(2,)))
-        with pytest.raises(ValueError, match=r"this model has batch_shape \(2,\)"):
-            model.pyro_model()
-
-    def test_pyro_model_of_targets_without_inputs(self, build, XY):
-        with pytest.raises(ValueError, match="`Y` without `X`"):
-            build("RRA", *XY).pyro_model(Y=XY[1])
-
-    @pytest.mark.parametrize("shape", [(48,), (3, 47), (3, 1, 48)])
-    def test_weights_of_another_shape(self, build, XY, shape):
-        model = build("RRA", *XY)
+def test_rra(build, data, XY):
+    with pytest.raises(ValueError, match=r"this model has batch_shape \(2,\)"):
+        build("RRA", *data(batch_shape=(2,))).pyro_model()
+    model = build("RRA", *XY)
+    with pytest.raises(ValueError, match="`Y` without `X`"):
+        model.pyro_model(Y=XY[1])
+    for shape in ((48,), (3, 47), (3, 1, 48)):
         with pytest.raises(ValueError, match=r"weights of shape k x 48, got"):
             model.functions(torch.zeros(*shape, dtype=torch.float64))

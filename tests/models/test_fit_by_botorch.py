@@ -17,31 +17,25 @@ def log_likelihood(model):
     return value.item()
 
 
+SETTINGS = {
+    "plain": lambda Y: {},
+    "raw units": lambda Y: {"outcome_transform": None, "input_transform": Normalize(2)},
+    "standardize": lambda Y: {
+        "outcome_transform": Standardize(Y.shape[-1], batch_shape=Y.shape[:-2])
+    },
+}
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("batch_shape", [(), (2,)], ids=["single", "batch"])
-def test_the_likelihood_rises(data, build, costly_kind, num_outputs, batch_shape):
+def test_the_likelihood_rises(data, build, costly_kind, num_outputs, setting, batch_shape):
     X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
-    model = build(costly_kind, X, Y)
+    Yvar = None if setting == "plain" else torch.full_like(Y, 1e-3)
+    model = build(costly_kind, X, Y, Yvar, **SETTINGS[setting](Y))
     before = log_likelihood(model)
     fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     assert not model.training
     assert log_likelihood(model) > before + 0.01
-
-
-@pytest.mark.parametrize("transform", ["none", "standardize"])
-def test_with_transforms_and_known_noise(data, build, costly_kind, transform):
-    X, Y = data()
-    outcome = Standardize(1) if transform == "standardize" else None
-    model = build(
-        costly_kind,
-        X,
-        Y,
-        torch.full_like(Y, 1e-3),
-        outcome_transform=outcome,
-        input_transform=Normalize(2),
-    )
-    before = log_likelihood(model)
-    fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
-    assert log_likelihood(model) > before
 
 
 def test_in_a_model_list(data, build, costly_kind, uniform):

@@ -41,6 +41,7 @@ def test_each_output_is_the_model_of_its_own_rows(
     known = {"noise": noise} if known_noise else {}
     more = model.condition_on_observations(new_X, new_Y, **known)
     loo = leave_one_out(model)
+    assert torch.equal(loo.Y.isnan(), Y.isnan())
     for j in range(2):
         single, rows = single_of(build, kind, model, X, Y, Yvar, crude_physics, j)
         same(single, model, Z, 1e-8, [j])
@@ -48,6 +49,8 @@ def test_each_output_is_the_model_of_its_own_rows(
         own = leave_one_out(single)
         close(loo.mean[rows][:, [j]], own.mean)
         close(loo.variance[rows][:, [j]], own.variance)
+        close(loo.nlpd[[j]], own.nlpd)
+        close(loo.coverage()[[j]], own.coverage())
         new = ~new_Y[:, j].isnan()
         one = {name: values[new][:, [j]] for name, values in known.items()}
         later = single.condition_on_observations(new_X[new], new_Y[new][:, [j]], **one)

@@ -46,7 +46,7 @@ def variances(model, X, Z):
 
 
 @pytest.mark.parametrize("length", [0.5, 1.5, 5.0])
-@pytest.mark.parametrize("n", [8, 12, 20, 40])
+@pytest.mark.parametrize("n", [8, 20, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("cls", [CKA, RRA])
 def test_variances(cls, n, length):
     X = torch.linspace(0, 1, n, dtype=torch.float64).unsqueeze(-1)

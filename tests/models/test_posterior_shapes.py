@@ -6,23 +6,17 @@ from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize, Standardize
 
 
-@pytest.fixture(params=["default", "raw units", "standardize and normalize"])
-def options(request, num_outputs):
-    """Options of a model, as a function of its batch shape."""
-    if request.param == "standardize and normalize":
-        return lambda batch_shape: {
-            "outcome_transform": Standardize(num_outputs, batch_shape=batch_shape),
-            "input_transform": Normalize(2),
-        }
-    return lambda batch_shape: {"outcome_transform": None} if request.param == "raw units" else {}
-
-
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 @pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])
-def test_posterior(data, build, uniform, kind, num_outputs, batch_shape, options, known_noise):
+@pytest.mark.parametrize("units", ["default", "raw", "standardize and normalize"])
+def test_posterior(data, build, uniform, kind, num_outputs, units, batch_shape, known_noise):
     X, Y = data(batch_shape=batch_shape, num_outputs=num_outputs)
     Yvar = 0.01 * torch.ones_like(Y) if known_noise else None
-    model = build(kind, X, Y, Yvar, **options(torch.Size(batch_shape)))
+    options = {"outcome_transform": None} if units == "raw" else {}
+    if units == "standardize and normalize":
+        outcome = Standardize(num_outputs, batch_shape=torch.Size(batch_shape))
+        options = {"outcome_transform": outcome, "input_transform": Normalize(2)}
+    model = build(kind, X, Y, Yvar, **options)
     assert isinstance(model, SingleTaskGP)
     assert model.num_outputs == num_outputs
     assert model.batch_shape == batch_shape
@@ -35,6 +29,10 @@ def test_posterior(data, build, uniform, kind, num_outputs, batch_shape, options
         assert posterior.rsample(torch.Size([6])).shape == (6, *expected)
         torch.testing.assert_close(noisy.mean, posterior.mean)
         assert (noisy.variance > posterior.variance).all()
+    if not batch_shape:  # batched inputs are predicted apart
+        one = model.posterior(Z[1, 2])
+        torch.testing.assert_close(one.mean, posterior.mean[1, 2])
+        torch.testing.assert_close(one.variance, posterior.variance[1, 2])
 
 
 def test_a_batched_input_transform(data, build, uniform, kind):
@@ -66,16 +64,6 @@ def test_outputs_are_independent(data, build, kind, uniform):
     Z = uniform(4, 2)
     torch.testing.assert_close(pair.posterior(Z).mean[:, 0], changed.posterior(Z).mean[:, 0])
     assert not torch.allclose(pair.posterior(Z).mean[:, 1], changed.posterior(Z).mean[:, 1])
-
-
-def test_batched_inputs_are_predicted_apart(data, build, kind, num_outputs, uniform):
-    model = build(kind, *data(num_outputs=num_outputs))
-    Z = uniform(5, 4, 2, high=2.0, seed=3)
-    batch = model.posterior(Z)
-    for i in range(5):
-        single = model.posterior(Z[i])
-        torch.testing.assert_close(batch.mean[i], single.mean)
-        torch.testing.assert_close(batch.variance[i], single.variance)
 
 
 @pytest.mark.parametrize("batch_shape", [(), (3,)], ids=["single", "batch"])

@@ -11,7 +11,6 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.settings import detach_test_caches
 
 from gpadjust import ZeroMeanGP, fit
-from gpadjust.models.cholesky_strategy import covariances, prepare
 
 
 def reference(model, Z, **options):
@@ -57,12 +56,6 @@ def test_given_noise(data, build, kind, num_outputs, uniform):
     torch.testing.assert_close(actual, (noise * scale).expand_as(actual))
 
 
-def test_gradients(data, build, kind, num_outputs, uniform):
-    model = build(kind, *data(num_outputs=num_outputs)).eval().requires_grad_(False)
-    Z = uniform(3, 2, high=2.0, seed=5).requires_grad_()
-    assert torch.autograd.gradcheck(lambda Z: model.predict(Z), Z)
-
-
 def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, uniform):
     model, Z = build(kind, *data(num_outputs=num_outputs)).eval(), uniform(3, 2)
     learnt = [p for p in model.parameters() if p.requires_grad]
@@ -82,22 +75,6 @@ def test_gradients_to_the_hyperparameters(data, build, kind, num_outputs, unifor
     # What is remembered has no graph that one backward pass would free.
     for _ in range(2):
         model.predict(Z.requires_grad_()).mean.sum().backward()
-
-
-@pytest.mark.parametrize("mean", [1.0, "learn"])
-def test_remembered_covariances(data, build, shuffle, uniform, num_outputs, mean):
-    X, Y = data(num_outputs=num_outputs)
-    model = shuffle(build("CKA", X, Y, rho_mean=mean, center="mean"))
-    (train,), inputs = model.train_inputs, model.model_inputs(uniform(4, 2, low=-1.0, high=3.0))
-    model.requires_grad_(False)
-    inputs.requires_grad_()
-    fast, direct = (
-        torch.cat(covariances(prepare(model.terms, train, slowly), inputs))
-        for slowly in (False, True)
-    )
-    torch.testing.assert_close(fast, direct)
-    gradients = (torch.autograd.grad(k.square().sum(), inputs)[0] for k in (fast, direct))
-    torch.testing.assert_close(*gradients)
 
 
 def test_no_points(data, build, kind, num_outputs):
@@ -149,19 +126,14 @@ def test_nothing_stale_is_kept(data, build, costly_kind, uniform, close, change)
         close(actual, expected, tolerance)
 
 
-def test_a_copy_of_a_conditioned_model(data, build, kind, num_outputs, uniform, close):
-    model, Z = build(kind, *data(num_outputs=num_outputs)), uniform(5, 2)
-    model = model.condition_on_observations(Z[:2] + 1, torch.ones(2, num_outputs).double())
-    for actual, expected in zip(copy.deepcopy(model).predict(Z), model.predict(Z), strict=True):
-        close(actual, expected, 1e-7)
-
-
 def test_factors_are_left_out_of_a_pickle(data, uniform):
-    model, Z = ZeroMeanGP(*data(n=150)), uniform(5, 2)
-    size = len(pickle.dumps(model))
+    model, Z = ZeroMeanGP(*data(n=148)), uniform(5, 2)
+    model = model.condition_on_observations(Z[:2] + 1, torch.ones(2, 1).double())
+    size = len(pickle.dumps(ZeroMeanGP(*data(n=150))))
     before = model.predict(Z).mean
     assert len(pickle.dumps(model)) < size + 10_000
-    torch.testing.assert_close(pickle.loads(pickle.dumps(model)).predict(Z).mean, before)
+    for again in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        torch.testing.assert_close(again.predict(Z).mean, before)
 
 
 def test_a_kernel_with_its_own_way(data, uniform, close):

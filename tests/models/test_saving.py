@@ -1,7 +1,5 @@
 """Models as files."""
 
-import pickle
-
 import pytest
 import torch
 from botorch.models.transforms import Normalize
@@ -119,11 +117,3 @@ def test_files_that_are_no_models(path):
         load(path)
     with pytest.raises(TypeError, match="Expected a model of gpadjust, got Linear"):
         save(torch.nn.Linear(1, 1), path)
-
-
-def test_pickle(uniform):
-    X, Y, Z = problem(uniform)
-    model = CKA(X, Y, physics=relu)
-    same(model, pickle.loads(pickle.dumps(model)), Z)
-    with pytest.raises(pickle.PicklingError, match="a function at the top level of a module"):
-        pickle.dumps(CKA(X, Y, physics=lambda X: relu(X)))

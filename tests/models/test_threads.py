@@ -8,8 +8,15 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from gpadjust.gp.gaussian import threads_for
 
+# With known noise and without.
+CASES = [(kind, m, m > 1) for kind in ("CKA", "AR1", "RRA") for m in (1, 2)]
+MORE = [(k, m, m == 1) for k in ("ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA") for m in (1, 2)]
 
-@pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
+
+@pytest.mark.parametrize(
+    ("kind", "num_outputs", "known_noise"),
+    CASES + [pytest.param(*case, marks=pytest.mark.slow) for case in MORE],
+)
 def test_answers_are_those_of_one_thread(data, build, kind, uniform, num_outputs, known_noise):
     X, Y = data(num_outputs=num_outputs)
     Yvar = 0.01 * torch.ones_like(Y) if known_noise else None

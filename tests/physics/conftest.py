@@ -1,13 +1,11 @@
 """Settings and fixtures shared by the tests of the physics."""
 
 import sys
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 torch.set_num_threads(1)
 
@@ -15,44 +13,44 @@ torch.set_num_threads(1)
 class RowCounter:
     """A torch function `x -> [sum(x^2), sin(x_0)]` that records the rows it is asked for."""
 
-    def __init__(self) -> None:
-        self.rows: list[tuple[float, ...]] = []
+    def __init__(self):
+        self.rows = []
 
-    def __call__(self, X: Tensor) -> Tensor:
+    def __call__(self, X):
         self.rows += [tuple(row) for row in X.detach().tolist()]
         return self.formula(X)
 
     @staticmethod
-    def formula(X: Tensor) -> Tensor:
+    def formula(X):
         return torch.stack([X.square().sum(-1), X[..., 0].sin()], dim=-1)
 
 
 class NumpyRowCounter:
     """The same function for a batch of NumPy rows, or for one."""
 
-    def __init__(self) -> None:
-        self.rows: list[tuple[float, ...]] = []
+    def __init__(self):
+        self.rows = []
 
-    def __call__(self, X: np.ndarray) -> np.ndarray:
+    def __call__(self, X):
         self.rows += [tuple(row) for row in np.atleast_2d(X).tolist()]
         return np.stack([np.square(X).sum(-1), np.sin(X[..., 0])], axis=-1)
 
 
 @pytest.fixture
-def counter() -> RowCounter:
+def counter():
     return RowCounter()
 
 
 @pytest.fixture
-def numpy_counter() -> NumpyRowCounter:
+def numpy_counter():
     return NumpyRowCounter()
 
 
 @pytest.fixture
-def points() -> Callable[..., Tensor]:
+def points():
     """Draws standard normal float64 numbers of a shape, the same ones each time."""
 
-    def draw(*shape: int, seed: int = 0) -> Tensor:
+    def draw(*shape, seed=0):
         generator = torch.Generator().manual_seed(seed)
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
@@ -60,10 +58,10 @@ def points() -> Callable[..., Tensor]:
 
 
 @pytest.fixture
-def in_threads() -> Iterator[Callable[[Callable[[int], None]], None]]:
+def in_threads():
     """Calls a function with 0, ..., 7, each in a thread, and switches between these often."""
 
-    def run(function: Callable[[int], None]) -> None:
+    def run(function):
         with ThreadPoolExecutor(8) as pool:
             list(pool.map(function, range(8)))
 

@@ -5,9 +5,7 @@ import os
 import pickle
 import threading
 import warnings
-from collections.abc import Callable
 from fractions import Fraction
-from typing import Any
 
 import cloudpickle
 import joblib
@@ -16,40 +14,32 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
 
-Points = Callable[..., Tensor]
 
-
-def waves(X: np.ndarray) -> np.ndarray:
+def waves(X):
     """For rows or one row: `[sin(x_0) exp(x_1), x_0 x_1^2]`."""
     return np.stack([np.sin(X[..., 0]) * np.exp(X[..., 1]), X[..., 0] * X[..., 1] ** 2], -1)
 
 
-def torch_waves(X: Tensor) -> Tensor:
+def torch_waves(X):
     return torch.stack([X[..., 0].sin() * X[..., 1].exp(), X[..., 0] * X[..., 1] ** 2], -1)
 
 
-def waves_jacobian(X: np.ndarray) -> np.ndarray:
+def waves_jacobian(X):
     x, y = X[:, 0], X[:, 1]
-    return np.stack(
-        [
-            np.stack([np.cos(x) * np.exp(y), np.sin(x) * np.exp(y)], -1),
-            np.stack([y**2, 2 * x * y], -1),
-        ],
-        1,
-    )
+    columns = [np.cos(x) * np.exp(y), np.sin(x) * np.exp(y), y**2, 2 * x * y]
+    return np.stack(columns, -1).reshape(-1, 2, 2)
 
 
 class Handle:
     """A simulator that cannot be pickled or copied."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.lock = threading.Lock()
 
-    def __call__(self, X: np.ndarray) -> np.ndarray:
+    def __call__(self, X):
         with self.lock:
             return waves(X)
 
@@ -57,7 +47,7 @@ class Handle:
 class NumpyModule(torch.nn.Module):
     """A module that computes with NumPy."""
 
-    def forward(self, X: np.ndarray) -> np.ndarray:
+    def forward(self, X):
         return waves(X)
 
 
@@ -65,22 +55,14 @@ class TestValues:
     @given(
         batch=st.lists(st.integers(1, 3), max_size=2), n=st.integers(1, 4), batched=st.booleans()
     )
-    def test_any_batch_shape_gives_the_plain_function(
-        self, batch: list[int], n: int, batched: bool
-    ) -> None:
+    def test_any_batch_shape_gives_the_plain_function(self, batch, n, batched):
         X = torch.randn(*batch, n, 2, dtype=torch.float64)
         assert torch.allclose(BlackBoxPhysics(waves, batched=batched)(X), torch_waves(X))
 
-    def test_scalar_per_row(self, points: Points) -> None:
-        X = points(3, 2)
-        expected = X.sum(-1, keepdim=True)
-        assert torch.allclose(BlackBoxPhysics(lambda x: x.sum(), batched=False)(X), expected)
-        assert torch.allclose(BlackBoxPhysics(lambda X: X.sum(-1))(X), expected)
+    def test_function_sees_float64_columns(self):
+        seen = []
 
-    def test_function_sees_float64_columns(self) -> None:
-        seen: list[np.ndarray] = []
-
-        def record(X: np.ndarray) -> np.ndarray:
+        def record(X):
             seen.append(X)
             return X[:, 0]
 
@@ -89,10 +71,10 @@ class TestValues:
         assert (seen[0].dtype, seen[0].tolist()) == (np.float64, [[2.0]])
 
     @pytest.mark.parametrize("batched", [True, False])
-    def test_function_may_write_to_its_input_and_reuse_its_output(self, batched: bool) -> None:
+    def test_function_may_write_to_its_input_and_reuse_its_output(self, batched):
         buffer = np.zeros(1)
 
-        def vandal(x: np.ndarray) -> np.ndarray:
+        def vandal(x):
             buffer[0] = x.flat[0]
             x[:] = 99.0
             return buffer
@@ -104,9 +86,7 @@ class TestValues:
         assert X.item() == first.item() == 1.0
 
     @pytest.mark.parametrize("batched", [True, False])
-    def test_each_row_is_evaluated_once(
-        self, batched: bool, numpy_counter: Any, points: Points
-    ) -> None:
+    def test_each_row_is_evaluated_once(self, batched, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter, batched=batched)
         X = points(4, 2)
         physics(X.expand(3, 4, 2))
@@ -118,7 +98,7 @@ class TestValues:
 class TestGradients:
     @pytest.mark.parametrize("batched", [True, False])
     @pytest.mark.parametrize("gradient", ["finite-difference", waves_jacobian])
-    def test_agrees_with_autograd(self, batched: bool, gradient: Any, points: Points) -> None:
+    def test_agrees_with_autograd(self, batched, gradient, points):
         physics = BlackBoxPhysics(waves, batched=batched, gradient=gradient)
         X, weights = points(3, 4, 2).requires_grad_(), points(3, 4, 2, seed=1)
         (found,) = torch.autograd.grad((weights * physics(X)).sum(), X)
@@ -126,7 +106,7 @@ class TestGradients:
         assert torch.allclose(found, expected, rtol=1e-7, atol=1e-8)
         assert torch.autograd.gradcheck(physics, X)
 
-    def test_expanded_and_repeated_rows(self, numpy_counter: Any, points: Points) -> None:
+    def test_expanded_and_repeated_rows(self, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter)
         x = points(1, 2).requires_grad_()
         physics(x.expand(3, 1, 2)).sum().backward()
@@ -138,42 +118,30 @@ class TestGradients:
         expected = 3 * (2 * x.detach() + torch.tensor([[1.0, 0.0]]) * x.detach().cos())
         assert torch.allclose(once, expected)
 
-    def test_reaches_only_the_columns_that_are_read(self, points: Points) -> None:
-        X = points(3, 3).requires_grad_()
-        BlackBoxPhysics(lambda X: X[:, 0] ** 2, inputs=[2])(X).sum().backward()
-        assert torch.allclose(X.grad[:, 2], 2 * X[:, 2].detach())
-        assert X.grad[:, :2].abs().max() == 0
-
-    def test_finite_differences_stay_out_of_the_memo(
-        self, numpy_counter: Any, points: Points
-    ) -> None:
+    def test_finite_differences_stay_out_of_the_memo(self, numpy_counter, points):
         physics = BlackBoxPhysics(numpy_counter)
-        physics(points(3, 2).requires_grad_()).sum().backward()
-        assert len(numpy_counter.rows) == 3 + 2 * 2 * 3
-        assert len(physics._memo) == 3
-
-    def test_only_a_backward_pass_pays_for_the_gradient(
-        self, numpy_counter: Any, points: Points
-    ) -> None:
-        BlackBoxPhysics(numpy_counter)(points(3, 2).requires_grad_())
-        assert len(numpy_counter.rows) == 3
+        for number in (1, 2):
+            Y = physics(points(3, 2).requires_grad_())
+            assert len(numpy_counter.rows) == 3 + (number - 1) * 2 * 2 * 3
+            Y.sum().backward()
+            assert len(numpy_counter.rows) == 3 + number * 2 * 2 * 3
 
     @pytest.mark.parametrize("fd_step", [0.5, [0.5, 0.25]])
-    def test_step(self, fd_step: Any, numpy_counter: Any) -> None:
+    def test_step(self, fd_step, numpy_counter):
         physics = BlackBoxPhysics(numpy_counter, fd_step=fd_step)
         X = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
         physics(X).sum().backward()
         h, k = np.broadcast_to(fd_step, 2)
         assert set(numpy_counter.rows[1:]) == {(h, 0), (-h, 0), (0, k), (0, -k)}
 
-    def test_second_derivative_is_refused(self, points: Points) -> None:
+    def test_second_derivative_is_refused(self, points):
         X = points(3, 2).requires_grad_()
         Y = BlackBoxPhysics(waves)(X).sum() + (X**3).sum()
         (first,) = torch.autograd.grad(Y, X, create_graph=True)
         with pytest.raises(NotImplementedError, match="first derivatives only"):
             torch.autograd.grad(first.sum(), X)
 
-    def test_none_warns_once_and_is_a_constant(self, points: Points) -> None:
+    def test_none_warns_once_and_is_a_constant(self, points):
         physics = BlackBoxPhysics(waves, gradient=None, name="mill")
         X = points(3, 2).requires_grad_()
         with pytest.warns(UserWarning, match="No gradient.*'mill'.*'with_grad': False"):
@@ -182,7 +150,7 @@ class TestGradients:
             warnings.simplefilter("error")
             assert torch.allclose(physics(X), torch_waves(X))
 
-    def test_failure_in_finite_differences_names_the_row(self) -> None:
+    def test_failure_in_finite_differences_names_the_row(self):
         physics = BlackBoxPhysics(np.sqrt)
         X = torch.tensor([[4.0, 1.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
         X.requires_grad_()
@@ -204,53 +172,69 @@ class TestGradients:
             (lambda X: np.full((3, 2, 2), 1j), "expected real numbers, found complex128"),
         ],
     )
-    def test_wrong_jacobian(
-        self, jacobian: Callable[..., Any], message: str, points: Points
-    ) -> None:
+    def test_wrong_jacobian(self, jacobian, message, points):
         Y = BlackBoxPhysics(waves, gradient=jacobian, name="mill")(points(3, 2).requires_grad_())
         with pytest.raises(PhysicsError, match="gradient of physics 'mill'.*" + message):
             Y.sum().backward()
 
 
 class TestSettings:
-    @pytest.mark.parametrize("gradient", ["autograd", 1, True])
-    def test_unknown_gradient(self, gradient: Any) -> None:
-        with pytest.raises(ValueError, match=f"Jacobian.*None for no gradient; found {gradient!r}"):
-            BlackBoxPhysics(waves, gradient=gradient)
+    def test_bad_ones(self):
+        for gradient in ("autograd", 1, True):
+            with pytest.raises(ValueError, match=f"None for no gradient; found {gradient!r}"):
+                BlackBoxPhysics(waves, gradient=gradient)
+        for fd_step in (0.0, -1.0, float("nan"), [0.1, 0.0], []):
+            with pytest.raises(ValueError, match="fd_step must be positive"):
+                BlackBoxPhysics(waves, fd_step=fd_step)
+        with pytest.raises(TypeError, match="function must be callable; found list"):
+            BlackBoxPhysics([])
 
-    @pytest.mark.parametrize("fd_step", [0.0, -1.0, float("nan"), [0.1, 0.0], []])
-    def test_step_is_not_positive(self, fd_step: Any) -> None:
-        with pytest.raises(ValueError, match="fd_step must be positive"):
-            BlackBoxPhysics(waves, fd_step=fd_step)
-
-    def test_steps_for_other_columns(self, points: Points) -> None:
+    def test_steps_for_other_columns(self, points):
         physics = BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
         with pytest.raises(ValueError, match=r"fd_step of physics 'waves' has 3 entries.*1 or 2"):
             physics(points(4, 2).requires_grad_())
 
-    def test_not_callable(self) -> None:
-        with pytest.raises(TypeError, match="function must be callable; found list"):
-            BlackBoxPhysics([])  # type: ignore[arg-type]
-
 
 class TestFailures:
-    def test_batch_names_its_rows(self, points: Points) -> None:
-        def broken(X: np.ndarray) -> np.ndarray:
-            raise OSError("no licence")
+    @pytest.mark.parametrize(
+        ("function", "batched", "says"),
+        [
+            (lambda x: x[0] + x[1], True, "single row pass batched=False"),
+            (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
+            *(
+                (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
+                for result, found in ((1j, "complex"), (None, "None"), ("1", "<U1"), ([None], "No"))
+                for batched in (True, False)
+            ),
+        ],
+    )
+    def test_wrong_results(self, function, batched, says, points):
+        physics = BlackBoxPhysics(function, batched=batched, name="mill")
+        with pytest.raises(PhysicsError, match=rf"Physics 'mill' .*{says}"):
+            physics(points(3, 2))
 
-        with pytest.raises(PhysicsError, match="raised OSError: no licence") as caught:
-            BlackBoxPhysics(broken)(points(3, 2))
-        assert caught.value.rows == (0, 1, 2)
+    def test_rows_of_different_length(self):
+        exact = BlackBoxPhysics(lambda x: Fraction(1, 4), batched=False)
+        assert exact(torch.ones(1, 1)).item() == 0.25
+        tape = BlackBoxPhysics(lambda x: np.zeros(int(x[0])), batched=False, name="tape")
+        with pytest.raises(PhysicsError, match=r"'tape' returned 2 output\(s\)") as caught:
+            tape(torch.tensor([[2.0], [3.0], [2.0]]))
+        assert caught.value.rows == (1,)
 
-    def test_row_function_taken_for_a_batch_function(self, points: Points) -> None:
-        with pytest.raises(PhysicsError, match="single row pass batched=False"):
-            BlackBoxPhysics(lambda x: x[0] + x[1])(points(3, 2))
+    def test_failed_rows_do_not_hide_a_new_number_of_outputs(self):
+        def fragile(x):
+            return np.zeros(int(x[0])) if x[0] else np.array([1 // 0])
+
+        physics = BlackBoxPhysics(fragile, batched=False)
+        physics(torch.tensor([[2.0]]))
+        with pytest.raises(PhysicsError, match=r"returned 3 output\(s\), expected 2"):
+            physics(torch.tensor([[3.0], [0.0]]))
 
     @pytest.mark.parametrize("grad", [False, True])
-    def test_good_rows_survive_failed_ones(self, grad: bool) -> None:
-        asked: list[float] = []
+    def test_good_rows_survive_failed_ones(self, grad):
+        asked = []
 
-        def fragile(x: np.ndarray) -> float:
+        def fragile(x):
             asked.append(x[0])
             if x[0] < 0:
                 raise ArithmeticError(f"below zero at {x[0]}")
@@ -269,51 +253,12 @@ class TestFailures:
         assert physics(X[[0, 2]]).flatten().tolist() == [2.0, 3.0]
         assert asked == [4.0, -1.0, 9.0, -2.0]
 
-    def test_every_row_failed(self, points: Points) -> None:
-        physics = BlackBoxPhysics(lambda x: 1 // 0, batched=False)
-        with pytest.raises(PhysicsError, match=r"ZeroDivisionError.*3 failed row\(s\) of 3"):
-            physics(points(3, 2))
-
-    def test_rows_of_different_length(self) -> None:
-        physics = BlackBoxPhysics(lambda x: np.zeros(int(x[0])), batched=False, name="tape")
-        with pytest.raises(PhysicsError, match=r"'tape' returned 2 output\(s\)") as caught:
-            physics(torch.tensor([[2.0], [3.0], [2.0]]))
-        assert caught.value.rows == (1,)
-
-    def test_row_of_a_wrong_shape(self, points: Points) -> None:
-        physics = BlackBoxPhysics(lambda x: np.zeros((2, 2)), batched=False)
-        with pytest.raises(PhysicsError, match=r"a scalar or outputs.*found \(2, 2\)"):
-            physics(points(1, 2))
-
-    @pytest.mark.parametrize("batched", [True, False])
-    @pytest.mark.parametrize(
-        ("result", "found"), [(1j, "complex128"), (None, "None"), ("1", "<U1"), ([None], "None")]
-    )
-    def test_result_that_is_not_real(self, result: Any, found: str, batched: bool) -> None:
-        physics = BlackBoxPhysics(lambda x: result, batched=batched, name="mill")
-        message = rf"Physics 'mill' raised TypeError: expected real numbers, found {found}"
-        with pytest.raises(PhysicsError, match=message):
-            physics(torch.ones(1, 1))
-
-    def test_exact_numbers_are_numbers(self) -> None:
-        physics = BlackBoxPhysics(lambda x: Fraction(1, 4), batched=False)
-        assert physics(torch.ones(1, 1)).item() == 0.25
-
-    def test_failed_rows_do_not_hide_a_new_number_of_outputs(self) -> None:
-        def fragile(x: np.ndarray) -> np.ndarray:
-            return np.zeros(int(x[0])) if x[0] else np.array([1 // 0])
-
-        physics = BlackBoxPhysics(fragile, batched=False)
-        physics(torch.tensor([[2.0]]))
-        with pytest.raises(PhysicsError, match=r"returned 3 output\(s\), expected 2"):
-            physics(torch.tensor([[3.0], [0.0]]))
-
 
 class TestParallel:
-    def test_threads_share_the_rows(self, points: Points) -> None:
+    def test_threads_share_the_rows(self, points):
         barrier = threading.Barrier(2, timeout=10)
 
-        def simulate(x: np.ndarray) -> float:
+        def simulate(x):
             barrier.wait()  # Only two calls at the same time get past this.
             return x[0]
 
@@ -322,12 +267,12 @@ class TestParallel:
         with joblib.parallel_config(backend="threading", n_jobs=2):
             assert torch.equal(physics(X), X[:, :1])
 
-    def test_processes_share_the_rows(self, points: Points) -> None:
+    def test_processes_share_the_rows(self, points):
         class UnpicklableError(Exception):
-            def __init__(self, code: int, reason: str) -> None:
+            def __init__(self, code, reason):
                 super().__init__(f"{reason} ({code})")
 
-        def simulate(x: np.ndarray) -> float:
+        def simulate(x):
             if x[0] < 0:
                 raise UnpicklableError(7, "diverged")
             return float(os.getpid())
@@ -345,24 +290,13 @@ class TestParallel:
 
 
 class TestCopies:
-    def test_deep_copy_keeps_a_handle(self, points: Points) -> None:
+    def test_deep_copy_keeps_a_handle(self, points):
         physics = BlackBoxPhysics(Handle())
         assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
-
-    def test_shallow_copy_keeps_a_handle(self, points: Points) -> None:
-        physics = BlackBoxPhysics(Handle())
-        X = points(3, 2)
-        assert torch.allclose(copy.copy(physics)(X), torch_waves(X))
-
-    def test_pickle_of_a_function(self, points: Points) -> None:
-        physics = BlackBoxPhysics(waves, gradient=waves_jacobian)
-        loaded = pickle.loads(pickle.dumps(physics))
-        X = points(3, 2)
-        assert torch.allclose(loaded(X), torch_waves(X))
-        assert loaded.gradient is waves_jacobian
+        assert torch.allclose(copy.copy(physics)(points(3, 2)), torch_waves(points(3, 2)))
 
     @pytest.mark.parametrize("batched", [True, False])
-    def test_pickle_of_a_handle_keeps_the_memo(self, batched: bool, points: Points) -> None:
+    def test_pickle_of_a_handle_keeps_the_memo(self, batched, points):
         physics = BlackBoxPhysics(Handle(), batched=batched, name="wind tunnel")
         X = points(3, 2)
         physics(X)
@@ -375,7 +309,7 @@ class TestCopies:
         assert torch.allclose(loaded(X + 1), torch_waves(X + 1))
         assert isinstance(physics.function, Handle)
 
-    def test_cloudpickle_keeps_lambdas(self, points: Points) -> None:
+    def test_cloudpickle_keeps_lambdas(self, points):
         scale = 3.0
         physics = BlackBoxPhysics(
             lambda X: scale * waves(X), gradient=lambda X: scale * waves_jacobian(X)
@@ -389,17 +323,17 @@ class TestCopies:
         assert torch.allclose(found, expected)
 
     @pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
-    def test_a_handle_never_hinders_a_pickle(self, dumps: Any, points: Points) -> None:
+    def test_a_handle_never_hinders_a_pickle(self, dumps, points):
         physics = BlackBoxPhysics(Handle())
         Y = physics(points(3, 2))
         assert torch.equal(pickle.loads(dumps(physics))(points(3, 2)), Y)
 
-    def test_a_pickled_module_is_no_attribute(self, points: Points) -> None:
+    def test_a_pickled_module_is_no_attribute(self, points):
         physics = BlackBoxPhysics(NumpyModule())
         X = points(3, 2)
         assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
-    def test_lost_gradient_is_not_taken_for_none(self, points: Points) -> None:
+    def test_lost_gradient_is_not_taken_for_none(self, points):
         physics = BlackBoxPhysics(waves, gradient=lambda X: waves_jacobian(X))
         loaded = pickle.loads(pickle.dumps(physics))
         Y = loaded(points(3, 2).requires_grad_())

@@ -2,33 +2,28 @@
 
 import pickle
 import warnings
-from collections.abc import Callable
-from typing import Any
 
 import cloudpickle
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, PhysicsError, as_physics
 
-Points = Callable[..., Tensor]
 
-
-def test_is_named_after_its_function() -> None:
+def test_is_named_after_its_function():
     assert FunctionPhysics(torch.sin).name == "sin"
     assert FunctionPhysics(torch.nn.Tanh()).name == "Tanh"
     assert FunctionPhysics(torch.sin, name="wave").name == "wave"
 
 
-def test_parameters_of_a_module_are_learnt(points: Points) -> None:
+def test_parameters_of_a_module_are_learnt(points):
     physics = FunctionPhysics(torch.nn.Linear(3, 2, dtype=torch.float64))
     X = points(20, 3)
     target = X @ points(3, 2, seed=1) + 1.0
     optimizer = torch.optim.LBFGS(physics.parameters(), max_iter=50)
 
-    def loss() -> Tensor:
+    def loss():
         optimizer.zero_grad()
         value = (physics(X) - target).square().mean()
         value.backward()
@@ -39,34 +34,29 @@ def test_parameters_of_a_module_are_learnt(points: Points) -> None:
     assert torch.allclose(physics.function.bias, torch.ones(2, dtype=torch.float64), atol=1e-4)
 
 
-def test_not_callable() -> None:
-    with pytest.raises(TypeError, match="function must be callable; found float"):
-        FunctionPhysics(1.0)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("grad", [False, True])
 @pytest.mark.parametrize(
     "function", [lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()]
 )
-def test_numpy_result(function: Callable[..., Any], grad: bool, points: Points) -> None:
+def test_numpy_result(function, grad, points):
     with pytest.raises(PhysicsError, match=r"'noodle' computes with NumPy.*BlackBoxPhysics\("):
         FunctionPhysics(function, name="noodle")(points(3, 2).requires_grad_(grad))
 
 
-def test_numpy_inside_where_a_gradient_is_needed(points: Points) -> None:
+def test_numpy_inside_where_a_gradient_is_needed(points):
     physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
     with pytest.raises(PhysicsError, match=r"computes with NumPy.*BlackBoxPhysics\(") as caught:
         physics(points(3, 2).requires_grad_())
     assert "Can't call numpy()" in str(caught.value.__cause__)
 
 
-def test_other_runtime_errors_are_not_taken_for_numpy(points: Points) -> None:
+def test_other_runtime_errors_are_not_taken_for_numpy(points):
     physics = FunctionPhysics(lambda X: X @ X)
     with pytest.raises(PhysicsError, match="raised RuntimeError: mat1 and mat2"):
         physics(points(3, 2))
 
 
-def test_missing_gradient_warns_once(points: Points) -> None:
+def test_missing_gradient_warns_once(points):
     physics = FunctionPhysics(lambda X: X.detach() ** 2, name="stone")
     X = points(3, 2).requires_grad_()
     with pytest.warns(UserWarning, match=r"No gradient flows through physics 'stone'.*BlackBox"):
@@ -76,7 +66,7 @@ def test_missing_gradient_warns_once(points: Points) -> None:
         physics(X)
 
 
-def test_no_warning_where_a_gradient_flows(points: Points) -> None:
+def test_no_warning_where_a_gradient_flows(points):
     physics = FunctionPhysics(torch.sin)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -84,35 +74,30 @@ def test_no_warning_where_a_gradient_flows(points: Points) -> None:
         physics(points(3, 2))
 
 
-def double(X: Tensor) -> Tensor:
+def double(X):
     return 2 * X
 
 
 class Owner:
     """Something that holds a physics made of its own method."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.physics = FunctionPhysics(self.formula)
 
-    def formula(self, X: Tensor) -> Tensor:
+    def formula(self, X):
         return X + 1
 
 
-def test_pickle_of_a_function_with_a_name(points: Points) -> None:
-    models = torch.nn.ModuleList([FunctionPhysics(double)])
-    assert torch.equal(pickle.loads(pickle.dumps(models))[0](points(3, 2)), 2 * points(3, 2))
-
-
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-@pytest.mark.parametrize("dumps", [pickle.dumps, pickle._dumps])  # type: ignore[attr-defined]
-def test_pickle_of_a_lambda_says_what_to_do(dumps: Any, protocol: int) -> None:
+@pytest.mark.parametrize("dumps", [pickle.dumps, pickle._dumps])
+def test_pickle_of_a_lambda_says_what_to_do(dumps, protocol):
     models = torch.nn.ModuleList([FunctionPhysics(lambda X: X, name="ghost")])
     message = r"function of physics 'ghost' cannot be pickled.*<lambda>.*top level.*cloudpickle"
     with pytest.raises(pickle.PicklingError, match=message):
         dumps(models, protocol)
 
 
-def test_cloudpickle_keeps_a_lambda_and_what_it_shares(points: Points) -> None:
+def test_cloudpickle_keeps_a_lambda_and_what_it_shares(points):
     shift = [1.0]
     physics = FunctionPhysics(lambda X: X + shift[0])
     physics(points(3, 2))
@@ -122,7 +107,7 @@ def test_cloudpickle_keeps_a_lambda_and_what_it_shares(points: Points) -> None:
     assert torch.equal(loaded(points(3, 2)), points(3, 2) + 2.0)
 
 
-def test_pickle_of_a_lambda_that_holds_its_physics(points: Points) -> None:
+def test_pickle_of_a_lambda_that_holds_its_physics(points):
     physics = FunctionPhysics(lambda X: X * len(physics.name))
     loaded = pickle.loads(cloudpickle.dumps(physics))
     assert torch.equal(loaded(points(3, 2)), 8.0 * points(3, 2))
@@ -131,26 +116,24 @@ def test_pickle_of_a_lambda_that_holds_its_physics(points: Points) -> None:
 
 
 @pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
-def test_pickle_of_a_method_that_holds_its_physics(dumps: Any, points: Points) -> None:
+def test_pickle_of_a_method_that_holds_its_physics(dumps, points):
     loaded = pickle.loads(dumps(Owner()))
     assert torch.equal(loaded.physics(points(3, 2)), points(3, 2) + 1)
     loaded = pickle.loads(dumps(Owner().physics))
     assert torch.equal(loaded(points(3, 2)), points(3, 2) + 1)
 
 
-def test_as_physics_wraps_callables(points: Points) -> None:
-    X = points(3, 2)
+def test_as_physics_wraps_callables(points):
+    X, physics = points(3, 2), BlackBoxPhysics(np.sin)
+    assert as_physics(physics) is physics
+    with pytest.raises(TypeError, match="function must be callable; found float"):
+        FunctionPhysics(1.0)
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
     assert torch.equal(as_physics(torch.sin)(X), X.sin())
     assert list(as_physics(torch.nn.Linear(2, 1)).parameters())
 
 
-def test_as_physics_takes_a_physics_as_it_is() -> None:
-    physics = BlackBoxPhysics(np.sin)
-    assert as_physics(physics) is physics
-
-
-def test_as_physics_joins_several(points: Points) -> None:
+def test_as_physics_joins_several(points):
     X = points(3, 2)
     for several in ([torch.sin, double], (torch.sin, double), {"a": torch.sin, "b": double}):
         assert torch.equal(as_physics(several)(X), torch.cat([X.sin(), 2 * X], -1))
@@ -163,7 +146,7 @@ def test_as_physics_joins_several(points: Points) -> None:
 @pytest.mark.parametrize(
     ("thing", "found"), [(3.0, "a float"), (None, "a NoneType"), (torch.nn.Tanh, "the class Tanh")]
 )
-def test_as_physics_rejects_the_rest(thing: Any, found: str) -> None:
+def test_as_physics_rejects_the_rest(thing, found):
     message = f"found {found}.*torch function.*ODEPhysics.*BlackBoxPhysics"
     with pytest.raises(TypeError, match=message):
         as_physics(thing)

@@ -1,14 +1,11 @@
 """Physics by name."""
 
 import sys
-from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, JoinedPhysics, Physics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
@@ -46,7 +43,7 @@ number = 3
 
 
 @pytest.fixture
-def plant() -> Iterator[Any]:
+def plant():
     """A module `plant` with physics in it."""
     module = ModuleType("plant")
     sys.modules["plant"] = module
@@ -58,7 +55,7 @@ def plant() -> Iterator[Any]:
 @pytest.mark.parametrize(
     "name", ["double", "Formula.triple", "drag", "net", "mill", "ghost", "pair"]
 )
-def test_what_a_module_names_comes_back(plant: Any, name: str) -> None:
+def test_what_a_module_names_comes_back(plant, name):
     thing = plant
     for part in name.split("."):
         thing = getattr(thing, part)
@@ -70,7 +67,7 @@ def test_what_a_module_names_comes_back(plant: Any, name: str) -> None:
         assert loaded is thing
 
 
-def test_wrapped_function_has_the_path_of_the_function(plant: Any) -> None:
+def test_wrapped_function_has_the_path_of_the_function(plant):
     assert import_path(FunctionPhysics(plant.double)) == "plant:double"
     assert import_path(FunctionPhysics(plant.net)) == "plant:net"
 
@@ -90,12 +87,12 @@ def test_wrapped_function_has_the_path_of_the_function(plant: Any) -> None:
         lambda plant: torch.sin,
     ],
 )
-def test_what_has_no_name(plant: Any, make: Callable[[Any], Any]) -> None:
+def test_what_has_no_name(plant, make):
     assert import_path(make(plant)) is None
 
 
-def test_function_that_another_has_replaced(plant: Any) -> None:
-    old: Callable[[Tensor], Tensor] = plant.double
+def test_function_that_another_has_replaced(plant):
+    old = plant.double
     plant.double = lambda X: X
     assert import_path(old) is None
 
@@ -112,6 +109,6 @@ def test_function_that_another_has_replaced(plant: Any) -> None:
         ("plant:Drag", "does not name a physics: .*the class Drag"),
     ],
 )
-def test_wrong_path(plant: Any, path: str, message: str) -> None:
+def test_wrong_path(plant, path, message):
     with pytest.raises(ValueError, match=message):
         physics_from_path(path)

@@ -84,15 +84,6 @@ def test_committed_notebooks_are_small_and_without_volatile_metadata(path):
     assert not [cell.metadata for cell in notebook.cells if cell.metadata]
 
 
-@by_name
-def test_a_tutorial_says_what_one_learns_and_what_goes_wrong(path):
-    texts = [cell.source for cell in nbformat.read(path, as_version=4).cells]
-    assert texts[0].startswith(f"# {path.name[0]}. ")
-    assert "You will learn" in texts[0].replace("\n", " ")
-    assert texts[0].count("\n- ") == 3
-    assert any("## What goes wrong, and how to see it" in text for text in texts)
-
-
 def test_the_readme_lists_every_tutorial():
     readme = (FOLDER / "README.md").read_text()
     assert set(re.findall(r"\]\((\w+\.ipynb)\)", readme)) == {path.name for path in notebooks()}

@@ -81,12 +81,21 @@ def test_ranking(scaled, criterion, field):
     assert comparison.criterion == criterion
     assert comparison.chosen == comparison.table[0].structure == "CKA"
     assert comparison.best is comparison.models["CKA"]
+    assert comparison.advice[0] == "Best: CKA."
+    assert not says(comparison, "no better")
+    lines = str(comparison).splitlines()
+    assert lines[0].split()[:2] == ["structure", "evidence"]
+    ranked = [row.structure for row in comparison.table]
+    assert [line.split("  ")[0] for line in lines[1:4]] == ranked
+    assert len({len(line) for line in lines[:4]}) == 1
 
 
 def test_evidence_is_in_the_users_units(scaled):
     X, Y = scaled
     small = compare(X, Y, crude, structures=THREE, **QUICK)
     large = compare(X, 1000 * Y, lambda X: 1000 * crude(X), structures=THREE, **QUICK)
+    known = compare(X, Y, crude, torch.full_like(Y, 1e-3), structures=["CKA"], **QUICK)
+    assert known.table[0].num_parameters == row(small, "CKA").num_parameters - 1
     shift = len(X) * torch.tensor(1000.0).log().item()
     for name in THREE:
         assert row(large, name).evidence == pytest.approx(
@@ -102,15 +111,18 @@ def test_all_structures_by_default(scaled):
 
 
 class TestAdvice:
-    @pytest.mark.parametrize("structures", [THREE, ["CKA"]])
-    def test_none_where_cka_is_clearly_better_or_alone(self, scaled, structures):
-        comparison = compare(*scaled, crude, structures=structures, **QUICK)
-        assert comparison.advice[0] == "Best: CKA."
-        assert not says(comparison, "no better")
+    def test_few_observations(self, X):
+        comparison = compare(X[:5], X[:5].exp(), crude, structures=THREE, **QUICK)
+        assert says(comparison, "observations are few")
+        comparison = compare(X[:2], X[:2].exp(), crude, **QUICK)
+        assert "constant rho" not in comparison.models
 
-    def test_a_physics_of_zero_does_not_help(self, X, noise):
-        comparison = compare(X, X.exp().sin() + noise, lambda X: 0 * X, **QUICK)
-        assert says(comparison, "does not help")
+    @pytest.mark.parametrize("criterion", ["leave-one-out", "evidence"])
+    def test_a_physics_that_does_not_help(self, X, noise, criterion):
+        for physics in (lambda X: (1e4 * X).sin(), lambda X: 0 * X):
+            options = {"structures": THREE, "criterion": criterion, **QUICK}
+            comparison = compare(X, X.exp().sin() + noise, physics, **options)
+            assert says(comparison, "physics does not help")
 
     def test_rra_is_not_chosen_where_cka_is_at_hand(self, scaled):
         comparison = compare(*scaled, crude, structures=["RRA", "CKA"], **QUICK)
@@ -118,24 +130,6 @@ class TestAdvice:
         assert comparison.best is comparison.models["CKA"]
         alone = compare(*scaled, crude, structures=["RRA"], **QUICK)
         assert alone.chosen == "RRA"
-
-    def test_few_observations(self, X):
-        comparison = compare(X[:5], X[:5].exp(), crude, structures=THREE, **QUICK)
-        assert says(comparison, "observations are few")
-
-    def test_too_few_for_unknown_constants(self, X):
-        comparison = compare(X[:2], X[:2].exp(), crude, **QUICK)
-        assert "constant rho" not in comparison.models
-
-    @pytest.mark.parametrize("criterion", ["leave-one-out", "evidence"])
-    def test_unrelated_physics(self, X, noise, criterion):
-        def unrelated(X):
-            return (1e4 * X).sin()
-
-        comparison = compare(
-            X, X.exp() + noise, unrelated, structures=THREE, criterion=criterion, **QUICK
-        )
-        assert says(comparison, "physics does not help")
 
     def test_a_smooth_bias(self, X, noise):
         def rough(X):
@@ -216,44 +210,15 @@ def test_several_physics_each_alone_and_all(X, noise):
     assert "CKA of all" in str(comparison)
 
 
-def test_known_noise(scaled):
+def test_bad_input(scaled):
     X, Y = scaled
-    comparison = compare(X, Y, crude, torch.full_like(Y, 1e-3), structures=THREE, **QUICK)
-    assert row(comparison, "CKA").num_parameters == 4
-
-
-def test_printing(scaled):
-    comparison = compare(*scaled, crude, structures=THREE, **QUICK)
-    lines = str(comparison).splitlines()
-    assert lines[0].split()[:2] == ["structure", "evidence"]
-    assert [line.split("  ")[0] for line in lines[1:4]] == [
-        f"{row.structure:12}".strip() for row in comparison.table
-    ]
-    assert lines[5] == "Best: CKA."
-    assert len({len(line) for line in lines[:4]}) == 1
-
-
-class TestBadInput:
-    @pytest.mark.parametrize("structures", [[], ["CKA", "kriging"]])
-    def test_structures(self, scaled, structures):
-        with pytest.raises(ValueError, match="structures"):
-            compare(*scaled, crude, structures=structures)
-
-    def test_criterion(self, scaled):
-        with pytest.raises(ValueError, match="leave-one-out"):
-            compare(*scaled, crude, criterion="BIC")
-
-    def test_batches(self, scaled):
-        X, Y = (t.expand(2, -1, -1) for t in scaled)
-        with pytest.raises(ValueError, match="one data set"):
-            compare(X, Y, crude)
-
-    def test_data(self, scaled):
-        X, Y = scaled
-        with pytest.raises(ValueError, match="train_Y"):
-            compare(X, Y[:5], crude)
-
-    @pytest.mark.parametrize("option", ["num_starts", "num_screened", "seed"])
-    def test_options_of_the_fits(self, scaled, option):
-        with pytest.raises(ValueError, match=f"Expected {option}"):
-            compare(*scaled, crude, structures=["CKA"], **{option: -1})
+    for data, options, says in (
+        ((X, Y), {"structures": []}, "structures"),
+        ((X, Y), {"structures": ["CKA", "kriging"]}, "structures"),
+        ((X, Y), {"criterion": "BIC"}, "leave-one-out"),
+        ((X.expand(2, -1, -1), Y.expand(2, -1, -1)), {}, "one data set"),
+        ((X, Y[:5]), {}, "train_Y"),
+        *(((X, Y), {n: -1}, f"Expected {n}") for n in ("num_starts", "num_screened", "seed")),
+    ):
+        with pytest.raises(ValueError, match=says):
+            compare(*data, crude, **{"structures": ["CKA"], **options})

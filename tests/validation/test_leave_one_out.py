@@ -5,7 +5,6 @@ import torch
 from botorch.models import ModelListGP, SingleTaskGP
 from botorch.models.transforms import Log, Normalize, Standardize
 
-from gpadjust import CKA
 from gpadjust.models.training_data import standardize
 from gpadjust.validation import coverage, crps, leave_one_out, nlpd, pit, rmse
 
@@ -120,15 +119,6 @@ def test_a_list_of_models_has_their_outputs(data, build):
     assert loo.Y.shape == Y.shape
 
 
-def test_a_subset_of_the_outputs(data, build, kind):
-    X, Y = data(num_outputs=2)
-    model = build(kind, X, Y).eval()
-    whole, part = leave_one_out(model), leave_one_out(model.subset_output([1]))
-    torch.testing.assert_close(part.Y, Y[:, 1:])
-    torch.testing.assert_close(part.mean, whole.mean[:, 1:])
-    torch.testing.assert_close(part.variance, whole.variance[:, 1:])
-
-
 def test_lists_of_different_inputs_are_refused(data, build):
     X, Y = data()
     models = ModelListGP(build("CKA", X, Y), build("CKA", X[1:], Y[1:]))
@@ -153,34 +143,3 @@ def test_after_conditioning(data, construct, kind, num_outputs, normalize):
     model = construct(kind, X[:6], Y[:6], **options).eval()
     conditioned = model.condition_on_observations(X[6:], Y[6:])
     check(construct, kind, conditioned, X, Y, **options)
-
-
-@pytest.mark.parametrize("known_noise", [False, True])
-@pytest.mark.parametrize("options", [{}, {"rho_mean": "learn", "center": 1.0}])
-def test_missing_observations_are_those_of_models_of_each_output(
-    data, crude_physics, shuffle, known_noise, options
-):
-    X, Y = data(num_outputs=2)
-    Y[2, 0] = Y[4:6, 1] = torch.nan
-    Yvar = torch.full_like(Y, 0.02) if known_noise else None
-    options = {**options, "physics": crude_physics}
-    both = shuffle(CKA(X, Y, Yvar, **options))
-    found, parameters = leave_one_out(both), dict(both.named_parameters())
-    assert torch.equal(found.Y.isnan(), Y.isnan())
-    assert found.mean.isfinite().all()
-    for j in range(2):
-        seen = ~Y[:, j].isnan()
-        noise = None if Yvar is None else Yvar[seen][:, [j]]
-        options["physics"] = lambda X, j=j: crude_physics(X)[..., [j]]
-        model = CKA(X[seen], Y[seen][:, [j]], noise, **options)
-        with torch.no_grad():
-            for name, parameter in model.named_parameters():
-                parameter.copy_(parameters[name][j].reshape(parameter.shape))
-        alone = leave_one_out(model)
-        for name in ("Y", "mean", "variance"):
-            actual = getattr(found, name)[seen][:, [j]]
-            torch.testing.assert_close(actual, getattr(alone, name), rtol=1e-7, atol=1e-7)
-        for name in ("rmse", "nlpd", "crps"):
-            score = getattr(found, name)[j : j + 1]
-            torch.testing.assert_close(score, getattr(alone, name), rtol=1e-7, atol=1e-7)
-        torch.testing.assert_close(found.coverage()[j], alone.coverage()[0])

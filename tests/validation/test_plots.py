@@ -14,14 +14,12 @@ from matplotlib.figure import Figure
 from gpadjust import CKA, ZeroMeanGP
 from gpadjust.validation import leave_one_out, score
 from gpadjust.validation.plots import (
-    adjustments,
     plot_adjustment,
     plot_adjustment_pair,
     plot_calibration,
     plot_leave_one_out,
     plot_pit,
     plot_prediction,
-    predictions,
 )
 
 mpl.use("Agg")
@@ -49,17 +47,6 @@ def _leave_pyplot_alone():
     assert dict(mpl.rcParams) == settings
 
 
-class Wrapped:
-    """A model with what else it is said to have."""
-
-    def __init__(self, model, **has):
-        self.model = model
-        vars(self).update(has)
-
-    def __getattr__(self, name):
-        return getattr(self.model, name)
-
-
 def curve(ax, label):
     (found,) = [line for line in ax.lines if line.get_label() == label]
     return found
@@ -77,6 +64,7 @@ def band(ax):
 def test_a_prediction_of_one_input(line, forrester):
     X = forrester.test_X.flip(0)
     ax = plot_prediction(line, X, forrester.truth(X))
+    assert plt.gcf() is ax.figure
     x = forrester.test_X
     posterior = line.posterior(x)
     mean, sd = posterior.mean.detach()[:, 0], posterior.variance.detach()[:, 0].sqrt()
@@ -100,6 +88,26 @@ def test_a_prediction_of_more_inputs(plane, data):
     np.testing.assert_allclose(container[0].get_xydata(), torch.stack([Y[:, 1], mean], dim=-1))
 
 
+def test_several_physics_behind_a_prediction(forrester):
+    both = {"coarse": forrester.crude, "fine": forrester.truth}
+    ax = plot_prediction(CKA(*forrester.data(0), physics=both), forrester.test_X)
+    for name, f_p in both.items():
+        drawn = curve(ax, f"physics {name}").get_ydata()
+        np.testing.assert_allclose(drawn, f_p(forrester.test_X)[:, 0])
+
+
+def test_a_fully_bayesian_prediction(uniform, forrester, line):
+    x = forrester.test_X
+    mean, sd = uniform(5, 40, seed=1), uniform(5, 40, low=0.1, seed=2)
+    mixture = GaussianMixturePosterior(MultivariateNormal(mean, torch.diag_embed(sd.square())))
+    line.posterior = lambda X, **kwargs: mixture
+    ax = plot_prediction(line, x)
+    np.testing.assert_allclose(curve(ax, "mean").get_ydata(), mean.mean(0))
+    spread = mixture.mixture_variance[:, 0].sqrt()
+    low, high = band(ax)[x[5].item()]
+    assert (high - low) / (2 * Z95) == pytest.approx(spread[5].item())
+
+
 def test_adjustments_are_slices_through_the_base_point(plane):
     base = torch.tensor([0.5, 1.5], dtype=torch.float64)
     axes = plot_adjustment(plane, base=base, output=1, num_points=7)
@@ -113,14 +121,39 @@ def test_adjustments_are_slices_through_the_base_point(plane):
             np.testing.assert_allclose(drawn[:, 1], mean)
 
 
-def test_pairs(plane):
+def test_lists_will_do_for_numbers(plane):
+    bounds, base = [[0.1, 0.2], [1.0, 1.5]], [0.5, 0.7]
+    axes = plot_adjustment(plane, bounds=bounds, base=base, num_points=3)
+    np.testing.assert_allclose(curve(axes[0, 1], "mean").get_xdata(), [0.2, 0.85, 1.5])
+    assert plot_adjustment_pair(plane, bounds=bounds, base=base, num_points=3).shape == (2, 2)
+
+
+def test_an_input_that_never_changed():
+    X = torch.rand(8, 2, dtype=torch.float64)
+    X[:, 1] = 0.5
+    assert plot_adjustment(CKA(X, X[:, :1].exp(), physics=lambda X: X[:, :1])).shape == (2, 2)
+
+
+def test_pairs_have_names_and_colour_bars(plane):
     axes = plot_adjustment_pair(plane, (1, 0), num_points=6)
-    assert [ax.get_title() for ax in axes[0]] == [
-        "mean of $\\rho$\nfor $y_{1}$",
-        "sd of $\\rho$\nfor $y_{1}$",
-    ]
+    assert axes[0, 0].get_title() == "mean of $\\rho$\nfor $y_{1}$"
     assert axes[1, 0].get_xlabel() == "$x_{2}$"
-    assert len(axes[0, 0].figure.axes) == 8  # a colour bar each
+    assert len(axes[0, 0].figure.axes) == 8
+
+
+def test_a_row_for_each_physics(uniform):
+    X = uniform(9, 2)
+    Y = torch.cat([X.prod(-1, keepdim=True), X[:, :1]], dim=-1)
+    physics = {"coarse": lambda X: X, "fine": lambda X: X.square()}
+    several = CKA(X, Y, physics=physics, rho_mean=(0.5, 0.25), delta_mean=-1.0)
+    axes = plot_adjustment(several, output=1, num_points=4)
+    names = ["$\\rho$ of coarse", "$\\rho$ of fine", "$\\delta$"]
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == [f"{name}\nfor $y_{{2}}$" for name in names]
+    drawn = [row[0].lines[0].get_ydata()[0] for row in axes]
+    np.testing.assert_allclose(drawn, [0.5, 0.25, -1.0])
+    axes = plot_adjustment_pair(several, num_points=4)
+    assert axes.shape == (3, 2)
+    assert axes[0, 1].get_title() == "sd of $\\rho$ of coarse\nfor $y_{1}$"
 
 
 def test_calibration_and_pit(plane, data):
@@ -128,6 +161,7 @@ def test_calibration_and_pit(plane, data):
     X, Y = data(num_outputs=2)
     for prediction in (loo, loo.pit, score(plane.posterior(X, observation_noise=True), Y)):
         ax = plot_calibration(prediction, output=1)
+        assert ax.get_title() == "$y_{2}$"
         values = prediction if isinstance(prediction, torch.Tensor) else prediction.pit
         x, y = curve(ax, "observed").get_data()
         for level in (0.3, 0.8):
@@ -136,6 +170,7 @@ def test_calibration_and_pit(plane, data):
         bars = plot_pit(prediction, bins=4).patches
         counts = [bar.get_height() for bar in bars]
         assert counts == list(np.histogram(values[:, 0].detach(), bins=4, range=(0, 1))[0])
+    assert plot_calibration(torch.rand(20)).get_title() == ""
 
 
 def test_leave_one_out(plane):
@@ -148,269 +183,147 @@ def test_leave_one_out(plane):
 
 
 def test_given_axes_are_drawn_on(line, forrester):
-    figure = Figure()
-    ax = figure.subplots()
+    ax, axes = Figure().subplots(), Figure().subplots(2)
     assert plot_prediction(line, forrester.test_X, ax=ax) is ax
-    axes = Figure().subplots(2)
     assert plot_adjustment(line, axes=axes)[0, 0] is axes[0]
     with pytest.raises(ValueError, match="Expected 2 axes, got 1"):
         plot_leave_one_out(leave_one_out(line), axes=ax)
 
 
-def test_bad_input(line, plane, data, build, forrester):
+def test_points_that_were_not_observed_are_not_drawn(data, build):
     X, Y = data(num_outputs=2)
-    with pytest.raises(ValueError, match="pass `Y`"):
-        plot_prediction(plane, X)
-    with pytest.raises(ValueError, match="There is no output 2; there are 2"):
-        plot_prediction(plane, X, Y, output=2)
-    with pytest.raises(ValueError, match="Expected Y of shape 9 x m"):
-        plot_prediction(plane, X, Y[1:])
-    with pytest.raises(ValueError, match="Expected X of shape n x d"):
-        plot_prediction(plane, X.unsqueeze(0), Y)
-    with pytest.raises(ValueError, match="Expected level between 0 and 1"):
-        plot_prediction(line, forrester.test_X, level=95)
-    with pytest.raises(ValueError, match="Expected PIT values between 0 and 1"):
-        plot_pit(torch.tensor([0.5, 1.5]))
-    with pytest.raises(ValueError, match="Expected bins to be a whole number >= 1, got 0"):
-        plot_pit(torch.tensor([0.5]), bins=0)
-    with pytest.raises(TypeError, match="ZeroMeanGP has neither rho nor delta"):
-        plot_adjustment(build("ZeroMeanGP", X, Y))
-    with pytest.raises(ValueError, match="Expected two different inputs from 0 to 1"):
-        plot_adjustment_pair(plane, (0, 2))
-    with pytest.raises(ValueError, match=r"Expected bounds of shape \(2, 2\)"):
-        plot_adjustment(plane, bounds=torch.zeros(2, 2))
-    with pytest.raises(ValueError, match="Expected a base point of 2 inputs"):
-        plot_adjustment(plane, base=torch.zeros(3))
-
-
-def test_a_fully_bayesian_prediction(uniform, forrester):
-    x = forrester.test_X
-    mean, sd = uniform(5, 40, seed=1), uniform(5, 40, low=0.1, seed=2)
-    mixture = GaussianMixturePosterior(MultivariateNormal(mean, torch.diag_embed(sd.square())))
-    X, Y = forrester.data(0)
-    line = CKA(X, Y, physics=forrester.crude)
-    line.posterior = lambda X, **kwargs: mixture
-    ax = plot_prediction(line, x)
-    np.testing.assert_allclose(curve(ax, "mean").get_ydata(), mean.mean(0))
-    spread = mixture.mixture_variance[:, 0].sqrt()
-    low, high = band(ax)[x[5].item()]
-    assert (high - low) / (2 * Z95) == pytest.approx(spread[5].item())
-
-
-def test_an_input_that_never_changed():
-    X = torch.rand(8, 2, dtype=torch.float64)
-    X[:, 1] = 0.5
-    model = CKA(X, X[:, :1].exp(), physics=lambda X: X[:, :1])
-    axes = plot_adjustment(model)
-    assert axes.shape == (2, 2)
-
-
-def test_default_axes_are_of_a_figure_that_pyplot_knows(line):
-    ax = plot_prediction(line, torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1))
-    assert plt.gcf() is ax.figure
-
-
-def test_calibration_names_the_output_if_there_are_several():
-    assert plot_calibration(torch.rand(20, 2), output=1).get_title() == "$y_{2}$"
-    assert plot_pit(torch.rand(20, 2)).get_title() == "$y_{1}$"
-    assert plot_calibration(torch.rand(20)).get_title() == ""
-
-
-def unobserved(loo, output=1, points=(0, 3)):
-    """The same without some observations."""
-    Y = loo.Y.clone()
-    Y[list(points), output] = torch.nan
-    return replace(loo, Y=Y)
-
-
-def test_points_that_were_not_observed_are_not_drawn(plane, data, monkeypatch):
-    loo = leave_one_out(plane)
-    part = unobserved(loo)
+    Y[[0, 3], 1] = torch.nan
     rest = [1, 2, *range(4, 9)]
-    axes = plot_leave_one_out(part, output=1)
+    model = build("CKA", X, Y)
+    loo = leave_one_out(model)
+    axes = plot_leave_one_out(loo, output=1)
     drawn = axes[0].containers[0][0].get_xydata()
     np.testing.assert_allclose(drawn, torch.stack([loo.Y, loo.mean], -1)[rest, 1])
-    drawn = axes[1].lines[-1].get_ydata()
-    np.testing.assert_allclose(drawn, loo.residuals[rest, 1])
+    np.testing.assert_allclose(axes[1].lines[-1].get_ydata(), loo.residuals[rest, 1])
     assert np.isfinite(axes[1].get_ylim()).all()
-    assert sum(bar.get_height() for bar in plot_pit(part, output=1).patches) == len(rest)
-    steps = curve(plot_calibration(part, output=1), "observed").get_ydata()
+    assert sum(bar.get_height() for bar in plot_pit(loo, output=1).patches) == len(rest)
+    steps = curve(plot_calibration(loo, output=1), "observed").get_ydata()
     np.testing.assert_allclose(np.unique(steps), np.arange(len(rest) + 1) / len(rest))
-    X, Y = data(num_outputs=2)
-    (container,) = plot_prediction(plane, X, part.Y, output=1).containers
+    (container,) = plot_prediction(model, X, Y, output=1).containers
     np.testing.assert_allclose(container[0].get_xydata()[:, 0], Y[rest, 1])
-    monkeypatch.setattr(adjustments, "training_data", lambda model: (part.X, part.Y))
-    ticks = plot_adjustment(plane, output=1, num_points=4)[0, 0].lines[-1]
+    ticks = plot_adjustment(model, output=1, num_points=4)[0, 0].lines[-1]
     np.testing.assert_allclose(ticks.get_xdata(), X[rest, 0])
 
 
-def test_a_line_without_what_was_not_observed(line, forrester, monkeypatch):
-    X, Y = forrester.data(0)
-    part = Y.clone()
-    part[2] = torch.nan
-    monkeypatch.setattr(predictions, "training_data", lambda model: (X, part))
+def test_a_truth_that_is_not_known_everywhere(line, forrester):
     truth = forrester.truth(forrester.test_X)
     truth[::2] = torch.nan
     ax = plot_prediction(line, forrester.test_X, truth)
-    assert len(curve(ax, "data").get_xdata()) == len(X) - 1
     np.testing.assert_allclose(curve(ax, "truth").get_ydata(), truth[1::2, 0])
 
 
 def test_an_output_without_observations_is_not_drawn(plane, data):
-    X, _ = data()
-    part = unobserved(leave_one_out(plane), points=range(9))
+    loo = leave_one_out(plane)
+    loo.Y[:, 1] = torch.nan
     for draw in (
         plot_leave_one_out,
         plot_pit,
         plot_calibration,
-        lambda loo, output: plot_prediction(plane, X, loo.Y, output=output),
+        lambda loo, output: plot_prediction(plane, data()[0], loo.Y, output=output),
     ):
         with pytest.raises(ValueError, match=r"Output 1 has no observed value .* another `output`"):
-            draw(part, output=1)
+            draw(loo, output=1)
     assert not plt.get_fignums()
-    assert plot_pit(part).get_title() == "$y_{1}$"
+    assert plot_pit(loo).get_title() == "$y_{1}$"
 
 
 def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
-    names = {"input_names": ("pressure [Pa]", "x2"), "output_names": ("force [N]", "flow")}
-    named = Wrapped(plane, **names)
-    axes = plot_adjustment(named, output=1, num_points=4)
-    assert [ax.get_xlabel() for ax in axes[1]] == ["pressure [Pa]", "$x_{2}$"]
-    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["$\\rho$\nfor flow", "$\\delta$\nfor flow"]
-    axes = plot_adjustment_pair(named, (1, 0), num_points=4)
-    assert axes[1, 0].get_xlabel() == "$x_{2}$"
-    assert axes[1, 0].get_ylabel() == "pressure [Pa]"
-    assert axes[1, 1].get_title() == "sd of $\\delta$\nfor force [N]"
     X, Y = data(num_outputs=2)
-    ax = plot_prediction(named, X, Y, output=1)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("true flow", "predicted flow")
-    ax = plot_prediction(plane, X, Y, output=1)
-    assert ax.get_xlabel() == "true $y_{2}$"
-    one = Wrapped(line, input_names=("time [s]",), output_names=("force [N]",))
-    ax = plot_prediction(one, forrester.test_X)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "force [N]")
-    assert plot_adjustment(one, num_points=4)[0, 0].get_ylabel() == r"$\rho$"
-
-
-def test_names_of_outputs_in_leave_one_out(line, plane):
     loo = leave_one_out(plane)
-    named = replace(loo, output_names=("force [N]", "flow"))
-    assert plot_leave_one_out(named, output=1)[0].get_xlabel() == "observed flow"
+    assert plot_prediction(plane, X, Y, output=1).get_xlabel() == "true $y_{2}$"
     assert plot_leave_one_out(loo, output=1)[0].get_xlabel() == "observed $y_{2}$"
     assert plot_leave_one_out(leave_one_out(line))[0].get_xlabel() == "observed"
+    plane.input_names, plane.output_names = ("pressure [Pa]", "x2"), ("force [N]", "flow")
+    axes = plot_adjustment(plane, output=1, num_points=4)
+    assert [ax.get_xlabel() for ax in axes[1]] == ["pressure [Pa]", "$x_{2}$"]
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["$\\rho$\nfor flow", "$\\delta$\nfor flow"]
+    axes = plot_adjustment_pair(plane, (1, 0), num_points=4)
+    assert (axes[1, 0].get_xlabel(), axes[1, 0].get_ylabel()) == ("$x_{2}$", "pressure [Pa]")
+    assert axes[1, 1].get_title() == "sd of $\\delta$\nfor force [N]"
+    ax = plot_prediction(plane, X, Y, output=1)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("true flow", "predicted flow")
+    named = replace(loo, output_names=plane.output_names)
+    assert plot_leave_one_out(named, output=1)[0].get_xlabel() == "observed flow"
     assert plot_calibration(named, output=1).get_title() == "flow"
     assert plot_pit(named).get_title() == "force [N]"
+    line.input_names, line.output_names = ("time [s]",), ("force [N]",)
+    ax = plot_prediction(line, forrester.test_X)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "force [N]")
+    assert plot_adjustment(line, num_points=4)[0, 0].get_ylabel() == r"$\rho$"
 
 
-def test_a_row_for_each_physics(uniform):
-    X = uniform(9, 2)
-    Y = torch.cat([X.prod(-1, keepdim=True), X[:, :1]], dim=-1)
-    physics = {"coarse": lambda X: X, "fine": lambda X: X.square()}
-    several = CKA(X, Y, physics=physics, rho_mean=(0.5, 0.25), delta_mean=-1.0)
-    axes = plot_adjustment(several, output=1, num_points=4)
-    assert [ax.get_ylabel() for ax in axes[:, 0]] == [
-        "$\\rho$ of coarse\nfor $y_{2}$",
-        "$\\rho$ of fine\nfor $y_{2}$",
-        "$\\delta$\nfor $y_{2}$",
-    ]
-    drawn = [row[0].lines[0].get_ydata()[0] for row in axes]
-    np.testing.assert_allclose(drawn, [0.5, 0.25, -1.0])
-    axes = plot_adjustment_pair(several, num_points=4)
-    assert axes.shape == (3, 2)
-    assert axes[0, 1].get_title() == "sd of $\\rho$ of coarse\nfor $y_{1}$"
-    with pytest.raises(TypeError, match="has neither rho nor delta to draw"):
-        plot_adjustment(ZeroMeanGP(X, Y))
-
-
-def test_several_physics_behind_a_prediction(forrester):
-    both = {"coarse": forrester.crude, "fine": forrester.truth}
-    model = CKA(*forrester.data(0), physics=both)
-    ax = plot_prediction(model, forrester.test_X)
-    for name, f_p in both.items():
-        drawn = curve(ax, f"physics {name}").get_ydata()
-        np.testing.assert_allclose(drawn, f_p(forrester.test_X)[:, 0])
-
-
-def test_lists_will_do_for_numbers(plane):
-    bounds, base = [[0.1, 0.2], [1.0, 1.5]], [0.5, 0.7]
-    axes = plot_adjustment(plane, bounds=bounds, base=base, num_points=3)
-    np.testing.assert_allclose(curve(axes[0, 1], "mean").get_xdata(), [0.2, 0.85, 1.5])
-    X = torch.tensor([[0.1, 0.7], [0.55, 0.7], [1.0, 0.7]], dtype=torch.float64)
-    expected = plane.rho(X).mean.detach()[:, 0]
-    np.testing.assert_allclose(curve(axes[0, 0], "mean").get_ydata(), expected)
-    assert plot_adjustment_pair(plane, bounds=bounds, base=base, num_points=3).shape == (2, 2)
-
-
-@pytest.mark.parametrize("draw", [plot_calibration, plot_pit, plot_leave_one_out])
-def test_a_model_in_place_of_its_predictions(line, draw):
-    with pytest.raises(TypeError, match=r"got CKA; pass `leave_one_out\(model\)`"):
-        draw(line)
-
-
-BAD = {
-    "num_points": [1, 2.5, "9", None],
-    "output": [0.0, "y1", None, -1, 2],
-    "bounds": [[0.0, 1.0], [[0.0, 0.0]], [[0.0, 0.0], [1.0, float("inf")]], torch.zeros(2, 3)],
-    "base": [[[0.5, 0.5]], 0.5, [0.5, float("nan")], torch.zeros(2, 1)],
-    "axes": [np.zeros((2, 2)), [1, 2]],
-}
-MESSAGES = {
-    "num_points": "Expected num_points to be a whole number >= 2, got",
-    "output": "Expected output to be a whole number >= 0, got|There is no output 2; there are 2",
-    "bounds": r"Expected bounds of shape \(2, 2\), finite, lower below upper, got",
-    "base": "Expected a base point of 2 inputs, finite, got",
-    "axes": "Expected 2 x 2 axes, got 0",
-}
+RANGES = ("wide", [[0.0], [1.0, 2.0]], object())
+BAD_OPTIONS = [
+    ("num_points", ValueError, "to be a whole number >= 2, got", (1, 2.5, "9", None)),
+    ("output", ValueError, "whole number >= 0, got|no output 2; there are 2", (0.0, None, -1, 2)),
+    (
+        "bounds",
+        ValueError,
+        r"Expected bounds of shape \(2, 2\), finite, lower below upper, got",
+        ([0.0, 1.0], [[0.0, 0.0]], [[0.0, 0.0], [1.0, float("inf")]], torch.zeros(2, 2)),
+    ),
+    (
+        "base",
+        ValueError,
+        "Expected a base point of 2 inputs, finite, got",
+        ([[0.5, 0.5]], 0.5, [0.5, float("nan")], torch.zeros(3)),
+    ),
+    ("axes", ValueError, "Expected 2 x 2 axes, got 0", (np.zeros((2, 2)), [1, 2])),
+    ("bounds", TypeError, "Expected bounds as a tensor or lists of numbers", RANGES),
+    ("base", TypeError, "Expected base as a tensor or lists of numbers", RANGES),
+]
 
 
 @pytest.mark.parametrize("draw", [plot_adjustment, plot_adjustment_pair])
-@pytest.mark.parametrize("name", BAD)
-def test_bad_options_of_adjustments(plane, draw, name):
-    for value in BAD[name]:
-        with pytest.raises(ValueError, match=MESSAGES[name]):
+@pytest.mark.parametrize(("name", "error", "says", "values"), BAD_OPTIONS)
+def test_bad_options_of_adjustments(plane, draw, name, error, says, values):
+    for value in values:
+        with pytest.raises(error, match=says):
             draw(plane, **{name: value})
     assert not plt.get_fignums()
 
 
-@pytest.mark.parametrize("draw", [plot_adjustment, plot_adjustment_pair])
-def test_ranges_that_are_no_numbers(plane, draw):
-    for name in ("bounds", "base"):
-        for value in ("wide", [[0.0], [1.0, 2.0]], object()):
-            with pytest.raises(TypeError, match=f"Expected {name} as a tensor or lists of numbers"):
-                draw(plane, **{name: value})
-
-
-@pytest.mark.parametrize("inputs", [0, (0,), (0, 1, 1), (0.0, 1.0), "01", (0, 0), (-1, 0), None])
+@pytest.mark.parametrize("inputs", [0, (0,), (0.0, 1.0), "01", (0, 0), (-1, 0), (0, 2), None])
 def test_inputs_that_are_no_pair(plane, inputs):
     with pytest.raises(ValueError, match="Expected two different inputs from 0 to 1, got"):
         plot_adjustment_pair(plane, inputs)
 
 
-def test_a_pair_needs_two_inputs(line):
+def test_models_that_have_nothing_to_draw(line, data):
+    with pytest.raises(TypeError, match="ZeroMeanGP has neither rho nor delta to draw"):
+        plot_adjustment(ZeroMeanGP(*data()))
     with pytest.raises(ValueError, match="of one input with `plot_adjustment`"):
         plot_adjustment_pair(line)
+    for draw in (plot_calibration, plot_pit, plot_leave_one_out):
+        with pytest.raises(TypeError, match=r"got CKA; pass `leave_one_out\(model\)`"):
+            draw(line)
 
 
-def test_bad_input_of_predictions(line, plane, data, forrester):
+def test_bad_input(line, plane, data, forrester):
     X, Y = data(num_outputs=2)
-    loo = leave_one_out(plane)
-    with pytest.raises(TypeError, match=r"Expected X .* got ndarray; convert .*as_tensor\(X, "):
-        plot_prediction(plane, X.numpy(), Y)
-    with pytest.raises(TypeError, match="Expected Y to be a torch tensor, got list"):
-        plot_prediction(plane, X, Y.tolist())
-    with pytest.raises(ValueError, match="Expected X of shape n x d, one point or more"):
-        plot_prediction(plane, X[:0], Y[:0])
-    with pytest.raises(ValueError, match="Expected Y with the 2 outputs of the model"):
-        plot_prediction(plane, X, Y[:, :1])
-    with pytest.raises(ValueError, match="Expected 1 x 1 axes, got 2"):
-        plot_prediction(line, forrester.test_X, ax=Figure().subplots(2))
-    with pytest.raises(TypeError, match="Expected level to be a number"):
-        plot_leave_one_out(loo, level="95 %")
-    with pytest.raises(ValueError, match="Expected output to be a whole number >= 0, got 'y1'"):
-        plot_leave_one_out(loo, output="y1")
-    with pytest.raises(ValueError, match=r"Expected bins to be a whole number >= 1, got 1\.5"):
-        plot_pit(loo, bins=1.5)
-    with pytest.raises(TypeError, match=r"got ndarray; .* the values themselves as a torch tensor"):
-        plot_pit(loo.pit.numpy())
-    with pytest.raises(ValueError, match="There is no output 2; there are 2, from 0"):
-        plot_calibration(loo, output=2)
+    loo, one = leave_one_out(plane), forrester.test_X
+    for call, error, says in (
+        (lambda: plot_prediction(plane, X), ValueError, "pass `Y`"),
+        (lambda: plot_prediction(plane, X, Y, output=2), ValueError, "There is no output 2; "),
+        (lambda: plot_prediction(plane, X, Y[1:]), ValueError, "Expected Y of shape 9 x m"),
+        (lambda: plot_prediction(plane, X, Y[:, :1]), ValueError, "Y with the 2 outputs of the m"),
+        (lambda: plot_prediction(plane, X[None], Y), ValueError, "Expected X of shape n x d"),
+        (lambda: plot_prediction(plane, X[:0], Y[:0]), ValueError, "n x d, one point or more"),
+        (lambda: plot_prediction(plane, X.numpy(), Y), TypeError, r"got ndarray; .*as_tensor\(X, "),
+        (lambda: plot_prediction(plane, X, Y.tolist()), TypeError, "torch tensor, got list"),
+        (lambda: plot_prediction(line, one, level=95), ValueError, "level between 0 and 1"),
+        (lambda: plot_prediction(line, one, ax=Figure().subplots(2)), ValueError, "1 x 1 axes"),
+        (lambda: plot_leave_one_out(loo, level="95 %"), TypeError, "level to be a number"),
+        (lambda: plot_leave_one_out(loo, output="y1"), ValueError, "number >= 0, got 'y1'"),
+        (lambda: plot_pit(torch.tensor([0.5, 1.5])), ValueError, "PIT values between 0 and 1"),
+        (lambda: plot_pit(loo, bins=1.5), ValueError, r"bins to be a whole number >= 1, got 1\.5"),
+        (lambda: plot_pit(loo.pit.numpy()), TypeError, "the values themselves as a torch tensor"),
+        (lambda: plot_calibration(loo, output=2), ValueError, "no output 2; there are 2, from 0"),
+    ):
+        with pytest.raises(error, match=says):
+            call()

@@ -1,0 +1,148 @@
+"""Faults made by hand, that the quick tests are to find: small, realistic, in every room."""
+
+from typing import NamedTuple
+
+
+class Fault(NamedTuple):
+    """One fault: a text of a file, once there, and what takes its place.
+
+    Attributes:
+        file: The file, from the root of the repository.
+        old: What it says.
+        new: What it would say.
+        why: What goes wrong then, and where it shows.
+    """
+
+    file: str
+    old: str
+    new: str
+    why: str
+
+    @property
+    def room(self) -> str:
+        """The folder of the library that it is in, whose tests come first."""
+        return self.file.split("/")[1]
+
+
+FAULTS = (
+    Fault(
+        "gpadjust/physics/black_box.py",
+        "i // d % n for i in error.rows",
+        "i // d for i in error.rows",
+        "A failure on the lower side of a difference blames a row that is not there.",
+    ),
+    Fault(
+        "gpadjust/physics/base.py",
+        "if len(state) != len(memo.state) or not all(map(_same, state, memo.state)):",
+        "if len(state) != len(memo.state):",
+        "The memo outlives a change of the physics' parameters.",
+    ),
+    Fault(
+        "gpadjust/gp/gaussian.py",
+        "added = nugget(n) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1, keepdim=True)",
+        "added = torch.full_like(covariance[..., :1, 0], nugget(n))",
+        "The nugget has no units: targets of a tiny scale drown in it.",
+    ),
+    Fault(
+        "gpadjust/gp/stationary.py",
+        "by_each if shape[-1] > 1 else by_each.sum(-1, keepdim=True)",
+        "by_each if shape[-1] > 1 else by_each.mean(-1, keepdim=True)",
+        "The gradient of a lengthscale that several inputs share is too small.",
+    ),
+    Fault(
+        "gpadjust/models/adjusted_gp.py",
+        "weights.append((term, -term.basis.offset / term.basis.scale))",
+        "weights.append((term, -term.basis.offset))",
+        "With a center, delta is in the wrong units wherever the targets are scaled.",
+    ),
+    Fault(
+        "gpadjust/models/exact_gp_base.py",
+        "self._outputs_last(noise * scale.square())",
+        "self._outputs_last(noise * scale)",
+        "Known variances are given back (and saved) as if they were standard deviations.",
+    ),
+    Fault(
+        "gpadjust/models/rra.py",
+        "parts.append(term.mean_variance.sqrt() * scale)",
+        "parts.append(term.mean_variance * scale)",
+        "RRA's weight of an unknown mean has the variance for its standard deviation.",
+    ),
+    Fault(
+        "gpadjust/inference/objective.py",
+        "gradient = gradient - self.parameters.noise * by_least",
+        "gradient = gradient + self.parameters.noise * by_least",
+        "The gradient is wrong where the noise is at its least value, and only there.",
+    ),
+    Fault(
+        "gpadjust/inference/hmc.py",
+        "(white.square() - here.square()).sum(-1) / _INFLATION**2)",
+        "(white.square() - here.square()).sum(-1) / _INFLATION)",
+        "The long jumps of the sampler accept too seldom in the tails: biased samples.",
+    ),
+    Fault(
+        "gpadjust/inference/full_bayes.py",
+        "torch.Generator().manual_seed(search.seed)",
+        "torch.Generator().manual_seed(0)",
+        "The seed of the sampler is ignored.",
+    ),
+    Fault(
+        "gpadjust/validation/scores.py",
+        "((pit - 0.5).abs() <= level / 2)",
+        "(pit <= 0.5 + level / 2)",
+        "The interval of the coverage is open below.",
+    ),
+    Fault(
+        "gpadjust/validation/leave_one_out.py",
+        "return y - factors.alpha * variance, variance\n",
+        "return y - factors.alpha * variance, variance + noise\n",
+        "Leave-one-out of another library's model has the noise twice.",
+    ),
+    Fault(
+        "gpadjust/active/best_points.py",
+        "acquisition.set_X_pending(taken if own is None else torch.cat([own, taken]))",
+        "acquisition.set_X_pending(taken)",
+        "Pending points of the acquisition function's own are lost.",
+    ),
+    Fault(
+        "gpadjust/active/adjustment_information_gain.py",
+        "if self._rest is None or self._rest.source is not self.model.strategy():",
+        "if self._rest is None:",
+        "The information is that before the model was trained or given other data.",
+    ),
+    Fault(
+        "gpadjust/dynamics/transition_scores.py",
+        "found = mean + spec.change(prediction[0], data.next_states)[:, spec.moving]",
+        "found = data.next_states[:, spec.moving]",
+        "An angle that wraps between prediction and truth counts as an error of a full turn.",
+    ),
+    Fault(
+        "gpadjust/dynamics/incremental_fit.py",
+        "observed.cumsum(0) <= 2",
+        "observed.cumsum(0) <= 1",
+        "A search among many transitions may see a single one of a state that is seldom measured.",
+    ),
+    Fault(
+        "gpadjust/envs/remember_action.py",
+        "taken = np.clip(action, self._taken.low, self._taken.high)",
+        "taken = action",
+        "The action that is remembered is not the one that was taken.",
+    ),
+    Fault(
+        "gpadjust/rl/dyna.py",
+        "ends = (step.terminated | step.truncated, step.truncated)",
+        "ends = (step.terminated | step.truncated, step.terminated)",
+        "Terminations count as time limits and the other way round: wrong targets of the critics.",
+    ),
+    Fault(
+        "gpadjust/rl/checkpoint.py",
+        'agent._random_state = RandomState.from_arrays(_unpacked(parts["random.npz"]))',
+        'RandomState.from_arrays(_unpacked(parts["random.npz"])).restore()',
+        "The generators are restored when the agent is read, not when it goes on to learn.",
+    ),
+    Fault(
+        "gpadjust/control/action_sequences.py",
+        "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
+        "drawn, score(drawn)",
+        "The planner forgets its best sequences of earlier rounds.",
+    ),
+)
