@@ -52,7 +52,17 @@ __all__ = [
 ]
 
 # Rooms that need no extra, in the order in which a name of `__all__` is looked for.
-_ROOMS = ("physics", "models", "inference", "validation", "gp", "states", "active", "dynamics", "control")
+_ROOMS = (
+    "physics",
+    "models",
+    "inference",
+    "validation",
+    "gp",
+    "states",
+    "active",
+    "dynamics",
+    "control",
+)
 
 
 def __getattr__(name: str) -> Any:

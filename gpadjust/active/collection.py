@@ -22,9 +22,9 @@ from gpadjust.active.arguments import (
 )
 from gpadjust.active.best_points import best_points
 from gpadjust.active.design import among, sobol_points
-from gpadjust.active.loop import measure_on
+from gpadjust.active.loop import Loop
 from gpadjust.active.measurement_log import MeasurementLog, Record
-from gpadjust.active.measurements import Measurements, measurement
+from gpadjust.active.measurements import measurement
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
 from gpadjust.models.sampled_functions import check_number, seeded
 
@@ -33,7 +33,7 @@ class MeasurementWarning(UserWarning):
     """A measurement failed."""
 
 
-class Collection(Measurements):
+class Collection(Loop):
     """Chooses where to measure, for a laboratory that measures when it can.
 
     :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points; where
@@ -262,47 +262,6 @@ class Collection(Measurements):
         """
         X = self.pending if X is None else as_points(X, self.bounds.shape[-1])
         self._enter([{"withdrawn": X.tolist()}])
-
-    def run(
-        self,
-        oracle: Callable[[Tensor], Any],
-        budget: int,
-        *,
-        progress: bool = False,
-        max_failures: int = 5,
-    ) -> Self:
-        """Ask, measure and tell, until a budget is spent; points that are pending come first.
-
-        A measurement that fails (the oracle raises an exception, or returns nothing but NaN and
-        infinity) is logged with its message and skipped, with a warning. It counts against the
-        budget, and no point within a hundredth of the bounds' widths of it is asked for again. An
-        exception fails the whole batch. Where some outputs are NaN, each output is learnt from its
-        own measurements.
-
-        Args:
-            oracle: Measures: maps points ``q x d`` to values ``q x m`` (or ``q``).
-            budget: Number of measurements in all: failed ones and those of the log included, those
-                of ``data`` not.
-            progress: Whether to show a progress bar.
-            max_failures: Number of calls of the oracle, in a row and without any result, that stop
-                it.
-
-        Returns:
-            This collection.
-
-        Raises:
-            TypeError: If the oracle is not callable.
-            ValueError: If a number is out of range.
-            LogError: If the log cannot be written.
-            CollectionError: If the oracle fails too often, or what it returns can be no measured
-                values or cannot be logged: it is in the error's ``result`` then, and the points
-                are still pending.
-
-        Warns:
-            MeasurementWarning: If a measurement fails.
-        """
-        measure_on(self, oracle, budget, progress, max_failures)
-        return self
 
     def close(self) -> None:
         """Let another collection have the log; :meth:`tell` takes it again, if none has written."""

@@ -45,7 +45,8 @@ class Task:
     """What is known of a system and of what it is to do, said once.
 
     All tensors are float64, in the units of ``dynamics.spec``. What is left out a learner takes
-    from its environment and the real episodes that it has seen.
+    from its environment and the real episodes that it has seen. To change a part, make another one
+    by ``dataclasses.replace``.
 
     Args:
         dynamics: The model of the real system.
@@ -58,7 +59,7 @@ class Task:
             environment.
         state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
             model is not followed; infinite where there is none. Default: far beyond all that was
-            seen.
+            seen, of an agent that has seen some; else none.
 
     Raises:
         TypeError: If something is of another kind, or a function takes other arguments.

@@ -6,6 +6,7 @@ import io
 import math
 import time
 import warnings
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,13 @@ class Dyna(TaskLearner):
                 "replay_buffer_class must be MixedReplayBuffer or a subclass of it; found "
                 f"{buffer_class.__name__}."
             )
+        misplaced = {entry.name for entry in fields(DynaOptions)} & {*kwargs}
+        if misplaced:
+            name = min(misplaced)
+            raise TypeError(
+                f"{name} is an option of the model: pass DynaOptions({name}={kwargs[name]!r}) as "
+                "options."
+            )
         self.options = DynaOptions() if options is None else options
         self.num_episodes = 0
         self.planned = PlannedEpisodes()
@@ -143,11 +151,12 @@ class Dyna(TaskLearner):
             super().train(gradient_steps, batch_size)
         if new is None:
             return
-        if serves:
-            self._learn_dynamics(new)
+        metrics = self._learn_dynamics(new) if serves else {}
         self.replay_buffer.num_new = 0
         self.num_episodes += new.num_ended
         if serves:
+            for hook in self.model_hooks:
+                hook.on_model_fit(metrics)
             self._train_in_model(self.options.model_episodes * new.num_ended, batch_size)
             total = sum(self.wall_time.values())
             for name, seconds in self.wall_time.items():
@@ -161,8 +170,8 @@ class Dyna(TaskLearner):
         least = 1 if self.ready_task().dynamics.is_fitted else 2  # a first fit needs two
         return new if new.num_ended and new.num_transitions >= least else None
 
-    def _learn_dynamics(self, new: RecordedEpisodes) -> None:
-        """Score the dynamics on new transitions, and teach them these."""
+    def _learn_dynamics(self, new: RecordedEpisodes) -> dict[str, float]:
+        """Score the dynamics on new transitions, and teach them these; return what is logged."""
         dynamics = self.ready_task().dynamics
         transitions = (new.states, new.actions, new.next_states)
         metrics: dict[str, float] = {}
@@ -182,8 +191,7 @@ class Dyna(TaskLearner):
         metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         for name, value in metrics.items():
             self.logger.record(f"model/{name}", value)
-        for hook in self.model_hooks:
-            hook.on_model_fit(metrics)
+        return metrics
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
         """Run model episodes, side by side, with updates at each step."""

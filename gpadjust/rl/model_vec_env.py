@@ -49,7 +49,8 @@ class ModelVecEnv(VecEnv):
 
     **Leaving the bounds never pays.** A particle that would leave the bounds of the task or the
     finite numbers, or meets a failure of the physics, stays where it is, and its episode is
-    terminated, with ``info["left_bounds"]``. Its reward is :math:`r_{\min} / (1 - \gamma)`, the
+    terminated, with ``info["left_bounds"]`` (which stands in the ``info`` of every episode's last
+    step). Its reward is :math:`r_{\min} / (1 - \gamma)`, the
     return of the worst reward seen so far if that went on for ever.
 
     Args:
@@ -62,9 +63,9 @@ class ModelVecEnv(VecEnv):
             in the paper. ``"trajectory"``: between two calls of ``reset``, each particle follows a
             transition function of its own, drawn from the posterior, so that what it meets is
             consistent along its trajectory. (In the terms of PETS, trajectory sampling 1 and
-            infinity; Chua et al. 2018.)
-        discount: The discount :math:`\gamma` of who learns in it; with 1 the worst reward goes on
-            for an episode.
+            infinity; Chua et al. 2018. Stable-Baselines3 calls ``reset`` once in ``learn``.)
+        discount: The discount :math:`\gamma`, that of who learns in it; with 1 the worst reward
+            goes on for an episode.
         worst_reward: The worst reward seen elsewhere, such as in real episodes.
 
     Attributes:
@@ -72,6 +73,7 @@ class ModelVecEnv(VecEnv):
         worst_reward: The worst reward seen so far; infinite before the first.
 
     Raises:
+        RuntimeError: If the dynamics have learnt nothing yet.
         ValueError: If the task leaves something open, spaces do not fit the spec, or a number is
             out of range.
     """
@@ -89,6 +91,11 @@ class ModelVecEnv(VecEnv):
     ) -> None:
         spec = task.dynamics.spec
         check_spaces(spec, observation_space, action_space)
+        if not task.dynamics.is_fitted:
+            raise RuntimeError(
+                f"{type(task.dynamics).__name__} has not learnt from transitions yet; call "
+                "`update`."
+            )
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1; found {num_envs}.")
         for name in ("initial_states", "episode_length"):

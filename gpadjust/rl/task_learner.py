@@ -43,6 +43,7 @@ class TaskLearner(OffPolicyAlgorithm):
         kwargs: Further arguments of the learner.
 
     Attributes:
+        task: The task; to change a part of it, set another one.
         wall_time: Seconds spent on each part of the work.
         notes: What you want to keep with the agent, in plain values; saved and resumed with it.
     """
@@ -55,7 +56,7 @@ class TaskLearner(OffPolicyAlgorithm):
         self.task = task
         self.wall_time: dict[str, float] = {}
         self.notes: dict[str, Any] = {}
-        self._known = [] if task is None else _known(task)
+        self._known = _known(task)
         self._num_stored = 0  # of the time steps, how many came into the buffer
         self._random_state: RandomState | None = None
         self._unread_dynamics: dict[str, Any] = {}  # of an agent that was loaded without a task
@@ -256,9 +257,10 @@ class TaskLearner(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), *_NOT_SAVED]
 
 
-def _known(task: Task) -> list[str]:
+def _known(task: Task | None) -> list[str]:
     """The functions that a task may have and this one has."""
-    return [name for name in ("terminated", "initial_states") if getattr(task, name) is not None]
+    names = ("terminated", "initial_states")
+    return [name for name in names if getattr(task, name, None) is not None]
 
 
 def _on_cpu(state: Any) -> Any:

@@ -31,7 +31,7 @@ class StateSpec:
         actions: The names of the action's entries.
         angles: The states that are angles in rad. Policy and model see their sine and cosine, and
             changes are the shortest way round the circle.
-        exogenous: The states that stay as they are during a trial, such as a target. The policy
+        exogenous: The states that stay as they are during an episode, such as a target. The policy
             sees them; models and physics do not.
         integrated: For states that a model need not predict, the states that are their
             velocities: :math:`q' = q + h (v + v') / 2`.

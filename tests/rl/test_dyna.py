@@ -949,6 +949,13 @@ def test_arguments_of_another_type_are_refused(point_agent, options, message):
         point_agent(**options)
 
 
+def test_what_has_its_place_elsewhere_is_told(point_env, point_dynamics, point_task):
+    with pytest.raises(TypeError, match=r"task must be a Task\(dynamics, reward"):
+        DynaSAC("MlpPolicy", point_env(), point_dynamics)
+    with pytest.raises(TypeError, match=r"pass DynaOptions\(model_episodes=2\) as options"):
+        DynaSAC("MlpPolicy", point_env(), point_task(), model_episodes=2)
+
+
 class Shaped(gymnasium.Env):
     def __init__(self, observation_space, action_space):
         self.observation_space, self.action_space = observation_space, action_space

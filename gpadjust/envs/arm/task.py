@@ -119,7 +119,7 @@ def hand_distance_cm(states: Tensor) -> Tensor:
         states: ``... x 6``.
 
     Returns:
-        ``...``. The score of trials is the root mean square of it over steps and targets.
+        ``...``. The score of episodes is the root mean square of it over steps and targets.
 
     Example:
         >>> hand_distance_cm(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi]))
