@@ -1,41 +1,52 @@
-"""The results of the runs that there are, their summaries, and the verdicts."""
+"""The tables of the runs that there are, and the verdicts."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
-from paper.active.learners import LABELS
-from paper.active.problems import NAMES
-from paper.control.claims import FEWEST, Judged, counted, met
+from paper.active import LABELS, PROBLEMS
+from paper.common.claims import FEWEST, Judged, counted, met
+from paper.common.experiment import Record, Table
+from paper.common.tables import claims_table, markdown
 
 REFERENCE = "gp"  # whose final error the others are to reach
 CLAIMS = {"forrester": "M1", "currin": "M2", "park91a": "M3", "cartpole": "M4"}
 _SECONDS = ["choice_seconds", "score_seconds"]
 
 
-def load(out: Path) -> pd.DataFrame:
-    """The scores of all finished runs: a row for each run and number of measurements.
-
-    Raises:
-        FileNotFoundError: If there is none.
-    """
-    frames = []
-    for path in sorted((out / "runs").glob("*.json")):
-        result = json.loads(path.read_text())
-        run = {name: result[name] for name in ("problem", "learner", "seed", *_SECONDS)}
-        frames.append(pd.DataFrame({**result["scores"], **run}))
-    if not frames:
-        raise FileNotFoundError(f"There are no results in {out / 'runs'}.")
-    ranks = {"problem": list(NAMES).index, "learner": list(LABELS).index}
+def load(records: Sequence[Record]) -> pd.DataFrame:
+    """The scores: a row for each run and number of measurements."""
+    frames = [
+        pd.DataFrame(
+            {**r["scores"], **{name: r[name] for name in ("problem", "learner", "seed", *_SECONDS)}}
+        )
+        for r in records
+    ]
+    ranks = {"problem": PROBLEMS.index, "learner": list(LABELS).index}
     order = ["problem", "learner", "seed", "measurements"]
-    runs = pd.concat(frames).astype(dict.fromkeys(_SECONDS, float))
+    runs = pd.concat(frames).astype(dict.fromkeys(["coverage", *_SECONDS], float))
     return runs.sort_values(
         order, key=lambda c: c.map(ranks[str(c.name)]) if c.name in ranks else c
-    ).reset_index(drop=True)[[*order, "nrmse", "coverage", *_SECONDS]]
+    ).reset_index(drop=True)
+
+
+def tables(runs: pd.DataFrame) -> dict[str, Table]:
+    """All tables, by the names of their markers."""
+    table = tabulate(runs)
+    seconds = table["choice_seconds"].map("{:.2g}".format)
+    seconds += table["score_seconds"].map(" + {:.2g}".format)
+    found = {"claims": Table("Targets", claims_table("target", {"": verdicts(runs)}))}
+    for name, title, cells in (
+        ("errors", "Median final error", table["nrmse"].map("{:.2g}".format)),
+        ("needed", "Measurements that reach the final error of `gp`", table.apply(_count, axis=1)),
+        ("coverage", "Final coverage of 95 %", table["coverage"].map("{:.2f}".format)),
+        ("seconds", "Seconds of choices + scores", seconds),
+    ):
+        found[name] = Table(title, _by_learner(table.assign(cell=cells.replace("nan", ""))))
+    return {f"active:{name}": table for name, table in found.items()}
 
 
 def needed(runs: pd.DataFrame, learner: str) -> pd.Series[float]:
@@ -67,11 +78,7 @@ def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
             {
                 "problem": name,
                 "learner": learner,
-                "runs": len(last),
-                "measurements": last["measurements"].max(),
-                "nrmse_median": last["nrmse"].median(),
-                "nrmse_low": last["nrmse"].quantile(0.25),
-                "nrmse_high": last["nrmse"].quantile(0.75),
+                "nrmse": last["nrmse"].median(),
                 "coverage": last["coverage"].mean(),
                 "needed": np.median(count) if len(count) else np.nan,
                 "reached": np.isfinite(count).sum(),
@@ -83,12 +90,13 @@ def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def verdicts(runs: pd.DataFrame, learner: str = "cka") -> pd.DataFrame:
+def verdicts(runs: pd.DataFrame, learner: str = "cka") -> list[Judged]:
     """Whether a learner reaches the reference's final error with half the measurements."""
     judged = []
+    labels: dict[str, str] = {**LABELS}
     for name, part in runs.groupby("problem", sort=False):
         count = needed(part, learner)
-        text = f"{name}: {LABELS[learner]} reaches the final error of {LABELS[REFERENCE]} with "
+        text = f"{name}: {labels[learner]} reaches the final error of {labels[REFERENCE]} with "
         text += "at most half the measurements"
         if len(count) < FEWEST:
             judged.append(Judged(CLAIMS[str(name)], text, "not run", "too few runs of both"))
@@ -98,9 +106,29 @@ def verdicts(runs: pd.DataFrame, learner: str = "cka") -> pd.DataFrame:
         measured = f"{counted(len(count))}: {reached} of {budget} (median), "
         measured += f"in {np.isfinite(count).sum()} of them at all"
         judged.append(Judged(CLAIMS[str(name)], text, met(middle <= budget / 2), measured))
-    return pd.DataFrame([vars(claim) for claim in judged])
+    return judged
 
 
 def _final(runs: pd.DataFrame, learner: str) -> pd.DataFrame:
     """The last row of each run of a learner, by seed."""
     return runs[runs["learner"] == learner].groupby("seed").last()
+
+
+def _by_learner(table: pd.DataFrame) -> str:
+    """A row for each learner, a column for each problem."""
+    cells = table.pivot(index="learner", columns="problem", values="cell").fillna("")
+    problems = list(table["problem"].unique())
+    rows = [
+        [label, *cells.loc[name, problems]] for name, label in LABELS.items() if name in cells.index
+    ]
+    return markdown(["", *problems], rows)
+
+
+def _count(row: pd.Series[float]) -> str:
+    """A number of measurements, and in how many runs if not in all."""
+    if np.isnan(row["needed"]):
+        return ""
+    text = f"{row['needed']:g}" if np.isfinite(row["needed"]) else "never"
+    return text if row["reached"] == row["compared"] else text + (
+        f" ({row['reached']} of {row['compared']})" if row["reached"] else ""
+    )

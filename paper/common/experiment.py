@@ -1,0 +1,95 @@
+"""What an experiment is; its fields are its command line."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple
+
+Task = tuple[Any, ...]
+Record = dict[str, Any]
+
+
+class Table(NamedTuple):
+    """A table in Markdown, and what stands above it."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Runs that do not depend on each other, and what is made of them.
+
+    A subclass adds its settings as further fields. It imports what it needs where it needs it: the
+    command line is made of the fields alone.
+    """
+
+    runs: int = 10
+    """number of runs, each with a seed of its own"""
+    seed: int = 0
+    """the first seed"""
+    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """parallel processes"""
+    out: Path = Path("results")
+    """folder of the results"""
+    backend: Literal["loky", "ray"] = "loky"
+    """processes on this machine, or on a Ray cluster"""
+    only_tables: bool = False
+    """run nothing; make tables and figures of the runs that are there"""
+    other_versions: Literal["refuse", "keep", "replace"] = "refuse"
+    """what becomes of runs that other versions of the packages made, if more are to be run: nothing
+    is run, they are kept beside the new ones, or they are run again"""
+
+    name: ClassVar[str]
+    """on the command line, and in the markers of the READMEs"""
+    key: ClassVar[tuple[str, ...]]
+    """what the parts of a task are called; the last is its seed"""
+    flat: ClassVar[bool] = True
+    """whether options of nested settings have the names of these alone"""
+    packages: ClassVar[tuple[str, ...]] = ("gpadjust", "torch", "gpytorch", "botorch", "numpy")
+    """whose versions decide the numbers"""
+
+    @property
+    def seeds(self) -> range:
+        """The seeds that are asked for."""
+        return range(self.seed, self.seed + self.runs)
+
+    def check(self) -> None:
+        """Raise a ValueError for an option, or an ImportError for a package, that will not do."""
+
+    def tasks(self) -> Sequence[Task]:
+        """What is asked for, in the order in which it is run; ``key`` names the parts of each."""
+        raise NotImplementedError
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """All that decides the numbers of a task (given without its seed), but for versions."""
+        raise NotImplementedError
+
+    def run(self, *task: Any, unfinished: Path) -> Record:
+        """Run a task, with one thread.
+
+        Args:
+            task: Its parts.
+            unfinished: A path that is the task's own, in a folder that there is. With a suffix it
+                is the place for what it needs to go on after an interruption; a run that ends
+                removes it.
+
+        Returns:
+            What was found, as JSON has it.
+        """
+        raise NotImplementedError
+
+    def first_look(self, records: Sequence[Record]) -> str | None:
+        """A short table of the first few runs; None if these are too few."""
+        return None
+
+    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
+        """The tables of all runs, by the names of their markers in the READMEs."""
+        raise NotImplementedError
+
+    def draw(self, records: Sequence[Record]) -> list[Path]:
+        """Draw the figures into ``out``; return their files."""
+        return []
