@@ -1,26 +1,30 @@
 """Gaussian processes that adjust a physics model to data."""
 
-from gpadjust.inference import FitResult, SampleResult, fit
-from gpadjust.models import (
-    AR1,
-    CKA,
-    RRA,
-    BiasGP,
-    PhysicsMeanGP,
-    ScaleGP,
-    ZeroMeanGP,
-    load,
-    save,
-)
-from gpadjust.physics import (
-    BlackBoxPhysics,
-    FunctionPhysics,
-    JoinedPhysics,
-    ODEPhysics,
-    Physics,
-    PhysicsError,
-)
-from gpadjust.validation import Comparison, compare
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gpadjust.inference import FitResult, SampleResult, fit
+    from gpadjust.models import (
+        AR1,
+        CKA,
+        RRA,
+        BiasGP,
+        PhysicsMeanGP,
+        ScaleGP,
+        ZeroMeanGP,
+        load,
+        save,
+    )
+    from gpadjust.physics import (
+        BlackBoxPhysics,
+        FunctionPhysics,
+        JoinedPhysics,
+        ODEPhysics,
+        Physics,
+        PhysicsError,
+    )
+    from gpadjust.validation import Comparison, compare
 
 __version__ = "0.1.0"
 
@@ -46,3 +50,23 @@ __all__ = [
     "load",
     "save",
 ]
+
+# Rooms that need no extra, in the order in which a name of `__all__` is looked for.
+_ROOMS = ("physics", "models", "inference", "validation", "gp", "states", "active", "dynamics")
+
+
+def __getattr__(name: str) -> Any:
+    """A name or a room at its first use: environments need no BoTorch, which takes long."""
+    if name in _ROOMS:
+        return import_module(f"gpadjust.{name}")
+    if name in __all__:
+        for room in _ROOMS:
+            module = import_module(f"gpadjust.{room}")
+            if name in module.__all__:
+                globals()[name] = getattr(module, name)
+                return globals()[name]
+    raise AttributeError(f"module 'gpadjust' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_ROOMS})

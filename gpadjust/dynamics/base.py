@@ -8,9 +8,11 @@ from typing import Any
 
 from torch import Tensor
 
-from gpadjust.dynamics.state_spec import StateSpec
+from gpadjust.dynamics.transition_scores import TransitionScores, score_transitions
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models import Prediction
+from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import check_columns
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
@@ -63,6 +65,22 @@ class Dynamics(ABC):
             ``k x N x action_dim`` to next states, each of the ``k`` blocks by its own draw.
         """
 
+    def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> TransitionScores:
+        """Judge the predictions by transitions that were not learnt from.
+
+        Args:
+            states: ``N x state_dim``.
+            actions: ``N x action_dim``.
+            next_states: ``N x state_dim``; NaN where an entry was not measured.
+
+        Raises:
+            RuntimeError: If nothing was learnt yet.
+            TypeError: If they are not float64 tensors.
+            ValueError: If shapes disagree or values are not finite.
+        """
+        data = Transitions.checked(self.spec, states, actions, next_states)
+        return score_transitions(self.spec, self.predict(data.states, data.actions), data)
+
     @abstractmethod
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text; of objects, the class."""
@@ -80,3 +98,15 @@ class Dynamics(ABC):
         data = Transitions.checked(self.spec, states, actions, next_states)
         self.spec.check_transitions(data.states, data.next_states, data.actions)
         return data
+
+    def _check_pair(self, states: Tensor, actions: Tensor) -> None:
+        check_columns(states, self.spec.state_dim, "states")
+        check_columns(actions, self.spec.action_dim, "actions")
+
+    def _check_blocks(self, states: Tensor, actions: Tensor, num_functions: int) -> None:
+        self._check_pair(states, actions)
+        if states.dim() != 3 or len(states) != num_functions:
+            raise ValueError(
+                f"Expected states of shape {num_functions} x N x {self.spec.state_dim}, a block "
+                f"for each function, got {tuple(states.shape)}."
+            )

@@ -2,105 +2,123 @@
 
 from __future__ import annotations
 
-import warnings
-from abc import abstractmethod
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 import torch
-from botorch.models.transforms.input import InputTransform
 from torch import Tensor
-from torch.nn import Module
 
-from gpadjust.dynamics.angle_input import AngleInput
-from gpadjust.dynamics.identity import check_identity, identity
-from gpadjust.dynamics.model_dynamics import ModelDynamics
-from gpadjust.dynamics.next_state_physics import check_physics, parts_of, warn_of_differences
-from gpadjust.dynamics.refitting import refit, search_rows
-from gpadjust.dynamics.state_spec import StateSpec
-from gpadjust.dynamics.transition_physics import Target, TransitionPhysics
+from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
+from gpadjust.dynamics.incremental_fit import checked_fit_options, refit, search_rows
+from gpadjust.dynamics.learnt import Learnt
+from gpadjust.dynamics.model_recipe import ModelRecipe
+from gpadjust.dynamics.next_state_physics import check_physics
+from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.inference import FitResult, fit
-from gpadjust.inference.fitting import FitOptions
-from gpadjust.models import ExactGPBase
+from gpadjust.inference import FitOptions, FitResult, fit
+from gpadjust.models import CKA, ExactGPBase, Prediction
 from gpadjust.models.adjusted_gp import PhysicsLike
-from gpadjust.physics import Physics, as_physics
+from gpadjust.states import StateSpec
 
 
-class LearnedDynamics(ModelDynamics):
-    """The base of dynamics that a Gaussian process of this library learns.
+class LearnedDynamics(Dynamics):
+    r"""Dynamics that a Gaussian process learns, as a rule by adjusting a physics of the system.
 
-    The states' targets are independent outputs of one model; users build
-    :class:`~gpadjust.dynamics.CKADynamics` and so on. The arguments are its own, except that
-    ``physics`` may be None.
+    Each state's change (or next value) is an independent output of one model, of the states that
+    move and the action, such as :math:`f_a = \rho f_p + \delta` of :class:`~gpadjust.CKA`.
+    Integrated states follow from their velocities, exogenous ones stay, and previous actions are
+    the action taken.
+
+    Args:
+        spec: What the entries of states and actions are.
+        physics: The next values of the states that are neither exogenous nor previous actions,
+            from these and the actions: columns ``[states, actions]`` in the order of the spec,
+            angles in rad. Several: a list, or a dictionary with their names, as of
+            :class:`~gpadjust.CKA`. None for a model without physics.
+        model: The class of the model: :class:`~gpadjust.CKA`, another one of
+            :mod:`gpadjust.models` (:class:`~gpadjust.ZeroMeanGP` is the one without physics), or
+            your own.
+        target: What the model learns: the ``"difference"`` of next state and state, of an angle
+            the shortest way round, or the next state itself (``"absolute"``). A scaling of an
+            absolute position or angle depends on where its origin is; one of a change does not.
+        encode_angles: Whether the model reads the sine and cosine of angles; the physics always
+            reads the angles.
+        model_options: Further arguments of the model, such as ``rho_mean`` of CKA or
+            ``num_features`` of RRA. A kernel may be a function of the number of inputs and the
+            batch shape that makes it; one that is a module is copied for each fit.
+        fit_options: Options of the search that :func:`gpadjust.fit` makes at the first fit.
+
+    Raises:
+        TypeError: If an argument is of another type, or the model needs a physics that is missing
+            or takes none that is given.
+        ValueError: If ``target`` or an option is unknown, or a physics returns the change of the
+            state.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec
+        >>> spec = StateSpec(["x"], ["v"])
+        >>> dynamics = LearnedDynamics(spec, physics=lambda X: X[:, :1] + 0.1 * X[:, 1:])
+        >>> x, v = torch.rand(8, 1, dtype=torch.float64), torch.rand(8, 1, dtype=torch.float64)
+        >>> dynamics.update(x, v, x + 0.12 * v)
+        >>> mean, variance = dynamics.predict(x, v)
+        >>> bool((mean - x - 0.12 * v).abs().max() < 1e-3)
+        True
     """
 
     def __init__(
         self,
         spec: StateSpec,
-        physics: PhysicsLike | None,
+        physics: PhysicsLike | None = None,
         *,
+        model: type[ExactGPBase] = CKA,
         target: Target = "difference",
         encode_angles: bool = True,
         model_options: Mapping[str, Any] | None = None,
         fit_options: FitOptions | None = None,
     ) -> None:
-        super().__init__(spec, target)
+        super().__init__(spec)
+        if not isinstance(encode_angles, bool):
+            raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
+        self.targets = TransitionTargets(spec, target)
         self.physics = None if physics is None else check_physics(physics)
         self.encode_angles = encode_angles
-        self.model_options = dict(model_options or {})
-        self.fit_options: FitOptions = {**(fit_options or {})}
-        own = {"physics", "input_transform", "train_Yvar"} & {*self.model_options}
-        if own:
-            raise ValueError(f"model_options may not hold {own.pop()!r}, which dynamics set.")
+        self.fit_options = checked_fit_options(fit_options)
         self.fit_result: FitResult | None = None
+        self._recipe = ModelRecipe(self.targets, self.physics, model, model_options, encode_angles)
+        self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions
-        self._forget_data()
-        self._parts = {
-            name: TransitionPhysics(part, self.targets)
-            for name, part in ({} if self.physics is None else parts_of(self.physics)).items()
-        }
-        self._physics = as_physics(self._parts) if self._parts else None
-
-    @abstractmethod
-    def _make_model(
-        self,
-        train_X: Tensor,
-        train_Y: Tensor,
-        physics: Physics | None,
-        **options: Any,
-    ) -> ExactGPBase:
-        """Build the model, from its options and an input transform."""
-
-    def _forget_data(self) -> None:
-        self._model: ExactGPBase | None = None
-        self._data: Transitions | None = None
-        self._known: Tensor | None = None  # f_p at the data
-        self._chunks: list[int] = []  # numbers of points: fitted, then conditioned on
-        self._searched_at = 0
 
     @property
     def is_fitted(self) -> bool:
         """Whether it has learnt from any transitions."""
-        return self._model is not None
+        return self._learnt is not None
 
     @property
     def model(self) -> ExactGPBase:
         """The model, whose targets are what ``target`` says of the predicted states."""
-        if self._model is None:
-            raise RuntimeError(
-                f"{type(self).__name__} has not learnt from transitions yet; call `update`."
-            )
-        return self._model
+        return self._known_so_far().model
+
+    @property
+    def model_class(self) -> type[ExactGPBase]:
+        """The class of the model."""
+        return self._recipe.model_class
+
+    @property
+    def model_options(self) -> dict[str, Any]:
+        """Further arguments of the model."""
+        return self._recipe.options
 
     @property
     def num_transitions(self) -> int:
         """Number of transitions that it has learnt from."""
-        return 0 if self._data is None else len(self._data.states)
+        return 0 if self._learnt is None else len(self._learnt.data.states)
 
     def fit(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Learn from these transitions only, by a full search of the hyper-parameters.
+
+        If this raises an error, what was learnt before stands; so it does in all methods below.
 
         Args:
             states: ``N x state_dim``, with ``N >= 2``.
@@ -116,7 +134,7 @@ class LearnedDynamics(ModelDynamics):
             PhysicsError: If the physics fails.
         """
         data = self._checked(states, actions, next_states)
-        self._learn(data, self._physics_at(data), None)
+        self._learn(data, self._recipe.physics_at(data), None)
 
     def update(
         self, states: Tensor, actions: Tensor, next_states: Tensor, *, refit: bool = True
@@ -124,8 +142,7 @@ class LearnedDynamics(ModelDynamics):
         """Learn from further transitions, beside the earlier ones.
 
         The hyper-parameters are fitted again from where they were, and searched for anew whenever
-        the number of transitions has doubled since the last search. If this raises an error, what
-        was learnt before stands.
+        the number of transitions has doubled since the last search.
 
         Args:
             states: ``N x state_dim``.
@@ -143,12 +160,10 @@ class LearnedDynamics(ModelDynamics):
             self.condition(states, actions, next_states)
             return
         data = self._checked(states, actions, next_states)
-        known = self._physics_at(data)
-        if self._data is not None:
-            data = self._data.append(data)
-            if known is not None and self._known is not None:
-                known = torch.cat([self._known, known])
-        self._learn(data, known, self._model)
+        known = self._recipe.physics_at(data)
+        if self._learnt is not None:
+            data, known = self._learnt.with_rows(data, known)
+        self._learn(data, known, self._learnt)
 
     def condition(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Condition on further transitions with the hyper-parameters as they are.
@@ -159,21 +174,76 @@ class LearnedDynamics(ModelDynamics):
         Raises:
             RuntimeError: If nothing was learnt yet.
         """
-        model = self.model
-        assert self._data is not None, "there is a model"
-        data = self._checked(states, actions, next_states)
-        known = self._physics_at(data)
-        self._model = self._condition(model, data)
-        self._data = self._data.append(data)
-        if known is not None and self._known is not None:
-            self._known = torch.cat([self._known, known])
-        self._chunks = [*self._chunks, len(data.states)]
+        before = self._known_so_far()
+        new = self._checked(states, actions, next_states)
+        data, known = before.with_rows(new, self._recipe.physics_at(new))
+        self._learnt = before._replace(
+            data=data,
+            known=known,
+            chunks=(*before.chunks, len(new.states)),
+            model=self._recipe.condition(before.model, new),
+        )
+
+    def predict(
+        self, states: Tensor, actions: Tensor, *, observation_noise: bool = True
+    ) -> Prediction:
+        """Mean and variance of the next states, entry by entry.
+
+        Args:
+            states: ``... x state_dim``.
+            actions: ``... x action_dim``.
+            observation_noise: Whether the variance includes the noise that was learnt, by which
+                next states scatter about the mean.
+
+        Returns:
+            ``... x state_dim`` each; of an angle, not wrapped.
+
+        Raises:
+            RuntimeError: If nothing was learnt yet.
+            PhysicsError: If the physics fails.
+        """
+        following, variance = self._predict(states, actions, observation_noise)
+        return Prediction(
+            self.spec.complete(states, actions, following), self.spec.complete_variance(variance)
+        )
+
+    def sample(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Draw next states, noise included, row by row, from PyTorch's generator."""
+        mean, variance = self._predict(states, actions, True)
+        return self.spec.complete(states, actions, mean + variance.sqrt() * torch.randn_like(mean))
+
+    def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
+        """Draw transition functions from the posterior; without noise.
+
+        Args:
+            num_functions: Number ``k`` of functions.
+            seed: Seed of the draw. Default: go on with PyTorch's generator.
+
+        Returns:
+            A function of states ``k x N x state_dim`` and actions ``k x N x action_dim`` to next
+            states. Later updates leave it as it is.
+
+        Raises:
+            ValueError: If ``num_functions`` is no positive whole number.
+            RuntimeError: If nothing was learnt yet.
+        """
+        functions: Any = self.model.sample_functions(num_functions, seed)
+
+        @torch.no_grad()
+        def step(states: Tensor, actions: Tensor) -> Tensor:
+            self._check_blocks(states, actions, num_functions)
+            values = functions.each(self.targets.inputs(states, actions))
+            return self.spec.complete(states, actions, self.targets.decode(states, values))
+
+        return step
 
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text; of objects, the class."""
-        several: dict[str, Any] = {"physics": [*self._parts]} if len(self._parts) > 1 else {}
-        return identity(
+        parts = [*self._recipe.parts]
+        several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
+        return fingerprint(
             self,
+            model=self.model_class,
             **several,
             target=self.targets.target,
             encode_angles=self.encode_angles,
@@ -182,16 +252,9 @@ class LearnedDynamics(ModelDynamics):
 
     def state_dict(self) -> dict[str, Any]:
         """All that was learnt, in tensors and plain values: data, f_p there, hyper-parameters."""
-        if self._model is None or self._data is None:
+        if self._learnt is None:
             return {}
-        return {
-            "identity": self.describe(),
-            "transitions": {name: t.clone() for name, t in self._data._asdict().items()},
-            "physics": None if self._known is None else self._known.clone(),
-            "chunks": [*self._chunks],
-            "searched_at": self._searched_at,
-            "model": {name: t.clone() for name, t in self._fitted.state_dict().items()},
-        }
+        return {"fingerprint": self.describe(), **self._learnt.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
@@ -202,24 +265,23 @@ class LearnedDynamics(ModelDynamics):
         Raises:
             RuntimeError: If it is of dynamics of another class, spec, target or model options.
         """
-        check_identity(state, self.describe())
-        self._forget_data()
-        self.fit_result = None
+        check_fingerprint(state, self.describe())
         if not state:
+            self._learnt = self.fit_result = None
             return
-        data = Transitions(**state["transitions"])
-        self._data, self._known = data, state["physics"]
-        self._chunks, self._searched_at = [*state["chunks"]], state["searched_at"]
-        start = self._chunks[0]
-        self._tell_physics(data, self._known)
-        model = self._build(data.rows(0, start), quiet=True)
+        data, known = Transitions(**state["transitions"]), state["physics"]
+        chunks = tuple(state["chunks"])
+        self._recipe.tell_physics(data, known)
+        model = self._recipe.build(data.rows(0, chunks[0]), quiet=True)
         model.load_state_dict(state["model"])
-        self._fitted = self._model = model.eval()
-        for size in self._chunks[1:]:
-            self._model = self._condition(self._model, data.rows(start, start + size))
+        fitted, start = model.eval(), chunks[0]
+        for size in chunks[1:]:
+            model = self._recipe.condition(model, data.rows(start, start + size))
             start += size
+        self._learnt = Learnt(data, known, chunks, state["searched_at"], fitted, model)
+        self.fit_result = None
 
-    def _learn(self, data: Transitions, known: Tensor | None, previous: ExactGPBase | None) -> None:
+    def _learn(self, data: Transitions, known: Tensor | None, previous: Learnt | None) -> None:
         n = len(data.states)
         observed = ~data.next_states[:, self.spec.predicted].isnan()
         least, i = observed.sum(0).min(0)
@@ -229,67 +291,38 @@ class LearnedDynamics(ModelDynamics):
                 f"Expected at least 2 transitions to learn from, got {least}{of}: there is no "
                 "scale in fewer. Collect more before the first update."
             )
-        if previous is None and known is not None and not self._compared:
-            self._compare(data, known)
-        self._tell_physics(data, known)
-        model = self._build(data, quiet=previous is not None)
-        searches = previous is None or n >= 2 * self._searched_at
+        if previous is None and not self._compared:
+            self._recipe.compare_physics(data, known)
+            self._compared = True
+        self._recipe.tell_physics(data, known)
+        model = self._recipe.build(data, quiet=previous is not None)
+        searched_at = n if previous is None else previous.searched_at
         if previous is None:
             result = fit(model, **self.fit_options)
         else:
+            searches = n >= 2 * searched_at
             rows = search_rows(observed) if searches else None
-            part = None if rows is None else self._build(data.some(rows), quiet=True)
-            result = refit(model, previous, searches, part)
+            part = None if rows is None else self._recipe.build(data.some(rows), quiet=True)
+            result = refit(model, previous.model, searches, part)
+            searched_at = n if searches else searched_at
         self.fit_result = result
-        self._searched_at = n if searches else self._searched_at
-        self._data, self._known, self._chunks = data, known, [n]
-        self._model = self._fitted = model
+        self._learnt = Learnt(data, known, (n,), searched_at, model, model)
 
-    def _compare(self, data: Transitions, known: Tensor) -> None:
-        """Warn of a physics that returns differences."""
-        predicted = self.spec.predicted
-        for name, values in zip(self._parts, known.split(len(predicted), dim=-1), strict=True):
-            change = self.targets.decode(data.states, values) - data.states[:, predicted]
-            warn_of_differences(name, self.spec, data, predicted, change)
-        self._compared = True
-
-    def _build(self, data: Transitions, quiet: bool) -> ExactGPBase:
-        """The model of some transitions; quiet where the first one has given its warnings."""
-        options = {
-            name: deepcopy(value) if isinstance(value, Module) else value
-            for name, value in self.model_options.items()
-        }
-        transform: InputTransform | None = None
-        if self.encode_angles and self.targets.angles:
-            transform = AngleInput(self.targets.angles)
-        with warnings.catch_warnings():
-            if quiet:
-                warnings.simplefilter("ignore")
-            return self._make_model(
-                self.targets.inputs(data.states, data.actions),
-                self.targets.encode(data.states, data.next_states),
-                self._physics,
-                input_transform=transform,
-                **options,
+    def _known_so_far(self) -> Learnt:
+        if self._learnt is None:
+            raise RuntimeError(
+                f"{type(self).__name__} has not learnt from transitions yet; call `update`."
             )
+        return self._learnt
 
-    def _condition(self, model: ExactGPBase, data: Transitions) -> ExactGPBase:
+    def _predict(
+        self, states: Tensor, actions: Tensor, observation_noise: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the predicted states, ``... x len(spec.predicted)``."""
+        self._check_pair(states, actions)
+        X = self.targets.inputs(states, actions)
         with torch.no_grad():
-            return model.condition_on_observations(
-                self.targets.inputs(data.states, data.actions),
-                self.targets.encode(data.states, data.next_states),
-            )
-
-    def _physics_at(self, data: Transitions) -> Tensor | None:
-        if self._physics is None:
-            return None
-        with torch.no_grad():
-            return self._physics(self.targets.inputs(data.states, data.actions))
-
-    def _tell_physics(self, data: Transitions, known: Tensor | None) -> None:
-        if known is None:
-            return
-        inputs = self.targets.inputs(data.states, data.actions)
-        values = known.split(len(self.spec.predicted), dim=-1)
-        for part, own in zip(self._parts.values(), values, strict=True):
-            part.know(inputs, own)
+            flat = X.reshape(-1, X.shape[-1])
+            mean, variance = self.model.predict(flat, observation_noise=observation_noise)
+        mean, variance = (t.reshape(*X.shape[:-1], t.shape[-1]) for t in (mean, variance))
+        return self.targets.decode(states, mean), variance

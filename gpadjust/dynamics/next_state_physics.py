@@ -8,10 +8,10 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.physics import JoinedPhysics, ODEPhysics, Physics, as_physics
+from gpadjust.states import StateSpec
 
 
 def check_physics(physics: PhysicsLike) -> Physics:

@@ -9,16 +9,17 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.identity import check_identity, identity
+from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
 from gpadjust.dynamics.next_state_physics import (
     check_physics,
     next_values,
     parts_of,
     warn_of_differences,
 )
-from gpadjust.dynamics.state_spec import StateSpec, check_columns
 from gpadjust.models import Prediction
 from gpadjust.physics import Physics
+from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import check_columns
 
 
 class PhysicsDynamics(Dynamics):
@@ -51,7 +52,8 @@ class PhysicsDynamics(Dynamics):
         if len(parts_of(self.physics)) > 1:
             raise ValueError(
                 "Expected one physics to follow, got "
-                f"{', '.join(map(repr, parts_of(self.physics)))}; CKADynamics learns their weights."
+                f"{', '.join(map(repr, parts_of(self.physics)))}; LearnedDynamics learns their "
+                "weights."
             )
         self._compared = False  # with transitions
 
@@ -92,11 +94,11 @@ class PhysicsDynamics(Dynamics):
 
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text."""
-        return identity(self)
+        return fingerprint(self)
 
     def state_dict(self) -> dict[str, Any]:
         """What these dynamics are; there is nothing learnt."""
-        return {"identity": self.describe()}
+        return {"fingerprint": self.describe()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Check that the state is of such dynamics.
@@ -104,7 +106,7 @@ class PhysicsDynamics(Dynamics):
         Raises:
             RuntimeError: If it is of dynamics of another class or spec.
         """
-        check_identity(state, self.describe())
+        check_fingerprint(state, self.describe())
 
     def _step(self, states: Tensor, actions: Tensor) -> Tensor:
         moving = self.spec.moving

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from gpadjust.active.information import UnknownCovariance, information_gain
-from gpadjust.dynamics.adjusted_dynamics import RRADynamics
 from gpadjust.dynamics.base import Dynamics
-from gpadjust.dynamics.model_dynamics import ModelDynamics
-from gpadjust.dynamics.state_spec import check_columns
+from gpadjust.dynamics.learned_dynamics import LearnedDynamics
+from gpadjust.models import PaperRRA
+from gpadjust.states.state_spec import check_columns
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
 
@@ -45,8 +45,9 @@ class TrajectoryInformation:
 
     Example:
         >>> import torch
-        >>> from gpadjust.dynamics import CKADynamics, StateSpec, TrajectoryInformation
-        >>> dynamics = CKADynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 0.1 * X[:, 1:])
+        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec, TrajectoryInformation
+        >>> spec = StateSpec(["x"], ["v"])
+        >>> dynamics = LearnedDynamics(spec, lambda X: X[:, :1] + 0.1 * X[:, 1:])
         >>> x, v = torch.rand(2, 8, 1, dtype=torch.float64)
         >>> dynamics.update(x, v, x + 0.12 * v)
         >>> information = TrajectoryInformation(dynamics)
@@ -57,7 +58,7 @@ class TrajectoryInformation:
 
     def __init__(self, dynamics: Dynamics) -> None:
         check_informative(dynamics)
-        assert isinstance(dynamics, ModelDynamics), "checked"
+        assert isinstance(dynamics, LearnedDynamics), "checked"
         self.spec = dynamics.spec
         self.targets = dynamics.targets
         self.model = dynamics.model.eval()
@@ -109,14 +110,13 @@ class TrajectoryInformation:
 
 def check_informative(dynamics: Dynamics | None) -> None:
     """Raise a TypeError unless the information of transitions can be told, once they are fitted."""
-    if not isinstance(dynamics, ModelDynamics):
+    if not isinstance(dynamics, LearnedDynamics):
         raise TypeError(
-            "Expected dynamics that a Gaussian process learns, such as CKADynamics or GPDynamics, "
-            f"to tell what transitions would teach; found {type(dynamics).__name__}, which say "
-            "nothing of their own errors."
+            "Expected LearnedDynamics, of a Gaussian process, to tell what transitions would "
+            f"teach; found {type(dynamics).__name__}, which say nothing of their own errors."
         )
-    if isinstance(dynamics, RRADynamics) and dynamics.prior == "paper":
+    if issubclass(dynamics.model_class, PaperRRA):
         raise TypeError(
-            "RRADynamics(prior='paper') has a covariance that is not a posterior's, so that there "
-            "is no information to speak of; take prior='physics'."
+            "PaperRRA has a covariance that is not a posterior's, so that there is no information "
+            "to speak of; take model=RRA."
         )

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.next_state_physics import next_values
-from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.physics import Physics
 from gpadjust.physics.memo import RowMemo, row_keys
+from gpadjust.states import StateSpec
 
 Target = Literal["difference", "absolute"]
 

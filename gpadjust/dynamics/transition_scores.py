@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
-from gpadjust.dynamics.state_spec import StateSpec
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models import Prediction
+from gpadjust.states import StateSpec
 from gpadjust.validation import coverage, nlpd, rmse
 
 
@@ -18,7 +19,8 @@ class TransitionScores(NamedTuple):
     These are the states that a model predicts and those integrated from them, in the spec's order;
     exogenous ones and previous actions are left out. The variance of an integrated state is what
     the dynamics say, :math:`(h / 2)^2` times that of its velocity: the more certain the velocity,
-    the more the trapezoid's own error counts in its ``nlpd`` and ``coverage``.
+    the more the trapezoid's own error counts in its ``nlpd`` and ``coverage``. Both are NaN where
+    a variance is zero, which says nothing of errors.
 
     Args:
         nlpd: Mean negative log predictive density, in nats.
@@ -35,11 +37,12 @@ def score_transitions(
     spec: StateSpec, prediction: Prediction, data: Transitions
 ) -> TransitionScores:
     """Compare predictions ``N x state_dim`` with what followed, angles the shortest way round."""
-    moving = spec.moving
-    mean, variance = prediction.mean[:, moving], prediction.variance[:, moving]
-    found = mean + spec.change(prediction.mean, data.next_states)[:, moving]
+    mean, variance = (tensor[:, spec.moving] for tensor in prediction)
+    found = mean + spec.change(prediction[0], data.next_states)[:, spec.moving]
+    says = (variance > 0).all(0)
+    silent = torch.full_like(says, torch.nan, dtype=mean.dtype)
     return TransitionScores(
-        nlpd=nlpd(mean, variance, found),
-        coverage=coverage(mean, variance, found),
+        nlpd=nlpd(mean, variance, found).where(says, silent),
+        coverage=coverage(mean, variance, found).where(says, silent),
         rmse=rmse(mean, found),
     )

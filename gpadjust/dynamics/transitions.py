@@ -7,8 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.state_spec import StateSpec, check_columns
 from gpadjust.models.training_data import check_finite, check_observed
+from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import check_columns
 
 
 class Transitions(NamedTuple):

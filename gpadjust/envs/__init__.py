@@ -2,6 +2,10 @@
 
 To import this package registers the environments with Gymnasium; ``gym.make`` imports it by itself
 where the id names it, as in ``gym.make("gpadjust.envs:gpadjust/CartPoleSwingUp-v0")``.
+
+A step that failed, as where a simulator could not integrate, truncates the episode and says
+``info["step_failed"] = True``: its observation and reward are no data, and no learner of this
+library takes them as such. Environments of your own may say so, too.
 """
 
 try:
@@ -9,7 +13,9 @@ try:
 except ImportError as error:
     raise ImportError('gpadjust.envs needs Gymnasium; run `pip install "gpadjust[rl]"`.') from error
 
-from gpadjust.envs.arm_task import (
+from gpadjust.envs.arm.muscle_arm import MuscleArmEnv
+from gpadjust.envs.arm.opensim_physics import opensim_arm_physics
+from gpadjust.envs.arm.task import (
     ARM_MEMORY_SPEC,
     ARM_SPEC,
     arm_reward,
@@ -18,7 +24,9 @@ from gpadjust.envs.arm_task import (
     hand_distance_cm,
     hand_position,
 )
-from gpadjust.envs.cart_pole import (
+from gpadjust.envs.arm.torque_arm import REAL_ARM, ArmEquation, torque_arm, torque_arm_physics
+from gpadjust.envs.cart_pole.swing_up import CartPoleSwingUpEnv
+from gpadjust.envs.cart_pole.system import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
     REAL_CART_POLE,
@@ -29,20 +37,16 @@ from gpadjust.envs.cart_pole import (
     cart_pole_start,
     random_cart_pole_physics,
 )
-from gpadjust.envs.cart_pole_swing_up import CartPoleSwingUpEnv
-from gpadjust.envs.muscle_arm import MuscleArmEnv
-from gpadjust.envs.opensim_arm import opensim_arm_physics
 from gpadjust.envs.remember_action import RememberAction
-from gpadjust.envs.torque_arm import REAL_ARM, ArmEquation, torque_arm, torque_arm_physics
 
 _gymnasium.register(
     id="gpadjust/CartPoleSwingUp-v0",
-    entry_point="gpadjust.envs.cart_pole_swing_up:CartPoleSwingUpEnv",
+    entry_point="gpadjust.envs.cart_pole.swing_up:CartPoleSwingUpEnv",
     max_episode_steps=25,
 )
 _gymnasium.register(
     id="gpadjust/MuscleArm-v0",
-    entry_point="gpadjust.envs.muscle_arm:MuscleArmEnv",
+    entry_point="gpadjust.envs.arm.muscle_arm:MuscleArmEnv",
     max_episode_steps=15,
 )
 

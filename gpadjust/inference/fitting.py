@@ -113,7 +113,7 @@ def fit(
         SamplingWarning: If the chains did not mix.
     """
     given: dict[str, Any] = {**options}
-    _check(method, given)
+    check_options(method, given)
     if isinstance(model, ModelListGP):
         results: list[FitResult | SampleResult] = []
         for part in model.models:
@@ -134,7 +134,7 @@ def fit(
         return sample(model, search, **given)
 
 
-def _check(method: str, options: dict[str, Any]) -> None:
+def check_options(method: str, options: dict[str, Any]) -> None:
     """Raise what :func:`fit` raises of its options."""
     if method not in _OPTIONS:
         raise ValueError(f"Unknown method {method!r}; expected 'map' or 'hmc'.")

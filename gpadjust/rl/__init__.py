@@ -7,21 +7,22 @@ except ImportError as error:
         'gpadjust.rl needs Stable-Baselines3 and Gymnasium; run `pip install "gpadjust[rl]"`.'
     ) from error
 
+from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
-from gpadjust.rl.checkpoint import TrialCheckpoint, resume, save_checkpoint
-from gpadjust.rl.dyna_sac import DynaSAC
-from gpadjust.rl.informative_trials import InformativeTrials, TrialPlan
-from gpadjust.rl.mixed_replay_buffer import MixedReplayBuffer
+from gpadjust.rl.checkpoint import EpisodeCheckpoint, resume, save_checkpoint
+from gpadjust.rl.dyna import Dyna, DynaSAC, DynaTD3
 from gpadjust.rl.model_vec_env import ModelVecEnv
+from gpadjust.rl.options import DynaOptions
 
 __all__ = [
+    "Dyna",
     "DynaCallback",
+    "DynaOptions",
     "DynaSAC",
-    "InformativeTrials",
+    "DynaTD3",
+    "EpisodeCheckpoint",
     "MixedReplayBuffer",
     "ModelVecEnv",
-    "TrialCheckpoint",
-    "TrialPlan",
     "resume",
     "save_checkpoint",
 ]

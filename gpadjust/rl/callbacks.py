@@ -5,23 +5,21 @@ from __future__ import annotations
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from gpadjust.rl.dyna_sac import DynaSAC
-
 
 class DynaCallback(BaseCallback):
-    """A Stable-Baselines3 callback with two more hooks, for :class:`DynaSAC`.
+    """A Stable-Baselines3 callback with two more hooks, for :class:`~gpadjust.rl.Dyna` agents.
 
     Subclasses that override ``_init_callback`` must call that of this class.
     """
 
-    model: DynaSAC
-
     def _init_callback(self) -> None:
-        if not isinstance(self.model, DynaSAC):
+        hooks = getattr(self.model, "model_hooks", None)
+        if hooks is None:
             raise TypeError(
-                f"{type(self).__name__} is for DynaSAC; found {type(self.model).__name__}."
+                f"{type(self).__name__} is for Dyna agents, such as DynaSAC; found "
+                f"{type(self.model).__name__}."
             )
-        self.model.model_hooks.append(self)
+        hooks.append(self)
 
     def _on_step(self) -> bool:
         return True
@@ -31,12 +29,12 @@ class DynaCallback(BaseCallback):
 
         Args:
             metrics: ``"fit_seconds"``; and of the newest real transitions, predicted before they
-                were learnt, from the second trial on: ``"nlpd"`` and ``"coverage"``, averaged over
-                the states, and ``"rmse/<state>"`` of each.
+                were learnt, as soon as the dynamics can predict: ``"nlpd"`` and ``"coverage"``,
+                averaged over the states, and ``"rmse/<state>"`` of each.
         """
 
-    def on_model_trials(self, returns: np.ndarray) -> None:
-        """Called after some model trials that ran side by side.
+    def on_model_episodes(self, returns: np.ndarray) -> None:
+        """Called after some model episodes that ran side by side.
 
         Args:
             returns: The sum of rewards of each.

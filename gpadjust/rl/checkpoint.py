@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import pickle
 import warnings
@@ -11,49 +12,55 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import gymnasium as gym
+import numpy as np
+from filelock import AcquireReturnProxy, BaseFileLock, FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from gpadjust.dynamics import Dynamics
-from gpadjust.rl.dyna_sac import DynaSAC
-from gpadjust.rl.model_vec_env import InitialStates, Reward, Termination
+from gpadjust.control import Task
+from gpadjust.rl.buffer import CompactReplayBuffer
+from gpadjust.rl.dyna import Dyna, DynaSAC
 from gpadjust.rl.random_state import RandomState
 
-_OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space")
+_FORMAT = "gpadjust episode checkpoint, version 2"
+_OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")
+_BUFFERS = ("replay_buffer", "model_buffer")
 
 
-class TrialCheckpoint(BaseCallback):
-    """Writes the whole state of a :class:`DynaSAC` run after each trial; :func:`resume` goes on.
+class EpisodeCheckpoint(BaseCallback):
+    """Writes the whole state of a Dyna run after each episode; :func:`resume` goes on.
 
     The file holds networks and optimisers, both buffers, what the dynamics learnt, the state of the
     environment, and all random generators, so that an interrupted run ends with the same weights,
     bit for bit, as one that was not (on the same machine and versions). It is replaced atomically:
-    whenever the process dies, a whole checkpoint is on the disk.
+    whenever the process dies, a whole checkpoint is on the disk. While it learns, a run holds a
+    lock beside the file (``.lock``): another process that would write there is refused.
 
-    Callbacks keep their own state: it is not in the file. One that draws random numbers (an
-    ``EvalCallback`` with ``deterministic=False``) or counts steps begins anew, and may so change
-    what follows.
+    Callbacks keep their own state: it is not in the file, unless they write it into
+    ``agent.notes``. One that draws random numbers (an ``EvalCallback`` with
+    ``deterministic=False``) or counts steps begins anew, and may so change what follows.
 
     The environment must be picklable for this; one that is not (a real robot) is reset when the
-    run goes on, which is then another run, and a warning says so. Files are pickles: open only
-    those you trust.
+    run goes on, which is then another run, and a warning says so.
 
     Args:
         path: The file.
-        every: Number of rollouts (trials, unless ``train_freq`` says otherwise) between two
+        every: Number of rollouts (episodes, unless ``train_freq`` says otherwise) between two
             checkpoints.
 
     Raises:
         ValueError: If ``every`` is not positive.
+        RuntimeError: When learning starts, if another process writes to this file.
 
     Example:
-        >>> checkpoint = TrialCheckpoint("run.ckpt")  # agent.learn(1250, callback=checkpoint)
-        >>> # after an interruption: agent = resume("run.ckpt", env, dynamics=..., reward=...)
+        >>> checkpoint = EpisodeCheckpoint("run.ckpt")  # agent.learn(1250, callback=checkpoint)
+        >>> # after an interruption: agent = resume("run.ckpt", env, task)
         >>> # agent.learn(1250 - agent.num_timesteps, checkpoint, reset_num_timesteps=False)
     """
 
-    model: DynaSAC
+    model: Dyna
 
     def __init__(self, path: str | Path, every: int = 1) -> None:
         if every < 1:
@@ -62,21 +69,26 @@ class TrialCheckpoint(BaseCallback):
         self.path = Path(path)
         self.every = every
         self._rollouts = 0
+        self._lock: BaseFileLock | None = None
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, DynaSAC):
-            raise TypeError(f"TrialCheckpoint is for DynaSAC; found {type(self.model).__name__}.")
+        if not isinstance(self.model, Dyna):
+            raise TypeError(
+                "EpisodeCheckpoint is for Dyna agents, such as DynaSAC; found "
+                f"{type(self.model).__name__}."
+            )
         if self.model.use_sde:
             raise ValueError(
-                "TrialCheckpoint cannot resume generalised state-dependent exploration exactly; "
-                "use DynaSAC with use_sde=False."
+                "EpisodeCheckpoint cannot resume generalised state-dependent exploration exactly; "
+                f"use {type(self.model).__name__} with use_sde=False."
             )
+        self._lock = _locked(self.path).lock
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        # The updates of the last trial are done, and the next has not begun.
+        # The updates of the last episode are done, and the next has not begun.
         if self._rollouts % self.every == 0:
             save_checkpoint(self.model, self.path)
         self._rollouts += 1
@@ -84,96 +96,170 @@ class TrialCheckpoint(BaseCallback):
     def _on_training_end(self) -> None:
         if self.model.num_timesteps >= self.model._total_timesteps:
             save_checkpoint(self.model, self.path)
-        # Otherwise a callback stopped the run within a trial.
+        # Otherwise a callback stopped the run within an episode.
+        if self._lock is not None:
+            self._lock.release()
 
 
-def save_checkpoint(agent: DynaSAC, path: str | Path) -> None:
-    """Write the state of a run between two trials to a file, atomically; see :func:`resume`."""
+def save_checkpoint(agent: Dyna, path: str | Path) -> None:
+    """Write the state of a run between two episodes to a file, atomically; see :func:`resume`.
+
+    Raises:
+        RuntimeError: If another process writes to this file.
+    """
     path = Path(path)
     saved = io.BytesIO()
     agent.save(saved)
-    random_state = (RandomState.capture(), agent.action_space.np_random.bit_generator.state)
-    parts = {
-        "agent.zip": saved.getvalue(),
-        "replay_buffer.pkl": pickle.dumps(agent.replay_buffer),
-        "environment.pkl": _environment_state(agent),
-        "random.pkl": pickle.dumps(random_state),
+    env = agent.get_env()
+    assert env is not None, "an agent that learnt has one"
+    environment = _environment_state(env)
+    manifest = {
+        "format": _FORMAT,
+        "algorithm": type(agent).__name__,
+        "environment": _described(env),
+        "task": None if agent.task is None else agent.task.describe(),
+        "num_new": agent.replay_buffer.num_new,
+        "action_space": agent.action_space.np_random.bit_generator.state,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")  # one of a killed process is overwritten
-    try:
-        with open(temporary, "wb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                for name, content in parts.items():
-                    archive.writestr(name, content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    parts = {
+        "manifest.json": json.dumps(manifest, default=_plain).encode(),
+        "agent.zip": saved.getvalue(),
+        **{f"{name}.npz": _packed(_buffer(agent, name).filled()) for name in _BUFFERS},
+        "random.npz": _packed(RandomState.capture().as_arrays()),
+        **({"environment.pkl": environment} if environment else {}),
+    }
+    with _locked(path):
+        temporary = path.with_name(f".{path.name}.part")  # one of a killed process is overwritten
+        try:
+            with open(temporary, "wb") as file:
+                with zipfile.ZipFile(file, "w") as archive:
+                    for name, content in parts.items():
+                        archive.writestr(name, content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
 
 
-def resume(
-    path: str | Path,
-    env: GymEnv,
-    *,
-    dynamics: Dynamics,
-    reward: Reward,
-    terminated: Termination | None = None,
-    initial_states: InitialStates | None = None,
-) -> DynaSAC:
-    """Read the agent of a run that :class:`TrialCheckpoint` wrote, ready to go on.
+def resume(path: str | Path, env: GymEnv, task: Task, algorithm: type[Dyna] = DynaSAC) -> Dyna:
+    """Read the agent of a run that :class:`EpisodeCheckpoint` wrote, ready to go on.
 
     Go on with ``agent.learn(total - agent.num_timesteps, reset_num_timesteps=False)``.
 
+    What can be checked is, before anything is unpickled: the class of the agent, the environment's
+    wrappers and spaces, and the task. Buffers, generators and what the dynamics learnt are read
+    without pickle; the agent's settings and the state of the environment are pickles. So open only
+    files that you trust.
+
     Args:
         path: The checkpoint.
-        env: The environment, made and wrapped as for the first part of the run.
-        dynamics: Dynamics of the same class, spec, physics and options, fitted or not.
-        reward: The reward of the run.
-        terminated: The termination of the run, if it had one.
-        initial_states: The initial states of its model trials, if they were given.
+        env: The environment, made and wrapped as for the first part of the run. What it wraps is
+            replaced by the one of the checkpoint, in its state.
+        task: The task of the run, its dynamics fitted or not.
+        algorithm: The class of the agent.
 
     Returns:
         The agent. ``learn`` restores the random generators; until then you may use them.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If the file is no checkpoint, or ``env`` does not fit it.
+        ValueError: If the file is no checkpoint, or is of another algorithm, environment or task.
+        RuntimeError: If the run had other dynamics, or another physics.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            saved, buffer, environment, random_state = (
-                archive.read(name)
-                for name in ("agent.zip", "replay_buffer.pkl", "environment.pkl", "random.pkl")
-            )
-    except (zipfile.BadZipFile, KeyError) as error:
-        raise ValueError(
-            f"{path} is not a checkpoint of TrialCheckpoint ({error}). An agent that was saved by "
-            "agent.save is read by DynaSAC.load."
-        ) from error
-    agent = DynaSAC.load(
-        io.BytesIO(saved),
-        env=env,
-        dynamics=dynamics,
-        reward=reward,
-        force_reset=False,
-        terminated=terminated,
-        initial_states=initial_states,
+    manifest, parts = _read(path)
+    vec_env = algorithm._wrap_env(env, verbose=0)
+    _check(path, manifest, vec_env, task, algorithm)
+    agent = algorithm.load(
+        io.BytesIO(parts["agent.zip"]), env=vec_env, task=task, force_reset=False
     )
-    agent.replay_buffer = pickle.loads(buffer)
-    agent.replay_buffer.device = agent.replay_buffer.model.device = agent.device
-    generators, action_space = pickle.loads(random_state)
-    agent.action_space.np_random.bit_generator.state = action_space
-    agent._random_state = generators
-    vec_env = agent.get_env()
-    assert vec_env is not None
-    if environment:
-        _restore_environment(vec_env, pickle.loads(environment))
+    for name in _BUFFERS:
+        _buffer(agent, name).fill(_unpacked(parts[f"{name}.npz"]))
+    agent.replay_buffer.num_new = manifest["num_new"]
+    agent.action_space.np_random.bit_generator.state = manifest["action_space"]
+    agent._random_state = RandomState.from_arrays(_unpacked(parts["random.npz"]))
+    if "environment.pkl" in parts:
+        _restore_environment(vec_env, *pickle.loads(parts["environment.pkl"]))
     else:
         agent._last_obs = None  # the environment is reset
     return agent
+
+
+def _locked(path: Path) -> AcquireReturnProxy:
+    """Acquire the lock of a file, which a process may have more than once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path.absolute().with_name(f"{path.name}.lock"), is_singleton=True)
+    try:
+        return lock.acquire(blocking=False)
+    except Timeout as error:
+        raise RuntimeError(
+            f"Another process writes checkpoints to {path}, and holds the lock {lock.lock_file}. "
+            "Wait for it, or give this run a file of its own."
+        ) from error
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The manifest of a checkpoint and its other parts, as they are on the disk."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: archive.read(name) for name in archive.namelist()}
+            manifest = json.loads(parts.pop("manifest.json"))
+        if manifest["format"] != _FORMAT:
+            raise ValueError(f"its format is {manifest['format']!r}, expected {_FORMAT!r}")
+    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} is not a checkpoint of EpisodeCheckpoint ({error}). An agent that was saved "
+            "by agent.save is read by DynaSAC.load."
+        ) from error
+    return manifest, parts
+
+
+def _check(
+    path: str | Path, manifest: dict[str, Any], env: VecEnv, task: Task, algorithm: type[Dyna]
+) -> None:
+    """Raise a ValueError unless a checkpoint is of this agent, environment and task."""
+    if not isinstance(task, Task):
+        raise TypeError(f"task must be a Task(dynamics, reward, ...); found {task!r}.")
+    own = {
+        "algorithm": algorithm.__name__,
+        "environment": _described(env),
+        "task": json.loads(json.dumps(task.describe(), default=_plain)),
+    }
+    for part, here in own.items():
+        found = manifest[part]
+        if part == "algorithm" or found is None:
+            found, here = {part: found}, {part: here}
+        different = [
+            f"{name} is {found.get(name)} in the checkpoint, {here.get(name)} here"
+            for name in {**here, **found}
+            if found.get(name) != here.get(name)
+        ]
+        if different:
+            raise ValueError(
+                f"{path} is of another {part}: {'; '.join(different)}. Pass {part} as in the first "
+                "part of the run."
+            )
+
+
+def _buffer(agent: Dyna, name: str) -> CompactReplayBuffer:
+    return agent.replay_buffer if name == "replay_buffer" else agent.replay_buffer.model_buffer
+
+
+def _packed(arrays: dict[str, np.ndarray]) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def _unpacked(content: bytes) -> dict[str, np.ndarray]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of NumPy as JSON has them."""
+    return value.tolist()
 
 
 def _layers(env: VecEnv) -> list[VecEnv]:
@@ -184,14 +270,27 @@ def _layers(env: VecEnv) -> list[VecEnv]:
     return layers
 
 
-def _names(layers: list[VecEnv]) -> str:
-    return " of ".join(type(layer).__name__ for layer in layers)
+def _described(env: VecEnv) -> dict[str, Any]:
+    """What an environment is, in plain values."""
+    layers = _layers(env)
+    inner: list[gym.Env[Any, Any]] = getattr(layers[-1], "envs", [])
+    names = [type(layer).__name__ for layer in layers]
+    if inner:
+        one = inner[0]
+        while isinstance(one, gym.Wrapper):
+            names.append(type(one).__name__)
+            one = one.env
+        names.append(type(one).__name__)
+    return {
+        "wrappers": " of ".join(names),
+        "num_envs": env.num_envs,
+        "observation_space": str(env.observation_space),
+        "action_space": str(env.action_space),
+    }
 
 
-def _environment_state(agent: DynaSAC) -> bytes:
+def _environment_state(vec_env: VecEnv) -> bytes:
     """The pickled state of the environment; empty if it has none that can be pickled."""
-    vec_env = agent.get_env()
-    assert vec_env is not None
     layers = _layers(vec_env)
     inner = layers[-1]
     problem = f"a {type(inner).__name__} keeps its environments elsewhere"
@@ -200,10 +299,8 @@ def _environment_state(agent: DynaSAC) -> bytes:
             {name: value for name, value in vars(layer).items() if name not in _OF_ALL}
             for layer in layers
         ]
-        for state in kept:
-            state.pop("metadata", None)
         try:
-            return bytes(cloudpickle.dumps((_names(layers), kept, inner.envs)))
+            return bytes(cloudpickle.dumps((kept, inner.envs)))
         except Exception as error:  # pickling runs the user's code
             problem = f"{type(error).__name__}: {error}"
     warnings.warn(
@@ -215,20 +312,9 @@ def _environment_state(agent: DynaSAC) -> bytes:
     return b""
 
 
-def _restore_environment(
-    vec_env: VecEnv, state: tuple[str, list[dict[str, Any]], list[Any]]
-) -> None:
+def _restore_environment(vec_env: VecEnv, kept: list[dict[str, Any]], envs: list[Any]) -> None:
     layers = _layers(vec_env)
-    names, kept, envs = state
-    if _names(layers) != names:
-        raise ValueError(
-            f"env is not wrapped as the one of the checkpoint, a {names}; found a {_names(layers)}."
-        )
-    if vec_env.num_envs != len(envs):
-        raise ValueError(
-            f"The checkpoint had {len(envs)} environments; found {vec_env.num_envs} in env."
-        )
-    assert isinstance(layers[-1], DummyVecEnv), "as saved"
+    assert isinstance(layers[-1], DummyVecEnv), "as described"
     for layer, attributes in zip(layers, kept, strict=True):
         vars(layer).update(attributes)
     layers[-1].envs = envs

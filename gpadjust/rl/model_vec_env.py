@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -13,16 +13,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 
-from gpadjust.dynamics import Dynamics, TransitionFunctions
-from gpadjust.rl.mixed_replay_buffer import CompactReplayBuffer
-from gpadjust.rl.sound_steps import sound_steps
+from gpadjust.control import Step, Task
+from gpadjust.dynamics import TransitionFunctions
+from gpadjust.rl.buffer import CompactReplayBuffer
+from gpadjust.states import StateSpec
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
 
-Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
-Termination = Callable[[Tensor], Tensor]
-InitialStates = Callable[[int], Tensor]
-Particles = Literal["independent", "functions"]
+Sampling = Literal["step", "trajectory"]
 
 
 class ModelStep(NamedTuple):
@@ -31,8 +29,8 @@ class ModelStep(NamedTuple):
     Args:
         observations: ``num_envs x observation_dim``.
         rewards: ``num_envs``, as all that follows.
-        terminated: Whether the state ended the trial.
-        truncated: Whether the time limit or the bounds did.
+        terminated: Whether the state ended the episode, or the particle left the bounds.
+        truncated: Whether the time limit alone did.
         left_bounds: Whether the particle would have left the bounds.
     """
 
@@ -46,81 +44,82 @@ class ModelStep(NamedTuple):
 class ModelVecEnv(VecEnv):
     r"""Particles that move by a dynamics model, as a Stable-Baselines3 ``VecEnv``.
 
-    A step of all particles is one call of the model. Its randomness is PyTorch's global generator.
+    Any algorithm of Stable-Baselines3 can learn in it. A step of all particles is one call of the
+    model. Its randomness is PyTorch's global generator.
+
+    **Leaving the bounds never pays.** A particle that would leave the bounds of the task or the
+    finite numbers, or meets a failure of the physics, stays where it is, and its episode is
+    terminated, with ``info["left_bounds"]``. Its reward is :math:`r_{\min} / (1 - \gamma)`, the
+    return of the worst reward seen so far if that went on for ever.
 
     Args:
-        dynamics: The model; it must be fitted.
-        reward: Known rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
-            states ``N x state_dim``, float64 tensors in the units of the spec.
-        initial_states: Draws ``n`` states, ``n x state_dim``, at which trials start.
+        task: What is known; its dynamics must be fitted, and it must say where episodes start and
+            how long they are. Its bounds give way to the states at which episodes start.
         num_envs: Number of particles.
-        trial_length: Steps after which a trial is truncated.
         observation_space: The policy's, of the spec's observations.
         action_space: The policy's.
-        terminated: Whether states ``N x state_dim`` end a trial, ``N`` booleans. Default: none.
-        particles: ``"independent"``: each step is a draw of its own from the predictive
-            distribution, as in the paper. ``"functions"``: between two calls of ``reset``, each
-            particle follows a transition function of its own, drawn from the posterior, so that
-            what it meets is consistent along its trajectory.
-        bounds: Lower and upper bounds of the states, ``2 x state_dim``. A particle that would leave
-            them or the finite numbers, or meets a failure of the physics, is truncated where it
-            is: the step's next observation is the old one, its reward zero, its
-            ``info["left_bounds"]`` True. Bounds give way to the states at which trials start.
-            Default: infinite.
+        sampling: ``"step"``: each step is a draw of its own from the predictive distribution, as
+            in the paper. ``"trajectory"``: between two calls of ``reset``, each particle follows a
+            transition function of its own, drawn from the posterior, so that what it meets is
+            consistent along its trajectory. (In the terms of PETS, trajectory sampling 1 and
+            infinity; Chua et al. 2018.)
+        discount: The discount :math:`\gamma` of who learns in it; with 1 the worst reward goes on
+            for an episode.
+        worst_reward: The worst reward seen elsewhere, such as in real episodes.
 
     Attributes:
         num_left_bounds: How many particles have left the bounds.
+        worst_reward: The worst reward seen so far; infinite before the first.
 
     Raises:
-        ValueError: If spaces do not fit the spec, a number is not positive, or ``bounds`` have
-            another shape.
+        ValueError: If the task leaves something open, spaces do not fit the spec, or a number is
+            out of range.
     """
 
     def __init__(
         self,
-        dynamics: Dynamics,
-        reward: Reward,
-        initial_states: InitialStates,
+        task: Task,
         num_envs: int,
-        trial_length: int,
         observation_space: spaces.Box,
         action_space: spaces.Box,
         *,
-        terminated: Termination | None = None,
-        particles: Particles = "independent",
-        bounds: Tensor | None = None,
+        sampling: Sampling = "step",
+        discount: float = 0.99,
+        worst_reward: float = np.inf,
     ) -> None:
-        spec = dynamics.spec
-        check_spaces(dynamics, observation_space, action_space)
-        for name, number in (("num_envs", num_envs), ("trial_length", trial_length)):
-            if number < 1:
-                raise ValueError(f"{name} must be at least 1; found {number}.")
-        if particles not in ("independent", "functions"):
-            raise ValueError(f"Unknown particles {particles!r}; use 'independent' or 'functions'.")
-        if bounds is not None and bounds.shape != (2, spec.state_dim):
-            raise ValueError(
-                f"bounds must be of shape 2 x {spec.state_dim}; found {tuple(bounds.shape)}."
-            )
+        spec = task.dynamics.spec
+        check_spaces(spec, observation_space, action_space)
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1; found {num_envs}.")
+        for name in ("initial_states", "episode_length"):
+            if getattr(task, name) is None:
+                raise ValueError(f"A ModelVecEnv needs a task with {name}; found None.")
+        if sampling not in get_args(Sampling):
+            raise ValueError(f"Unknown sampling {sampling!r}; use 'step' or 'trajectory'.")
+        if not 0 <= discount <= 1:
+            raise ValueError(f"discount must lie in [0, 1]; found {discount}.")
         self.render_mode = None
         super().__init__(num_envs, observation_space, action_space)
-        self.dynamics = dynamics
-        self.reward = reward
-        self.initial_states = initial_states
-        self.trial_length = trial_length
-        self.terminated = terminated
-        self.particles = particles
-        self.bounds = bounds
+        self.task = task
+        self.sampling = sampling
+        self.discount = discount
+        self.worst_reward = worst_reward
         self.num_left_bounds = 0
         self._states = torch.empty(num_envs, spec.state_dim, dtype=torch.float64)
         self._steps = torch.zeros(num_envs, dtype=torch.long)
         self._functions: TransitionFunctions | None = None
 
+    @property
+    def episode_length(self) -> int:
+        """Steps after which an episode is truncated."""
+        assert self.task.episode_length is not None, "checked at the start"
+        return self.task.episode_length
+
     def reset(self) -> np.ndarray:
-        """Start all trials; observations ``num_envs x observation_dim``."""
+        """Start all episodes; observations ``num_envs x observation_dim``."""
         self._states = self._draw_initial(self.num_envs)
         self._steps.zero_()
-        if self.particles == "functions":
-            self._functions = self.dynamics.sample_functions(self.num_envs)
+        self._draw_functions()
         return self._observe(self._states)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -128,7 +127,7 @@ class ModelVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all particles; those whose trial ended start another."""
+        """Step all particles; those whose episode ended start another."""
         step = self.transition(self._actions)
         dones = step.terminated | step.truncated
         observations = step.observations.copy()
@@ -147,70 +146,70 @@ class ModelVecEnv(VecEnv):
         return observations, step.rewards, dones, infos
 
     def transition(self, actions: np.ndarray) -> ModelStep:
-        """Step all particles, without a new start for those whose trial ended."""
+        """Step all particles, without a new start for those whose episode ended."""
         moves = torch.as_tensor(actions, dtype=torch.float64)
-        self._states, rewards, terminated, left = self._outcome(self._states, moves)
+        step = self._step(self._states, moves)
+        self._states = step.next_states
         self._steps += 1
-        self.num_left_bounds += int(left.sum())
-        truncated = ((self._steps >= self.trial_length) | left) & ~terminated
+        self.num_left_bounds += int(step.left_bounds.sum())
+        truncated = (self._steps >= self.episode_length) & ~step.terminated
         return ModelStep(
             self._observe(self._states),
-            rewards.numpy().astype(np.float32),
-            terminated.numpy(),
+            step.rewards.numpy().astype(np.float32),
+            step.terminated.numpy(),
             truncated.numpy(),
-            left.numpy(),
+            step.left_bounds.numpy(),
         )
+
+    def steps_ahead(self) -> np.ndarray:
+        """How many steps each particle has before the time limit, ``num_envs``."""
+        return self.episode_length - self._steps.numpy()
 
     def refresh(self, buffer: CompactReplayBuffer) -> None:
         """Let the transitions in a buffer end anew, as the model now has it.
 
-        The states and actions stay, and with them the time limits; where the model would leave the
-        bounds, a transition stays as it was.
+        The states and actions stay, and with them the time limits.
 
         Args:
             buffer: Transitions of an earlier model.
         """
         if not buffer.size():
             return
-        if self.particles == "functions":
-            self._functions = self.dynamics.sample_functions(self.num_envs)
+        self._draw_functions()
+        assert isinstance(self.action_space, spaces.Box), "checked at the start"
+        low, high = self.action_space.low, self.action_space.high
         for rows in np.array_split(np.arange(buffer.size()), -(-buffer.size() // _CHUNK)):
             obs = torch.from_numpy(buffer.observations[rows, 0].astype(np.float64))
-            assert isinstance(self.action_space, spaces.Box), "checked at the start"
-            low, high = self.action_space.low, self.action_space.high
             scaled = buffer.actions[rows, 0].astype(np.float64)
             actions = torch.from_numpy(low + (scaled + 1) / 2 * (high - low))
-            states = self.dynamics.spec.decode(obs)
-            following, rewards, terminated, left = self._outcome(states, actions)
-            kept = ~left.numpy()
-            timeouts = buffer.timeouts[rows, 0].astype(bool) & ~terminated.numpy()
-            for name, values in (
-                ("next_observations", self._observe(following)),
-                ("rewards", rewards.numpy()),
-                ("dones", terminated.numpy() | timeouts),
-                ("timeouts", timeouts),
-            ):
-                getattr(buffer, name)[rows[kept], 0] = values[kept]
+            step = self._step(self.task.dynamics.spec.decode(obs), actions)
+            terminated = step.terminated.numpy()
+            timeouts = buffer.timeouts[rows, 0].astype(bool) & ~terminated
+            buffer.next_observations[rows, 0] = self._observe(step.next_states)
+            buffer.rewards[rows, 0] = step.rewards.numpy()
+            buffer.dones[rows, 0] = terminated | timeouts
+            buffer.timeouts[rows, 0] = timeouts
 
-    def _outcome(self, states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Next states, rewards, termination, and who would have left the bounds."""
-        following = sound_steps(self._move, states, actions)
-        left = ~following.isfinite().all(-1)
-        if self.bounds is not None:
-            low, high = self.bounds
-            left |= ((following < low) | (following > high)).any(-1)
-        following = torch.where(left.unsqueeze(-1), states, following)
-        rewards = per_particle(self.reward(states, actions, following), len(states), "reward")
-        terminated = torch.zeros_like(left)
-        if self.terminated is not None:
-            terminated = per_particle(self.terminated(following), len(states), "terminated").bool()
-        return following, rewards.masked_fill(left, 0.0), terminated & ~left, left
+    def _step(self, states: Tensor, actions: Tensor) -> Step:
+        """A step of the task, in which leaving the bounds is the worst that can be."""
+        step = self.task.step(states, actions, self._move)
+        left = step.left_bounds
+        self.worst_reward = min(self.worst_reward, float(step.rewards.min()))
+        if not left.any():
+            return step
+        lasting = 1 / (1 - self.discount) if self.discount < 1 else self.episode_length
+        rewards = step.rewards.double().masked_fill(left, self.worst_reward * lasting)
+        return step._replace(rewards=rewards, terminated=step.terminated | left)
+
+    def _draw_functions(self) -> None:
+        if self.sampling == "trajectory":
+            self._functions = self.task.dynamics.sample_functions(self.num_envs)
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states of ``N`` rows, which follow the functions in blocks, if there are any."""
         functions = self._functions
         if functions is None:
-            return self.dynamics.sample(states, actions)
+            return self.task.dynamics.sample(states, actions)
         n, k = len(states), self.num_envs
         filled = torch.arange(-(-n // k) * k).clamp_max(n - 1)
         blocks = (rows[filled].reshape(k, -1, rows.shape[-1]) for rows in (states, actions))
@@ -252,61 +251,26 @@ class ModelVecEnv(VecEnv):
         return [None] * self.num_envs
 
     def _draw_initial(self, n: int) -> Tensor:
-        states = torch.as_tensor(self.initial_states(n), dtype=torch.float64)
-        if states.shape != (n, self.dynamics.spec.state_dim):
-            raise ValueError(
-                f"initial_states({n}) must return states of shape {n} x "
-                f"{self.dynamics.spec.state_dim}; found {tuple(states.shape)}."
-            )
-        if self.bounds is not None:
-            low, high = self.bounds
+        states = self.task.draw_initial_states(n)
+        bounds = self.task.state_bounds
+        if bounds is not None and ((states < bounds[0]) | (states > bounds[1])).any():
+            low, high = bounds
             room = torch.where((high - low).isfinite(), (high - low) / 2, 0.0)
-            wider = (states < low) | (states > high)
-            low = torch.where(wider.any(0), torch.minimum(low, states.amin(0) - room), low)
-            high = torch.where(wider.any(0), torch.maximum(high, states.amax(0) + room), high)
-            self.bounds = torch.stack([low, high])
+            wider = ((states < low) | (states > high)).any(0)
+            low = torch.where(wider, torch.minimum(low, states.amin(0) - room), low)
+            high = torch.where(wider, torch.maximum(high, states.amax(0) + room), high)
+            self.task = replace(self.task, state_bounds=torch.stack([low, high]))
         return states
 
     def _observe(self, states: Tensor) -> np.ndarray:
-        return self.dynamics.spec.observe(states).numpy().astype(self.observation_space.dtype)
-
-
-def per_particle(values: Tensor, n: int, name: str) -> Tensor:
-    """Check what a function of the user's says of ``n`` rows."""
-    values = torch.as_tensor(values).detach()
-    if values.shape != (n,):
-        raise ValueError(
-            f"{name} must return one value per row, shape ({n},); found {tuple(values.shape)}."
-        )
-    if not values.isfinite().all():
-        row = int((~values.isfinite()).nonzero()[0])
-        raise ValueError(f"{name} returned {values[row]} for row {row}; expected finite numbers.")
-    return values
-
-
-def check_function(function: Any, name: str, num_arguments: int) -> None:
-    """Raise a TypeError unless a function of the user's takes what it will be given, or is None."""
-    if function is None:
-        return
-    if not callable(function):
-        raise TypeError(f"{name} must be a function; found {function!r}.")
-    try:
-        signature = inspect.signature(function)
-    except ValueError:  # some compiled functions have none
-        return
-    try:
-        signature.bind(*range(num_arguments))
-    except TypeError as error:
-        raise TypeError(
-            f"{name} is called with {num_arguments} argument(s); found {name}{signature}."
-        ) from error
+        seen: np.ndarray = self.task.dynamics.spec.observe(states).numpy()
+        return seen.astype(self.observation_space.dtype)
 
 
 def check_spaces(
-    dynamics: Dynamics, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+    spec: StateSpec, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
 ) -> None:
     """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
-    spec = dynamics.spec
     for name, space, size in (
         ("observation", observation_space, spec.observation_dim),
         ("action", action_space, spec.action_dim),

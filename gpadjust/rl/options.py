@@ -1,90 +1,102 @@
-"""What a Dyna agent was given, checked before it learns."""
+"""How a Dyna agent uses its model."""
 
 from __future__ import annotations
 
-from contextlib import suppress
-from typing import TYPE_CHECKING, get_args
+import math
+from dataclasses import dataclass, fields
+from typing import get_args
 
-from stable_baselines3.common.vec_env import VecEnv
+from gpadjust.control import CrossEntropyPlanner
+from gpadjust.rl.model_vec_env import Sampling
 
-from gpadjust.dynamics import Dynamics
-from gpadjust.dynamics.trajectory_information import check_informative
-from gpadjust.rl.informative_trials import InformativeTrials
-from gpadjust.rl.model_vec_env import Particles, check_function
-
-if TYPE_CHECKING:
-    from gpadjust.rl.dyna_sac import DynaSAC
-
-FUNCTIONS = ("reward", "terminated", "initial_states")  # which are not saved
-_NUMBERS: tuple[tuple[str, bool, int], ...] = (  # name, whether it is whole, the least
-    ("explore_trials", True, 0),
-    ("model_trials", True, 0),
-    ("model_updates", False, 0),
-    ("model_until", True, 0),
-    ("trial_length", True, 1),
-    ("num_particles", True, 1),
-    ("reward_tolerance", False, 0),
-)
+_WHOLE = {  # the least of each
+    "model_episodes": 0,
+    "last_model_episode": 0,
+    "model_buffer_size": 1,
+    "num_particles": 1,
+    "explore_episodes": 0,
+}
+_FRACTIONAL = {"updates_per_model_step": math.inf, "real_fraction": 1, "reward_tolerance": math.inf}
 
 
-def check_options(agent: DynaSAC, needed: tuple[str, ...]) -> None:
-    """Whether an agent can learn with what it has.
+@dataclass(frozen=True, kw_only=True)
+class DynaOptions:
+    """How a Dyna agent uses its model.
 
     Args:
-        agent: The agent.
-        needed: Those of :data:`FUNCTIONS` that it was made with.
+        model_episodes: Model episodes for each real one.
+        updates_per_model_step: Gradient steps for each model step; may be fractional, such as 0.5.
+        last_model_episode: Number of real episodes after which the model is neither fitted nor run,
+            and its experience is kept out of the batches, unless ``keep_model_data``; 0 never uses
+            the model. Default: it always serves.
+        keep_model_data: Whether batches hold model experience after ``last_model_episode``.
+        refresh_model_data: Whether the transitions that earlier models made are made again by the
+            newest one, from the same states and actions, as soon as it is fitted. What the first
+            models got wrong would mislead the agent for long. It costs a prediction of the whole
+            model buffer after each real episode. (The paper does not have it.)
+        real_fraction: Share of real transitions in a batch, see :class:`MixedReplayBuffer`. The
+            default, a real one for ten of the model, is what a uniform draw from both buffers would
+            give with ten model episodes for each real one. (MBPO has 1/20; Janner et al. 2019.)
+        model_buffer_size: How many model transitions are kept. Default: as ``buffer_size``.
+        reward_tolerance: How far the known rewards may be from the recorded ones, relative to the
+            largest of an episode; None to check neither rewards nor terminations, as noisy sensors
+            may need.
+        num_particles: Model episodes that run side by side. Default: all.
+        sampling: How they are sampled, by ``"step"`` or ``"trajectory"``, see
+            :class:`ModelVecEnv`.
+        exploration: Plans real episodes, for example by what they teach the dynamics. Default: the
+            policy acts in all.
+        explore_episodes: How many episodes after the first are planned, if there is an
+            ``exploration``.
 
     Raises:
-        ValueError: If something is missing, or out of range.
         TypeError: If something is of another kind.
+        ValueError: If something is out of range.
     """
-    for name in ("dynamics", *needed, "reward"):
-        if getattr(agent, name) is None:
-            raise ValueError(
-                f"DynaSAC needs {name} to learn; found None. Pass {name}=... to DynaSAC or, as "
-                "it is not saved, to DynaSAC.load. Without it the agent can only predict."
-            )
-    if not isinstance(agent.dynamics, Dynamics):
-        raise TypeError(f"dynamics must be an object of a Dynamics; found {agent.dynamics!r}.")
-    for name, arguments in zip(FUNCTIONS, (3, 1, 1), strict=True):
-        check_function(getattr(agent, name), name, arguments)
-    if agent.particles not in get_args(Particles):
-        raise ValueError(
-            f"Unknown particles {agent.particles!r}; use 'independent' or 'functions'."
-        )
-    for name, is_whole, least in _NUMBERS:
-        value = getattr(agent, name)
-        if value is None:
-            continue
-        if not isinstance(value, int if is_whole else (int, float)):
-            whole = "whole " if is_whole else ""
-            raise TypeError(f"{name} must be a {whole}number; found {value!r}.")
-        if not value >= least:
-            raise ValueError(f"{name} must be at least {least}; found {value}.")
-    if agent.exploration is not None:
-        if not isinstance(agent.exploration, InformativeTrials):
+
+    model_episodes: int = 20
+    updates_per_model_step: float = 1.0
+    last_model_episode: int | None = None
+    keep_model_data: bool = False
+    refresh_model_data: bool = True
+    real_fraction: float = 1 / 11
+    model_buffer_size: int | None = None
+    reward_tolerance: float | None = 1e-3
+    num_particles: int | None = None
+    sampling: Sampling = "step"
+    exploration: CrossEntropyPlanner | None = None
+    explore_episodes: int = 3
+
+    def __post_init__(self) -> None:
+        """Check them."""
+        optional = {entry.name for entry in fields(self) if entry.default is None}
+        for name, least in _WHOLE.items():
+            value = getattr(self, name)
+            if value is None and name in optional:
+                continue
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise TypeError(f"{name} must be a whole number; found {value!r}.")
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}; found {value}.")
+        for name, most in _FRACTIONAL.items():
+            value = getattr(self, name)
+            if value is None and name == "reward_tolerance":
+                continue
+            if not isinstance(value, (int, float)) or isinstance(value, bool):
+                raise TypeError(f"{name} must be a number; found {value!r}.")
+            if not 0 <= value <= most or math.isinf(value):
+                bounds = "finite and at least 0" if most == math.inf else f"in [0, {most}]"
+                raise ValueError(f"{name} must be {bounds}; found {value}.")
+        for name in ("keep_model_data", "refresh_model_data"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} must be True or False; found {getattr(self, name)!r}.")
+        if self.sampling not in get_args(Sampling):
+            raise ValueError(f"Unknown sampling {self.sampling!r}; use 'step' or 'trajectory'.")
+        if not isinstance(self.exploration, (CrossEntropyPlanner, type(None))):
             raise TypeError(
-                "exploration must be an object of InformativeTrials, or None; found "
-                f"{agent.exploration!r}."
+                f"exploration must be a CrossEntropyPlanner, or None; found {self.exploration!r}."
             )
-        check_informative(agent.dynamics)
 
-
-def time_limit(env: VecEnv) -> int:
-    """Steps of a trial in an environment.
-
-    Raises:
-        ValueError: If it has no time limit that can be read.
-    """
-    spec = env.get_attr("spec")[0]
-    length = None if spec is None else spec.max_episode_steps
-    if length is None:
-        # A TimeLimit that was put around an environment by hand.
-        with suppress(AttributeError):
-            length = env.get_attr("_max_episode_steps")[0]
-    if length is None:
-        raise ValueError(
-            "The environment has no time limit that could be read; pass trial_length, the "
-            "number of steps of a trial."
-        )
-    return int(length)
+    def uses_model(self, num_episodes: int) -> bool:
+        """Whether the model serves after so many real episodes."""
+        return self.last_model_episode is None or num_episodes < self.last_model_episode

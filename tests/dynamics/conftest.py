@@ -1,19 +1,13 @@
-"""A cart-pole, its crude physics, and dynamics of every class."""
+"""A cart-pole, its crude physics, and dynamics of every model."""
 
 import math
 
 import pytest
 import torch
 
-from gpadjust.dynamics import (
-    BiasDynamics,
-    CKADynamics,
-    GPDynamics,
-    PhysicsMeanDynamics,
-    RRADynamics,
-    ScaleDynamics,
-    StateSpec,
-)
+from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust.dynamics import LearnedDynamics, StateSpec
+from gpadjust.models import PaperRRA
 from gpadjust.physics import ODEPhysics
 
 
@@ -57,35 +51,31 @@ def cart_pole_system():
     return CartPole()
 
 
-_CLASSES = {
-    "GP": GPDynamics,
-    "PhysicsMean": PhysicsMeanDynamics,
-    "Bias": BiasDynamics,
-    "Scale": ScaleDynamics,
-    "CKA": CKADynamics,
-    "RRA": RRADynamics,
-    "RRA-paper": RRADynamics,
+_MODELS = {
+    "GP": ZeroMeanGP,
+    "PhysicsMean": PhysicsMeanGP,
+    "Scale": ScaleGP,
+    "CKA": CKA,
+    "RRA": RRA,
+    "RRA-paper": PaperRRA,
 }
 
 
-@pytest.fixture(params=_CLASSES)
+@pytest.fixture(params=_MODELS)
 def kind(request):
-    """The name of each class, for `make`."""
+    """The name of each model, for `make`."""
     return request.param
 
 
 @pytest.fixture
 def make():
-    """Makes dynamics by the name of their class, with a quick search."""
+    """Makes dynamics by the name of their model, with a quick search."""
 
     def make(kind, spec, physics, **options):
         options.setdefault("fit_options", {"num_starts": 4, "num_screened": 32})
-        if kind == "GP":
-            return GPDynamics(spec, **options)
         if kind.startswith("RRA"):
-            options.setdefault("num_features", 32)
-        if kind == "RRA-paper":
-            options.setdefault("prior", "paper")
-        return _CLASSES[kind](spec, physics, **options)
+            options.setdefault("model_options", {"num_features": 32})
+        physics = None if kind == "GP" else physics
+        return LearnedDynamics(spec, physics, model=_MODELS[kind], **options)
 
     return make

@@ -5,15 +5,8 @@ import math
 import pytest
 import torch
 
-from gpadjust import CKA
-from gpadjust.dynamics import (
-    CKADynamics,
-    GPDynamics,
-    PhysicsDynamics,
-    RRADynamics,
-    ScaleDynamics,
-    StateSpec,
-)
+from gpadjust import CKA, ScaleGP, ZeroMeanGP
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import ODEPhysics
 
 pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
@@ -85,7 +78,7 @@ def test_absolute_targets_of_an_angle_go_on_across_the_seam(uniform):
     spec = StateSpec(["theta"], ["rate"], angles=["theta"])
     states, actions = uniform(20, 1, low=2.8, high=3.4), uniform(20, 1, high=0.3, seed=1)
     wrapped = torch.atan2((states + actions).sin(), (states + actions).cos())
-    dynamics = CKADynamics(
+    dynamics = LearnedDynamics(
         spec,
         lambda X: torch.atan2((X[:, :1] + 0.9 * X[:, 1:]).sin(), (X[:, :1]).cos()),
         target="absolute",
@@ -110,7 +103,7 @@ def test_exogenous_and_integrated_states(uniform):
         seen.append(X.shape[-1])
         return torch.cat([X[:, :1] + 0.1 * X[:, 1:2], X[:, 1:2] + 0.08 * X[:, 2:]], -1)
 
-    dynamics = CKADynamics(spec, physics)
+    dynamics = LearnedDynamics(spec, physics)
     dynamics.update(states, actions, follow(states, actions))
     assert dynamics.model.num_outputs == 1
     assert set(seen) == {3}
@@ -141,7 +134,7 @@ def test_a_system_that_follows_the_previous_action(uniform):
         seen.append(X.shape[-1])
         return X[:, :1] + 0.2 * X[:, 1:]
 
-    dynamics = CKADynamics(spec, physics)
+    dynamics = LearnedDynamics(spec, physics)
     dynamics.update(states, actions, follow(states, actions))
     assert dynamics.model.num_outputs == 1
     new, pushes = uniform(10, 2, low=-1, seed=2), uniform(10, 1, low=-1, seed=3)
@@ -156,7 +149,7 @@ def test_a_system_that_follows_the_previous_action(uniform):
         assert torch.equal(drawn[:, :1], pushes)
     assert set(seen) == {2}  # its own state and the action
     assert dynamics.score(new, pushes, follow(new, pushes)).rmse.shape == (1,)
-    again = CKADynamics(spec, physics)
+    again = LearnedDynamics(spec, physics)
     again.load_state_dict(dynamics.state_dict())
     assert torch.equal(again.predict(new, pushes).mean, mean)
 
@@ -177,7 +170,7 @@ def test_each_transition_costs_one_row_of_the_physics(uniform):
         rows.append(len(X))
         return X[:, :1] + 0.1 * X[:, 1:]
 
-    dynamics = CKADynamics(StateSpec(["x"], ["v"]), physics)
+    dynamics = LearnedDynamics(StateSpec(["x"], ["v"]), physics)
     for seed in range(3):
         x, v = uniform(6, 1, seed=seed), uniform(6, 1, seed=seed + 10)
         dynamics.update(x, v, x + 0.12 * v)
@@ -289,19 +282,17 @@ def test_bad_data_are_refused_and_what_was_learnt_stands(cart_pole_system, make)
 def test_bad_arguments(cart_pole_system):
     system = cart_pole_system
     with pytest.raises(ValueError, match="Unknown target 'change'"):
-        GPDynamics(system.spec, target="change")
+        LearnedDynamics(system.spec, target="change", model=ZeroMeanGP)
     with pytest.raises(ValueError, match="may not hold 'input_transform'"):
-        GPDynamics(system.spec, model_options={"input_transform": None})
+        LearnedDynamics(system.spec, model_options={"input_transform": None}, model=ZeroMeanGP)
     with pytest.raises(ValueError, match="difference=False"):
-        CKADynamics(system.spec, ODEPhysics(lambda s, a: s, 0.1, 4, difference=True))
-    with pytest.raises(ValueError, match="Unknown prior"):
-        RRADynamics(system.spec, system.crude, prior="none").update(*system.trial(0))
+        LearnedDynamics(system.spec, ODEPhysics(lambda s, a: s, 0.1, 4, difference=True))
 
 
 @pytest.mark.filterwarnings("default")
 def test_a_warning_of_the_model_is_given_once(recwarn):
     still = StateSpec(["x"], ["v"])
-    dynamics = ScaleDynamics(still, lambda X: X[:, :1] + 0.1 * X[:, 1:])
+    dynamics = LearnedDynamics(still, lambda X: X[:, :1] + 0.1 * X[:, 1:], model=ScaleGP)
     x = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
     with pytest.warns(UserWarning, match="nearly zero"):
         dynamics.update(x, x, x + 0.12 * x)

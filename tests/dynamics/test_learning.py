@@ -115,11 +115,11 @@ def test_a_warm_start_is_the_same_in_the_users_units(cart_pole_system, make):
     next_states = next_states + 0.01 * torch.randn_like(next_states)
     dynamics.update(states, actions, next_states)
     before = dynamics.predict(states, actions)
-    model = dynamics._build(dynamics._data, quiet=True)
+    model = dynamics._recipe.build(dynamics._learnt.data, quiet=True)
     again = type(model)(
         dynamics.targets.inputs(states, actions),
         dynamics.targets.encode(states, next_states),
-        physics=dynamics._physics,
+        physics=dynamics._recipe.physics,
         outcome_transform=Standardize(m=4),
         input_transform=model.input_transform.base,
     )
@@ -159,7 +159,7 @@ def test_refits_come_near_what_a_search_reaches(cart_pole_system, make, first):
     for seed in range(first, first + 8):
         dynamics.update(*system.trial(seed))
     reached = dynamics.fit_result.log_likelihood.sum()
-    cold = dynamics._build(dynamics._data, quiet=True)
+    cold = dynamics._recipe.build(dynamics._learnt.data, quiet=True)
     best = fit(cold).log_likelihood.sum()
     units = (dynamics.model.outcome_transform.stdvs - cold.outcome_transform.stdvs).abs().max()
     assert units < 1e-12

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from gpadjust.dynamics import CKADynamics, GPDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.refitting import search_rows
+from gpadjust import ZeroMeanGP
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics.incremental_fit import search_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
 
@@ -131,7 +132,7 @@ def test_declared_states_are_checked_where_they_were_measured():
     following[:, 1] += 0.1 * actions[:, 0]
     following[:, 0] += 0.05 * (states[:, 1] + following[:, 1])
     following[1, 0] = following[2, 2] = math.nan
-    dynamics = GPDynamics(spec)
+    dynamics = LearnedDynamics(spec, model=ZeroMeanGP)
     dynamics.update(states, actions, following)
     wrong = following.clone()
     wrong[:, 0] = states[:, 0] + 3 * (following[:, 0] - states[:, 0])
@@ -152,6 +153,6 @@ def test_a_physics_of_differences_is_still_found_out(cart_pole_system, holed):
     def change(X):
         return system.crude(X) - X[:, :4]
 
-    for dynamics in (CKADynamics(system.spec, change), PhysicsDynamics(system.spec, change)):
+    for dynamics in (LearnedDynamics(system.spec, change), PhysicsDynamics(system.spec, change)):
         with pytest.warns(UserWarning, match="seems to return the change"):
             dynamics.update(*holed)

@@ -5,7 +5,8 @@ import io
 import pytest
 import torch
 
-from gpadjust.dynamics import CKADynamics, GPDynamics, PhysicsDynamics, StateSpec
+from gpadjust import ZeroMeanGP
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import ODEPhysics
 
 SPEC = StateSpec(["x", "v"], ["a"])
@@ -43,7 +44,7 @@ def test_it_predicts_the_physics_without_doubt():
         ({"integrated": {"x": "v"}, "step": 0.3}, "'x' is said to be integrated"),
     ],
 )
-@pytest.mark.parametrize("make", [PhysicsDynamics, CKADynamics])
+@pytest.mark.parametrize("make", [PhysicsDynamics, LearnedDynamics])
 def test_states_that_are_not_as_declared_are_named(make, declared, message):
     dynamics = make(StateSpec(["x", "v"], ["a"], **declared), push)
     with pytest.raises(ValueError, match=message):
@@ -68,7 +69,7 @@ def test_a_physics_of_differences_is_warned_of(learnt):
     def change(X):
         return push(X) - X[:, :2]
 
-    dynamics = CKADynamics(SPEC, change) if learnt else PhysicsDynamics(SPEC, change)
+    dynamics = LearnedDynamics(SPEC, change) if learnt else PhysicsDynamics(SPEC, change)
     with pytest.warns(UserWarning, match="seems to return the change of the state"):
         dynamics.update(*transitions())
     dynamics.update(*transitions(seed=1))  # no second warning, which would be an error here
@@ -103,7 +104,7 @@ def stored(dynamics):
 
 
 def learnt(**options):
-    dynamics = CKADynamics(**{"spec": SPEC, "physics": push, **options})
+    dynamics = LearnedDynamics(**{"spec": SPEC, "physics": push, **options})
     dynamics.update(*transitions())
     return dynamics
 
@@ -112,7 +113,7 @@ def test_a_state_is_of_the_same_dynamics():
     dynamics = PhysicsDynamics(SPEC, push)
     dynamics.load_state_dict(stored(PhysicsDynamics(SPEC, push)))
     state = stored(learnt())
-    other = CKADynamics(SPEC, push)
+    other = LearnedDynamics(SPEC, push)
     other.load_state_dict(state)
     assert other.num_transitions == 20
 
@@ -120,11 +121,17 @@ def test_a_state_is_of_the_same_dynamics():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: GPDynamics(SPEC), "class is CKADynamics in the state, GPDynamics here"),
-        (lambda: PhysicsDynamics(SPEC, push), "class is CKADynamics in the state"),
-        (lambda: CKADynamics(SPEC, push, target="absolute"), "target is 'difference' in the state"),
-        (lambda: CKADynamics(StateSpec(["y", "v"], ["a"]), push), r"states is \('x', 'v'\)"),
-        (lambda: CKADynamics(StateSpec(["x", "v"], ["a"], step=0.1), push), "step is None"),
+        (
+            lambda: LearnedDynamics(SPEC, model=ZeroMeanGP),
+            "model is CKA in the state, ZeroMeanGP here",
+        ),
+        (lambda: PhysicsDynamics(SPEC, push), "class is LearnedDynamics in the state"),
+        (
+            lambda: LearnedDynamics(SPEC, push, target="absolute"),
+            "target is 'difference' in the state",
+        ),
+        (lambda: LearnedDynamics(StateSpec(["y", "v"], ["a"]), push), r"states is \('x', 'v'\)"),
+        (lambda: LearnedDynamics(StateSpec(["x", "v"], ["a"], step=0.1), push), "step is None"),
     ],
 )
 def test_a_state_of_others_is_refused(make, message):
@@ -138,4 +145,4 @@ def test_a_state_of_others_is_refused(make, message):
 
 def test_a_state_that_says_nothing_is_refused():
     with pytest.raises(RuntimeError, match="does not say of what dynamics it is"):
-        CKADynamics(SPEC, push).load_state_dict({"weights": torch.ones(2)})
+        LearnedDynamics(SPEC, push).load_state_dict({"weights": torch.ones(2)})

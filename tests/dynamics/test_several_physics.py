@@ -5,7 +5,7 @@ import io
 import pytest
 import torch
 
-from gpadjust.dynamics import CKADynamics, PhysicsDynamics, TrajectoryInformation
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, TrajectoryInformation
 from gpadjust.physics import JoinedPhysics, ODEPhysics, PhysicsError
 
 pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
@@ -33,8 +33,8 @@ def test_targets_are_those_of_each_part(cart_pole_system, make, still):
     states, actions, _ = system.trial(0)
     one = [make("CKA", system.spec, part) for part in (system.crude, still)]
     inputs = dynamics.targets.inputs(states, actions)
-    expected = torch.cat([each._physics(inputs) for each in one], -1)
-    assert torch.equal(dynamics._physics(inputs), expected)
+    expected = torch.cat([each._recipe.physics(inputs) for each in one], -1)
+    assert torch.equal(dynamics._recipe.physics(inputs), expected)
 
 
 def test_the_better_physics_gets_the_weight(cart_pole_system, make, still):
@@ -95,15 +95,15 @@ def test_each_part_is_checked(cart_pole_system, still):
     system = cart_pole_system
     change = ODEPhysics(lambda s, a: s, 0.1, 4, difference=True)
     with pytest.raises(ValueError, match="difference=False"):
-        CKADynamics(system.spec, [system.crude, change])
+        LearnedDynamics(system.spec, [system.crude, change])
     with pytest.raises(ValueError, match="Expected one physics to follow"):
         PhysicsDynamics(system.spec, [system.crude, still])
     assert PhysicsDynamics(system.spec, JoinedPhysics([still])).is_fitted
-    dynamics = CKADynamics(
+    dynamics = LearnedDynamics(
         system.spec, {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
     )
     with pytest.warns(UserWarning, match="'late' seems to return the change"):
         dynamics.update(*system.trial(0))
-    dynamics = CKADynamics(system.spec, [system.crude, lambda X: X[:, :3]])
+    dynamics = LearnedDynamics(system.spec, [system.crude, lambda X: X[:, :3]])
     with pytest.raises(PhysicsError, match="next values of the 4 states"):
         dynamics.update(*system.trial(0))

@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
+from gpadjust import ZeroMeanGP
 from gpadjust.active import qAdjustmentInformationGain
 from gpadjust.dynamics import (
-    CKADynamics,
-    GPDynamics,
+    LearnedDynamics,
     PhysicsDynamics,
-    RRADynamics,
     StateSpec,
     TrajectoryInformation,
 )
+from gpadjust.models import PaperRRA
 
 QUICK = {"fit_options": {"num_starts": 1, "num_screened": 0, "max_iterations": 15}}
 pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
@@ -53,7 +53,7 @@ def dense(dynamics, states, actions, learnt_from):
     return total
 
 
-@pytest.mark.parametrize("kind", ["CKA", "GP", "Bias", "RRA"])
+@pytest.mark.parametrize("kind", ["CKA", "GP", "PhysicsMean", "RRA"])
 def test_it_is_that_of_linear_algebra(learnt, trajectory, cart_pole_system, kind):
     dynamics = learnt(kind)
     found = TrajectoryInformation(dynamics)(*trajectory)
@@ -75,7 +75,7 @@ def test_of_cka_it_is_the_information_about_rho_and_delta(learnt, trajectory):
 
 def test_a_single_output():
     x, v = torch.rand(2, 9, 1, dtype=torch.float64)
-    dynamics = GPDynamics(StateSpec(["x"], ["v"]), **QUICK)
+    dynamics = LearnedDynamics(StateSpec(["x"], ["v"]), **QUICK, model=ZeroMeanGP)
     dynamics.update(x, v, x + 0.1 * v.sin() + 0.02 * torch.randn_like(x))
     states, actions = 3 * torch.rand(2, 4, 3, 1, dtype=torch.float64)
     information = TrajectoryInformation(dynamics)
@@ -158,12 +158,12 @@ def test_later_updates_do_not_count(learnt, cart_pole_system, trajectory):
 
 def test_dynamics_that_cannot_tell(cart_pole_system):
     spec, crude = cart_pole_system.spec, cart_pole_system.crude
-    with pytest.raises(TypeError, match=r"such as CKADynamics .* found PhysicsDynamics"):
+    with pytest.raises(TypeError, match=r"Expected LearnedDynamics.* found PhysicsDynamics"):
         TrajectoryInformation(PhysicsDynamics(spec, crude))
-    with pytest.raises(RuntimeError, match="CKADynamics has not learnt"):
-        TrajectoryInformation(CKADynamics(spec, crude))
-    with pytest.raises(TypeError, match="take prior='physics'"):
-        TrajectoryInformation(RRADynamics(spec, crude, prior="paper"))
+    with pytest.raises(RuntimeError, match="LearnedDynamics has not learnt"):
+        TrajectoryInformation(LearnedDynamics(spec, crude))
+    with pytest.raises(TypeError, match="take model=RRA"):
+        TrajectoryInformation(LearnedDynamics(spec, crude, model=PaperRRA))
 
 
 @pytest.mark.parametrize(

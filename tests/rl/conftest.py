@@ -1,13 +1,16 @@
 """Small systems, and agents that learn them in moments."""
 
+from dataclasses import fields
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
 
 import gpadjust.envs
-from gpadjust.dynamics import CKADynamics, PhysicsDynamics, StateSpec
-from gpadjust.rl import DynaSAC
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.rl import DynaOptions, DynaSAC
 
 POINT_SPEC = StateSpec(["x"], ["v"])
 
@@ -37,8 +40,8 @@ class Point(gymnasium.Env):
 def point_env():
     """Makes the point's environment, of 5 steps: `point_env(end=None)`."""
 
-    def make(trial_length=5, **options):
-        return gymnasium.wrappers.TimeLimit(Point(**options), trial_length)
+    def make(episode_length=5, **options):
+        return gymnasium.wrappers.TimeLimit(Point(**options), episode_length)
 
     return make
 
@@ -52,7 +55,7 @@ def point_dynamics():
 @pytest.fixture
 def learnt_dynamics(point_dynamics):
     """Makes dynamics that learn the point from a physics that errs."""
-    return lambda: CKADynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
+    return lambda: LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
 
 
 @pytest.fixture
@@ -61,23 +64,37 @@ def point_reward():
 
 
 @pytest.fixture
-def point_agent(point_env, point_dynamics, point_reward):
-    """Makes an agent for the point; every argument can be given."""
+def point_task(point_dynamics, point_reward):
+    """Makes the point's task; every part can be given."""
 
-    def make(env=None, **options):
+    def make(**parts):
+        known = {"dynamics": point_dynamics, "reward": point_reward, "episode_length": 5}
+        return Task(**{**known, **parts})
+
+    return make
+
+
+@pytest.fixture
+def point_agent(point_env, point_task):
+    """Makes an agent for the point; parts of the task, options and arguments can be given."""
+
+    def make(env=None, algorithm=DynaSAC, **given):
+        def taken(kind, **defaults):
+            names = {entry.name for entry in fields(kind)} & {*given}
+            return {**defaults, **{name: given.pop(name) for name in names}}
+
+        task = given.pop("task", None) or point_task(**taken(Task))
+        options = DynaOptions(**taken(DynaOptions, model_episodes=2))
         defaults = {
-            "dynamics": point_dynamics,
-            "reward": point_reward,
-            "trial_length": 5,
-            "model_trials": 2,
+            "policy": "MlpPolicy",
             "batch_size": 8,
             "buffer_size": 500,
             "policy_kwargs": {"net_arch": [8]},
             "device": "cpu",
             "seed": 0,
         }
-        policy = options.pop("policy", "MlpPolicy")
-        return DynaSAC(policy, point_env() if env is None else env, **{**defaults, **options})
+        env = point_env() if env is None else env
+        return algorithm(env=env, task=task, options=options, **{**defaults, **given})
 
     return make
 
@@ -115,11 +132,11 @@ def tensors_of():
     def tensors(agent):
         found = {}
         flatten("parameters", agent.get_parameters(), found)
-        flatten("log_ent_coef", agent.log_ent_coef, found)
+        flatten("log_ent_coef", getattr(agent, "log_ent_coef", None), found)
         for name in ("observations", "next_observations", "actions", "rewards", "dones"):
-            for buffer in (agent.replay_buffer, agent.replay_buffer.model):
+            for buffer in (agent.replay_buffer, agent.replay_buffer.model_buffer):
                 flatten(f"{name}{buffer is agent.replay_buffer}", getattr(buffer, name), found)
-        flatten("counts", [agent.num_timesteps, agent.num_trials, agent._n_updates], found)
+        flatten("counts", [agent.num_timesteps, agent.num_episodes, agent._n_updates], found)
         normalizer = agent.get_vec_normalize_env()
         if normalizer is not None:
             flatten("obs_rms", vars(normalizer.obs_rms), found)

@@ -1,18 +1,14 @@
 """Runs that are interrupted, and go on as if they had not been."""
 
-import hashlib
-import multiprocessing
 import os
 import pickle
 import random
-import signal
 import subprocess
 import sys
 import textwrap
 import threading
 import time
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -20,16 +16,16 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from gpadjust.dynamics import CKADynamics, PhysicsDynamics
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics
 from gpadjust.envs import (
     CART_POLE_SPEC,
-    cart_pole_physics,
     cart_pole_reward,
     random_cart_pole_physics,
 )
-from gpadjust.rl import DynaSAC, TrialCheckpoint, resume, save_checkpoint
+from gpadjust.rl import DynaOptions, DynaSAC, EpisodeCheckpoint, resume, save_checkpoint
 
-TOTAL = 20  # four trials of the point
+TOTAL = 20  # four episodes of the point
 
 
 class PowerCut(Exception):  # noqa: N818
@@ -67,7 +63,7 @@ def kind_of_dynamics(point_dynamics):
     def make(kind):
         if kind == "physics":
             return point_dynamics
-        return CKADynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
+        return LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
 
     return make
 
@@ -86,42 +82,42 @@ def go_on(agent, *callbacks):
 @pytest.mark.parametrize(("kind", "step"), [("physics", 6), ("cka", 13)])
 @pytest.mark.parametrize("layers", [(), ("normalised",), ("monitored", "normalised")], ids=len)
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
-    kind, layers, step, point_agent, point_reward, kind_of_dynamics, wrapped, assert_same, tmp_path
+    kind, layers, step, point_agent, point_task, kind_of_dynamics, wrapped, assert_same, tmp_path
 ):
     path = tmp_path / "run.ckpt"
-    whole = point_agent(wrapped(layers), dynamics=kind_of_dynamics(kind), model_updates=0.7)
+    whole = point_agent(
+        wrapped(layers), dynamics=kind_of_dynamics(kind), updates_per_model_step=0.7
+    )
     whole.learn(TOTAL)
 
-    first = point_agent(wrapped(layers), dynamics=kind_of_dynamics(kind), model_updates=0.7)
+    first = point_agent(
+        wrapped(layers), dynamics=kind_of_dynamics(kind), updates_per_model_step=0.7
+    )
     with pytest.raises(PowerCut):
-        first.learn(TOTAL, [TrialCheckpoint(path), CutAt(step)])
+        first.learn(TOTAL, [EpisodeCheckpoint(path), CutAt(step)])
     scramble()
-    second = resume(path, wrapped(layers), dynamics=kind_of_dynamics(kind), reward=point_reward)
+    second = resume(path, wrapped(layers), point_task(dynamics=kind_of_dynamics(kind)))
     assert second.num_timesteps == step // 5 * 5
     scramble()
-    go_on(second, TrialCheckpoint(path))
+    go_on(second, EpisodeCheckpoint(path))
     assert_same(whole, second)
-    last = resume(path, wrapped(layers), dynamics=kind_of_dynamics(kind), reward=point_reward)
+    last = resume(path, wrapped(layers), point_task(dynamics=kind_of_dynamics(kind)))
     assert_same(whole, last)
 
 
-def test_many_interruptions(
-    point_agent, point_reward, point_dynamics, point_env, assert_same, tmp_path
-):
+def test_many_interruptions(point_agent, point_task, point_env, assert_same, tmp_path):
     path = tmp_path / "run.ckpt"
     whole = point_agent(learning_starts=7).learn(TOTAL)
     agent = point_agent(learning_starts=7)  # the action space draws the first actions
     for step in (4, 6, 8, 19):
         with pytest.raises(PowerCut):
-            go_on(agent, TrialCheckpoint(path), CutAt(step))
+            go_on(agent, EpisodeCheckpoint(path), CutAt(step))
         scramble()
-        agent = resume(path, point_env(), dynamics=point_dynamics, reward=point_reward)
+        agent = resume(path, point_env(), point_task())
     assert_same(whole, go_on(agent))
 
 
-def test_steps_in_the_middle_of_trials(
-    point_agent, point_reward, point_dynamics, point_env, assert_same, tmp_path
-):
+def test_steps_in_the_middle_of_episodes(point_agent, point_task, point_env, assert_same, tmp_path):
     def env():
         return DummyVecEnv([point_env, point_env])
 
@@ -129,86 +125,33 @@ def test_steps_in_the_middle_of_trials(
     whole = point_agent(env(), train_freq=(3, "step")).learn(TOTAL + 4)
     agent = point_agent(env(), train_freq=(3, "step"))
     with pytest.raises(PowerCut):
-        agent.learn(TOTAL + 4, [TrialCheckpoint(path), CutAt(16)])
-    agent = resume(path, env(), dynamics=point_dynamics, reward=point_reward)
+        agent.learn(TOTAL + 4, [EpisodeCheckpoint(path), CutAt(16)])
+    agent = resume(path, env(), point_task())
     assert agent.num_timesteps == 12
     agent.learn(TOTAL + 4 - 12, reset_num_timesteps=False)
     assert_same(whole, agent)
 
 
-def test_checkpoints_come_every_so_many_trials(point_agent, tmp_path, monkeypatch):
+def test_checkpoints_come_every_so_many_episodes(point_agent, tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(
         "gpadjust.rl.checkpoint.save_checkpoint", lambda agent, _: saved.append(agent.num_timesteps)
     )
-    point_agent().learn(25, TrialCheckpoint(tmp_path / "run.ckpt", every=2))
+    point_agent().learn(25, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
     assert saved == [0, 10, 20, 25]
 
 
-def test_functions_are_passed_on(point_agent, point_reward, point_dynamics, point_env, tmp_path):
+def test_functions_are_passed_on(point_agent, point_task, point_env, tmp_path):
     functions = {
         "terminated": lambda states: states[:, 0] > 99,
         "initial_states": lambda n: torch.ones(n, 1),
     }
     save_checkpoint(point_agent(**functions).learn(5), tmp_path / "run.ckpt")
-    agent = resume(
-        tmp_path / "run.ckpt",
-        point_env(),
-        dynamics=point_dynamics,
-        reward=point_reward,
-        **functions,
-    )
-    assert agent.terminated is functions["terminated"]
-    assert agent.initial_states is functions["initial_states"]
+    task = point_task(**functions)
+    assert resume(tmp_path / "run.ckpt", point_env(), task).task is task
 
 
 # Processes that are killed
-
-
-def run_of_cart_pole(path, out, trials=4):
-    """Start or go on with a run; write a hash of what it learnt to `out`."""
-    torch.set_num_threads(1)
-    env = gymnasium.make("gpadjust.envs:gpadjust/CartPoleSwingUp-v0")
-    dynamics = PhysicsDynamics(CART_POLE_SPEC, cart_pole_physics(0.5, 0.5, 0.6, 0.1))
-    if path.exists():
-        agent = resume(path, env, dynamics=dynamics, reward=cart_pole_reward)
-    else:
-        agent = DynaSAC(
-            "MlpPolicy", env, dynamics, cart_pole_reward, model_trials=2, batch_size=8, seed=0,
-            policy_kwargs={"net_arch": [8]}, device="cpu",
-        )  # fmt: skip
-    agent.learn(25 * trials - agent.num_timesteps, TrialCheckpoint(path), reset_num_timesteps=False)
-    weights = b"".join(p.detach().numpy().tobytes() for p in agent.policy.parameters())
-    out.write_text(hashlib.sha256(weights).hexdigest())
-
-
-def test_a_killed_process(tmp_path):
-    path, out = tmp_path / "run.ckpt", tmp_path / "hash"
-    fork = multiprocessing.get_context("fork")
-
-    def start():
-        process = fork.Process(target=run_of_cart_pole, args=(path, out))
-        process.start()
-        return process
-
-    start().join()
-    whole = out.read_text()
-    out.unlink()
-    path.unlink()
-
-    process = start()
-    seen = set()
-    while len(seen) < 3:  # three checkpoints have been written
-        if path.exists():
-            seen.add(path.stat().st_mtime_ns)
-        assert process.is_alive()
-        time.sleep(0.001)
-    process.kill()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
-    assert not out.exists()
-    start().join()
-    assert out.read_text() == whole
 
 
 SCRIPT = """
@@ -218,19 +161,20 @@ SCRIPT = """
     import gymnasium, torch
 
     torch.set_num_threads(1)
-    from gpadjust.dynamics import CKADynamics
+    from gpadjust.control import Task
+    from gpadjust.dynamics import LearnedDynamics
     from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-    from gpadjust.rl import DynaSAC, TrialCheckpoint, resume
+    from gpadjust.rl import DynaOptions, DynaSAC, EpisodeCheckpoint, resume
 
     path = Path(sys.argv[1])
     env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    dynamics = CKADynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+    task = Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward)
     if path.exists():
-        agent = resume(path, env, dynamics=dynamics, reward=cart_pole_reward)
+        agent = resume(path, env, task)
     else:
-        agent = DynaSAC("MlpPolicy", env, dynamics, cart_pole_reward, model_trials=2,
-                        batch_size=8, seed=0, policy_kwargs={"net_arch": [8]}, device="cpu")
-    agent.learn(100 - agent.num_timesteps, TrialCheckpoint(path), reset_num_timesteps=False)
+        agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), batch_size=8,
+                        seed=0, policy_kwargs={"net_arch": [8]}, device="cpu")
+    agent.learn(100 - agent.num_timesteps, EpisodeCheckpoint(path), reset_num_timesteps=False)
     weights = b"".join(p.detach().numpy().tobytes() for p in agent.policy.parameters())
     print(hashlib.sha256(weights).hexdigest())
 """
@@ -280,7 +224,7 @@ def test_a_failure_while_writing_leaves_the_old_file_and_no_litter(
     with pytest.raises(OSError, match="No space left"):
         save_checkpoint(agent, path)
     assert path.read_bytes() == before
-    assert [*tmp_path.iterdir()] == [path]
+    assert {*tmp_path.iterdir()} == {path, path.with_name("run.ckpt.lock")}
 
 
 def test_what_a_killed_writer_left_does_not_pile_up(point_agent, tmp_path, monkeypatch):
@@ -290,9 +234,9 @@ def test_what_a_killed_writer_left_does_not_pile_up(point_agent, tmp_path, monke
         patch.setattr("os.replace", lambda *_: None)  # it dies before
         save_checkpoint(agent, path)
         save_checkpoint(agent, path)
-    assert len([*tmp_path.iterdir()]) == 1
+    assert len([*tmp_path.iterdir()]) == 2  # with the lock
     save_checkpoint(agent, path)
-    assert [*tmp_path.iterdir()] == [path]
+    assert {*tmp_path.iterdir()} == {path, path.with_name("run.ckpt.lock")}
 
 
 def test_a_folder_is_made(point_agent, tmp_path):
@@ -300,7 +244,7 @@ def test_a_folder_is_made(point_agent, tmp_path):
     assert (tmp_path / "new" / "run.ckpt").exists()
 
 
-def test_other_files_are_refused(point_agent, point_dynamics, point_reward, point_env, tmp_path):
+def test_other_files_are_refused(point_agent, point_task, point_env, tmp_path):
     agent = point_agent().learn(5)
     whole, cut, other, saved = (tmp_path / name for name in ("whole", "cut", "other", "agent.zip"))
     save_checkpoint(agent, whole)
@@ -308,24 +252,26 @@ def test_other_files_are_refused(point_agent, point_dynamics, point_reward, poin
     other.write_bytes(pickle.dumps(agent.replay_buffer))
     agent.save(saved)
     for path in (cut, other, saved):
-        with pytest.raises(ValueError, match=f"{path.name} is not a checkpoint of TrialCheckpoint"):
-            resume(path, point_env(), dynamics=point_dynamics, reward=point_reward)
+        with pytest.raises(
+            ValueError, match=f"{path.name} is not a checkpoint of"
+        ):
+            resume(path, point_env(), point_task())
     with pytest.raises(FileNotFoundError):
-        resume(tmp_path / "none", point_env(), dynamics=point_dynamics, reward=point_reward)
+        resume(tmp_path / "none", point_env(), point_task())
 
 
-def test_a_damaged_file_is_refused(point_agent, point_dynamics, point_reward, point_env, tmp_path):
+def test_a_damaged_file_is_refused(point_agent, point_task, point_env, tmp_path):
     path = tmp_path / "run.ckpt"
     save_checkpoint(point_agent().learn(5), path)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(ValueError, match="is not a checkpoint of TrialCheckpoint"):
-        resume(path, point_env(), dynamics=point_dynamics, reward=point_reward)
+    with pytest.raises(ValueError, match="is not a checkpoint of EpisodeCheckpoint"):
+        resume(path, point_env(), point_task())
 
 
 def test_an_environment_that_cannot_be_pickled_is_reset(
-    point_agent, point_env, point_dynamics, point_reward, tmp_path
+    point_agent, point_env, point_task, tmp_path
 ):
     def robot():
         env = point_env()
@@ -337,12 +283,12 @@ def test_an_environment_that_cannot_be_pickled_is_reset(
         pytest.warns(UserWarning, match="environment cannot be saved .*pickle") as warned,
         pytest.raises(PowerCut),
     ):
-        point_agent(robot()).learn(TOTAL, [TrialCheckpoint(path), CutAt(13)])
+        point_agent(robot()).learn(TOTAL, [EpisodeCheckpoint(path), CutAt(13)])
     assert warned
-    agent = resume(path, robot(), dynamics=point_dynamics, reward=point_reward)
+    agent = resume(path, robot(), point_task())
     assert agent.num_timesteps == 10
     go_on(agent)
-    assert agent.num_trials == 4
+    assert agent.num_episodes == 4
     assert agent.replay_buffer.size() == TOTAL
 
 
@@ -354,54 +300,49 @@ def test_an_environment_that_cannot_be_pickled_is_reset(
         (("monitored",), ("normalised",)),
     ],
 )
-def test_other_wrappers_are_refused(
-    before, after, point_agent, wrapped, point_dynamics, point_reward, tmp_path
-):
+def test_other_wrappers_are_refused(before, after, point_agent, wrapped, point_task, tmp_path):
     save_checkpoint(point_agent(wrapped(before)).learn(5), tmp_path / "run.ckpt")
-    with pytest.raises(ValueError, match="env is not wrapped as the one of the checkpoint"):
-        resume(tmp_path / "run.ckpt", wrapped(after), dynamics=point_dynamics, reward=point_reward)
+    with pytest.raises(ValueError, match="of another environment: wrappers is"):
+        resume(tmp_path / "run.ckpt", wrapped(after), point_task())
 
 
-def test_another_number_of_environments_is_refused(
-    point_agent, point_env, point_dynamics, point_reward, tmp_path
-):
+def test_another_number_of_environments_is_refused(point_agent, point_env, point_task, tmp_path):
     agent = point_agent(DummyVecEnv([point_env] * 2), train_freq=1)
     save_checkpoint(agent.learn(10), tmp_path / "run.ckpt")
-    with pytest.raises(ValueError, match="had 2 environments; found 1"):
-        resume(tmp_path / "run.ckpt", point_env(), dynamics=point_dynamics, reward=point_reward)
+    with pytest.raises(ValueError, match="num_envs is 2 in the checkpoint, 1 here"):
+        resume(tmp_path / "run.ckpt", point_env(), point_task())
 
 
 def test_runs_that_could_not_be_resumed_are_refused(point_agent, point_env, tmp_path):
     path = tmp_path / "run.ckpt"
     with pytest.raises(ValueError, match="use_sde=False"):
-        point_agent(use_sde=True).learn(5, TrialCheckpoint(path))
-    with pytest.raises(TypeError, match="TrialCheckpoint is for DynaSAC; found SAC"):
-        SAC("MlpPolicy", point_env()).learn(5, TrialCheckpoint(path))
+        point_agent(use_sde=True).learn(5, EpisodeCheckpoint(path))
+    with pytest.raises(TypeError, match=r"EpisodeCheckpoint is for Dyna agents.*found SAC"):
+        SAC("MlpPolicy", point_env()).learn(5, EpisodeCheckpoint(path))
     with pytest.raises(ValueError, match="every must be at least 1; found 0"):
-        TrialCheckpoint(path, every=0)
+        EpisodeCheckpoint(path, every=0)
     assert not path.exists()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("particles", ["independent", "functions"])
-def test_cart_pole_of_co_kriging(particles, cart_pole, assert_same, tmp_path):
+@pytest.mark.parametrize("sampling", ["step", "trajectory"])
+def test_cart_pole_of_co_kriging(sampling, cart_pole, assert_same, tmp_path):
     path = tmp_path / "run.ckpt"
 
-    def dynamics():
-        return CKADynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+    def task():
+        return Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward)
 
     def agent():
         return DynaSAC(
-            "MlpPolicy", VecNormalize(DummyVecEnv([cart_pole])), dynamics(), cart_pole_reward,
-            model_trials=2, batch_size=8, seed=0, particles=particles,
+            "MlpPolicy", VecNormalize(DummyVecEnv([cart_pole])), task(),
+            DynaOptions(model_episodes=2, sampling=sampling), batch_size=8, seed=0,
             policy_kwargs={"net_arch": [8]}, device="cpu",
         )  # fmt: skip
 
     whole = agent().learn(100)
     with pytest.raises(PowerCut):
-        agent().learn(100, [TrialCheckpoint(path), CutAt(88)])
+        agent().learn(100, [EpisodeCheckpoint(path), CutAt(88)])
     scramble()
-    env = VecNormalize(DummyVecEnv([cart_pole]))
-    rest = resume(path, env, dynamics=dynamics(), reward=cart_pole_reward)
+    rest = resume(path, VecNormalize(DummyVecEnv([cart_pole])), task())
     assert rest.num_timesteps == 75
     assert_same(whole, rest.learn(25, reset_num_timesteps=False))

@@ -1,5 +1,7 @@
 """The model as a vectorised environment."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -7,28 +9,33 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecMonitor
 
-from gpadjust.dynamics import CKADynamics, PhysicsDynamics
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.envs import cart_pole_reward, cart_pole_start
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import ModelVecEnv
-from gpadjust.rl.mixed_replay_buffer import CompactReplayBuffer
+from gpadjust.rl.buffer import CompactReplayBuffer
 
 
 @pytest.fixture
-def point_particles(point_env, point_dynamics, point_reward):
+def point_particles(point_env, point_task):
     """Makes particles that are points, from x = 1; every argument can be given."""
 
-    def make(num_envs=3, trial_length=5, start=1.0, **options):
+    def make(num_envs=3, start=1.0, **given):
         env = point_env()
-        arguments = {
-            "dynamics": point_dynamics,
-            "reward": point_reward,
-            "initial_states": lambda n: torch.full((n, 1), start),
-            "observation_space": env.observation_space,
-            "action_space": env.action_space,
-            **options,
-        }
-        return ModelVecEnv(num_envs=num_envs, trial_length=trial_length, **arguments)
+        parts = {entry.name for entry in fields(Task)} & {*given}
+        task = point_task(
+            **{
+                "initial_states": lambda n: torch.full((n, 1), start),
+                **{name: given.pop(name) for name in parts},
+            }
+        )
+        spaces = (env.observation_space, env.action_space)
+        spaces = tuple(
+            given.pop(name, space)
+            for name, space in zip(("observation_space", "action_space"), spaces, strict=True)
+        )
+        return ModelVecEnv(task, num_envs, *spaces, **given)
 
     return make
 
@@ -43,11 +50,13 @@ def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics)
     env = cart_pole()
     starts = cart_pole_start(3)
     particles = ModelVecEnv(
-        cart_pole_dynamics,
-        cart_pole_reward,
-        lambda n: starts[:n],
+        Task(
+            cart_pole_dynamics,
+            cart_pole_reward,
+            initial_states=lambda n: starts[:n],
+            episode_length=25,
+        ),
         3,
-        25,
         env.observation_space,
         env.action_space,
     )
@@ -111,7 +120,7 @@ def test_seed_repeats_what_particles_meet(point_particles, rise):
 @pytest.fixture
 def unsure_dynamics(point_dynamics):
     """Of the point, learnt from few transitions."""
-    dynamics = CKADynamics(point_dynamics.spec, point_dynamics.physics)
+    dynamics = LearnedDynamics(point_dynamics.spec, point_dynamics.physics)
     states, actions = torch.rand(4, 1).double(), torch.rand(4, 1).double()
     dynamics.update(states, actions, states + 0.4 * actions + 0.3 * (3 * states).sin())
     return dynamics
@@ -119,7 +128,7 @@ def unsure_dynamics(point_dynamics):
 
 def test_particles_of_functions_meet_the_same_twice(point_particles, unsure_dynamics, rise):
     particles = point_particles(
-        num_envs=2, trial_length=1, dynamics=unsure_dynamics, particles="functions"
+        num_envs=2, episode_length=1, dynamics=unsure_dynamics, sampling="trajectory"
     )
     particles.reset()
     first, second = (particles.step(2 * rise(2))[1] for _ in range(2))
@@ -130,13 +139,13 @@ def test_particles_of_functions_meet_the_same_twice(point_particles, unsure_dyna
 
 
 def test_independent_particles_do_not(point_particles, unsure_dynamics, rise):
-    particles = point_particles(num_envs=2, trial_length=1, dynamics=unsure_dynamics)
+    particles = point_particles(num_envs=2, episode_length=1, dynamics=unsure_dynamics)
     particles.reset()
     first, second = (particles.step(2 * rise(2))[1] for _ in range(2))
     assert (first != second).all()
 
 
-def test_termination_ends_a_trial(point_particles, rise):
+def test_termination_ends_a_episode(point_particles, rise):
     particles = point_particles(num_envs=2, terminated=lambda states: states[:, 0] > 1.7)
     particles.reset()
     _, _, dones, _ = particles.step(rise(2))
@@ -150,7 +159,7 @@ def test_termination_ends_a_trial(point_particles, rise):
 
 
 def test_a_termination_at_the_time_limit_is_no_truncation(point_particles, rise):
-    particles = point_particles(trial_length=1, terminated=lambda states: states[:, 0] > 0)
+    particles = point_particles(episode_length=1, terminated=lambda states: states[:, 0] > 0)
     particles.reset()
     *_, dones, infos = particles.step(rise(3))
     assert dones.all()
@@ -159,7 +168,7 @@ def test_a_termination_at_the_time_limit_is_no_truncation(point_particles, rise)
 
 def test_each_particle_has_its_own_clock(point_particles, rise):
     particles = point_particles(
-        num_envs=2, trial_length=3, terminated=lambda states: states[:, 0] > 1.9
+        num_envs=2, episode_length=3, terminated=lambda states: states[:, 0] > 1.9
     )
     particles.reset()
     particles.step(np.array([[2.0], [0.0]], dtype=np.float32))  # ends the first
@@ -167,15 +176,17 @@ def test_each_particle_has_its_own_clock(point_particles, rise):
     assert ended == [[False, False], [False, True], [True, False]]
 
 
-def test_particles_that_leave_the_bounds_are_truncated_and_counted(point_particles, rise):
-    particles = point_particles(num_envs=2, bounds=torch.tensor([[-5.0], [1.3]]))
+def test_particles_that_leave_the_bounds_end_and_are_counted(point_particles, rise):
+    particles = point_particles(
+        num_envs=2, discount=0.9, state_bounds=torch.tensor([[-5.0], [1.3]])
+    )
     particles.reset()
     obs, rewards, dones, infos = particles.step(np.array([[1.0], [0.1]], dtype=np.float32))
     assert dones.tolist() == [True, False]
     assert infos[0]["left_bounds"]
-    assert infos[0]["TimeLimit.truncated"]
+    assert not infos[0]["TimeLimit.truncated"]
     assert infos[0]["terminal_observation"].tolist() == [1.0]
-    assert rewards[0] == 0
+    assert rewards.tolist() == pytest.approx([-(1.05**2) / (1 - 0.9), -(1.05**2)])
     assert obs[:, 0].tolist() == pytest.approx([1.0, 1.05])
     assert particles.num_left_bounds == 1
 
@@ -200,9 +211,9 @@ def test_particles_that_leave_the_numbers_are_truncated(
     assert np.isfinite(infos[1]["terminal_observation"]).all()
 
 
-@pytest.mark.parametrize("particles", ["independent", "functions"])
+@pytest.mark.parametrize("sampling", ["step", "trajectory"])
 def test_particles_at_which_the_physics_fails_are_truncated(
-    point_particles, unsure_dynamics, particles, rise
+    point_particles, unsure_dynamics, sampling, rise
 ):
     def choosy(X):
         if (X[:, 1] > 1.5).any():
@@ -211,7 +222,7 @@ def test_particles_at_which_the_physics_fails_are_truncated(
         return X[:, :1] + 0.4 * X[:, 1:]
 
     dynamics = PhysicsDynamics(unsure_dynamics.spec, choosy)
-    env = point_particles(dynamics=dynamics, particles=particles, num_envs=3)
+    env = point_particles(dynamics=dynamics, sampling=sampling, num_envs=3)
     env.reset()
     obs, _, dones, infos = env.step(np.array([[1.0], [2.0], [0.0]], dtype=np.float32))
     assert dones.tolist() == [False, True, False]
@@ -224,24 +235,24 @@ def test_particles_at_which_the_physics_fails_are_truncated(
 
 
 def test_bounds_give_way_to_the_starts(point_particles, rise):
-    particles = point_particles(start=4.0, bounds=torch.tensor([[0.0], [2.0]]))
+    particles = point_particles(start=4.0, state_bounds=torch.tensor([[0.0], [2.0]]))
     particles.reset()
     _, _, dones, _ = particles.step(rise(3))
     assert not dones.any()
-    assert particles.bounds.tolist() == [[0.0], [5.0]]
+    assert particles.task.state_bounds.tolist() == [[0.0], [5.0]]
 
 
-@pytest.mark.parametrize("particles", ["independent", "functions"])
+@pytest.mark.parametrize("sampling", ["step", "trajectory"])
 @pytest.mark.parametrize("rows", [0, 1, 7])
 def test_refreshed_transitions_end_as_the_model_has_it(
-    point_particles, unsure_dynamics, point_env, particles, rows
+    point_particles, unsure_dynamics, point_env, sampling, rows
 ):
-    env = point_particles(dynamics=unsure_dynamics, particles=particles)
+    env = point_particles(dynamics=unsure_dynamics, sampling=sampling)
     spaces_of = point_env()
     buffer = CompactReplayBuffer(20, spaces_of.observation_space, spaces_of.action_space, "cpu")
     states = np.linspace(0.1, 0.9, rows, dtype=np.float32)[:, None]
     zeros = np.zeros(rows, dtype=np.float32)
-    buffer.extend(states, states + 99, 0.2 * states, zeros, zeros, zeros)
+    buffer.add_rows(states, states + 99, 0.2 * states, zeros, zeros, zeros)
     env.refresh(buffer)
     assert buffer.size() == rows
     mean, variance = unsure_dynamics.predict(
@@ -268,12 +279,12 @@ def test_rewards_may_carry_gradients(point_particles, rise):
 
 def test_attributes_are_those_of_all_particles(point_particles):
     particles = point_particles()
-    assert particles.get_attr("trial_length", indices=[0, 2]) == [5, 5]
-    particles.set_attr("trial_length", 7)
-    assert particles.get_attr("trial_length") == [7, 7, 7]
+    assert particles.get_attr("episode_length", indices=[0, 2]) == [5, 5]
+    particles.set_attr("discount", 0.5)
+    assert particles.get_attr("discount") == [0.5, 0.5, 0.5]
     assert particles.env_is_wrapped(VecMonitor) == [False] * 3
     with pytest.raises(ValueError, match="all at once"):
-        particles.set_attr("trial_length", 7, indices=0)
+        particles.set_attr("discount", 0.5, indices=0)
     with pytest.raises(NotImplementedError, match="fly"):
         particles.env_method("fly")
 
@@ -316,9 +327,10 @@ def test_bad_starts_are_refused(point_particles):
         ({"observation_space": spaces.Discrete(2)}, "observation has 1 entries"),
         ({"action_space": spaces.Box(-1, 1, (3,))}, "action has 1 entries"),
         ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
-        ({"trial_length": 0}, "trial_length must be at least 1; found 0"),
-        ({"particles": "swarm"}, "Unknown particles 'swarm'"),
-        ({"bounds": torch.zeros(2, 4)}, r"bounds must be of shape 2 x 1; found \(2, 4\)"),
+        ({"episode_length": 0}, "episode_length must be at least 1; found 0"),
+        ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
+        ({"discount": 1.5}, r"discount must lie in \[0, 1\]; found 1.5"),
+        ({"initial_states": None}, "needs a task with initial_states"),
     ],
 )
 def test_bad_arguments_are_refused(point_particles, options, message):

@@ -10,7 +10,7 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.declarations import (
+from gpadjust.states.spec_checks import (
     check_exogenous,
     check_integrated,
     check_previous,
@@ -49,7 +49,7 @@ class StateSpec:
 
     Example:
         >>> import torch
-        >>> from gpadjust.dynamics import StateSpec
+        >>> from gpadjust.states import StateSpec
         >>> spec = StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"])
         >>> spec.observe(torch.tensor([[0.0, 2.0]]))
         tensor([[0., 1., 2.]])

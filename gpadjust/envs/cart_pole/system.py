@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import StateSpec
 from gpadjust.physics import ODEPhysics
+from gpadjust.states import StateSpec
 
 TIME_STEP = 0.1
 SUBSTEPS = 5  # of 0.02 s: a single Euler step of 0.1 s errs by 0.3 rad/s

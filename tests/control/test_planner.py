@@ -1,15 +1,15 @@
-"""Plans of trials that teach, and the search that makes them."""
+"""Plans of episodes that teach, and the search that makes them."""
 
 import pickle
 
 import pytest
 import torch
 
-from gpadjust.dynamics import GPDynamics, PhysicsDynamics, StateSpec, TrajectoryInformation
+from gpadjust.control import CrossEntropyPlanner, Information, Return, Rollouts, Task
+from gpadjust.control.action_sequences import cross_entropy, random_sequences
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec, TrajectoryInformation
+from gpadjust.models import ZeroMeanGP
 from gpadjust.physics import PhysicsError
-from gpadjust.rl import InformativeTrials
-from gpadjust.rl.action_sequences import cross_entropy, random_sequences
-from gpadjust.rl.sampled_rollouts import SampledRollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
 BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
@@ -22,7 +22,7 @@ def known_left():
     """Dynamics of x' = x + v / 2 that were measured, often, where v is negative."""
     x = torch.linspace(-3, 3, 40, dtype=torch.float64).unsqueeze(-1)
     v = -torch.rand(40, 1, dtype=torch.float64)
-    dynamics = GPDynamics(SPEC, fit_options=QUICK)
+    dynamics = LearnedDynamics(SPEC, model=ZeroMeanGP, fit_options=QUICK)
     dynamics.update(x, v, x + 0.5 * v + 0.01 * torch.randn_like(x))
     return dynamics
 
@@ -86,7 +86,7 @@ def half_steps(fails_beyond=None):
 
 def test_sequences_are_followed(origin):
     sequences = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
-    steps = SampledRollouts(half_steps(), 3).follow(origin, sequences)
+    steps = Rollouts(half_steps(), 3).follow(origin, sequences)
     assert steps.made.all()
     assert torch.equal(steps.actions, sequences.expand(3, 2, 3, 1))
     expected = torch.tensor([[0, 0.5, 1.5], [0, 0, -0.5]], dtype=torch.float64)
@@ -103,9 +103,9 @@ def test_sequences_are_followed(origin):
         ),
     ],
 )
-def test_trials_end_in_the_model(origin, options, made):
+def test_episodes_end_in_the_model(origin, options, made):
     sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
-    steps = SampledRollouts(half_steps(), 2, **options).follow(origin, sequences)
+    steps = Rollouts(half_steps(), 2, **options).follow(origin, sequences)
     assert steps.made[:, 1].all()
     assert steps.made[:, 0].tolist() == [made] * 2
     lost = ~steps.made
@@ -113,23 +113,23 @@ def test_trials_end_in_the_model(origin, options, made):
     assert (steps.actions[lost] == 1).all()
 
 
-def test_trials_end_where_the_physics_fails(origin):
+def test_episodes_end_where_the_physics_fails(origin):
     sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
-    steps = SampledRollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
+    steps = Rollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
     assert steps.made[0].tolist() == [[True, True, False, False, False], [True] * 5]
     assert steps.states.max() <= 0.9
 
 
-def test_all_trials_may_end_at_once_but_not_at_the_start(origin):
+def test_all_episodes_may_end_at_once_but_not_at_the_start(origin):
     sequences = torch.ones(2, 5, 1).double()
-    steps = SampledRollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
+    steps = Rollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
     assert steps.made.tolist() == [[[True, True, False, False, False]] * 2] * 2
     with pytest.raises(PhysicsError, match="too far"):
-        SampledRollouts(half_steps(fails_beyond=-1), 2).follow(origin, sequences)
+        Rollouts(half_steps(fails_beyond=-1), 2).follow(origin, sequences)
 
 
 def test_the_policy_proposes(origin):
-    rollouts = SampledRollouts(half_steps(), 2)
+    rollouts = Rollouts(half_steps(), 2)
     sequences = rollouts.propose(origin, 4, lambda states: 1 + states, 3)
     assert sequences.shape == (3, 4, 1)
     expected = torch.tensor([1.0, 1.5, 2.25, 3.375], dtype=torch.float64)
@@ -140,7 +140,9 @@ def test_the_policy_proposes(origin):
 
 
 def test_a_plan_goes_where_little_is_known(known_left, origin):
-    plan = InformativeTrials(num_random=24, rounds=1).plan(known_left, origin, 4, BOUNDS)
+    plan = CrossEntropyPlanner(Information(), num_random=24, rounds=1).plan(
+        known_left, origin, 4, BOUNDS
+    )
     assert plan.actions.shape == (4, 1)
     assert ((plan.actions >= BOUNDS[0]) & (plan.actions <= BOUNDS[1])).all()
     assert plan.actions.max() > 1
@@ -154,24 +156,24 @@ def test_more_rounds_teach_more(known_left, origin):
     values = []
     for rounds in (0, 4):
         torch.manual_seed(0)
-        options = InformativeTrials(num_random=16, num_policy=0, rounds=rounds)
+        options = CrossEntropyPlanner(Information(), num_random=16, num_policy=0, rounds=rounds)
         values.append(options.plan(known_left, origin, 4, BOUNDS).information)
     assert values[1] > values[0]
 
 
 def test_a_plan_may_be_the_policys(known_left, origin):
-    options = InformativeTrials(num_random=0, num_policy=4, rounds=0)
+    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=4, rounds=0)
     plan = options.plan(known_left, origin, 3, BOUNDS, policy=lambda s: torch.full_like(s, 9.0))
     assert (plan.actions == 2).all()
     without = options.plan(known_left, origin, 3, BOUNDS)
     assert without.actions.unique().numel() > 1
 
 
-def test_the_rest_of_a_trial_counts_what_the_trial_told(known_left):
-    """Of what only the first steps can tell, the rest of a trial that repeats them tells less."""
+def test_the_rest_of_a_episode_counts_what_the_episode_told(known_left):
+    """Of what only the first steps can tell, the rest of a episode that repeats them tells less."""
     state = torch.zeros(1, dtype=torch.float64)
     held = torch.full((2, 1), 1.5, dtype=torch.float64)
-    options = InformativeTrials(num_random=0, num_policy=1, rounds=0)
+    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
     alone = options.plan(known_left, state, 2, BOUNDS, policy=lambda s: s * 0 + 1.5)
     states = torch.tensor([[0.0], [0.75]], dtype=torch.float64)
     both = options.plan(
@@ -183,19 +185,21 @@ def test_the_rest_of_a_trial_counts_what_the_trial_told(known_left):
 
 def test_a_known_sequence_is_kept_if_nothing_is_better(known_left, origin):
     known = torch.full((4, 1), 2.0, dtype=torch.float64)
-    options = InformativeTrials(num_random=0, num_policy=1, rounds=0)
+    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
     plan = options.plan(known_left, origin, 4, BOUNDS, policy=lambda s: s * 0 - 0.5, known=known)
     assert torch.equal(plan.actions, known)
 
 
 def test_a_state_from_which_every_step_leaves_the_bounds(known_left, origin):
     bounds = torch.tensor([[5.0], [6.0]], dtype=torch.float64)
-    plan = InformativeTrials(num_random=4).plan(known_left, origin, 3, BOUNDS, state_bounds=bounds)
+    plan = CrossEntropyPlanner(Information(), num_random=4).plan(
+        known_left, origin, 3, BOUNDS, state_bounds=bounds
+    )
     assert plan.information == 0
 
 
 def test_plans_are_those_of_the_generator(known_left, origin):
-    options = pickle.loads(pickle.dumps(InformativeTrials(num_random=8, rounds=1)))
+    options = pickle.loads(pickle.dumps(CrossEntropyPlanner(Information(), num_random=8, rounds=1)))
     plans = []
     for seed in (0, 0, 1):
         torch.manual_seed(seed)
@@ -217,11 +221,11 @@ def test_plans_are_those_of_the_generator(known_left, origin):
 )
 def test_bad_options_are_refused(options, error, message):
     with pytest.raises(error, match=message):
-        InformativeTrials(**options)
+        CrossEntropyPlanner(Information(), **options)
 
 
 def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
-    options = InformativeTrials()
+    options = CrossEntropyPlanner(Information())
     with pytest.raises(ValueError, match=r"state of shape 1, found \(2,\)"):
         options.plan(known_left, origin.repeat(2), 3, BOUNDS)
     with pytest.raises(ValueError, match=r"finite action_bounds of shape 2 x 1, found .*inf"):
@@ -229,4 +233,4 @@ def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
     with pytest.raises(TypeError, match="found PhysicsDynamics"):
         options.plan(half_steps(), origin, 3, BOUNDS)
     with pytest.raises(RuntimeError, match="has not learnt"):
-        options.plan(GPDynamics(SPEC), origin, 3, BOUNDS)
+        options.plan(LearnedDynamics(SPEC, model=ZeroMeanGP), origin, 3, BOUNDS)

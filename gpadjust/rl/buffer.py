@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -11,13 +12,20 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-_ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-
 
 class CompactReplayBuffer(ReplayBuffer):
-    """A ``ReplayBuffer`` that takes many rows at once, and pickles only those that are filled."""
+    """A ``ReplayBuffer`` that takes many rows at once, and saves only those that are filled."""
 
-    def extend(
+    rows: ClassVar[tuple[str, ...]] = (
+        "observations",
+        "next_observations",
+        "actions",
+        "rewards",
+        "dones",
+        "timeouts",
+    )
+
+    def add_rows(
         self,
         obs: np.ndarray,
         next_obs: np.ndarray,
@@ -37,26 +45,47 @@ class CompactReplayBuffer(ReplayBuffer):
             timeouts: Whether it ended by a time limit alone, ``N``.
         """
         if self.n_envs != 1:
-            raise ValueError(f"extend() is for buffers of one environment; found {self.n_envs}.")
-        rows = (obs, next_obs, actions, rewards, dones, timeouts)
+            raise ValueError(f"add_rows() is for buffers of one environment; found {self.n_envs}.")
+        columns = (obs, next_obs, actions, rewards, dones, timeouts)
         n = min(len(obs), self.buffer_size)
         places = (self.pos + np.arange(n)) % self.buffer_size
-        for name, values in zip(_ROWS, rows, strict=True):
+        for name, values in zip(self.rows, columns, strict=True):
             getattr(self, name)[places, 0] = values[len(values) - n :]
         self.full = self.full or self.pos + n >= self.buffer_size
         self.pos = (self.pos + n) % self.buffer_size
 
+    def filled(self) -> dict[str, np.ndarray]:
+        """The rows that are filled and where the next one goes, as arrays."""
+        rows = {name: getattr(self, name)[: self.size()] for name in self.rows}
+        return {**rows, "next": np.array([self.pos, self.full])}
+
+    def fill(self, content: Mapping[str, np.ndarray]) -> None:
+        """Take back what :meth:`filled` gave, with space for the other rows.
+
+        Raises:
+            ValueError: If it is of a buffer of other shapes.
+        """
+        for name in self.rows:
+            found, own = content[name], getattr(self, name)
+            if found.shape[1:] != own.shape[1:] or len(found) > len(own):
+                raise ValueError(
+                    f"Expected {name} of at most {len(own)} rows of shape {own.shape[1:]}, found "
+                    f"{found.shape}."
+                )
+        for name in self.rows:
+            rows = np.zeros_like(getattr(self, name))
+            rows[: len(content[name])] = content[name]
+            setattr(self, name, rows)
+        self.pos, self.full = int(content["next"][0]), bool(content["next"][1])
+
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, of the rows those that are filled."""
-        state = self.__dict__.copy()
-        for name in _ROWS:
-            state[name] = state[name][: self.size()]
-        return state
+        return {**self.__dict__, **{name: getattr(self, name)[: self.size()] for name in self.rows}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the attributes back, with space for the other rows."""
         self.__dict__.update(state)
-        for name in _ROWS:
+        for name in self.rows:
             filled = state[name]
             rows = np.zeros((self.buffer_size, *filled.shape[1:]), dtype=filled.dtype)
             rows[: len(filled)] = filled
@@ -66,11 +95,15 @@ class CompactReplayBuffer(ReplayBuffer):
 class MixedReplayBuffer(CompactReplayBuffer):
     """The replay buffer of Dyna: real experience D_R, and beside it model experience D_M.
 
-    To Stable-Baselines3 it is the buffer of the real transitions. The attribute ``model`` is a
-    buffer of the others. Every batch is drawn from both: of ``batch_size`` samples,
-    ``batch_size * real_fraction`` are real, a broken number being rounded up or down at random so
-    that the mean is exact. As long as one of the buffers is empty, or ``mix`` is False, batches
+    To Stable-Baselines3 it is the buffer of the real transitions. The attribute ``model_buffer`` is
+    one of the others. Every batch is drawn from both: of ``batch_size`` samples,
+    ``batch_size * real_fraction`` are real, a fractional number being rounded up or down at random
+    so that the mean is exact. As long as one of the buffers is empty, or ``mix`` is False, batches
     come from the real one, or from the model's if that is all there is.
+
+    A real step whose ``info["step_failed"]`` is true did not happen, as where a simulator failed.
+    It is not kept: the step before it is the last one of its episode, truncated. (Where other
+    environments made theirs, its place in the row repeats another transition.)
 
     Args:
         buffer_size: Capacity of the real buffer.
@@ -84,7 +117,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
         model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
 
     Attributes:
-        model: The model's transitions.
+        model_buffer: The model's transitions.
+        failed: Which places repeat another transition, ``buffer_size x n_envs`` booleans.
         mix: Whether batches hold model transitions.
         num_new: Steps that were added since this was last set to zero, by whom reads them.
         real_fraction: Share of real samples in a batch.
@@ -93,6 +127,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
         ValueError: If the fraction or the size is out of range, or ``optimize_memory_usage`` is
             asked for.
     """
+
+    rows = (*CompactReplayBuffer.rows, "failed")
 
     def __init__(
         self,
@@ -127,17 +163,45 @@ class MixedReplayBuffer(CompactReplayBuffer):
         self.real_fraction = real_fraction
         self.mix = True
         self.num_new = 0
-        self.model = CompactReplayBuffer(
+        self.failed = np.zeros((self.buffer_size, n_envs), dtype=bool)
+        self.model_buffer = CompactReplayBuffer(
             buffer_size if model_buffer_size is None else model_buffer_size,
             observation_space,
             action_space,
             device,
         )
 
-    def add(self, *args: Any, **kwargs: Any) -> None:
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
         """Add a real step of each environment, see Stable-Baselines3."""
-        super().add(*args, **kwargs)
+        failed = np.array([bool(info.get("step_failed")) for info in infos])
+        if failed.any():
+            self._end_episodes(failed)
+        if failed.all():
+            return
+        pos = self.pos
+        super().add(obs, next_obs, action, reward, done, infos)
         self.num_new += 1
+        self.failed[pos] = failed
+        for i in failed.nonzero()[0]:
+            # Its place in the row is taken by a transition that is sampled once more.
+            row, env = (pos - 1, i) if self.size() > 1 else (pos, int(failed.argmin()))
+            for name in CompactReplayBuffer.rows:
+                getattr(self, name)[pos, i] = getattr(self, name)[row, env]
+
+    def _end_episodes(self, failed: np.ndarray) -> None:
+        """Let the newest steps of some environments be the last ones of their episodes."""
+        if not self.size():
+            return
+        ended = failed & (self.dones[self.pos - 1] == 0)
+        self.dones[self.pos - 1][ended] = self.timeouts[self.pos - 1][ended] = 1
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw a batch from both buffers; the real samples come first.
@@ -146,17 +210,17 @@ class MixedReplayBuffer(CompactReplayBuffer):
             batch_size: Number of samples.
             env: Normalises observations and rewards, see Stable-Baselines3.
         """
-        if not self.mix or not self.model.size():
+        if not self.mix or not self.model_buffer.size():
             return super().sample(batch_size, env)
         if not self.size():
-            return self.model.sample(batch_size, env)
+            return self.model_buffer.sample(batch_size, env)
         expected = batch_size * self.real_fraction
         num_real = int(expected) + int(np.random.random() < expected % 1)  # noqa: NPY002
         parts = []
         if num_real:
             parts.append(super().sample(num_real, env))
         if num_real < batch_size:
-            parts.append(self.model.sample(batch_size - num_real, env))
+            parts.append(self.model_buffer.sample(batch_size - num_real, env))
         names = ReplayBufferSamples._fields[:-1]  # the last is for n-step returns
         columns = [torch.cat([getattr(part, name) for part in parts]) for name in names]
         return ReplayBufferSamples(*columns)
@@ -164,5 +228,6 @@ class MixedReplayBuffer(CompactReplayBuffer):
     def reset(self) -> None:
         """Empty both buffers."""
         super().reset()
-        self.model.reset()
+        self.model_buffer.reset()
+        self.failed[:] = False
         self.num_new = 0

@@ -1,20 +1,20 @@
-"""What a replay buffer tells of the real trials."""
+"""What a replay buffer tells of the real episodes."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 
-from gpadjust.dynamics import StateSpec
-from gpadjust.rl.model_vec_env import Reward, Termination, per_particle
+from gpadjust.control import Task
+from gpadjust.rl.buffer import MixedReplayBuffer
+from gpadjust.states import StateSpec
 
 _REACH = 10.0  # how many half ranges of the recorded states particles may be from their middle
 
 
-class RecordedTrials:
+class RecordedEpisodes:
     """The transitions in a replay buffer, as states and actions in the user's units.
 
     Rows are in the order of time, one environment after the other.
@@ -24,11 +24,19 @@ class RecordedTrials:
         policy: Knows the scale of the actions in the buffer.
         spec: Decodes the observations.
         newest: How many steps of each environment to take. Default: all.
+
+    Attributes:
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+        next_states: ``N x state_dim``.
+        rewards: ``N``.
+        terminated: Whether the next state ended the episode, ``N`` booleans.
+        num_ended: How many episodes ended.
     """
 
     def __init__(
         self,
-        buffer: ReplayBuffer,
+        buffer: MixedReplayBuffer,
         policy: BasePolicy,
         spec: StateSpec,
         newest: int | None = None,
@@ -36,10 +44,11 @@ class RecordedTrials:
         first = buffer.pos if buffer.full else 0
         rows = (first + np.arange(buffer.size())) % buffer.buffer_size
         rows = rows if newest is None else rows[len(rows) - min(newest, len(rows)) :]
+        happened = ~buffer.failed[rows].T.flatten()
 
         def column(name: str) -> np.ndarray:
             values = getattr(buffer, name)[rows].swapaxes(0, 1)
-            return values.reshape(-1, *values.shape[2:]).astype(np.float64)
+            return values.reshape(-1, *values.shape[2:])[happened].astype(np.float64)
 
         self.spec = spec
         self.states = spec.decode(torch.from_numpy(column("observations")))
@@ -48,12 +57,13 @@ class RecordedTrials:
         self.rewards = torch.from_numpy(column("rewards"))
         dones = torch.from_numpy(column("dones"))
         self.terminated = (dones * (1 - torch.from_numpy(column("timeouts")))).bool()
-        self._num_ended = int(dones.sum())
-        starts = torch.ones(buffer.n_envs, len(rows), dtype=torch.bool)
-        starts[:, 1:] = dones.reshape(starts.shape)[:, :-1].bool()
+        self.num_ended = int(dones.sum())
+        ended = buffer.dones[rows].astype(bool).T
+        starts = np.ones_like(ended)
+        starts[:, 1:] = ended[:, :-1]
         if buffer.full and starts[:, 1:].any():
             starts[:, 0] = False  # what came before the oldest row is lost
-        self._starts = starts.flatten()
+        self._starts = torch.from_numpy(starts.flatten()[happened])
 
     @property
     def num_transitions(self) -> int:
@@ -61,7 +71,7 @@ class RecordedTrials:
         return len(self.states)
 
     def draw_starts(self, n: int) -> Tensor:
-        """Draw states at which trials started, ``n x state_dim``, from PyTorch's generator."""
+        """Draw states at which episodes started, ``n x state_dim``, from PyTorch's generator."""
         starts = self.states[self._starts]
         return starts[torch.randint(len(starts), (n,))]
 
@@ -76,28 +86,17 @@ class RecordedTrials:
                 reach[i] = torch.inf
         return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
 
-    @property
-    def num_ended(self) -> int:
-        """How many trials ended."""
-        return self._num_ended
-
-    def check(
-        self, reward: Reward, terminated: Termination | None, tolerance: float = 1e-3
-    ) -> None:
-        """Compare the functions that the user gave with what was recorded.
+    def check(self, task: Task, tolerance: float = 1e-3) -> None:
+        """Compare the functions of a task with what was recorded.
 
         Args:
-            reward: The user's.
-            terminated: The user's, or None for no termination.
+            task: The user's.
             tolerance: Greatest error of the reward, relative to the largest that was recorded.
 
         Raises:
             ValueError: If they differ; it shows the worst transition.
         """
-        n = len(self.states)
-        rewards = per_particle(
-            reward(self.states, self.actions, self.next_states), n, "reward"
-        ).double()
+        rewards = task.rewards(self.states, self.actions, self.next_states).double()
         error = (rewards - self.rewards).abs()
         if (error > tolerance * self.rewards.abs().max().clamp_min(1e-6)).any():
             i = int(error.argmax())
@@ -108,13 +107,13 @@ class RecordedTrials:
                 "which entries are angles, seen as sine and then cosine). If rewards or "
                 "observations are noisy, raise reward_tolerance; None checks nothing."
             )
-        says = torch.zeros(n, dtype=torch.bool)
-        if terminated is not None:
-            says = per_particle(terminated(self.next_states), n, "terminated").bool()
+        says = task.terminations(self.next_states)
         wrong = says != self.terminated
         if wrong.any():
             i = int(wrong.nonzero()[0])
-            given = "the function says" if terminated is not None else "none was given, that is"
+            given = (
+                "the function says" if task.terminated is not None else "none was given, that is"
+            )
             raise ValueError(
                 f"terminated(states) is not the environment's: transition {i} was recorded with "
                 f"terminated={bool(self.terminated[i])}, but {given} {bool(says[i])}; "

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import StateSpec
-from gpadjust.envs.torque_arm import REAL_ARM
+from gpadjust.envs.arm.torque_arm import REAL_ARM
+from gpadjust.states import StateSpec
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)

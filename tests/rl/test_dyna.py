@@ -19,9 +19,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from gpadjust.dynamics import CKADynamics, GPDynamics, PhysicsDynamics, StateSpec
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-from gpadjust.rl import DynaCallback, DynaSAC
+from gpadjust.models import ZeroMeanGP
+from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def normalised(point_env):
 
 
 def model_rows(agent):
-    return agent.replay_buffer.model.size()
+    return agent.replay_buffer.model_buffer.size()
 
 
 # What a run does
@@ -41,16 +43,16 @@ def model_rows(agent):
     ("options", "updates"),
     [
         ({}, 3 * (5 + 10)),
-        ({"model_updates": 2}, 3 * (5 + 20)),
-        ({"model_updates": 0}, 3 * 5),
-        ({"model_updates": 0.3}, 3 * (5 + 3)),
-        ({"model_updates": 0.25}, 3 * 5 + 7),  # of 7.5
-        ({"model_trials": 0}, 3 * 5),
-        ({"model_trials": 5, "num_particles": 2}, 3 * (5 + 25)),
+        ({"updates_per_model_step": 2}, 3 * (5 + 20)),
+        ({"updates_per_model_step": 0}, 3 * 5),
+        ({"updates_per_model_step": 0.3}, 3 * (5 + 3)),
+        ({"updates_per_model_step": 0.25}, 3 * 5 + 7),  # of 7.5
+        ({"model_episodes": 0}, 3 * 5),
+        ({"model_episodes": 5, "num_particles": 2}, 3 * (5 + 25)),
         ({"gradient_steps": 2}, 3 * (2 + 10)),
-        ({"model_until": 2}, 3 * 5 + 2 * 10),
-        ({"model_until": 0}, 3 * 5),
-        ({"trial_length": 3}, 3 * (5 + 6)),
+        ({"last_model_episode": 2}, 3 * 5 + 2 * 10),
+        ({"last_model_episode": 0}, 3 * 5),
+        ({"episode_length": 3}, 3 * (5 + 6)),
         ({"learning_starts": 5}, 2 * 5 + 3 * 10),
         ({"train_freq": (2, "episode")}, 2 * 10 + 4 * 10),
     ],
@@ -65,12 +67,12 @@ def test_model_steps_are_no_time_steps(point_agent):
     assert agent.num_timesteps == 15
     assert agent.replay_buffer.size() == 15
     assert model_rows(agent) == 3 * 2 * 5
-    assert agent.num_trials == 3
+    assert agent.num_episodes == 3
 
 
 def test_model_rows_are_transitions_of_the_model(point_agent):
     agent = point_agent(terminated=lambda states: states[:, 0] > 9).learn(10)
-    rows = agent.replay_buffer.model
+    rows = agent.replay_buffer.model_buffer
     n = rows.size()
     obs, following, actions, rewards, dones, timeouts = (
         getattr(rows, name)[:n, 0]
@@ -87,27 +89,27 @@ def test_model_rows_are_transitions_of_the_model(point_agent):
 
 def test_initial_states_may_be_given(point_agent):
     agent = point_agent(initial_states=lambda n: torch.full((n, 1), 0.25)).learn(5)
-    assert (agent.replay_buffer.model.observations[:2] == 0.25).all()
+    assert (agent.replay_buffer.model_buffer.observations[:2] == 0.25).all()
 
 
-def test_trials_that_terminate_in_the_model_end_there(point_agent, point_env):
+def test_episodes_that_terminate_in_the_model_end_there(point_agent, point_env):
     agent = point_agent(
         point_env(end=1.2),
         terminated=lambda states: states[:, 0] > 1.2,
         initial_states=lambda n: torch.full((n, 1), 1.19),
-        model_trials=8,
+        model_episodes=8,
     ).learn(10)
-    rows = agent.replay_buffer.model
+    rows = agent.replay_buffer.model_buffer
     n = rows.size()
-    assert n < 8 * 5 * agent.num_trials
+    assert n < 8 * 5 * agent.num_episodes
     over = rows.next_observations[:n, 0, 0] > 1.2
     assert over.any()
     np.testing.assert_array_equal(over, (rows.dones * (1 - rows.timeouts))[:n, 0].astype(bool))
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_after_model_until_batches_hold_model_rows_only_if_kept(point_agent, keep):
-    agent = point_agent(model_until=2, keep_model_data=keep, real_fraction=0.0)
+def test_after_last_model_episode_batches_hold_model_rows_only_if_kept(point_agent, keep):
+    agent = point_agent(last_model_episode=2, keep_model_data=keep, real_fraction=0.0)
     mixed = []
     sample = agent.replay_buffer.sample
 
@@ -127,11 +129,11 @@ def test_a_long_run_in_pieces_goes_on(point_agent, learnt_dynamics):
     for total in (10, 20):  # the second call counts time steps from zero again
         agent.learn(10)
         assert dynamics.num_transitions == total
-        assert agent.num_trials == total // 5
+        assert agent.num_episodes == total // 5
         assert model_rows(agent) == 2 * total
     agent.learn(5, reset_num_timesteps=False)
     assert dynamics.num_transitions == 25
-    assert agent.num_trials == 5
+    assert agent.num_episodes == 5
 
 
 def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
@@ -145,7 +147,7 @@ def test_dynamics_learn_each_real_transition_once(point_agent, learnt_dynamics):
 
     dynamics.update = watch
     agent = point_agent(dynamics=dynamics, learning_starts=5).learn(20)
-    assert torch.equal(torch.cat(seen), agent.recorded_trials().states)
+    assert torch.equal(torch.cat(seen), agent.recorded_episodes().states)
     assert [len(states) for states in seen] == [10, 5, 5]
 
 
@@ -160,21 +162,21 @@ class Stop(BaseCallback):
         return self.num_timesteps < self.step
 
 
-def test_a_run_that_was_stopped_within_a_trial_starts_another(point_agent, learnt_dynamics):
+def test_a_run_that_was_stopped_within_a_episode_starts_another(point_agent, learnt_dynamics):
     dynamics = learnt_dynamics()
     agent = point_agent(dynamics=dynamics)
     agent.learn(10, callback=Stop(8))
     assert agent.replay_buffer.size() == 7  # what a callback stops at is not stored
     agent.learn(10, reset_num_timesteps=False)
-    trials = agent.recorded_trials()
-    follows = (trials.states[1:] == trials.next_states[:-1]).all(-1)
+    episodes = agent.recorded_episodes()
+    follows = (episodes.states[1:] == episodes.next_states[:-1]).all(-1)
     assert follows.logical_not().nonzero().flatten().tolist() == [4, 6, 11]
     assert dynamics.num_transitions == 17
 
 
-def test_each_trial_that_ended_is_followed_by_model_trials(point_agent):
-    agent = point_agent(train_freq=(15, "step"), model_trials=4).learn(15)
-    assert agent.num_trials == 3
+def test_each_episode_that_ended_is_followed_by_model_episodes(point_agent):
+    agent = point_agent(train_freq=(15, "step"), model_episodes=4).learn(15)
+    assert agent.num_episodes == 3
     assert model_rows(agent) == 3 * 4 * 5
 
 
@@ -182,11 +184,11 @@ def test_states_beyond_the_bounds_are_not_followed(point_agent):
     bounds = torch.tensor([[0.9], [1.1]])
     agent = point_agent(state_bounds=bounds, initial_states=lambda n: torch.ones(n, 1)).learn(10)
     assert 0 < model_rows(agent) < 2 * 2 * 5
-    following = agent.replay_buffer.model.next_observations[: model_rows(agent)]
+    following = agent.replay_buffer.model_buffer.next_observations[: model_rows(agent)]
     assert ((following > 0.9) & (following < 1.1)).all()
 
 
-def test_model_trials_that_teach_nothing_are_warned_of(point_agent):
+def test_model_episodes_that_teach_nothing_are_warned_of(point_agent):
     bounds = torch.tensor([[0.99], [1.01]])
     agent = point_agent(
         state_bounds=bounds,
@@ -204,16 +206,16 @@ def test_the_model_buffer_keeps_the_newest(point_agent):
     assert model_rows(agent) == 15
 
 
-def test_a_first_trial_of_a_single_step_waits_for_the_second(
+def test_a_first_episode_of_a_single_step_waits_for_the_second(
     point_agent, point_env, learnt_dynamics
 ):
     dynamics = learnt_dynamics()
     agent = point_agent(
         point_env(end=-9), terminated=lambda states: states[:, 0] > -9, dynamics=dynamics
     )
-    assert agent.learn(1).num_trials == 0
+    assert agent.learn(1).num_episodes == 0
     agent.learn(2, reset_num_timesteps=False)
-    assert agent.num_trials == dynamics.num_transitions == 3
+    assert agent.num_episodes == dynamics.num_transitions == 3
     assert agent._n_updates == 3 + 3 * 2
 
 
@@ -225,7 +227,7 @@ def test_a_trivial_task_is_improved(point_agent):
 
     agent = point_agent(
         learning_rate=1e-2,
-        model_trials=10,
+        model_episodes=10,
         batch_size=32,
         gamma=0.5,
         tau=0.05,
@@ -237,7 +239,7 @@ def test_a_trivial_task_is_improved(point_agent):
 
 
 def test_cart_pole(cart_pole):
-    dynamics = CKADynamics(
+    dynamics = LearnedDynamics(
         CART_POLE_SPEC,
         random_cart_pole_physics(0),
         fit_options={"num_screened": 8, "num_starts": 1},
@@ -245,10 +247,8 @@ def test_cart_pole(cart_pole):
     agent = DynaSAC(
         "MlpPolicy",
         cart_pole(),
-        dynamics,
-        cart_pole_reward,
-        model_trials=1,
-        particles="functions",
+        Task(dynamics, cart_pole_reward),
+        DynaOptions(model_episodes=1, sampling="trajectory"),
         batch_size=8,
         policy_kwargs={"net_arch": [8]},
         seed=0,
@@ -280,7 +280,7 @@ def test_a_system_with_an_angle_of_another_order(point_agent):
     env.observation_space = spaces.Box(-8, 8, (3,))
     spec = StateSpec(["theta", "speed"], ["torque"], angles=["theta"])
     agent = point_agent(
-        env, dynamics=PhysicsDynamics(spec, pendulum_step), reward=reward, trial_length=None
+        env, dynamics=PhysicsDynamics(spec, pendulum_step), reward=reward, episode_length=None
     ).learn(16)
     assert model_rows(agent) == 2 * 2 * 8
 
@@ -291,10 +291,10 @@ def test_several_environments(point_agent, point_env, learnt_dynamics):
     agent = point_agent(env, dynamics=dynamics, train_freq=(4, "step"), gradient_steps=1)
     agent.learn(40)
     assert agent.num_timesteps == 40
-    assert agent.num_trials == 8
+    assert agent.num_episodes == 8
     assert dynamics.num_transitions == 40
     assert torch.equal(
-        dynamics._data.states.sort(0).values, agent.recorded_trials().states.sort(0).values
+        dynamics._data.states.sort(0).values, agent.recorded_episodes().states.sort(0).values
     )
 
 
@@ -303,9 +303,9 @@ def test_normalised_environments(point_agent, normalised, learnt_dynamics):
     dynamics = learnt_dynamics()
     agent = point_agent(env, dynamics=dynamics).learn(15)
     assert env.obs_rms.count > 15
-    raw = agent.recorded_trials()
+    raw = agent.recorded_episodes()
     assert torch.allclose(raw.next_states, raw.states + 0.5 * raw.actions, atol=0.1)
-    rows = agent.replay_buffer.model
+    rows = agent.replay_buffer.model_buffer
     start = torch.from_numpy(rows.observations[:2, 0]).double()
     assert torch.isin(start, raw.states).all()
 
@@ -321,7 +321,7 @@ def test_normalised_observations_are_what_the_policy_sees_in_the_model(
     agent.learn(5)
     in_model = seen[5:]
     assert len(in_model) == 5
-    start = agent.replay_buffer.model.observations[:2, 0]
+    start = agent.replay_buffer.model_buffer.observations[:2, 0]
     np.testing.assert_allclose(in_model[0], env.normalize_obs(start), rtol=1e-6)
 
 
@@ -345,7 +345,7 @@ def test_metrics_of_the_model_are_logged(point_agent, learnt_dynamics, tmp_path)
     agent.logger.close()
     with open(tmp_path / "progress.csv") as file:
         last = [*csv.DictReader(file)][-1]
-    shares = [float(last[f"model/share_{part}"]) for part in ("fit", "rollout", "sac")]
+    shares = [float(last[f"model/share_{part}"]) for part in ("fit", "rollout", "update")]
     assert sum(shares) == pytest.approx(1, abs=1e-3)
     for name in ("nlpd", "coverage", "rmse/x", "fit_seconds", "ep_rew_mean"):
         assert np.isfinite(float(last[f"model/{name}"]))
@@ -357,7 +357,7 @@ def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynam
         point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
     )
     starts = torch.tensor([[0.6], [1.4], [0.8]])
-    agent = point_agent(dynamics=runaway, model_trials=3, initial_states=lambda n: starts)
+    agent = point_agent(dynamics=runaway, model_episodes=3, initial_states=lambda n: starts)
     agent.learn(5)
     assert agent.logger.name_to_value["model/left_bounds"] == 1
     assert model_rows(agent) == 2 * 5
@@ -395,7 +395,7 @@ def test_progress_bar(point_agent, capsys):
 
 @pytest.fixture
 def saved(point_agent, learnt_dynamics, tmp_path):
-    """An agent after two trials, and its file."""
+    """An agent after two episodes, and its file."""
     agent = point_agent(dynamics=learnt_dynamics()).learn(10)
     agent.save(tmp_path / "agent")
     return agent, tmp_path / "agent.zip"
@@ -410,70 +410,71 @@ def test_a_loaded_agent_predicts_the_same(saved):
     )
 
 
-def test_without_dynamics_a_loaded_agent_only_predicts(saved, point_env, point_reward):
+def test_without_dynamics_a_loaded_agent_only_predicts(saved, point_env):
     _, path = saved
-    with pytest.raises(ValueError, match=r"needs dynamics to learn.*DynaSAC.load"):
+    with pytest.raises(ValueError, match=r"needs a task to learn.*DynaSAC.load"):
         DynaSAC.load(path, env=point_env()).learn(5)
-    with pytest.raises(ValueError, match=r"needs dynamics to learn"):
+    with pytest.raises(ValueError, match=r"needs a task to learn"):
         DynaSAC.load(path).learn(5)
 
 
-def test_with_dynamics_but_no_environment_it_says_so(saved, learnt_dynamics, point_reward):
+def test_with_dynamics_but_no_environment_it_says_so(saved, learnt_dynamics, point_task):
     _, path = saved
-    loaded = DynaSAC.load(path, dynamics=learnt_dynamics(), reward=point_reward)
+    loaded = DynaSAC.load(path, task=point_task(dynamics=learnt_dynamics()))
     with pytest.raises(ValueError, match="env"):
         loaded.learn(5)
 
 
-def test_with_dynamics_a_loaded_agent_goes_on(saved, point_env, learnt_dynamics, point_reward):
+def test_with_dynamics_a_loaded_agent_goes_on(saved, point_env, learnt_dynamics, point_task):
     agent, path = saved
     dynamics = learnt_dynamics()
-    loaded = DynaSAC.load(path, env=point_env(), dynamics=dynamics, reward=point_reward)
+    loaded = DynaSAC.load(path, env=point_env(), task=point_task(dynamics=dynamics))
     x = torch.linspace(0, 1, 5).double()[:, None]
-    for one, other in zip(dynamics.predict(x, x), agent.dynamics.predict(x, x), strict=True):
+    for one, other in zip(dynamics.predict(x, x), agent.task.dynamics.predict(x, x), strict=True):
         assert torch.equal(one, other)
-    assert loaded.num_trials == 2
+    assert loaded.num_episodes == 2
     loaded.learn(5, reset_num_timesteps=False)
     assert dynamics.num_transitions == 15
     assert loaded.num_timesteps == 15
-    assert loaded.num_trials == 3
+    assert loaded.num_episodes == 3
 
 
-def test_what_the_dynamics_learnt_outlives_an_agent_without_them(saved, tmp_path, learnt_dynamics):
+def test_what_the_dynamics_learnt_outlives_an_agent_without_them(
+    saved, tmp_path, learnt_dynamics, point_task
+):
     agent, path = saved
     again = tmp_path / "again.zip"
     DynaSAC.load(path).save(again)
     dynamics = learnt_dynamics()
-    DynaSAC.load(again, dynamics=dynamics)
-    assert dynamics.num_transitions == agent.dynamics.num_transitions
+    DynaSAC.load(again, task=point_task(dynamics=dynamics))
+    assert dynamics.num_transitions == agent.task.dynamics.num_transitions
 
 
 def test_a_termination_that_was_given_is_asked_for_again(
-    point_agent, point_env, point_reward, point_dynamics, tmp_path
+    point_agent, point_env, point_task, tmp_path
 ):
     def over(states):
         return states[:, 0] > 9
 
     path = tmp_path / "agent.zip"
     point_agent(terminated=over).learn(5).save(path)
-    given = {"env": point_env(), "reward": point_reward, "dynamics": point_dynamics}
-    with pytest.raises(ValueError, match=r"needs terminated .*to DynaSAC\.load"):
-        DynaSAC.load(path, **given).learn(5)
-    assert DynaSAC.load(path, **given, terminated=over).learn(5).num_trials == 2
+    with pytest.raises(ValueError, match=r"made with a task that has terminated"):
+        DynaSAC.load(path, env=point_env(), task=point_task()).learn(5)
+    loaded = DynaSAC.load(path, env=point_env(), task=point_task(terminated=over))
+    assert loaded.learn(5).num_episodes == 2
 
 
-def test_dynamics_of_another_kind_are_not_loaded(saved):
+def test_dynamics_of_another_kind_are_not_loaded(saved, point_task):
     _, path = saved
-    other = GPDynamics(StateSpec(["x"], ["v"]))
-    with pytest.raises(RuntimeError, match="class is CKADynamics in the state, GPDynamics here"):
-        DynaSAC.load(path, dynamics=other)
+    other = LearnedDynamics(StateSpec(["x"], ["v"]), model=ZeroMeanGP)
+    with pytest.raises(RuntimeError, match=r"model is .*CKA.* in the state, .*ZeroMeanGP.* here"):
+        DynaSAC.load(path, task=point_task(dynamics=other))
 
 
-def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics):
+def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics, point_task):
     _, path = saved
-    loaded = DynaSAC.load(
-        path, env=point_env(), dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0]
-    )
+    task = point_task(dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0])
+    loaded = DynaSAC.load(path, env=point_env(), task=task)
     with pytest.raises(ValueError, match="is not the environment's"):
         loaded.learn(5)
 
@@ -507,19 +508,19 @@ def test_the_file_holds_neither_physics_nor_functions_nor_environment(
     agent.save(tmp_path / "agent.zip")
     with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
         data = archive.read("data").decode()
-    for name in ("dynamics", "reward", "terminated", "initial_states", "env", "_hooks"):
+    for name in ("task", "dynamics", "env", "model_hooks"):
         assert f'"{name}":' not in data
 
 
 def test_both_buffers_are_saved_together(point_agent, tmp_path):
     agent = point_agent().learn(10)
-    agent.replay_buffer.model.device = torch.device("meta")  # as if saved on another machine
+    agent.replay_buffer.model_buffer.device = torch.device("meta")  # as if saved on another machine
     agent.save_replay_buffer(tmp_path / "buffer.pkl")
     other = point_agent(seed=1)
     other.load_replay_buffer(tmp_path / "buffer.pkl")
     for one, again in [
         (agent.replay_buffer, other.replay_buffer),
-        (agent.replay_buffer.model, other.replay_buffer.model),
+        (agent.replay_buffer.model_buffer, other.replay_buffer.model_buffer),
     ]:
         np.testing.assert_array_equal(one.observations, again.observations)
         assert again.size() == one.size() > 0
@@ -544,20 +545,30 @@ def test_parameters_can_be_moved(saved, point_agent, learnt_dynamics):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"dynamics": None}, "needs dynamics to learn; found None"),
-        ({"reward": None}, "needs reward to learn; found None"),
         ({"n_steps": 3}, "no n-step returns; found n_steps=3"),
         ({"replay_buffer_class": dict}, "must be MixedReplayBuffer .*found dict"),
         ({"optimize_memory_usage": True}, "optimize_memory_usage"),
-        ({"real_fraction": 2}, r"real_fraction must lie in \[0, 1\]; found 2"),
+        ({"real_fraction": 2}, r"real_fraction must be in \[0, 1\]; found 2"),
+        ({"updates_per_model_step": float("inf")}, "must be finite and at least 0; found inf"),
+        ({"state_bounds": torch.ones(2, 4)}, r"state_bounds must be of shape 2 x 1"),
+        (
+            {"state_bounds": torch.tensor([[1.0], [-1.0]])},
+            r"below its upper one; found",
+        ),
         ({"model_buffer_size": -1}, "model_buffer_size must be at least 1; found -1"),
-        ({"model_trials": -1}, "model_trials must be at least 0; found -1"),
-        ({"model_updates": -0.5}, "model_updates must be at least 0; found -0.5"),
-        ({"model_updates": float("nan")}, "model_updates must be at least 0; found nan"),
-        ({"model_until": -1}, "model_until must be at least 0; found -1"),
-        ({"trial_length": 0}, "trial_length must be at least 1; found 0"),
+        ({"model_episodes": -1}, "model_episodes must be at least 0; found -1"),
+        (
+            {"updates_per_model_step": -0.5},
+            "updates_per_model_step must be finite and at least 0; found -0.5",
+        ),
+        (
+            {"updates_per_model_step": float("nan")},
+            "updates_per_model_step must be finite and at least 0; found nan",
+        ),
+        ({"last_model_episode": -1}, "last_model_episode must be at least 0; found -1"),
+        ({"episode_length": 0}, "episode_length must be at least 1; found 0"),
         ({"num_particles": 0}, "num_particles must be at least 1; found 0"),
-        ({"particles": "swarm"}, "Unknown particles 'swarm'"),
+        ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
         ({"gradient_steps": 0}, "gradient_steps"),
     ],
 )
@@ -570,12 +581,15 @@ def test_bad_arguments_are_refused(point_agent, options, message):
     ("options", "message"),
     [
         ({"dynamics": "cka"}, "dynamics must be an object of a Dynamics; found 'cka'"),
+        ({"reward": None}, "reward must be a function .*found None"),
+        ({"keep_model_data": 1}, "keep_model_data must be True or False; found 1"),
+        ({"episode_length": 2.5}, "episode_length must be a whole number; found 2.5"),
         ({"reward": 1.0}, "reward must be a function; found 1.0"),
         ({"reward": lambda states: states}, r"reward is called with 3 .*found reward\(states\)"),
         ({"terminated": lambda: None}, r"terminated is called with 1 .*found terminated\(\)"),
         ({"initial_states": torch.ones(3, 1)}, "initial_states must be a function"),
-        ({"model_trials": 2.5}, "model_trials must be a whole number; found 2.5"),
-        ({"model_updates": "2"}, "model_updates must be a number; found '2'"),
+        ({"model_episodes": 2.5}, "model_episodes must be a whole number; found 2.5"),
+        ({"updates_per_model_step": "2"}, "updates_per_model_step must be a number; found '2'"),
         ({"reward_tolerance": "no"}, "reward_tolerance must be a number; found 'no'"),
     ],
 )
@@ -637,11 +651,11 @@ def test_noisy_rewards_may_be_tolerated(point_agent, point_reward):
     with pytest.raises(ValueError, match="raise reward_tolerance; None checks nothing"):
         point_agent(reward=noisy).learn(5)
     for tolerance in (0.1, None):
-        assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_trials == 1
+        assert point_agent(reward=noisy, reward_tolerance=tolerance).learn(5).num_episodes == 1
 
 
 def test_a_time_limit_put_around_by_hand_is_read(point_agent):
-    agent = point_agent(trial_length=None).learn(5)
+    agent = point_agent(episode_length=None).learn(5)
     assert model_rows(agent) == 2 * 5
 
 
@@ -651,8 +665,8 @@ def test_several_environments_cannot_train_by_episodes(point_agent, point_env):
 
 
 def test_an_unknown_time_limit_is_refused(point_agent, point_env):
-    with pytest.raises(ValueError, match=r"no time limit .*pass trial_length"):
-        point_agent(point_env().unwrapped, trial_length=None).learn(5)
+    with pytest.raises(ValueError, match=r"no time limit .*give the task an episode_length"):
+        point_agent(point_env().unwrapped, episode_length=None).learn(5)
 
 
 def test_a_model_without_starts_is_refused(point_agent):
@@ -673,7 +687,7 @@ def test_states_that_are_no_numbers_never_reach_the_buffer(point_agent, point_dy
         return following
 
     point_dynamics.sample = broken
-    agent = point_agent(model_trials=3).learn(10)
-    assert np.isfinite(agent.replay_buffer.model.next_observations).all()
+    agent = point_agent(model_episodes=3).learn(10)
+    assert np.isfinite(agent.replay_buffer.model_buffer.next_observations).all()
     assert model_rows(agent) == 2 * 2 * 5
     assert all(p.isfinite().all() for p in agent.policy.parameters())

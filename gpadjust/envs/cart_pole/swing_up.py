@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.envs.cart_pole import (
+from gpadjust.envs.cart_pole.system import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
     REAL_CART_POLE,
@@ -20,7 +20,7 @@ from gpadjust.envs.cart_pole import (
     cart_pole_cost,
     equation_physics,
 )
-from gpadjust.envs.cart_pole_view import CartPoleView
+from gpadjust.envs.cart_pole.view import CartPoleView
 from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv, checked_options
 
 MAX_FORCE = 10.0

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.opensim_model import controls, load_opensim
-from gpadjust.envs.torque_arm import ARM_TIME_STEP
+from gpadjust.envs.arm.opensim_model import controls, load_opensim
+from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP
 
 
 class ArmSimulation:
@@ -21,7 +21,7 @@ class ArmSimulation:
 
     Args:
         build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` and
-            :func:`build_torque_arm` do (:mod:`gpadjust.envs.opensim_model`): a
+            :func:`build_torque_arm` do (:mod:`gpadjust.envs.arm.opensim_model`): a
             ``functools.partial`` of one of these can be pickled.
         accuracy: The relative accuracy of the integrator.
 
@@ -31,8 +31,8 @@ class ArmSimulation:
 
     Example:
         >>> from functools import partial
-        >>> from gpadjust.envs.opensim_model import build_torque_arm
-        >>> from gpadjust.envs.torque_arm import REAL_ARM
+        >>> from gpadjust.envs.arm.opensim_model import build_torque_arm
+        >>> from gpadjust.envs.arm.torque_arm import REAL_ARM
         >>> simulation = ArmSimulation(partial(build_torque_arm, REAL_ARM), accuracy=1e-6)
         >>> simulation.step(np.array([0.6, 1.1, 0.0, 0.0]), np.zeros(2)).round(6)
         array([0.6, 1.1, 0. , 0. ])

@@ -1,4 +1,4 @@
-"""Steps of many particles, of which some may be where the physics fails."""
+"""Steps of many states, at some of which the physics may fail."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from gpadjust.physics import PhysicsError
 
 
-def sound_steps(
+def step_or_nan(
     move: Callable[[Tensor, Tensor], Tensor],
     states: Tensor,
     actions: Tensor,
@@ -41,7 +41,7 @@ def sound_steps(
             if failed.all():
                 return torch.full_like(states, torch.nan)
             # They are evaluated with the others, at a place where the physics does not fail.
-            sound = int((~failed).nonzero()[0])
-            states[failed], actions[failed] = states[sound], actions[sound]
+            working = int((~failed).nonzero()[0])
+            states[failed], actions[failed] = states[working], actions[working]
         else:
             return following.masked_fill(failed.unsqueeze(-1), torch.nan)

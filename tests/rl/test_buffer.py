@@ -23,7 +23,7 @@ def buffer():
         for i in range(1, num_real + 1):
             made.add(*real_row(i, n_envs))
         if num_model:
-            made.model.extend(*rows(np.arange(-1, -num_model - 1, -1)))
+            made.model_buffer.add_rows(*rows(np.arange(-1, -num_model - 1, -1)))
         return made
 
     return make
@@ -83,17 +83,17 @@ def test_terminations_by_the_time_limit_are_not_dones(buffer):
     made = buffer(0, 0)
     obs, following, actions, rewards, _, _ = rows(np.arange(1, 4))
     dones, timeouts = np.array([0, 1, 1], dtype=bool), np.array([0, 0, 1], dtype=bool)
-    made.model.extend(obs, following, actions, rewards, dones, timeouts)
+    made.model_buffer.add_rows(obs, following, actions, rewards, dones, timeouts)
     batch = made.sample(64)
     np.testing.assert_array_equal(batch.dones, batch.rewards == 2)
 
 
 @pytest.mark.parametrize("chunks", [[3, 4], [7, 2, 5], [10], [4, 10], [3, 23], [25, 1], [0, 2]])
-def test_extend_keeps_the_newest_rows_in_order(buffer, chunks):
-    many, one = buffer(model_buffer_size=10).model, buffer(buffer_size=10)
+def test_add_rows_keeps_the_newest_rows_in_order(buffer, chunks):
+    many, one = buffer(model_buffer_size=10).model_buffer, buffer(buffer_size=10)
     start = 1
     for size in chunks:
-        many.extend(*rows(np.arange(start, start + size)))
+        many.add_rows(*rows(np.arange(start, start + size)))
         start += size
     for i in range(1, start):
         one.add(*real_row(i))
@@ -110,14 +110,14 @@ def test_extend_keeps_the_newest_rows_in_order(buffer, chunks):
     assert in_order(many) == in_order(one)
 
 
-def test_extend_is_for_one_environment(buffer):
+def test_add_rows_is_for_one_environment(buffer):
     with pytest.raises(ValueError, match="one environment; found 2"):
-        buffer(n_envs=2).extend(*rows(np.arange(3)))
+        buffer(n_envs=2).add_rows(*rows(np.arange(3)))
 
 
 def test_several_real_environments(buffer):
     made = buffer(6, 6, n_envs=2, buffer_size=20, real_fraction=0.5)
-    assert made.model.n_envs == 1
+    assert made.model_buffer.n_envs == 1
     assert int((made.sample(10).rewards > 0).sum()) == 5
 
 
@@ -128,12 +128,12 @@ def test_a_copy_goes_on_as_the_buffer_would(buffer, num_rows, copied):
     again = copied(made)
     for side in (made, again):
         side.add(*real_row(99))
-        side.model.extend(*rows(np.array([-98, -99])))
+        side.model_buffer.add_rows(*rows(np.array([-98, -99])))
         np.random.seed(1)  # noqa: NPY002
         side.batch = side.sample(40)
     for one, other in zip(made.batch[:-1], again.batch[:-1], strict=True):
         np.testing.assert_array_equal(one, other)
-    for one, other in [(made, again), (made.model, again.model)]:
+    for one, other in [(made, again), (made.model_buffer, again.model_buffer)]:
         assert (one.pos, one.full) == (other.pos, other.full)
         np.testing.assert_array_equal(one.observations, other.observations)
 
@@ -165,7 +165,7 @@ def test_samples_are_normalised(buffer, point_env):
 def test_reset_empties_both(buffer):
     made = buffer(5, 5)
     made.reset()
-    assert made.size() == made.model.size() == 0
+    assert made.size() == made.model_buffer.size() == 0
 
 
 @pytest.mark.parametrize(

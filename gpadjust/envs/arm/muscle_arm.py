@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm_simulation import ArmSimulation
-from gpadjust.envs.arm_task import MAX_TARGET, START_MEAN, START_STD, angle_error, hand_distance_cm
-from gpadjust.envs.arm_view import ArmView
-from gpadjust.envs.opensim_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION, build_muscle_arm
-from gpadjust.envs.torque_arm import ARM_TIME_STEP, REAL_ARM
+from gpadjust.envs.arm.opensim_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION, build_muscle_arm
+from gpadjust.envs.arm.simulation import ArmSimulation
+from gpadjust.envs.arm.task import MAX_TARGET, START_MEAN, START_STD, angle_error, hand_distance_cm
+from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, REAL_ARM
+from gpadjust.envs.arm.view import ArmView
 from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv, checked_options
 
 # The arm itself stays within 3 rad and 20 rad/s.
@@ -39,8 +39,9 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
     should be. An episode does not terminate; ``gym.make`` truncates it after 15 steps. It starts
     at rest around 35° and 65° with a standard deviation of 5°, targets are from U(0°, 100°) each.
 
-    Should an integration fail, the step warns, leaves the arm where it was and truncates the
-    episode, with ``info["integration_failed"]``.
+    The ``info`` of each step has ``"step_failed"``. Should an integration fail it is True, and the
+    step warns and truncates the episode. Its observation and reward are then those of the state
+    before, and are no data.
 
     Environments can be pickled at any time and go on as they were, with their random state.
 
@@ -129,7 +130,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
 
         Returns:
             Observation, reward, False, whether the integration failed, and
-            ``{"hand_distance_cm": ..., "integration_failed": ...}``.
+            ``{"hand_distance_cm": ..., "step_failed": ...}``.
 
         Raises:
             ValueError: If the action is not four finite numbers.
@@ -162,7 +163,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
         reward = -angle_error(state).item()
         info = {
             "hand_distance_cm": hand_distance_cm(state).item(),
-            "integration_failed": self._failed,
+            "step_failed": self._failed,
         }
         return self.state.astype(np.float32), reward, False, self._failed, info
 

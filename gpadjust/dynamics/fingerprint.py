@@ -9,11 +9,11 @@ from typing import Any
 from gpadjust.dynamics.base import Dynamics
 
 
-def identity(dynamics: Dynamics, **settings: Any) -> dict[str, str]:
+def fingerprint(dynamics: Dynamics, **settings: Any) -> dict[str, str]:
     """Class, spec and settings of dynamics, each as a text.
 
     A setting that is a mapping counts by its items. Modules, functions and other objects that have
-    no value to compare are named by their class.
+    no value to compare are named by their class, classes by their name.
     """
     texts = {"class": type(dynamics).__name__}
     for name, value in {**asdict(dynamics.spec), **settings}.items():
@@ -25,18 +25,18 @@ def identity(dynamics: Dynamics, **settings: Any) -> dict[str, str]:
     return texts
 
 
-def check_identity(state: dict[str, Any], expected: dict[str, str]) -> None:
+def check_fingerprint(state: dict[str, Any], expected: dict[str, str]) -> None:
     """Raise a RuntimeError, as PyTorch does, if a state is of other dynamics.
 
     The state of dynamics that learnt nothing is empty, and fits all.
     """
     if not state:
         return
-    found = state.get("identity")
+    found = state.get("fingerprint")
     if found is None:
         raise RuntimeError(
             "The state does not say of what dynamics it is; expected one that `state_dict` gave, "
-            f"with an 'identity'. It holds {sorted(map(str, state))}."
+            f"with a 'fingerprint'. It holds {sorted(map(str, state))}."
         )
     names = [name for name in {**expected, **found} if found.get(name) != expected.get(name)]
     if names:
@@ -59,4 +59,4 @@ def _text(value: Any) -> str:
         return repr(float(value))  # NumPy's print their type
     if value is None or isinstance(value, (bool, int, str)):
         return repr(value)
-    return f"<{type(value).__name__}>"
+    return value.__name__ if isinstance(value, type) else f"<{type(value).__name__}>"

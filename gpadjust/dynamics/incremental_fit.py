@@ -1,15 +1,16 @@
-"""Hyper-parameters of a model that has more data than the one before it."""
+"""Fitting the models of data that grow, each from where the one before it was."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 
 from gpadjust.inference import FitResult, fit
-from gpadjust.inference.fitting import FitOptions
+from gpadjust.inference.fitting import FitOptions, check_options
 from gpadjust.inference.objective import Objective
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models import ExactGPBase
@@ -17,6 +18,21 @@ from gpadjust.models import ExactGPBase
 _SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
 _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
 _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=15)
+
+
+def checked_fit_options(options: FitOptions | None) -> FitOptions:
+    """The options of the first fit, once they are found to be right."""
+    if options is not None and not isinstance(options, Mapping):
+        raise TypeError(
+            f"Expected fit_options as a dictionary of options of gpadjust.fit, found {options!r}."
+        )
+    if "method" in (options or {}):
+        raise ValueError(
+            "Dynamics are fitted by method 'map', a point estimate that each update goes on from; "
+            "leave 'method' out of fit_options. For full Bayes, fit a model of the targets itself."
+        )
+    check_options("map", {**(options or {})})
+    return {**(options or {})}
 
 
 def search_rows(observed: Tensor) -> Tensor | None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.torque_arm import REAL_ARM
+from gpadjust.envs.arm.torque_arm import REAL_ARM
 from gpadjust.envs.view import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, Colour, View
 
 WIDTH, HEIGHT = 480, 400

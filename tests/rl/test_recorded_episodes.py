@@ -1,4 +1,4 @@
-"""What a buffer tells of the real trials."""
+"""What a buffer tells of the real episodes."""
 
 import math
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
 
-from gpadjust.dynamics import StateSpec
-from gpadjust.rl.recorded_trials import RecordedTrials
+from gpadjust.control import Task
+from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.rl import MixedReplayBuffer
+from gpadjust.rl.recorded_episodes import RecordedEpisodes
 
 SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
 ACTIONS = spaces.Box(-4, 4, (1,))
@@ -25,19 +26,19 @@ class Policy:
 
 @pytest.fixture
 def recorded():
-    """Records steps 0, 1, ... of trials of so many steps; `x` is the step, plus 100 per env."""
+    """Records steps 0, 1, ... of episodes of so many steps; `x` is the step, plus 100 per env."""
 
-    def record(num_steps, trial_length=3, n_envs=1, capacity=100, newest=None, terminal=False):
-        buffer = ReplayBuffer(
+    def record(num_steps, episode_length=3, n_envs=1, capacity=100, newest=None, terminal=False):
+        buffer = MixedReplayBuffer(
             capacity * n_envs, spaces.Box(-np.inf, np.inf, (3,)), ACTIONS, "cpu", n_envs
         )
         for t in range(num_steps):
             x = t + 100.0 * np.arange(n_envs)
             obs, following = observe(x), observe(x + 0.5)
-            done = (t + 1) % trial_length == 0
+            done = (t + 1) % episode_length == 0
             infos = [{"TimeLimit.truncated": done and not terminal}] * n_envs
             buffer.add(obs, following, np.full((n_envs, 1), 0.25), -x, np.full(n_envs, done), infos)
-        return RecordedTrials(buffer, Policy(), SPEC, newest)
+        return RecordedEpisodes(buffer, Policy(), SPEC, newest)
 
     return record
 
@@ -50,16 +51,21 @@ def reward(states, actions, next_states):
     return -states[:, 0]
 
 
+def task(reward=reward, terminated=None):
+    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :2])
+    return Task(dynamics, reward, terminated=terminated)
+
+
 def test_rows_are_states_and_actions_in_the_users_units(recorded):
-    trials = recorded(4)
+    episodes = recorded(4)
     expected = torch.arange(4.0).double()
-    assert trials.states.dtype == trials.actions.dtype == torch.float64
-    assert torch.equal(trials.states[:, 0], expected)
+    assert episodes.states.dtype == episodes.actions.dtype == torch.float64
+    assert torch.equal(episodes.states[:, 0], expected)
     angle = torch.atan2(expected.sin(), expected.cos())
-    assert torch.allclose(trials.states[:, 1], angle, atol=1e-6)
-    assert torch.equal(trials.next_states[:, 0], expected + 0.5)
-    assert torch.equal(trials.actions, torch.ones(4, 1).double())
-    assert torch.equal(trials.rewards, -expected)
+    assert torch.allclose(episodes.states[:, 1], angle, atol=1e-6)
+    assert torch.equal(episodes.next_states[:, 0], expected + 0.5)
+    assert torch.equal(episodes.actions, torch.ones(4, 1).double())
+    assert torch.equal(episodes.rewards, -expected)
 
 
 def test_environments_follow_one_another(recorded):
@@ -68,25 +74,25 @@ def test_environments_follow_one_another(recorded):
 
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_a_full_buffer_is_read_from_its_oldest_row(recorded, n_envs):
-    trials = recorded(8, n_envs=n_envs, capacity=5)
-    assert trials.num_transitions == 5 * n_envs
-    assert trials.states[:5, 0].tolist() == [3, 4, 5, 6, 7]
+    episodes = recorded(8, n_envs=n_envs, capacity=5)
+    assert episodes.num_transitions == 5 * n_envs
+    assert episodes.states[:5, 0].tolist() == [3, 4, 5, 6, 7]
 
 
 @pytest.mark.parametrize(("newest", "expected"), [(2, [6, 7]), (0, []), (99, [3, 4, 5, 6, 7])])
 def test_the_newest_rows_alone(recorded, newest, expected):
-    trials = recorded(8, capacity=5, newest=newest)
-    assert trials.states[:, 0].tolist() == expected
+    episodes = recorded(8, capacity=5, newest=newest)
+    assert episodes.states[:, 0].tolist() == expected
 
 
-def starts_of(trials):
-    return sorted(set(trials.draw_starts(200)[:, 0].tolist()))
+def starts_of(episodes):
+    return sorted(set(episodes.draw_starts(200)[:, 0].tolist()))
 
 
-def test_starts_are_those_of_trials(recorded):
-    trials = recorded(8, n_envs=2)
-    assert starts_of(trials) == [0, 3, 6, 100, 103, 106]
-    assert trials.draw_starts(5).shape == (5, 2)
+def test_starts_are_those_of_episodes(recorded):
+    episodes = recorded(8, n_envs=2)
+    assert starts_of(episodes) == [0, 3, 6, 100, 103, 106]
+    assert episodes.draw_starts(5).shape == (5, 2)
 
 
 def test_the_oldest_row_of_a_full_buffer_may_be_no_start(recorded):
@@ -94,7 +100,7 @@ def test_the_oldest_row_of_a_full_buffer_may_be_no_start(recorded):
 
 
 def test_without_a_start_in_the_buffer_the_oldest_row_serves(recorded):
-    assert starts_of(recorded(8, capacity=4, trial_length=20)) == [4]
+    assert starts_of(recorded(8, capacity=4, episode_length=20)) == [4]
 
 
 def test_bounds_are_far_beyond_what_was_seen(recorded):
@@ -105,8 +111,8 @@ def test_bounds_are_far_beyond_what_was_seen(recorded):
 
 
 def test_the_environments_functions_pass(recorded):
-    recorded(6).check(reward, None)
-    recorded(6, terminal=True).check(reward, lambda states: (states[:, 0] % 3) > 2)
+    recorded(6).check(task())
+    recorded(6, terminal=True).check(task(terminated=lambda states: (states[:, 0] % 3) > 2))
 
 
 def test_a_wrong_reward_is_shown_by_its_worst_transition(recorded):
@@ -114,20 +120,20 @@ def test_a_wrong_reward_is_shown_by_its_worst_transition(recorded):
         return torch.where(states[:, 0] == 2, 5.0, -states[:, 0])
 
     with pytest.raises(ValueError, match=r"transition 2 gave -2, but the function says 5") as error:
-        recorded(4).check(wrong, None)
+        recorded(4).check(task(wrong))
     assert "actions[2] = [1.0]" in str(error.value)
 
 
 def test_a_reward_of_another_shape_is_refused(recorded):
     with pytest.raises(ValueError, match=r"reward must return one value per row, shape \(4,\)"):
-        recorded(4).check(lambda states, actions, next_states: states, None)
+        recorded(4).check(task(lambda states, actions, next_states: states))
 
 
 def test_terminations_that_were_not_told_are_refused(recorded):
     with pytest.raises(ValueError, match=r"transition 2 .*terminated=True, but none was given"):
-        recorded(4, terminal=True).check(reward, None)
+        recorded(4, terminal=True).check(task())
 
 
 def test_wrong_terminations_are_refused(recorded):
     with pytest.raises(ValueError, match=r"transition 1 .*terminated=False, but the function says"):
-        recorded(4).check(reward, lambda states: states[:, 0] == 1.5)
+        recorded(4).check(task(terminated=lambda states: states[:, 0] == 1.5))

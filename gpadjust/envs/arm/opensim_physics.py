@@ -7,9 +7,9 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm_simulation import ArmSimulation
-from gpadjust.envs.opensim_model import build_torque_arm
-from gpadjust.envs.torque_arm import ArmEquation, torque_arm
+from gpadjust.envs.arm.opensim_model import build_torque_arm
+from gpadjust.envs.arm.simulation import ArmSimulation
+from gpadjust.envs.arm.torque_arm import ArmEquation, torque_arm
 from gpadjust.physics import BlackBoxPhysics
 
 FD_STEP = 1e-3  # in rad, rad/s and 1: far above the error of the integration

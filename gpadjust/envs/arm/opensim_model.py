@@ -8,7 +8,7 @@ from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
-from gpadjust.envs.torque_arm import ArmEquation
+from gpadjust.envs.arm.torque_arm import ArmEquation
 
 JOINTS = ("shoulder", "elbow")
 LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow

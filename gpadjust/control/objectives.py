@@ -1,0 +1,104 @@
+"""What a sequence of actions is worth."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gpadjust.control.rollouts import Rollout
+from gpadjust.control.task import Task
+from gpadjust.dynamics.trajectory_information import TrajectoryInformation, check_informative
+
+Past = tuple[Tensor, Tensor]
+"""States ``t x state_dim`` and actions ``t x action_dim`` of an episode so far."""
+
+Score = Callable[[Rollout, Past | None], Tensor]
+"""The worth ``n`` of the ``n`` sequences of a rollout, higher is better."""
+
+
+class Objective(ABC):
+    """What a planner looks for."""
+
+    def check(self, task: Task) -> None:  # noqa: B027 - most need nothing
+        """Raise a TypeError if the task's dynamics cannot tell this worth."""
+
+    @abstractmethod
+    def of(self, task: Task) -> Score:
+        """The worth of rollouts in a task, as its dynamics stand."""
+
+
+@dataclass(frozen=True)
+class Information(Objective):
+    """What the transitions of an episode would tell about the dynamics, in nats.
+
+    It is :class:`~gpadjust.dynamics.TrajectoryInformation`, averaged over the functions; steps of
+    the past, which were made and not learnt yet, count with those ahead.
+
+    What is informative need not matter for the task: bound the states that are worth knowing
+    (``state_bounds`` of the task).
+    """
+
+    def check(self, task: Task) -> None:
+        """Raise a TypeError unless the dynamics can tell what transitions teach."""
+        check_informative(task.dynamics)
+
+    def of(self, task: Task) -> Score:
+        """The information of rollouts.
+
+        Raises:
+            TypeError: If the dynamics cannot tell what transitions teach.
+            RuntimeError: If they have learnt nothing yet.
+        """
+        information = TrajectoryInformation(task.dynamics)
+
+        def score(rollout: Rollout, past: Past | None) -> Tensor:
+            steps = _without_failures(rollout)
+            if not rollout.made.any():
+                return torch.zeros(rollout.made.shape[1], dtype=torch.float64)
+            if past is not None:
+                done = (*past, torch.ones(len(past[0]), dtype=torch.bool))
+                steps = tuple(_prepend(*parts) for parts in zip(done, steps, strict=True))
+            return information(*steps).mean(0)
+
+        return score
+
+
+@dataclass(frozen=True)
+class Return(Objective):
+    """The sum of rewards of the steps ahead, averaged over the functions.
+
+    An episode that leaves the bounds gets the worst reward among all rollouts for each step that it
+    does not make, so that leaving never pays.
+    """
+
+    def of(self, task: Task) -> Score:
+        """The return of rollouts; what has been is the same for all."""
+
+        def score(rollout: Rollout, past: Past | None) -> Tensor:
+            made = rollout.made
+            worst = rollout.rewards[made].min() if made.any() else rollout.rewards.new_zeros(())
+            lost = rollout.left_bounds.unsqueeze(-1) & ~made
+            rewards = rollout.rewards.masked_fill(~made, 0.0)
+            return torch.where(lost, worst, rewards).double().sum(-1).mean(0)
+
+        return score
+
+
+def _without_failures(rollout: Rollout) -> tuple[Tensor, ...]:
+    """States, actions and which were made; others are put where the physics does not fail."""
+    states, actions, made = rollout.states, rollout.actions, rollout.made
+    if made.all() or not made.any():
+        return states, actions, made
+    working = tuple(made.nonzero()[0])
+    lost = ~made.unsqueeze(-1)
+    states = torch.where(lost, states[working], states)
+    return states, torch.where(lost, actions[working], actions), made
+
+
+def _prepend(done: Tensor, ahead: Tensor) -> Tensor:
+    """Steps ``t x ...`` before those of all episodes, ``k x n x T x ...``."""
+    return torch.cat([done.expand(*ahead.shape[:2], *done.shape), ahead], dim=2)

@@ -1,0 +1,225 @@
+"""What is known of a system and of what it is to do."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.control.step_or_nan import step_or_nan
+from gpadjust.dynamics import Dynamics
+
+Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
+Termination = Callable[[Tensor], Tensor]
+InitialStates = Callable[[int], Tensor]
+
+
+class Step(NamedTuple):
+    """What a step from ``N`` states gave.
+
+    Args:
+        next_states: ``N x state_dim``; the old state where the step left the bounds.
+        rewards: ``N``; where it did, that of staying.
+        terminated: ``N`` booleans: whether the next state ends the episode; not where it left.
+        left_bounds: ``N`` booleans: whether it would have left the bounds or the finite numbers, or
+            the physics failed.
+    """
+
+    next_states: Tensor
+    rewards: Tensor
+    terminated: Tensor
+    left_bounds: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is known of a system and of what it is to do, said once.
+
+    All tensors are float64, in the units of ``dynamics.spec``. What is left out a learner takes
+    from its environment and the real episodes that it has seen.
+
+    Args:
+        dynamics: The model of the real system.
+        reward: Known rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
+            states ``N x state_dim``.
+        terminated: Whether states ``N x state_dim`` end an episode, ``N`` booleans. Default: none.
+        initial_states: Draws ``n`` states, ``n x state_dim``, at which episodes start. Default:
+            those at which real episodes started.
+        episode_length: Steps after which an episode is truncated. Default: the time limit of the
+            environment.
+        state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
+            model is not followed; infinite where there is none. Default: far beyond all that was
+            seen.
+
+    Raises:
+        TypeError: If something is of another kind, or a function takes other arguments.
+        ValueError: If a number or the bounds are out of range.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.control import Task
+        >>> from gpadjust.dynamics import LearnedDynamics, StateSpec
+        >>> dynamics = LearnedDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 0.1 * X[:, 1:])
+        >>> task = Task(dynamics, lambda states, actions, next_states: -next_states[:, 0].square())
+    """
+
+    dynamics: Dynamics
+    reward: Reward
+    _: KW_ONLY
+    terminated: Termination | None = None
+    initial_states: InitialStates | None = None
+    episode_length: int | None = None
+    state_bounds: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a state."""
+        if not isinstance(self.dynamics, Dynamics):
+            raise TypeError(f"dynamics must be an object of a Dynamics; found {self.dynamics!r}.")
+        if self.reward is None:
+            raise TypeError(
+                "reward must be a function of states, actions, next states; found None."
+            )
+        for name, arguments in (("reward", 3), ("terminated", 1), ("initial_states", 1)):
+            _check_function(getattr(self, name), name, arguments)
+        length = self.episode_length
+        if length is not None and (not isinstance(length, int) or isinstance(length, bool)):
+            raise TypeError(f"episode_length must be a whole number; found {length!r}.")
+        if length is not None and length < 1:
+            raise ValueError(f"episode_length must be at least 1; found {length}.")
+        if self.state_bounds is not None:
+            bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
+            object.__setattr__(self, "state_bounds", bounds)
+
+    def rehearse(self, states: Tensor) -> None:
+        """Call the functions once at states ``N x state_dim``, to find what is wrong with them now.
+
+        Raises:
+            ValueError: If they return another shape, or numbers that are not finite.
+        """
+        if self.initial_states is not None:
+            states = self.draw_initial_states(len(states))
+        actions = states.new_zeros(len(states), self.dynamics.spec.action_dim)
+        self.rewards(states, actions, states)
+        self.terminations(states)
+
+    def draw_initial_states(self, n: int) -> Tensor:
+        """Draw ``n x state_dim`` states at which episodes start.
+
+        Raises:
+            ValueError: If there is no function that draws them, or they have another shape, or are
+                not finite.
+        """
+        if self.initial_states is None:
+            raise ValueError("The task does not say where episodes start; pass initial_states.")
+        states = torch.as_tensor(self.initial_states(n), dtype=torch.float64)
+        if states.shape != (n, self.dynamics.spec.state_dim):
+            raise ValueError(
+                f"initial_states({n}) must return states of shape {n} x "
+                f"{self.dynamics.spec.state_dim}; found {tuple(states.shape)}."
+            )
+        if not states.isfinite().all():
+            row = int((~states.isfinite()).any(-1).nonzero()[0])
+            raise ValueError(
+                f"initial_states({n}) must return finite states; found {states[row].tolist()}."
+            )
+        return states
+
+    def rewards(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+        """The known rewards ``N`` of transitions, checked."""
+        return _per_row(self.reward(states, actions, next_states), len(states), "reward")
+
+    def terminations(self, states: Tensor) -> Tensor:
+        """Whether states ``N x state_dim`` end an episode, checked: ``N`` booleans."""
+        if self.terminated is None:
+            return torch.zeros(len(states), dtype=torch.bool)
+        return _per_row(self.terminated(states), len(states), "terminated").bool()
+
+    def step(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        move: Callable[[Tensor, Tensor], Tensor] | None = None,
+        *,
+        some_must_succeed: bool = False,
+    ) -> Step:
+        """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
+
+        Args:
+            states: The states.
+            actions: The actions.
+            move: Next states of these. Default: drawn from the dynamics, row by row.
+            some_must_succeed: Whether it is an error that the physics fails for all rows.
+
+        Raises:
+            PhysicsError: If the physics does not say where it fails; or fails everywhere, though it
+                must not.
+        """
+        move = self.dynamics.sample if move is None else move
+        following = step_or_nan(move, states, actions, some_must_succeed=some_must_succeed)
+        left = ~following.isfinite().all(-1)
+        if self.state_bounds is not None:
+            low, high = self.state_bounds
+            left |= ((following < low) | (following > high)).any(-1)
+        following = torch.where(left.unsqueeze(-1), states, following)
+        rewards = self.rewards(states, actions, following)
+        return Step(following, rewards, self.terminations(following) & ~left, left)
+
+    def describe(self) -> dict[str, Any]:
+        """What the task is, in plain values: of functions, whether there is one."""
+        bounds = self.state_bounds
+        return {
+            **{f"dynamics.{name}": text for name, text in self.dynamics.describe().items()},
+            "terminated": self.terminated is not None,
+            "initial_states": self.initial_states is not None,
+            "episode_length": self.episode_length,
+            "state_bounds": None if bounds is None else bounds.tolist(),
+        }
+
+
+def _per_row(values: Any, n: int, name: str) -> Tensor:
+    """Check what a function of the user's says of ``n`` rows."""
+    values = torch.as_tensor(values).detach()
+    if values.shape != (n,):
+        raise ValueError(
+            f"{name} must return one value per row, shape ({n},); found {tuple(values.shape)}."
+        )
+    if not values.isfinite().all():
+        row = int((~values.isfinite()).nonzero()[0])
+        raise ValueError(f"{name} returned {values[row]} for row {row}; expected finite numbers.")
+    return values
+
+
+def _checked_bounds(bounds: Any, state_dim: int) -> Tensor:
+    bounds = torch.as_tensor(bounds, dtype=torch.float64)
+    if bounds.shape != (2, state_dim):
+        raise ValueError(
+            f"state_bounds must be of shape 2 x {state_dim}, lower ones and then upper ones; found "
+            f"{tuple(bounds.shape)}."
+        )
+    if not (bounds[0] < bounds[1]).all():  # NaN is not, either
+        raise ValueError(
+            f"Each lower one of state_bounds must be below its upper one; found {bounds.tolist()}."
+        )
+    return bounds
+
+
+def _check_function(function: Any, name: str, num_arguments: int) -> None:
+    """Raise a TypeError unless a function of the user's takes what it will be given, or is None."""
+    if function is None:
+        return
+    if not callable(function):
+        raise TypeError(f"{name} must be a function; found {function!r}.")
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # some compiled functions have none
+        return
+    try:
+        signature.bind(*range(num_arguments))
+    except TypeError as error:
+        raise TypeError(
+            f"{name} is called with {num_arguments} argument(s); found {name}{signature}."
+        ) from error

@@ -1,0 +1,166 @@
+"""How the model of some transitions is built."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from copy import deepcopy
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Module
+
+from gpadjust.dynamics.angle_input import AngleInput
+from gpadjust.dynamics.next_state_physics import parts_of, warn_of_differences
+from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
+from gpadjust.dynamics.transitions import Transitions
+from gpadjust.models import ExactGPBase
+from gpadjust.physics import Physics, as_physics
+
+_OWN = ("train_X", "train_Y", "train_Yvar", "physics", "input_transform")
+
+
+class ModelRecipe:
+    """Builds the models of dynamics, and asks their physics about transitions.
+
+    Args:
+        targets: What the models learn.
+        physics: The physics of next states, or None.
+        model: The class of the models.
+        options: Further arguments of the class.
+        encode_angles: Whether the models read the sine and cosine of angles.
+
+    Raises:
+        TypeError: If ``model`` is no class of models, needs a physics that is missing or takes none
+            that is given, or ``options`` is no mapping.
+        ValueError: If the class does not take an option, or needs one.
+    """
+
+    def __init__(
+        self,
+        targets: TransitionTargets,
+        physics: Physics | None,
+        model: type[ExactGPBase],
+        options: Mapping[str, Any] | None,
+        encode_angles: bool,
+    ) -> None:
+        self.targets = targets
+        self.model_class = model
+        self.options = checked_options(model, physics is not None, options)
+        self.parts = {
+            name: TransitionPhysics(part, targets)
+            for name, part in ({} if physics is None else parts_of(physics)).items()
+        }
+        self.physics = as_physics(self.parts) if self.parts else None
+        self.columns = targets.angles if encode_angles else []
+
+    def build(self, data: Transitions, quiet: bool) -> ExactGPBase:
+        """The model of some transitions; quiet where the first one has given its warnings."""
+        options = {
+            name: deepcopy(value) if isinstance(value, Module) else value
+            for name, value in self.options.items()
+        }
+        if self.physics is not None:
+            options["physics"] = self.physics
+        if self.columns:
+            options["input_transform"] = AngleInput(self.columns)
+        with warnings.catch_warnings():
+            if quiet:
+                warnings.simplefilter("ignore")
+            make: Callable[..., ExactGPBase] = self.model_class
+            return make(*self._rows(data), **options)
+
+    def condition(self, model: ExactGPBase, data: Transitions) -> ExactGPBase:
+        """The model with further transitions, its hyper-parameters as they are."""
+        with torch.no_grad():
+            return model.condition_on_observations(*self._rows(data))
+
+    def physics_at(self, data: Transitions) -> Tensor | None:
+        """What the physics says of the targets, those of its parts side by side."""
+        if self.physics is None:
+            return None
+        with torch.no_grad():
+            return self.physics(self.targets.inputs(data.states, data.actions))
+
+    def tell_physics(self, data: Transitions, known: Tensor | None) -> None:
+        """Give the physics its values at some transitions, so that it need not run there again."""
+        inputs = self.targets.inputs(data.states, data.actions)
+        for part, own in self._of_parts(known):
+            part.know(inputs, own)
+
+    def compare_physics(self, data: Transitions, known: Tensor | None) -> None:
+        """Warn of a physics that returns differences."""
+        predicted = self.targets.spec.predicted
+        for part, own in self._of_parts(known):
+            change = self.targets.decode(data.states, own) - data.states[:, predicted]
+            name = next(name for name, each in self.parts.items() if each is part)
+            warn_of_differences(name, self.targets.spec, data, predicted, change)
+
+    def _of_parts(self, known: Tensor | None) -> Iterator[tuple[TransitionPhysics, Tensor]]:
+        if known is not None:
+            values = known.split(len(self.targets.predicted), dim=-1)
+            yield from zip(self.parts.values(), values, strict=True)
+
+    def _rows(self, data: Transitions) -> tuple[Tensor, Tensor]:
+        inputs = self.targets.inputs(data.states, data.actions)
+        return inputs, self.targets.encode(data.states, data.next_states)
+
+
+def checked_options(
+    model: type[ExactGPBase], has_physics: bool, options: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """The further arguments of a class of models, once they and the class are found to be right."""
+    if not isinstance(model, type) or not issubclass(model, ExactGPBase):
+        found = f"an instance of {type(model).__name__}" if isinstance(model, Module) else model
+        raise TypeError(
+            "Expected model as a class of gpadjust.models, such as CKA, PhysicsMeanGP or "
+            f"ZeroMeanGP, or one of your own on AdjustedGP; found {found!s}. Its arguments go into "
+            "model_options."
+        )
+    name, takes = model.__name__, arguments_of(model)
+    if takes.get("physics") and not has_physics:
+        raise TypeError(
+            f"{name} adjusts a physics, but none was given: pass `physics`, or take "
+            "model=ZeroMeanGP, which learns without one."
+        )
+    if has_physics and "physics" not in takes:
+        raise TypeError(
+            f"{name} takes no physics, but one was given: leave it out, or take model=CKA, which "
+            "adjusts it."
+        )
+    if options is not None and not isinstance(options, Mapping):
+        raise TypeError(
+            f"Expected model_options as a dictionary of arguments of {name}, found {options!r}."
+        )
+    options = dict(options or {})
+    for option in options:
+        if option in _OWN:
+            raise ValueError(f"model_options may not hold {option!r}, which dynamics set.")
+        if option not in takes:
+            known = ", ".join(each for each in takes if each not in _OWN)
+            raise ValueError(f"{name} does not take {option!r} of model_options; it takes {known}.")
+    missing = [each for each, needed in takes.items() if needed and each not in (*_OWN, *options)]
+    if missing:
+        raise ValueError(f"{name} needs {' and '.join(missing)}; give it in model_options.")
+    return options
+
+
+def arguments_of(model: type) -> dict[str, bool]:
+    """The arguments of a class by name, and whether they are needed.
+
+    Where it passes on whatever else it is given, those of its base class are among them.
+    """
+    found: dict[str, bool] = {}
+    for owner in model.__mro__:
+        if "__init__" not in vars(owner):
+            continue
+        own = [*inspect.signature(vars(owner)["__init__"]).parameters.values()][1:]
+        needed = not found  # what a base class needs is given by the class
+        for each in own:
+            if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY):
+                found.setdefault(each.name, needed and each.default is each.empty)
+        if not any(each.kind is each.VAR_KEYWORD for each in own):
+            break
+    return found
