@@ -41,8 +41,11 @@ def _run(name: str, arguments: list[str]) -> None:
     kind = getattr(import_module(f"paper.{name}"), EXPERIMENTS[name][0])
     config = [tyro.conf.FlagCreatePairsOff, *([tyro.conf.OmitArgPrefixes] if kind.flat else [])]
     experiment = tyro.cli(kind, prog=f"python -m paper {name}", args=arguments, config=config)
+    runner = import_module("paper.common.runner")
     try:
-        import_module("paper.common.runner").main(experiment)
+        runner.main(experiment)
+    except runner.Refused as error:
+        raise SystemExit(str(error)) from error
     except KeyboardInterrupt:
         raise SystemExit(
             "\nInterrupted. The same command goes on where this one stopped."

@@ -22,12 +22,12 @@ def load(records: Sequence[Record]) -> pd.DataFrame:
     frames = [
         pd.DataFrame(
             {**r["scores"], **{name: r[name] for name in ("problem", "learner", "seed", *_SECONDS)}}
-        )
+        ).astype(dict.fromkeys(["coverage", *_SECONDS], float))
         for r in records
     ]
     ranks = {"problem": PROBLEMS.index, "learner": list(LABELS).index}
     order = ["problem", "learner", "seed", "measurements"]
-    runs = pd.concat(frames).astype(dict.fromkeys(["coverage", *_SECONDS], float))
+    runs = pd.concat(frames)
     return runs.sort_values(
         order, key=lambda c: c.map(ranks[str(c.name)]) if c.name in ranks else c
     ).reset_index(drop=True)

@@ -23,6 +23,10 @@ from paper.common.experiment import Experiment, Task
 from paper.common.runs_file import RunsFile
 from paper.common.tables import aligned, as_document
 
+class Refused(ValueError):
+    """What is asked cannot be done with what is there; the message says why."""
+
+
 RUNS = "runs.jsonl"
 TABLES = "tables.md"
 
@@ -36,23 +40,23 @@ def main(experiment: Experiment) -> None:
     """Run what is missing; write and print tables, and draw figures, of all that there is.
 
     Raises:
-        SystemExit: With a sentence, if that cannot be.
+        Refused: If that cannot be.
     """
     if experiment.runs < 2:
-        raise SystemExit(f"--runs: expected at least 2 (for a spread), got {experiment.runs}")
+        raise Refused(f"--runs: expected at least 2 (for a spread), got {experiment.runs}")
     if experiment.jobs < 1:
-        raise SystemExit(f"--jobs: expected at least 1 process, got {experiment.jobs}")
+        raise Refused(f"--jobs: expected at least 1 process, got {experiment.jobs}")
     file = runs_file(experiment)
     if not experiment.only_tables:
         try:
             experiment.check()
         except (ImportError, ValueError) as error:
-            raise SystemExit(str(error)) from error
+            raise Refused(str(error)) from error
         with _alone(experiment.out):
             run_missing(experiment)
     records = list(file.read().values())
     if not records:
-        raise SystemExit(f"There are no results in {experiment.out}.")
+        raise Refused(f"There are no results in {experiment.out}.")
     tables = experiment.tables(records)
     for table in tables.values():
         print(f"\n{table.title}\n\n{aligned(table.text)}")
@@ -65,7 +69,7 @@ def run_missing(experiment: Experiment) -> None:
     """Run the tasks that there is no run of, and add them to the file.
 
     Raises:
-        SystemExit: If the runs that are there were made with other settings; or by other versions,
+        Refused: If the runs that are there were made with other settings; or by other versions,
             unless ``other_versions`` says what is to become of them.
     """
     file = runs_file(experiment)
@@ -81,7 +85,7 @@ def run_missing(experiment: Experiment) -> None:
         missing = [task for task in tasks if task not in done or task in others]
     elif others and missing and experiment.other_versions == "refuse":
         task = next(iter(others))
-        raise SystemExit(
+        raise Refused(
             f"{file.path} has runs of other versions: {differences(done[task]['versions'], made_by)}."
             " Pass --other-versions keep to add to them, --other-versions replace to run them "
             "again, or another --out."
@@ -120,10 +124,10 @@ def run_one(experiment: Experiment, task: Task) -> Task:
 def check_settings(
     path: Path, task: Task, found: Mapping[str, Any], expected: Mapping[str, Any]
 ) -> None:
-    """End the program if a run was made with other settings, and say which."""
+    """Refuse a run that was made with other settings, and say which."""
     differ = differences(found, expected)
     if differ:
-        raise SystemExit(
+        raise Refused(
             f"{path}: {_title(task)} was made with other settings: {differ}. Choose another --out, "
             "or the settings of the runs that are there."
         )
@@ -190,7 +194,7 @@ def _alone(out: Path) -> Iterator[None]:
         try:
             stack.enter_context(FileLock(out / "unfinished" / "process.lock", timeout=0))
         except Timeout:
-            raise SystemExit(
+            raise Refused(
                 f"Another process adds runs to {out}. Wait until it has ended, or choose another "
                 "--out; --only-tables shows what there is."
             ) from None
@@ -204,7 +208,7 @@ def _backend(name: str) -> Iterator[dict[str, Any]]:
         try:
             from ray.util.joblib import register_ray
         except ImportError as error:
-            raise SystemExit(
+            raise Refused(
                 "--backend ray needs Ray; install it with `pip install gpadjust[ray]`"
             ) from error
         register_ray()
