@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
-from paper.common.experiment import Experiment, Record, Table, Task
+from paper.common.experiment import Experiment, Task
 
 ProblemName = Literal["forrester", "currin", "park91a", "cartpole"]
-PROBLEMS: tuple[ProblemName, ...] = ("forrester", "currin", "park91a", "cartpole")
+PROBLEMS: tuple[ProblemName, ...] = get_args(ProblemName)
 LearnerName = Literal["f_p", "phy", "random", "sobol", "gp", "cka", "both", "rho"]
-LABELS: dict[LearnerName, str] = {
+LABELS: dict[str, str] = {
     "f_p": "f_p alone",
     "phy": "physics mean, Sobol points",
     "random": "CKA, random points",
@@ -78,7 +77,7 @@ class Active(Experiment):
     """number of runs, each with an initial design of its own"""
     out: Path = Path("results/active")
     problems: tuple[ProblemName, ...] = PROBLEMS
-    learners: tuple[LearnerName, ...] = tuple(LABELS)
+    learners: tuple[LearnerName, ...] = get_args(LearnerName)
     forrester: Settings = field(default_factory=Settings)
     currin: Settings = field(default_factory=lambda: Settings(initial=6, budget=30))
     park91a: Settings = field(default_factory=lambda: Settings(initial=10, budget=40, every=2))
@@ -105,25 +104,3 @@ class Active(Experiment):
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings of the problem."""
         return asdict(self.settings_of(kind[0]))
-
-    def run(self, *task: Any, unfinished: Path) -> Record:
-        """Measure with a learner, and score what it learns."""
-        from paper.active.learners import run
-
-        return run(*task, self.settings_of(task[0]), unfinished)
-
-    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
-        """Settings, errors, measurements that are needed, intervals, seconds, and verdicts."""
-        from paper.active.tables import load, tables
-        from paper.common.tables import settings_table
-
-        columns = {problem: asdict(self.settings_of(problem)) for problem in PROBLEMS}
-        settings = {"active:settings": Table("Settings", settings_table(columns))}
-        return settings | tables(load(records))
-
-    def draw(self, records: Sequence[Record]) -> list[Path]:
-        """The errors over the measurements."""
-        from paper.active.figure import draw
-        from paper.active.tables import load
-
-        return [draw(load(records), self.out / "errors.png")]

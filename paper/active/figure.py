@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
 
-from paper.active import LABELS
-from paper.active.tables import REFERENCE
+from paper.active import LABELS, Active
+from paper.active.tables import REFERENCE, load
 from paper.common.claims import counted
+from paper.common.experiment import Record
 from paper.common.figures import draw_quartiles, one_legend, panels, save
 
 COLORS = {
@@ -24,13 +26,9 @@ COLORS = {
 TITLES = {"forrester": "Forrester, reading B", "cartpole": "cart-pole transitions"}
 
 
-def draw(runs: pd.DataFrame, path: Path) -> Path:
-    """Draw the median and the quartiles of the error over the number of measurements.
-
-    Args:
-        runs: The scores of all runs.
-        path: Where to save the PNG.
-    """
+def draw(records: Sequence[Record], experiment: Active) -> list[Path]:
+    """Draw the median and the quartiles of the error over the number of measurements."""
+    runs = load(records)
     by_problem = {str(name): part for name, part in runs.groupby("problem", sort=False)}
     titles = [
         f"{TITLES.get(name, name)} ({counted(part['seed'].nunique())})"
@@ -43,17 +41,16 @@ def draw(runs: pd.DataFrame, path: Path) -> Path:
         ax.set_ylabel("RMSE / sd of the truth")
     figure.supxlabel("measurements, those of the initial design included", fontsize="medium")
     one_legend(figure, axes)
-    return save(figure, path)
+    return [save(figure, experiment.out / "errors.png")]
 
 
 def _panel(ax: Axes, runs: pd.DataFrame) -> None:
-    labels: dict[str, str] = {**LABELS}
     for name, part in runs.groupby("learner", sort=False):
         learner, errors = str(name), part.groupby("measurements")["nrmse"].median()
         if learner == "f_p":
-            ax.axhline(errors.iloc[0], color="tab:red", lw=1.2, ls="--", label=labels[learner])
+            ax.axhline(errors.iloc[0], color="tab:red", lw=1.2, ls="--", label=LABELS[learner])
             continue
-        color, label = COLORS[learner], labels[learner]
+        color, label = COLORS[learner], LABELS[learner]
         draw_quartiles(ax, part, "nrmse", by="measurements", color=color, label=label)
         if learner == REFERENCE:
             ax.axhline(errors.iloc[-1], color=color, lw=1, ls=":", label="its final error")

@@ -16,7 +16,7 @@ from torch import Tensor
 from gpadjust import CKA, BlackBoxPhysics, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import AngleInput
 from gpadjust.envs import REAL_CART_POLE, CartPoleEquation, random_cart_pole_physics
-from gpadjust.envs.cart_pole import SUBSTEPS, TIME_STEP
+from gpadjust.envs.cart_pole.system import SUBSTEPS, TIME_STEP
 from gpadjust.physics import ODEPhysics
 from paper.active import PROBLEMS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from paper.active import LABELS, PROBLEMS
+from paper.active import LABELS, PROBLEMS, Active
 from paper.common.claims import FEWEST, Judged, counted, met
 from paper.common.experiment import Record, Table
-from paper.common.tables import claims_table, markdown
+from paper.common.tables import claims_table, markdown, settings_table
 
 REFERENCE = "gp"  # whose final error the others are to reach
 CLAIMS = {"forrester": "M1", "currin": "M2", "park91a": "M3", "cartpole": "M4"}
@@ -33,12 +35,17 @@ def load(records: Sequence[Record]) -> pd.DataFrame:
     ).reset_index(drop=True)
 
 
-def tables(runs: pd.DataFrame) -> dict[str, Table]:
-    """All tables, by the names of their markers."""
+def tables(records: Sequence[Record], experiment: Active) -> dict[str, Table]:
+    """All tables, by name."""
+    runs = load(records)
     table = tabulate(runs)
     seconds = table["choice_seconds"].map("{:.2g}".format)
     seconds += table["score_seconds"].map(" + {:.2g}".format)
-    found = {"claims": Table("Targets", claims_table("target", {"": verdicts(runs)}))}
+    columns: dict[str, Any] = {
+        problem: asdict(experiment.settings_of(problem)) for problem in PROBLEMS
+    }
+    found = {"settings": Table("Settings", settings_table(columns))}
+    found["claims"] = Table("Targets", claims_table("target", {"": verdicts(runs)}))
     for name, title, cells in (
         ("errors", "Median final error", table["nrmse"].map("{:.2g}".format)),
         ("needed", "Measurements that reach the final error of `gp`", table.apply(_count, axis=1)),
@@ -46,7 +53,7 @@ def tables(runs: pd.DataFrame) -> dict[str, Table]:
         ("seconds", "Seconds of choices + scores", seconds),
     ):
         found[name] = Table(title, _by_learner(table.assign(cell=cells.replace("nan", ""))))
-    return {f"active:{name}": table for name, table in found.items()}
+    return found
 
 
 def needed(runs: pd.DataFrame, learner: str) -> pd.Series[float]:
@@ -93,10 +100,9 @@ def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
 def verdicts(runs: pd.DataFrame, learner: str = "cka") -> list[Judged]:
     """Whether a learner reaches the reference's final error with half the measurements."""
     judged = []
-    labels: dict[str, str] = {**LABELS}
     for name, part in runs.groupby("problem", sort=False):
         count = needed(part, learner)
-        text = f"{name}: {labels[learner]} reaches the final error of {labels[REFERENCE]} with "
+        text = f"{name}: {LABELS[learner]} reaches the final error of {LABELS[REFERENCE]} with "
         text += "at most half the measurements"
         if len(count) < FEWEST:
             judged.append(Judged(CLAIMS[str(name)], text, "not run", "too few runs of both"))
@@ -129,6 +135,8 @@ def _count(row: pd.Series[float]) -> str:
     if np.isnan(row["needed"]):
         return ""
     text = f"{row['needed']:g}" if np.isfinite(row["needed"]) else "never"
-    return text if row["reached"] == row["compared"] else text + (
-        f" ({row['reached']} of {row['compared']})" if row["reached"] else ""
+    return (
+        text
+        if row["reached"] == row["compared"]
+        else text + (f" ({row['reached']} of {row['compared']})" if row["reached"] else "")
     )

@@ -10,7 +10,7 @@ claim is inconclusive. Low is at most 10 cm at a target, on average over the run
 in ten; only near the start, at less than half, and within 20 cm of where the hand starts better
 than beyond 40 cm.
 
-U1 is about the intervals of the models, see :mod:`paper.multifidelity.tables`; there is no AR1 here.
+U1 is about the intervals of the models, as in :mod:`paper.multifidelity.tables`; no AR1 here.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def claims(episodes: pd.DataFrame, maps: pd.DataFrame) -> tuple[Claim, ...]:
         ),
         Claim(
             "U1",
-            "the models of Dyna-CKA and Dyna-RRA quantify uncertainty more accurately than Dyna-GP's",
+            "CKA and RRA quantify uncertainty more accurately than GP",
             ("cka", "rra", "gp"),
             partial(_intervals, episodes),
         ),

@@ -12,13 +12,11 @@ from matplotlib.axes import Axes
 
 from gpadjust.envs import REAL_ARM, arm_targets, hand_position
 from gpadjust.envs.arm.task import START_MEAN
-from paper.arm.claims import LAST, MAP_AFTER
-from paper.arm.tables import MEASURES, load_evaluations, load_maps, times
+from paper.arm.claims import MAP_AFTER
+from paper.arm.tables import MEASURES, load_evaluations, load_maps
 from paper.common.experiment import Record
 from paper.common.figures import draw_quartiles, one_legend, panels, save
 from paper.control import Control
-from paper.control.figures import draw_iqm, draw_time
-from paper.control.tables import load_episodes
 
 BOUND = 4.3  # cm, all steps: a feedback policy trained on the true system
 BOUND_LABEL = "policy trained on the true system, all steps"
@@ -26,22 +24,14 @@ HELD = 34.0  # cm, all steps
 BACKDROP = "mf"  # in every panel, for comparison
 _COLUMNS = 4
 _WIDEST = 10  # cm, the end of the sizes
-_ENDS = {(e, e): f"after trial {e}" for e in (6, 15, LAST)}
 
 
 def draw(records: Sequence[Record], experiment: Control) -> list[Path]:
-    """Draw all figures; return their files."""
-    evaluations, maps = load_evaluations(records, experiment), load_maps(records, experiment)
-    out, labels, line = experiment.out, experiment.labels, (BOUND, BOUND_LABEL)
-    seconds = times(load_episodes(records, experiment), evaluations)
-    unit = "hand's RMSE, cm"
-    found = [
-        _curves(evaluations, experiment, out / "curves.png"),
-        draw_iqm(evaluations, labels, MEASURES, _ENDS, line, unit, out / "iqm.png"),
-        draw_time(seconds, labels, out / "time.png"),
-    ]
+    """Draw curves and maps; return their files."""
+    maps = load_maps(records, experiment)
     maps = maps[maps["episode"] == MAP_AFTER]
-    return found if maps.empty else [*found, _map(maps, experiment, out / "map.png")]
+    found = [_curves(load_evaluations(records, experiment), experiment)]
+    return found if maps.empty else [*found, _map(maps, experiment)]
 
 
 def _titles(rows: pd.DataFrame, experiment: Control) -> dict[str, str]:
@@ -50,7 +40,7 @@ def _titles(rows: pd.DataFrame, experiment: Control) -> dict[str, str]:
     return {str(name): f"{experiment.labels[str(name)]} ({n})" for name, n in runs.items()}
 
 
-def _curves(evaluations: pd.DataFrame, experiment: Control, path: Path) -> Path:
+def _curves(evaluations: pd.DataFrame, experiment: Control) -> Path:
     """The hand's error over the episodes, median and quartiles of each scenario."""
     titles = _titles(evaluations, experiment)
     figure, axes = panels([*titles.values()], _COLUMNS, (2.9, 2.5), width=9)
@@ -69,10 +59,10 @@ def _curves(evaluations: pd.DataFrame, experiment: Control, path: Path) -> Path:
     figure.supxlabel("trial", fontsize="medium")
     figure.supylabel("hand's RMSE over targets, cm", fontsize="medium")
     one_legend(figure, axes)
-    return save(figure, path)
+    return save(figure, experiment.out / "curves.png")
 
 
-def _map(maps: pd.DataFrame, experiment: Control, path: Path) -> Path:
+def _map(maps: pd.DataFrame, experiment: Control) -> Path:
     """The error at each target after some episodes: colour for the mean, size for its spread."""
     titles = _titles(maps, experiment)
     figure, axes = panels([*titles.values()], _COLUMNS, (2.9, 2.0))
@@ -83,7 +73,8 @@ def _map(maps: pd.DataFrame, experiment: Control, path: Path) -> Path:
         mean, sd = by_target.mean().to_numpy(), by_target.std().fillna(0).to_numpy()
         _draw_arm(ax)
         dots = ax.scatter(
-            *targets.T,
+            targets[:, 0],
+            targets[:, 1],
             c=mean,
             s=6 + 6 * sd.clip(max=_WIDEST),
             cmap="viridis_r",
@@ -100,7 +91,7 @@ def _map(maps: pd.DataFrame, experiment: Control, path: Path) -> Path:
         for sd, more in ((0, ""), (5, ""), (_WIDEST, " or more"))
     ]
     figure.legend(handles=sizes, loc="outside upper center", ncols=3)
-    return save(figure, path)
+    return save(figure, experiment.out / "map.png")
 
 
 def _draw_arm(ax: Axes) -> None:

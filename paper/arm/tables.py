@@ -65,7 +65,7 @@ def times(episodes: pd.DataFrame, evaluations: pd.DataFrame) -> pd.DataFrame:
 
 
 def tables(records: Sequence[Record], experiment: Control) -> dict[str, Table]:
-    """All tables, by the names of their markers."""
+    """All tables, by name."""
     episodes, maps = load_episodes(records, experiment), load_maps(records, experiment)
     evaluations = load_evaluations(records, experiment)
     of = {measure: Curves(evaluations, measure) for measure in MEASURES}
@@ -80,7 +80,7 @@ def tables(records: Sequence[Record], experiment: Control) -> dict[str, Table]:
         hundred = Curves(evaluations, f"{measure}_100")
         columns: dict[str, Callable[[str], Any]] = {
             **{f"at {e}": partial(_at, of[measure], e) for e in _SHOWN},
-            "sd of runs": lambda name, of=of[measure]: of.spread(name).loc[3:].mean(),
+            "sd of runs": partial(_spread, of[measure]),
             f"100 targets, at {LAST}": partial(_at, hundred, LAST),
         }
         text = summary(
@@ -110,11 +110,16 @@ def tables(records: Sequence[Record], experiment: Control) -> dict[str, Table]:
     }
     rows = seconds.rename(index=experiment.labels)[list(parts)]
     found["time"] = Table("Seconds", numbers(rows, ["of a run", *parts.values()], ".0f"))
-    return {f"arm:{name}": table for name, table in found.items()}
+    return found
 
 
 def _at(curves: Curves, episode: int, name: str) -> float:
     return curves.mean_at(name, episode)
+
+
+def _spread(curves: Curves, name: str) -> float:
+    """The standard deviation over runs, averaged over the evaluations from episode 3."""
+    return float(curves.spread(name).loc[3:].mean())
 
 
 def _memory(every: Curves, experiment: Control) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from paper.common.experiment import Record, Table
 from paper.control import Control, Scenario
 from paper.control import Settings as ControlSettings
 
@@ -75,18 +74,3 @@ class CartPole(Control):
         from paper.cartpole.system import system
 
         return system(self.known[name], self.settings_of(name), seed)
-
-    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
-        """Costs, verdicts, models, seconds and settings."""
-        from paper.cartpole.tables import tables
-        from paper.common.tables import settings_table
-
-        settings = settings_table({"value": asdict(self.settings)})
-        found: dict[str, Any] = {"cartpole:settings": Table("Settings", settings)}
-        return found | tables(records, self)
-
-    def draw(self, records: Sequence[Record]) -> list[Path]:
-        """Curves, interquartile means and seconds."""
-        from paper.cartpole.figure import draw
-
-        return draw(records, self)

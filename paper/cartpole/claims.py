@@ -7,7 +7,7 @@ trials 1-25). CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up 
 of the paired difference of 41-50 reaches down to CKA's.
 
 Targets are judged by the mean over runs; an ± is a standard error. T6 takes the best of three
-settings on the seeds that it reports; all three are said. T4 and T5 are the same for either measure.
+settings on the seeds that it reports; all three are said. T4 and T5 are the same for either.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _costs(curves: Curves, first: int, last: int) -> str:
 
 
 def _stays_from(curves: Curves, name: str) -> int | None:
-    """The first episode from which every one's mean cost, while the model serves, is at most 0.5."""
+    """The first episode from which the mean cost stays at most 0.5 while the model serves."""
     by_episode = curves.mean(name).loc[:_SERVES]
     above = by_episode.index[by_episode > 0.5]
     first = int(above[-1]) + 1 if len(above) else 1

@@ -31,7 +31,7 @@ _SMOOTHED = 3
 
 
 def tables(records: Sequence[Record], experiment: Control) -> dict[str, Table]:
-    """All tables, by the names of their markers."""
+    """All tables, by name."""
     episodes = load_episodes(records, experiment)
     last = experiment.settings.episodes
     of = {measure: Curves(episodes, measure) for measure in MEASURES}
@@ -56,7 +56,7 @@ def tables(records: Sequence[Record], experiment: Control) -> dict[str, Table]:
     }
     times = cost_of_a_run(episodes).rename(index=experiment.labels)[list(parts)]
     found["time"] = Table("Seconds", numbers(times, ["of a run", *parts.values()], ".0f"))
-    return {f"cartpole:{name}": table for name, table in found.items()}
+    return found
 
 
 def holds_from(curve: pd.Series[float], threshold: float, until: int) -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -23,8 +24,16 @@ class Table(NamedTuple):
 class Experiment:
     """Runs that do not depend on each other, and what is made of them.
 
-    A subclass adds its settings as further fields. It imports what it needs where it needs it: the
-    command line is made of the fields alone.
+    An experiment is a folder. Its ``__init__.py`` has a subclass with the settings as further
+    fields, and imports nothing slow: the command line is made of it. Beside it lie
+
+    - ``run.py`` with ``run(experiment, *task, unfinished)``: runs a task with one thread, returns
+      what it found, as JSON has it. ``unfinished`` is a path of the task's own; with a suffix it is
+      the place for what it needs to go on after an interruption, and removes when it ends.
+    - ``tables.py`` with ``tables(records, experiment)``: tables of all runs by name. It may have
+      ``first_look(records)``: a short table of the first few runs, None if they are too few.
+    - if there are figures, ``figure.py`` with ``draw(records, experiment)``: draws them into
+      ``experiment.out`` and returns their files.
     """
 
     runs: int = 10
@@ -69,27 +78,10 @@ class Experiment:
         raise NotImplementedError
 
     def run(self, *task: Any, unfinished: Path) -> Record:
-        """Run a task, with one thread.
+        """Run a task."""
+        found: Record = self.part("run").run(self, *task, unfinished=unfinished)
+        return found
 
-        Args:
-            task: Its parts.
-            unfinished: A path that is the task's own, in a folder that there is. With a suffix it
-                is the place for what it needs to go on after an interruption; a run that ends
-                removes it.
-
-        Returns:
-            What was found, as JSON has it.
-        """
-        raise NotImplementedError
-
-    def first_look(self, records: Sequence[Record]) -> str | None:
-        """A short table of the first few runs; None if these are too few."""
-        return None
-
-    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
-        """The tables of all runs, by the names of their markers in the READMEs."""
-        raise NotImplementedError
-
-    def draw(self, records: Sequence[Record]) -> list[Path]:
-        """Draw the figures into ``out``; return their files."""
-        return []
+    def part(self, name: str) -> Any:
+        """A module of the experiment's folder, imported when it is needed."""
+        return import_module(f"{type(self).__module__}.{name}")

@@ -7,9 +7,10 @@ import math
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 import gpadjust
-from paper.common.experiment import Experiment, Task
+from paper.common.experiment import Experiment, Record, Table, Task
 from paper.common.runs_file import RunsFile
-from paper.common.tables import aligned, as_document
+from paper.common.tables import aligned, as_document, settings_table
 
-class Refused(ValueError):
+
+class Refused(ValueError):  # noqa: N818 - it is no error of the program
     """What is asked cannot be done with what is there; the message says why."""
 
 
@@ -57,12 +59,22 @@ def main(experiment: Experiment) -> None:
     records = list(file.read().values())
     if not records:
         raise Refused(f"There are no results in {experiment.out}.")
-    tables = experiment.tables(records)
+    tables = tables_of(experiment, records)
     for table in tables.values():
         print(f"\n{table.title}\n\n{aligned(table.text)}")
     (experiment.out / TABLES).write_text(as_document(tables))
-    for path in (experiment.out / TABLES, *experiment.draw(records)):
-        print(path)
+    print(experiment.out / TABLES)
+    if find_spec(f"{type(experiment).__module__}.figure"):
+        print(*experiment.part("figure").draw(records, experiment), sep="\n")
+
+
+def tables_of(experiment: Experiment, records: Sequence[Record]) -> dict[str, Table]:
+    """Settings and results, by the names of their markers in the READMEs."""
+    found = experiment.part("tables").tables(records, experiment)
+    settings = getattr(experiment, "settings", None)
+    if settings is not None:
+        found["settings"] = Table("Settings", settings_table({"value": asdict(settings)}))
+    return {f"{experiment.name}:{name}": table for name, table in found.items()}
 
 
 def run_missing(experiment: Experiment) -> None:
@@ -85,10 +97,10 @@ def run_missing(experiment: Experiment) -> None:
         missing = [task for task in tasks if task not in done or task in others]
     elif others and missing and experiment.other_versions == "refuse":
         task = next(iter(others))
+        differ = differences(done[task]["versions"], made_by)
         raise Refused(
-            f"{file.path} has runs of other versions: {differences(done[task]['versions'], made_by)}."
-            " Pass --other-versions keep to add to them, --other-versions replace to run them "
-            "again, or another --out."
+            f"{file.path} has runs of other versions: {differ}. Pass --other-versions keep to add "
+            "to them, --other-versions replace to run them again, or another --out."
         )
     elif others:
         print(f"{len(others)} of the runs were made by other versions of the packages.")
@@ -180,7 +192,8 @@ def _described(experiment: Experiment, kind: Task) -> dict[str, Any]:
 
 def _first_look(experiment: Experiment, records: Any) -> bool:
     """Show a short table as soon as there are runs enough; tell whether there were."""
-    text = experiment.first_look(list(records)) if records else None
+    look = getattr(experiment.part("tables"), "first_look", None)
+    text = look(list(records)) if look and records else None
     if text:
         tqdm.write(f"\n{aligned(text)}\n")
     return bool(text)

@@ -145,4 +145,4 @@ class Control(Experiment):
         """Learn, or go on with it."""
         from paper.control.learner import run
 
-        return run(self, *task, unfinished)
+        return run(self, task[0], task[1], unfinished=unfinished)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from paper.cartpole import RMSES
 from paper.cartpole import Settings as CartPoleSettings
-from paper.common.experiment import Record, Table
 from paper.control import Control, Scenario
 
 if TYPE_CHECKING:
@@ -80,19 +79,3 @@ class Exploration(Control):
         from paper.exploration.held_out import system
 
         return system(self.known[name], self.settings_of(name), seed)
-
-    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
-        """Errors of models, costs of policies, seconds, and settings of the plans."""
-        from paper.common.tables import settings_table
-        from paper.exploration.tables import tables
-
-        plans = {name: vars(self.settings)[name] for name in PLANS[1:]}
-        text = settings_table({"value": plans})
-        found: dict[str, Any] = {"exploration:plans": Table("Plans", text)}
-        return found | tables(records, self)
-
-    def draw(self, records: Sequence[Record]) -> list[Path]:
-        """The measures after each episode."""
-        from paper.exploration.tables import draw
-
-        return [draw(records, self, self.out / "curves.png")]

@@ -47,7 +47,7 @@ def system(scenario: Scenario, settings: Settings, seed: int) -> System:
 
 
 class ExplorationRecorder(cartpole.CartPoleRecorder):
-    """Records also how well the model that has learnt from an episode predicts the held-out ones."""
+    """Records also how well the newest model predicts the held-out episodes."""
 
     def of_policy(self, episode: int) -> dict[str, Any]:
         """The deterministic policy's cost, and the errors of the newest model."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from paper.common.experiment import Experiment, Record, Table, Task
+from paper.common.experiment import Experiment, Task
 
-FIGURE_SEED = 3  # the data set of the six fits
 FIRST_LOOK = 3  # data sets
 
 
@@ -53,44 +51,3 @@ class Forrester(Experiment):
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings."""
         return asdict(self.settings)
-
-    def run(self, *task: Any, unfinished: Path) -> Record:
-        """Train and score all models on a data set."""
-        from paper.forrester.models import scores
-
-        return scores(*task, self.settings)
-
-    def first_look(self, records: Sequence[Record]) -> str | None:
-        """The errors on the first data sets."""
-        from paper.forrester.tables import errors, load
-
-        runs = load(records)
-        runs = runs[(runs["reading"] == "B") & (runs["protocol"] != "closed form")]
-        sets = runs.groupby("protocol")["seed"].nunique()
-        if len(sets) < 2 or sets.min() < FIRST_LOOK:
-            return None
-        return f"The first {sets.min()} data sets, reading B, mean / median RMSE\n\n" + errors(runs)
-
-    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
-        """Errors, scores, verdicts and the grid."""
-        from paper.forrester.tables import load, tables
-
-        return tables(load(records))
-
-    def draw(self, records: Sequence[Record]) -> list[Path]:
-        """The paper's figure 1, for each protocol."""
-        from paper.forrester.figure import draw
-        from paper.forrester.tables import PROTOCOLS, load
-
-        runs = load(records)
-        return [
-            draw(
-                runs,
-                protocol,
-                "B",
-                FIGURE_SEED,
-                self.settings,
-                self.out / f"forrester_{protocol}.png",
-            )
-            for protocol in PROTOCOLS
-        ]

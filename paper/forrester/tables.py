@@ -11,7 +11,7 @@ of the grid, gives both verdicts: the paper does not say which it took.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -20,9 +20,10 @@ from paper.common.claims import Judged, Verdict, all_of, reproduced, within
 from paper.common.experiment import Record, Table
 from paper.common.statistics import Difference, bootstrap
 from paper.common.tables import claims_table, markdown, number
+from paper.forrester import FIRST_LOOK, Forrester
 
 NAMES = ("Zero-mean GP", "Phy-mean GP", "GP-bias", "GP-scale", "AR1", "CKA", "RRA")
-PROTOCOLS = ("paper", "gpadjust")
+PROTOCOLS: tuple[Literal["paper", "gpadjust"], ...] = ("paper", "gpadjust")
 READINGS = ("B", "A")
 _COLUMNS = ("rmse", "nlpd", "crps", "coverage", "seconds")
 _ABOUT_HALF = (0.4, 0.6)  # below the physics mean
@@ -39,16 +40,27 @@ def load(records: Sequence[Record]) -> pd.DataFrame:
     return pd.concat(parts).astype(dict.fromkeys(_COLUMNS, float)).reset_index(drop=True)
 
 
-def tables(runs: pd.DataFrame) -> dict[str, Table]:
-    """All tables, by the names of their markers."""
+def first_look(records: Sequence[Record]) -> str | None:
+    """The errors on the first data sets."""
+    runs = load(records)
+    runs = runs[(runs["reading"] == "B") & (runs["protocol"] != "closed form")]
+    sets = runs.groupby("protocol")["seed"].nunique()
+    if len(sets) < 2 or sets.min() < FIRST_LOOK:
+        return None
+    return f"The first {sets.min()} data sets, reading B\n\n" + errors(runs)
+
+
+def tables(records: Sequence[Record], experiment: Forrester) -> dict[str, Table]:
+    """All tables, by name."""
+    runs = load(records)
     by_reading = {reading: runs[runs["reading"] == reading] for reading in READINGS}
     grid = runs[runs["protocol"] == "closed form"]
-    found = {"forrester:rmse": Table("Reading B, mean / median RMSE", errors(by_reading["B"]))}
+    found = {"rmse": Table("Reading B, mean / median RMSE", errors(by_reading["B"]))}
     for reading, part in by_reading.items():
         for protocol in PROTOCOLS:
             title = f"Reading {reading} of the crude function, protocol {protocol}"
             scored = part[part["protocol"] == protocol]
-            found[f"forrester:{reading}:{protocol}"] = Table(title, _scores(scored))
+            found[f"{reading}:{protocol}"] = Table(title, _scores(scored))
     for reading, part in by_reading.items():
         judged = {
             f"protocol {p}": judge(
@@ -57,9 +69,9 @@ def tables(runs: pd.DataFrame) -> dict[str, Table]:
             for p in PROTOCOLS
         }
         title = f"Claims, on reading {reading}"
-        found[f"forrester:claims-{reading}"] = Table(title, claims_table("claim", judged))
+        found[f"claims-{reading}"] = Table(title, claims_table("claim", judged))
     title = "The closed form of RRA, reading B: mean RMSE less that of Phy-mean GP"
-    found["forrester:grid"] = Table(title, _grid(_wide(by_reading["B"], "paper"), grid))
+    found["grid"] = Table(title, _grid(_wide(by_reading["B"], "paper"), grid))
     return found
 
 
@@ -177,9 +189,7 @@ def _closed_form(rmse: pd.DataFrame, grid: pd.DataFrame) -> dict[str, Difference
     """The change of each cell of the grid from the physics mean."""
     cells = _wide(grid, "closed form").drop(columns="f_p")
     reference = rmse["Phy-mean GP"]
-    return {
-        str(cell): Difference.of(cells[cell] - reference) / reference.mean() for cell in cells
-    }
+    return {str(cell): Difference.of(cells[cell] - reference) / reference.mean() for cell in cells}
 
 
 def _grid(rmse: pd.DataFrame, grid: pd.DataFrame) -> str:

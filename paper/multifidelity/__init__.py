@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
-from paper.common.experiment import Experiment, Record, Table, Task
+from paper.common.experiment import Experiment, Task
 
 Method = Literal["GP", "Phy", "AR1", "SMT MFK", "CKA", "CKA Bayes", "chosen", "RRA"]
-METHODS: tuple[Method, ...] = ("GP", "Phy", "AR1", "SMT MFK", "CKA", "CKA Bayes", "chosen", "RRA")
+METHODS: tuple[Method, ...] = get_args(Method)
 PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
 FIRST_LOOK = 8  # runs
 
@@ -65,29 +64,3 @@ class Multifidelity(Experiment):
         settings = asdict(self.settings)
         del settings["sizes"]
         return settings
-
-    def run(self, *task: Any, unfinished: Path) -> Record:
-        """Train and score a method on a data set."""
-        from paper.multifidelity.models import scores
-
-        return scores(*task, self.settings)
-
-    def first_look(self, records: Sequence[Record]) -> str | None:
-        """The errors of the first runs."""
-        from paper.multifidelity.tables import first_rows
-
-        return first_rows(records[:FIRST_LOOK]) if len(records) >= FIRST_LOOK else None
-
-    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
-        """Scores, comparisons and the verdict on the intervals."""
-        from paper.multifidelity.tables import load, tables
-
-        return tables(load(records))
-
-    def draw(self, records: Sequence[Record]) -> list[Path]:
-        """All runs, a figure for each of three scores."""
-        from paper.multifidelity.figure import COLUMNS, draw
-        from paper.multifidelity.tables import load
-
-        runs = load(records)
-        return [draw(runs, column, self.out / f"{column}.png") for column in COLUMNS]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -10,7 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from paper.common.experiment import Record
 from paper.common.figures import panels, save
+from paper.multifidelity import Multifidelity
+from paper.multifidelity.tables import load
 
 COLUMNS = {
     "nrmse": "RMSE / sd of the truth",
@@ -20,14 +24,13 @@ COLUMNS = {
 COLORS = ("tab:orange", "tab:blue")  # of the smaller and the larger number of observations
 
 
-def draw(runs: pd.DataFrame, column: str, path: Path) -> Path:
-    """Draw a score of all runs, with the medians, and save it.
+def draw(records: Sequence[Record], experiment: Multifidelity) -> list[Path]:
+    """Draw three scores of all runs, with the medians."""
+    runs = load(records)
+    return [_draw(runs, column, experiment.out / f"{column}.png") for column in COLUMNS]
 
-    Args:
-        runs: The scores of all runs.
-        column: One of ``COLUMNS``.
-        path: Where to save the PNG.
-    """
+
+def _draw(runs: pd.DataFrame, column: str, path: Path) -> Path:
     methods = list(runs["method"].unique())
     names = list(runs["pair"].unique())
     figure, axes = panels(names, 3, (3.6, 0.6 + 0.3 * len(methods)), share=False, width=9)

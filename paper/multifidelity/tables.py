@@ -17,7 +17,7 @@ from paper.common.claims import Judged, all_of, within
 from paper.common.experiment import Record, Table
 from paper.common.statistics import Difference
 from paper.common.tables import best_in_bold, claims_table, markdown, number
-from paper.multifidelity import METHODS
+from paper.multifidelity import FIRST_LOOK, METHODS, Multifidelity
 
 _PAIRED = ("GP", "Phy", "AR1", "SMT MFK")  # which CKA is compared with
 _ADJUSTED, _OTHERS = ("CKA", "RRA"), ("GP", "AR1")  # of U1
@@ -33,8 +33,9 @@ def load(records: Sequence[Record]) -> pd.DataFrame:
     ).reset_index(drop=True)
 
 
-def tables(runs: pd.DataFrame) -> dict[str, Table]:
-    """All tables, by the names of their markers."""
+def tables(records: Sequence[Record], experiment: Multifidelity) -> dict[str, Table]:
+    """All tables, by name."""
+    runs = load(records)
     found = {"short": Table("Five observations per input", _short(runs))}
     for name, column, how, title in (
         ("nrmse", "nrmse", "median", "Median RMSE / sd of the truth"),
@@ -48,18 +49,18 @@ def tables(runs: pd.DataFrame) -> dict[str, Table]:
         found[name] = Table(title, _by_method(runs, column, how, bold))
     title = "RMSE of CKA / that of others on the same data sets, geometric mean (Wilcoxon's p)"
     found["paired"] = Table(title, _paired(runs))
-    judged = {
-        f"N = {size} d": [judge_intervals(part)] for size, part in runs.groupby("per_input")
-    }
+    judged = {f"N = {size} d": [judge_intervals(part)] for size, part in runs.groupby("per_input")}
     found["claims"] = Table("Claim on the intervals", claims_table("claim", judged))
     chosen = runs[runs["chosen"] != ""].groupby(["pair", "N"], sort=False)["chosen"]
     rows = [[f"{pair}, N = {N}", _counted(names)] for (pair, N), names in chosen]
     found["chosen"] = Table("What was chosen, and in how many runs", markdown(["", ""], rows))
-    return {f"multifidelity:{name}": table for name, table in found.items()}
+    return found
 
 
-def first_rows(records: Sequence[Record]) -> str:
-    """The scores of some runs as they are."""
+def first_look(records: Sequence[Record]) -> str | None:
+    """The scores of the first runs as they are."""
+    if len(records) < FIRST_LOOK:
+        return None
     rows = [
         [r["pair"], f"{r['N']}", r["method"], f"{r['seed']}", f"{r['nrmse']:.2g}"] for r in records
     ]

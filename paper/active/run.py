@@ -24,8 +24,9 @@ from gpadjust.active import collect, qAdjustmentInformationGain
 from gpadjust.active.adjustment_information_gain import About
 from gpadjust.active.refitting import refit
 from gpadjust.validation import coverage, rmse
-from paper.active import LearnerName, Settings
+from paper.active import Active, LearnerName, Settings
 from paper.active.problems import Model, Problem, problem
+from paper.common.experiment import Record
 
 Acquisition = Callable[[Any, Tensor], AcquisitionFunction]
 
@@ -76,21 +77,22 @@ LEARNERS: dict[LearnerName, Learner] = {
 
 
 def run(
-    name: str, learner: LearnerName, seed: int, settings: Settings, unfinished: Path
-) -> dict[str, Any]:
+    experiment: Active, name: str, learner: LearnerName, seed: int, *, unfinished: Path
+) -> Record:
     """Measure with a learner, and score what it learns.
 
     Args:
+        experiment: The experiment.
         name: The problem.
         learner: The learner.
         seed: Of the initial design, the physics where it is random, and the learner.
-        settings: Of the problem.
         unfinished: Beside it lies the log of the measurements, until the run is done.
 
     Returns:
         The scores, and the seconds that choices and scores took; those of choices are None if the
         run was interrupted.
     """
+    settings = experiment.settings_of(name)
     # Other settings have another log.
     mark = zlib.crc32(json.dumps(asdict(settings)).encode())
     log = unfinished.with_name(f"{unfinished.name}-{mark:08x}.jsonl")
@@ -103,7 +105,7 @@ def run(
         return {"choice_seconds": 0.0, "score_seconds": 0.0, "scores": scores}
     with _quiet():
         start = time.process_time()
-        X = measured(system, chosen_by, settings, seed, log)
+        X = measured(system, chosen_by, chosen_by.model, settings, seed, log)
         between = time.process_time()
         scores = scored(system, chosen_by.model, settings, X)
     log.unlink(missing_ok=True)
@@ -114,7 +116,9 @@ def run(
     }
 
 
-def measured(system: Problem, learner: Learner, settings: Settings, seed: int, log: Path) -> Tensor:
+def measured(
+    system: Problem, learner: Learner, kind: Model, settings: Settings, seed: int, log: Path
+) -> Tensor:
     """The points that a learner measures, ``budget x d``, the initial design first."""
     initial, budget = settings.initial, settings.budget
     if learner.design == "sobol":
@@ -127,7 +131,7 @@ def measured(system: Problem, learner: Learner, settings: Settings, seed: int, l
     if acquisition is None:
         raise ValueError("A learner needs a design or an acquisition function.")
     collection = collect(
-        partial(system.model, kind=learner.model),
+        partial(system.model, kind=kind),
         system.truth,
         system.bounds,
         lambda model: acquisition(model, points),
@@ -145,9 +149,7 @@ def measured(system: Problem, learner: Learner, settings: Settings, seed: int, l
     return collection.X
 
 
-def scored(
-    system: Problem, kind: Model, settings: Settings, X: Tensor
-) -> dict[str, list[Any]]:
+def scored(system: Problem, kind: Model, settings: Settings, X: Tensor) -> dict[str, list[Any]]:
     """How well a model predicts after each number of measurements in turn.
 
     Args:

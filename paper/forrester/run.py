@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -17,7 +18,8 @@ from torch import Tensor
 from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
 from gpadjust.models import PaperRRA
 from gpadjust.validation import coverage, crps, nlpd, rmse
-from paper.forrester import Settings
+from paper.common.experiment import Record
+from paper.forrester import Forrester, Settings
 from paper.forrester.problem import CRUDE, GRID, Reading, observations, truth
 
 Protocol = Literal["paper", "gpadjust", "closed form"]
@@ -33,12 +35,15 @@ def _prepare(settings: Settings) -> None:
     trained("CKA", "gpadjust", "B", *observations(0, settings.observations), settings)
 
 
-def scores(reading: Reading, protocol: Protocol, seed: int, settings: Settings) -> dict[str, Any]:
+def run(
+    experiment: Forrester, reading: Reading, protocol: Protocol, seed: int, *, unfinished: Path
+) -> Record:
     """Train all models of a protocol on a data set.
 
     Returns:
         For each model, and for f_p, its name, its scores and the seconds that it took.
     """
+    settings = experiment.settings
     _prepare(settings)
     X, Y = observations(seed, settings.observations)
     y = truth(GRID)
@@ -84,7 +89,8 @@ def closed_form(
     """RRA as printed, with nothing learnt."""
     model = PaperRRA(X, Y, torch.full_like(Y, ridge), physics=CRUDE[reading])
     for term in model.terms:
-        term.kernel.base_kernel.lengthscale = lengthscale
+        kernel: Any = term.kernel
+        kernel.base_kernel.lengthscale = lengthscale
     return model.eval()
 
 

@@ -6,6 +6,7 @@ import math
 import time
 import warnings
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,7 +20,8 @@ from torch import Tensor
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ZeroMeanGP, compare, fit
 from gpadjust.inference import SamplingWarning
 from gpadjust.validation import coverage, crps, nlpd, rmse
-from paper.multifidelity import Method, Settings
+from paper.common.experiment import Record
+from paper.multifidelity import Method, Multifidelity, Settings
 from paper.multifidelity.problem import Pair, low_inputs, observations, pair
 
 _CHUNK = 50  # points predicted jointly, for the sake of memory
@@ -59,10 +61,17 @@ def _prepare(method: Method, settings: Settings) -> None:
     trained(method, forrester, *observations(forrester, 5, 0), settings.num_low, 0)
 
 
-def scores(
-    name: str, per_input: int, method: Method, seed: int, settings: Settings
-) -> dict[str, Any]:
+def run(
+    experiment: Multifidelity,
+    name: str,
+    per_input: int,
+    method: Method,
+    seed: int,
+    *,
+    unfinished: Path,
+) -> Record:
     """Train a method on a data set; return its scores, in units of the truth's sd."""
+    settings = experiment.settings
     _prepare(method, settings)
     problem = pair(name)
     X, Y = observations(problem, per_input * problem.d, seed)
