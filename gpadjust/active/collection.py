@@ -5,22 +5,28 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable
-from typing import Any
+from copy import copy
+from typing import Any, Self
 
 import torch
 from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
 
-from gpadjust.active.arguments import as_bounds, as_outcomes, as_points, as_points_within
+from gpadjust.active.arguments import (
+    as_bounds,
+    as_options,
+    as_outcomes,
+    as_points,
+    as_points_within,
+)
 from gpadjust.active.best_points import best_points
 from gpadjust.active.design import among, sobol_points
+from gpadjust.active.loop import measure_on
 from gpadjust.active.measurement_log import MeasurementLog, Record
 from gpadjust.active.measurements import Measurements, measurement
-from gpadjust.active.refitting import load_parameter_values, parameter_values, refit
+from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
 from gpadjust.models.sampled_functions import check_number, seeded
-
-_FORMAT = "gpadjust measurements, version 1"
 
 
 class MeasurementWarning(UserWarning):
@@ -30,16 +36,19 @@ class MeasurementWarning(UserWarning):
 class Collection(Measurements):
     """Chooses where to measure, for a laboratory that measures when it can.
 
-    :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points. The
-    first points are a scrambled Sobol design; later ones maximise the acquisition function of a
-    model of all data so far, which is fitted from the last one's hyper-parameters. Points that were
-    asked for and not yet told are pending: acquisition functions that take ``X_pending`` count on
-    them.
+    :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points; where
+    a program can measure, :meth:`run` does both. The first points are a scrambled Sobol design;
+    later ones maximise the acquisition function of a model of all data so far, which is fitted from
+    the last one's hyper-parameters. Points that were asked for and not yet told are pending:
+    acquisition functions that take ``X_pending`` count on them.
 
     With a log, each measurement is on the disk before :meth:`tell` does anything else, as a line of
     JSON; so are the points asked for, before :meth:`ask` returns them. A new collection with the
     same log goes on where the last one stopped, asks for the same points (with the same seed), and
-    has the same points pending.
+    has the same points pending. One collection at a time holds a log, until :meth:`close` (or the
+    end of ``with Collection(...) as collection:``), until it is out of scope, or until its process
+    ends. Nothing in a log is executed or unpickled: one from a stranger can be wrong, but does no
+    harm.
 
     Args:
         model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64, with
@@ -48,7 +57,7 @@ class Collection(Measurements):
         acquisition: Makes a BoTorch acquisition function of the fitted model.
         batch_size: Number of points that :meth:`ask` returns.
         initial: Number of measurements, those of ``data`` included, before the first model; or the
-            first points, ``k x d``, in place of Sobol's. Default: ``2 (d + 1)``.
+            first points, ``k x d``, no two alike, in place of Sobol's. Default: ``2 (d + 1)``.
         data: ``(X, Y)`` measured before. They are not logged: give them each time.
         num_outputs: Number ``m`` of outputs. Default: that of the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`. Take
@@ -59,8 +68,10 @@ class Collection(Measurements):
             state is left alone.
 
     Raises:
-        TypeError: If ``model_factory``, ``acquisition`` or ``fit`` is not callable.
-        ValueError: If another argument is out of range, or the log is of another problem.
+        TypeError: If ``model_factory``, ``acquisition`` or ``fit`` is not callable, or another
+            argument is of a wrong type.
+        ValueError: If an argument is out of range, or the log is of another problem.
+        LogError: If the log is held by another collection, or cannot be opened for writing.
 
     Example:
         >>> import torch
@@ -85,7 +96,7 @@ class Collection(Measurements):
         acquisition: Callable[[Any], AcquisitionFunction],
         *,
         batch_size: int = 1,
-        initial: int | Tensor | None = None,
+        initial: int | Tensor | list[list[float]] | None = None,
         data: tuple[Tensor, Tensor] | None = None,
         num_outputs: int | None = None,
         fit: Callable[[Any], Any] | None = None,
@@ -108,27 +119,50 @@ class Collection(Measurements):
         self.bounds = as_bounds(bounds)
         d = self.bounds.shape[-1]
         check_number(batch_size, "batch_size")
-        if not isinstance(seed, int) or seed < 0:
-            raise ValueError(f"Expected seed to be a whole number >= 0, got {seed!r}.")
-        self.batch_size, self.seed = batch_size, seed
+        if not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise ValueError(
+                f"Expected seed to be a whole number >= 0 and below 2^63, got {seed!r}."
+            )
+        self.batch_size, self.seed = batch_size, int(seed)
         initial = 2 * (d + 1) if initial is None else initial
         self._first_points = self.bounds[:0]
-        if isinstance(initial, Tensor):
+        if not isinstance(initial, int | float | str):
             self._first_points, initial = as_points_within(initial, self.bounds, "initial"), 2
+            if len(self._first_points.unique(dim=0)) < len(self._first_points):
+                raise ValueError(
+                    "Expected the points of initial to differ, got some twice. To measure a point "
+                    "again, tell() what came out."
+                )
         if not isinstance(initial, int) or initial < 2:
             raise ValueError(
                 f"Expected initial to be a number of points >= 2, or the points, got {initial!r}."
             )
         self._initial, self._fit = initial, fit
-        self._options = optimizer_options or {}
+        self._options = as_options(optimizer_options)
         if num_outputs is not None:
             check_number(num_outputs, "num_outputs")
         super().__init__(self.bounds, num_outputs, data)
         self._model: Any = None
         self._last_model: tuple[Any, int] = (None, 0)
+        if not isinstance(log, str | os.PathLike | None):
+            raise TypeError(f"Expected log to be the path of a file, got {log!r}.")
         self.log = None if log is None else MeasurementLog(log)
         if self.log is not None:
-            self._resume(self.log)
+            try:
+                self._resume(self.log)
+            except BaseException:
+                self.close()  # what is raised may keep this half of a collection alive
+                raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state of a copy or a pickle, whose log is its own and not held."""
+        return {**self.__dict__, "log": copy(self.log)}
 
     @property
     def model(self) -> Any:
@@ -136,6 +170,7 @@ class Collection(Measurements):
 
         Raises:
             RuntimeError: If there are fewer than two measurements of an output.
+            TypeError: If ``model_factory`` makes no model.
         """
         if self._model is None:
             if self.num_observed < 2:
@@ -145,7 +180,7 @@ class Collection(Measurements):
                 )
             previous, count = self._previous()
             if count < len(self.X):
-                model = self.model_factory(self.X, self.Y)
+                model = self._make_model(len(self.X))
                 refit(model, previous, self._fit)
                 self._last_model = model, len(self.X)
             self._model = self._last_model[0]
@@ -163,6 +198,7 @@ class Collection(Measurements):
         Raises:
             TypeError: If ``acquisition`` makes no acquisition function.
             ValueError: If it takes single points, and ``q`` is larger.
+            LogError: If the points cannot be logged; then they are not pending.
         """
         q = self.batch_size if q is None else q
         check_number(q, "q")
@@ -190,6 +226,8 @@ class Collection(Measurements):
         Raises:
             TypeError: If they are no numbers.
             ValueError: If shapes disagree.
+            LogError: If they cannot be logged. They are in neither the log nor the collection
+                then; tell them again.
 
         Warns:
             MeasurementWarning: If one of them has failed.
@@ -200,17 +238,18 @@ class Collection(Measurements):
         self._enter(records)
         self._warn(records)
 
-    def fail(self, X: Tensor, message: str) -> None:
+    def fail(self, X: Tensor, reason: str | Exception) -> None:
         """Take it that measurements failed. Their points are not asked for again.
 
         Args:
             X: The points, ``n x d``.
-            message: Why.
+            reason: Why.
 
         Warns:
             MeasurementWarning: In any case.
         """
         X = as_points(X, self.bounds.shape[-1])
+        message = reason if isinstance(reason, str) else f"{type(reason).__name__}: {reason}"
         records: list[Record] = [{"x": x, "failed": message} for x in X.tolist()]
         self._enter(records)
         self._warn(records)
@@ -223,6 +262,52 @@ class Collection(Measurements):
         """
         X = self.pending if X is None else as_points(X, self.bounds.shape[-1])
         self._enter([{"withdrawn": X.tolist()}])
+
+    def run(
+        self,
+        oracle: Callable[[Tensor], Any],
+        budget: int,
+        *,
+        progress: bool = False,
+        max_failures: int = 5,
+    ) -> Self:
+        """Ask, measure and tell, until a budget is spent; points that are pending come first.
+
+        A measurement that fails (the oracle raises an exception, or returns nothing but NaN and
+        infinity) is logged with its message and skipped, with a warning. It counts against the
+        budget, and no point within a hundredth of the bounds' widths of it is asked for again. An
+        exception fails the whole batch. Where some outputs are NaN, each output is learnt from its
+        own measurements.
+
+        Args:
+            oracle: Measures: maps points ``q x d`` to values ``q x m`` (or ``q``).
+            budget: Number of measurements in all: failed ones and those of the log included, those
+                of ``data`` not.
+            progress: Whether to show a progress bar.
+            max_failures: Number of calls of the oracle, in a row and without any result, that stop
+                it.
+
+        Returns:
+            This collection.
+
+        Raises:
+            TypeError: If the oracle is not callable.
+            ValueError: If a number is out of range.
+            LogError: If the log cannot be written.
+            CollectionError: If the oracle fails too often, or what it returns can be no measured
+                values or cannot be logged: it is in the error's ``result`` then, and the points
+                are still pending.
+
+        Warns:
+            MeasurementWarning: If a measurement fails.
+        """
+        measure_on(self, oracle, budget, progress, max_failures)
+        return self
+
+    def close(self) -> None:
+        """Let another collection have the log; :meth:`tell` takes it again, if none has written."""
+        if self.log is not None:
+            self.log.close()
 
     def _design(self, q: int) -> Tensor | None:
         """The next points that need no model, ``q x d``, or None if a model is to choose."""
@@ -247,11 +332,20 @@ class Collection(Measurements):
             )
         return function
 
+    def _make_model(self, count: int) -> Model:
+        """A new model of the first so many measurements."""
+        model = self.model_factory(self.X[:count], self.Y[:count])
+        if not isinstance(model, Model):
+            raise TypeError(
+                f"Expected model_factory(X, Y) to be a BoTorch model, got {type(model).__name__}."
+            )
+        return model
+
     def _previous(self) -> tuple[Any, int]:
         """The model fitted last, made again from the log if need be, and its number of points."""
         if self._last_model[0] is None and self._last_fit is not None:
             count, values = self._last_fit
-            model = self.model_factory(self.X[:count], self.Y[:count])
+            model = self._make_model(count)
             self._last_model = (model, count) if load_parameter_values(model, values) else (None, 0)
         return self._last_model
 
@@ -265,26 +359,16 @@ class Collection(Measurements):
         self._model = None if len(self.X) > known else self._model
 
     def _resume(self, log: MeasurementLog) -> None:
-        """Take in what is in the log, or begin it."""
-        records = log.read()
-        header = {"format": _FORMAT, "bounds": self.bounds.tolist()}
-        if not records:
-            log.append([header])
-            return
-        if records[0].get("format") != _FORMAT:
-            raise ValueError(f"{log.path} is no log of measurements; name another file.")
-        if records[0]["bounds"] != header["bounds"]:
-            raise ValueError(
-                f"The log {log.path} is of measurements within the bounds {records[0]['bounds']}, "
-                f"got {header['bounds']}; name another file, or take those bounds."
-            )
-        for number, record in enumerate(records[1:], start=2):
+        """Take in what is in the log."""
+        for number, record in enumerate(log.open(self.bounds.tolist()), start=2):
             try:
                 self._take(record)
             except (KeyError, TypeError, ValueError, RuntimeError) as error:
+                m = "any number of" if self.num_outputs is None else self.num_outputs
                 raise ValueError(
-                    f"Line {number} of the log {log.path} does not belong to this collection of "
-                    f"{self.bounds.shape[-1]} inputs and {self.num_outputs} outputs: {error}"
+                    f"Line {number} of the log {log.path}, {str(record)[:80]}, does not belong to "
+                    f"this collection of {self.bounds.shape[-1]} inputs and {m} outputs "
+                    f"({type(error).__name__}: {error}). Remove it, or name another file."
                 ) from error
 
     def _warn(self, records: list[Record]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +24,9 @@ class Measurements:
       parameters of the model that chose them, if one did;
     - ``{"x": x, "y": y}``: a measurement, null where an output was not measured;
     - ``{"x": x, "failed": message}``: one that failed, whether it has a ``"y"`` or not;
-    - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more.
+    - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more;
+    - ``{"refused": result, "of": [x, ...], "because": message}``: what an oracle returned for
+      points and could not be their measured values. It changes nothing; a human may recover it.
 
     A measurement is of the pending point that it is nearest to, if that is within a hundredth of
     the bounds' widths: what a laboratory sets is seldom what was asked for to the last digit.
@@ -52,6 +56,8 @@ class Measurements:
         self._num_asks = 0
         self._last_fit: tuple[int, Record] | None = None  # of how many points, and its result
         if data is not None:
+            if not isinstance(data, tuple | list) or len(data) != 2:
+                raise TypeError(f"Expected data to be a pair (X, Y), got {data!r}.")
             X = as_points(data[0], bounds.shape[-1], "the X of data")
             Y = as_outcomes(data[1], len(X), num_outputs)
             check_observed(Y, "the Y of data")
@@ -64,6 +70,8 @@ class Measurements:
 
     def _take(self, record: Record) -> None:
         """Take in one record."""
+        if "refused" in record:
+            return
         if "asked" in record:
             asked = self._points(record["asked"])
             self.pending = torch.cat([self.pending, asked])
@@ -110,6 +118,24 @@ class Measurements:
         """The points of a record, ``n x d``."""
         d = self.X.shape[-1]
         return as_points(rows, d) if rows else self.X.new_zeros(0, d)
+
+
+def refusal(X: Tensor, result: Any, error: Exception) -> Record:
+    """The record of what an oracle returned for points ``q x d`` and is refused.
+
+    Example:
+        >>> refusal(torch.zeros(1, 1), {"Y": torch.tensor([1.5, math.nan])}, ValueError("no"))
+        {'refused': {'Y': [1.5, 'NaN']}, 'of': [[0.0]], 'because': 'no'}
+    """
+
+    def plain(part: Any) -> Any:
+        return part.tolist() if hasattr(part, "tolist") else repr(part)
+
+    try:
+        result = json.loads(json.dumps(result, default=plain), parse_constant=str)
+    except (TypeError, ValueError, RecursionError):
+        result = repr(result)
+    return {"refused": result, "of": X.tolist(), "because": str(error)}
 
 
 def measurement(x: list[float], y: list[float]) -> Record:

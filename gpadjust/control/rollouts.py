@@ -92,7 +92,8 @@ class Rollouts:
             steps.append((states, actions, following, rewards, made))
             running = made & ~ended
             states = torch.where(running.unsqueeze(-1), following, states)
-        return Rollout(*(torch.stack(parts, dim=2) for parts in zip(*steps, strict=True)), left)
+        columns = [torch.stack(parts, dim=2) for parts in zip(*steps, strict=True)]
+        return Rollout._make([*columns, left])
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states of rows, of which each function has as many."""

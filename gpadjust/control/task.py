@@ -94,17 +94,22 @@ class Task:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)
 
-    def rehearse(self, states: Tensor) -> None:
-        """Call the functions once at states ``N x state_dim``, to find what is wrong with them now.
+    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+        """Call physics and functions once, to find what is wrong with them before it costs data.
+
+        Args:
+            states: Where episodes start, ``N x state_dim``.
+            actions: Some that may be taken there, ``N x action_dim``.
 
         Raises:
             ValueError: If they return another shape, or numbers that are not finite.
+            PhysicsError: If the physics fails.
         """
         if self.initial_states is not None:
-            states = self.draw_initial_states(len(states))
-        actions = states.new_zeros(len(states), self.dynamics.spec.action_dim)
+            self.draw_initial_states(len(states))
         self.rewards(states, actions, states)
         self.terminations(states)
+        self.dynamics.rehearse(states, actions)
 
     def draw_initial_states(self, n: int) -> Tensor:
         """Draw ``n x state_dim`` states at which episodes start.

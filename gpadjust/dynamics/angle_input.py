@@ -18,6 +18,7 @@ class AngleInput(InputTransform):
         columns: The columns of X that are angles in rad.
 
     Raises:
+        TypeError: If ``columns`` is no sequence of whole numbers.
         ValueError: If ``columns`` is empty, or has a negative or repeated number.
 
     Example:
@@ -33,6 +34,10 @@ class AngleInput(InputTransform):
 
     def __init__(self, columns: Sequence[int]) -> None:
         super().__init__()
+        if not isinstance(columns, Sequence) or not all(isinstance(i, int) for i in columns):
+            raise TypeError(
+                f"Expected columns as a sequence of numbers, such as [0], got {columns!r}."
+            )
         self.columns = tuple(columns)
         distinct = set(self.columns)
         if not distinct or len(distinct) < len(self.columns) or min(distinct) < 0:

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gpadjust.dynamics.transition_scores import TransitionScores, score_transitions
@@ -81,6 +82,20 @@ class Dynamics(ABC):
         data = Transitions.checked(self.spec, states, actions, next_states)
         return score_transitions(self.spec, self.predict(data.states, data.actions), data)
 
+    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+        """Find what is wrong with the physics before there are transitions, if it can be told.
+
+        Args:
+            states: ``N x state_dim``.
+            actions: ``N x action_dim``.
+
+        Raises:
+            ValueError: If the physics returns another number of states.
+            PhysicsError: If the physics fails.
+        """
+        if self.is_fitted:
+            self.predict(states, actions)
+
     @abstractmethod
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text; of objects, the class."""
@@ -102,6 +117,16 @@ class Dynamics(ABC):
     def _check_pair(self, states: Tensor, actions: Tensor) -> None:
         check_columns(states, self.spec.state_dim, "states")
         check_columns(actions, self.spec.action_dim, "actions")
+        if states.dtype != torch.float64:
+            raise TypeError(
+                f"Expected states in float64, got {states.dtype}; use `states.double()`."
+            )
+        lead = zip(reversed(actions.shape[:-1]), reversed(states.shape[:-1]), strict=False)
+        if actions.dim() > states.dim() or any(own not in (1, other) for own, other in lead):
+            raise ValueError(
+                "Expected an action for each state, or one for all, got states of shape "
+                f"{tuple(states.shape)} and actions of shape {tuple(actions.shape)}."
+            )
 
     def _check_blocks(self, states: Tensor, actions: Tensor, num_functions: int) -> None:
         self._check_pair(states, actions)

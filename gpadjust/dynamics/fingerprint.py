@@ -29,11 +29,16 @@ def check_fingerprint(state: dict[str, Any], expected: dict[str, str]) -> None:
     """Raise a RuntimeError, as PyTorch does, if a state is of other dynamics.
 
     The state of dynamics that learnt nothing is empty, and fits all.
+
+    Raises:
+        TypeError: If it is no dictionary.
     """
+    if not isinstance(state, Mapping):
+        raise TypeError(f"Expected a dictionary that `state_dict` gave, found {state!r}.")
     if not state:
         return
     found = state.get("fingerprint")
-    if found is None:
+    if not isinstance(found, Mapping):
         raise RuntimeError(
             "The state does not say of what dynamics it is; expected one that `state_dict` gave, "
             f"with a 'fingerprint'. It holds {sorted(map(str, state))}."

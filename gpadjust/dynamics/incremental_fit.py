@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 
+from gpadjust.dynamics.learnt import Learnt
+from gpadjust.dynamics.model_recipe import ModelRecipe
+from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitResult, fit
 from gpadjust.inference.fitting import FitOptions, check_options
 from gpadjust.inference.objective import Objective
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models import ExactGPBase
+from gpadjust.states import StateSpec
 
 _SEARCHED = 128  # points that a search is made on; more would tell the same, and take longer
 _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
@@ -33,6 +38,56 @@ def checked_fit_options(options: FitOptions | None) -> FitOptions:
         )
     check_options("map", {**(options or {})})
     return {**(options or {})}
+
+
+class Fitted(NamedTuple):
+    """A fitted model.
+
+    Args:
+        model: The model.
+        result: What the last fit has reached.
+        searched_at: The number of transitions at the last search of the hyper-parameters.
+    """
+
+    model: ExactGPBase
+    result: FitResult
+    searched_at: int
+
+
+def fit_all(
+    recipe: ModelRecipe, data: Transitions, previous: Learnt | None, options: FitOptions
+) -> Fitted:
+    """Fit a model of all transitions, from where the one before it was.
+
+    Args:
+        recipe: Builds the model.
+        data: All transitions, earlier ones first.
+        previous: What was learnt from earlier ones, or None for a full search.
+        options: Of this search.
+    """
+    n, observed = len(data.states), check_observed(recipe.targets.spec, data)
+    model = recipe.build(data, quiet=previous is not None)
+    if previous is None:
+        return Fitted(model, fit(model, **options), n)
+    searches = n >= 2 * previous.searched_at
+    rows = search_rows(observed) if searches else None
+    part = None if rows is None else recipe.build(data.some(rows), quiet=True)
+    result = refit(model, previous.model, searches, part)
+    return Fitted(model, result, n if searches else previous.searched_at)
+
+
+def check_observed(spec: StateSpec, data: Transitions) -> Tensor:
+    """Which outputs were observed in each transition, ``n x m``; an error if they are too few."""
+    observed = ~data.next_states[:, spec.predicted].isnan()
+    least, i = observed.sum(0).min(0)
+    if least < 2:
+        name = spec.states[spec.predicted[i]]
+        of = "" if len(observed) < 2 else f" with a measured {name!r}"
+        raise ValueError(
+            f"Expected at least 2 transitions to learn from, got {least}{of}: there is no scale in "
+            "fewer. Collect more before the first update."
+        )
+    return observed
 
 
 def search_rows(observed: Tensor) -> Tensor | None:

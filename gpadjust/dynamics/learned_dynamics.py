@@ -10,13 +10,13 @@ from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
-from gpadjust.dynamics.incremental_fit import checked_fit_options, refit, search_rows
-from gpadjust.dynamics.learnt import Learnt
+from gpadjust.dynamics.incremental_fit import check_observed, checked_fit_options, fit_all
+from gpadjust.dynamics.learnt import Learnt, LearntState
 from gpadjust.dynamics.model_recipe import ModelRecipe
 from gpadjust.dynamics.next_state_physics import check_physics
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.inference import FitOptions, FitResult, fit
+from gpadjust.inference import FitOptions, FitResult
 from gpadjust.models import CKA, ExactGPBase, Prediction
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.states import StateSpec
@@ -165,6 +165,10 @@ class LearnedDynamics(Dynamics):
             data, known = self._learnt.with_rows(data, known)
         self._learn(data, known, self._learnt)
 
+    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+        """Call the physics once, to find what is wrong with it before there are transitions."""
+        self._recipe.physics_at(Transitions(states, actions, states))
+
     def condition(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Condition on further transitions with the hyper-parameters as they are.
 
@@ -259,54 +263,51 @@ class LearnedDynamics(Dynamics):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
 
+        An empty state, that of dynamics that have learnt nothing, lets them forget. The physics is
+        asked about at most three of the transitions, whether it is the one that they were learnt
+        with; a physics that is costly runs for these.
+
         Args:
             state: Of dynamics of the same class, options, spec and physics.
 
         Raises:
-            RuntimeError: If it is of dynamics of another class, spec, target or model options.
+            TypeError: If it is no dictionary.
+            RuntimeError: If it is of dynamics of another class, spec, target, model, options or
+                physics, or damaged.
+            PhysicsError: If the physics fails.
         """
         check_fingerprint(state, self.describe())
         if not state:
             self._learnt = self.fit_result = None
             return
-        data, known = Transitions(**state["transitions"]), state["physics"]
-        chunks = tuple(state["chunks"])
-        self._recipe.tell_physics(data, known)
-        model = self._recipe.build(data.rows(0, chunks[0]), quiet=True)
-        model.load_state_dict(state["model"])
-        fitted, start = model.eval(), chunks[0]
-        for size in chunks[1:]:
-            model = self._recipe.condition(model, data.rows(start, start + size))
-            start += size
-        self._learnt = Learnt(data, known, chunks, state["searched_at"], fitted, model)
+        num_known = len(self._recipe.parts) * len(self.spec.predicted)
+        data, known, chunks, searched_at, parameters = LearntState.checked(
+            state, self.spec, num_known
+        )
+        with self._recipe.restored_on_error():
+            self._recipe.tell_physics(data, known)
+            model = self._recipe.build(data.rows(0, chunks[0]), quiet=True)
+            model.load_state_dict(parameters)
+            self._recipe.check_same_physics(data, known)
+            fitted, start = model.eval(), chunks[0]
+            for size in chunks[1:]:
+                model = self._recipe.condition(model, data.rows(start, start + size))
+                start += size
+        self._learnt = Learnt(data, known, chunks, searched_at, fitted, model)
         self.fit_result = None
 
     def _learn(self, data: Transitions, known: Tensor | None, previous: Learnt | None) -> None:
-        n = len(data.states)
-        observed = ~data.next_states[:, self.spec.predicted].isnan()
-        least, i = observed.sum(0).min(0)
-        if least < 2:
-            of = "" if n < 2 else f" with a measured {self.spec.states[self.spec.predicted[i]]!r}"
-            raise ValueError(
-                f"Expected at least 2 transitions to learn from, got {least}{of}: there is no "
-                "scale in fewer. Collect more before the first update."
-            )
-        if previous is None and not self._compared:
-            self._recipe.compare_physics(data, known)
-            self._compared = True
-        self._recipe.tell_physics(data, known)
-        model = self._recipe.build(data, quiet=previous is not None)
-        searched_at = n if previous is None else previous.searched_at
-        if previous is None:
-            result = fit(model, **self.fit_options)
-        else:
-            searches = n >= 2 * searched_at
-            rows = search_rows(observed) if searches else None
-            part = None if rows is None else self._recipe.build(data.some(rows), quiet=True)
-            result = refit(model, previous.model, searches, part)
-            searched_at = n if searches else searched_at
+        check_observed(self.spec, data)
+        with self._recipe.restored_on_error():
+            if previous is None and not self._compared:
+                self._recipe.compare_physics(data, known)
+            self._recipe.tell_physics(data, known)
+            model, result, searched_at = fit_all(self._recipe, data, previous, self.fit_options)
+            if self._recipe.physics_learns:
+                known = self._recipe.physics_at(data)
+        self._compared = self._compared or previous is None
         self.fit_result = result
-        self._learnt = Learnt(data, known, (n,), searched_at, model, model)
+        self._learnt = Learnt(data, known, (len(data.states),), searched_at, model, model)
 
     def _known_so_far(self) -> Learnt:
         if self._learnt is None:

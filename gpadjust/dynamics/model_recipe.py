@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch.nn import Module
 
 from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.next_state_physics import parts_of, warn_of_differences
+from gpadjust.dynamics.physics_probes import PhysicsProbes
 from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models import ExactGPBase
@@ -98,6 +100,28 @@ class ModelRecipe:
             name = next(name for name, each in self.parts.items() if each is part)
             warn_of_differences(name, self.targets.spec, data, predicted, change)
 
+    def check_same_physics(self, data: Transitions, known: Tensor | None) -> None:
+        """Raise a RuntimeError if the physics says something else at 3 of the transitions."""
+        spec, columns = self.targets.spec, self.targets.spec.predicted
+        for part, own in self._of_parts(known):
+            probes = PhysicsProbes.of(data.states, data.actions, own, columns)
+            with torch.no_grad():
+                found = part.anew(self.targets.inputs(probes.states, probes.actions))
+            probes.check(found, part.name, spec, columns)
+
+    @contextmanager
+    def restored_on_error(self) -> Iterator[None]:
+        """Leave the physics, and what it was told, as it was if there is an error."""
+        with ExitStack() as stack:
+            for part in self.parts.values():
+                stack.enter_context(part.restored_on_error())
+            yield
+
+    @property
+    def physics_learns(self) -> bool:
+        """Whether the physics has parameters to learn, so that what it says changes with a fit."""
+        return any(p.requires_grad for part in self.parts.values() for p in part.parameters())
+
     def _of_parts(self, known: Tensor | None) -> Iterator[tuple[TransitionPhysics, Tensor]]:
         if known is not None:
             values = known.split(len(self.targets.predicted), dim=-1)
@@ -113,10 +137,11 @@ def checked_options(
 ) -> dict[str, Any]:
     """The further arguments of a class of models, once they and the class are found to be right."""
     if not isinstance(model, type) or not issubclass(model, ExactGPBase):
-        found = f"an instance of {type(model).__name__}" if isinstance(model, Module) else model
+        is_module = isinstance(model, Module)
+        found = f"an instance of {type(model).__name__}" if is_module else repr(model)
         raise TypeError(
             "Expected model as a class of gpadjust.models, such as CKA, PhysicsMeanGP or "
-            f"ZeroMeanGP, or one of your own on AdjustedGP; found {found!s}. Its arguments go into "
+            f"ZeroMeanGP, or one of your own on AdjustedGP; found {found}. Its arguments go into "
             "model_options."
         )
     name, takes = model.__name__, arguments_of(model)
@@ -143,7 +168,10 @@ def checked_options(
             raise ValueError(f"{name} does not take {option!r} of model_options; it takes {known}.")
     missing = [each for each, needed in takes.items() if needed and each not in (*_OWN, *options)]
     if missing:
-        raise ValueError(f"{name} needs {' and '.join(missing)}; give it in model_options.")
+        raise ValueError(
+            f"{name} needs {', '.join(missing)} besides: give them in model_options, or take a "
+            "class that sets them itself."
+        )
     return options
 
 

@@ -36,12 +36,17 @@ def parts_of(physics: Physics) -> dict[str, Physics]:
 def next_values(physics: Physics, inputs: Tensor, num_states: int) -> Tensor:
     """What the physics says, ``... x num_states``, from ``... x (num_states + a)``."""
     Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0))
+    check_next_values(physics, Y, num_states)
+    return Y
+
+
+def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
+    """Raise a ValueError unless the physics has returned as many columns as there are states."""
     if Y.shape[-1] != num_states:
         raise ValueError(
             f"Expected physics {physics.name!r} to return the next values of the {num_states} "
             f"states that are neither exogenous nor previous actions, got {Y.shape[-1]} columns."
         )
-    return Y
 
 
 def warn_of_differences(

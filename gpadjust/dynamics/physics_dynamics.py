@@ -16,10 +16,11 @@ from gpadjust.dynamics.next_state_physics import (
     parts_of,
     warn_of_differences,
 )
+from gpadjust.dynamics.physics_probes import PhysicsProbes
 from gpadjust.models import Prediction
+from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import check_columns
 
 
 class PhysicsDynamics(Dynamics):
@@ -55,6 +56,7 @@ class PhysicsDynamics(Dynamics):
                 f"{', '.join(map(repr, parts_of(self.physics)))}; LearnedDynamics learns their "
                 "weights."
             )
+        self._probes: PhysicsProbes | None = None
         self._compared = False  # with transitions
 
     @property
@@ -74,10 +76,11 @@ class PhysicsDynamics(Dynamics):
         if self._compared:
             return
         columns = self.spec.moving
-        following = self._step(data.states, data.actions)
-        change = self.spec.change(data.states, following)[:, columns]
+        change = self._change(data.states, data.actions)
         warn_of_differences(self.physics.name, self.spec, data, columns, change)
         self._compared = True
+        if self._probes is None:
+            self._probes = PhysicsProbes.of(data.states, data.actions, change, columns)
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
         """The next states, and zero variance."""
@@ -89,29 +92,57 @@ class PhysicsDynamics(Dynamics):
         return self._step(states, actions)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """The physics, whatever the number."""
-        return self._step
+        """The physics, whatever the number; the functions are those of :class:`LearnedDynamics`.
+
+        Raises:
+            ValueError: If ``num_functions`` is no positive whole number.
+        """
+        check_number(num_functions, "num_functions")
+
+        def step(states: Tensor, actions: Tensor) -> Tensor:
+            self._check_blocks(states, actions, num_functions)
+            return self._step(states, actions)
+
+        return step
 
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text."""
         return fingerprint(self)
 
     def state_dict(self) -> dict[str, Any]:
-        """What these dynamics are; there is nothing learnt."""
-        return {"fingerprint": self.describe()}
+        """What these dynamics are, and what the physics said of the first transitions."""
+        probes = None if self._probes is None else [tensor.clone() for tensor in self._probes]
+        return {"fingerprint": self.describe(), "probes": probes}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Check that the state is of such dynamics.
+        """Check that the state is of such dynamics; there is nothing learnt.
+
+        The physics is asked about at most three transitions that the state holds.
 
         Raises:
-            RuntimeError: If it is of dynamics of another class or spec.
+            TypeError: If it is no dictionary.
+            RuntimeError: If it is of dynamics of another class, spec or physics, or damaged.
+            PhysicsError: If the physics fails.
         """
         check_fingerprint(state, self.describe())
+        given = state.get("probes")
+        if given is None:
+            return
+        moving = self.spec.moving
+        probes = PhysicsProbes.checked(given, self.spec, len(moving))
+        found = self._change(probes.states, probes.actions)
+        probes.check(found, self.physics.name, self.spec, moving)
+        self._probes = probes
+
+    def _change(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The change of the states that move."""
+        following = self._step(states, actions)
+        return self.spec.change(states, following)[..., self.spec.moving]
 
     def _step(self, states: Tensor, actions: Tensor) -> Tensor:
         moving = self.spec.moving
-        check_columns(states, self.spec.state_dim, "states")
-        check_columns(actions, self.spec.action_dim, "actions")
+        self._check_pair(states, actions)
+        actions = actions.expand(*states.shape[:-1], -1)
         following = states.clone()
         with torch.no_grad():
             following[..., moving] = next_values(

@@ -85,11 +85,11 @@ class TrajectoryInformation:
         check_columns(states, self.spec.state_dim, "states")
         check_columns(actions, self.spec.action_dim, "actions")
         batch = states.shape[:-1]
-        if states.dim() < 2 or actions.shape[:-1] != batch:
+        if states.dim() < 2 or 0 in batch or actions.shape[:-1] != batch:
             raise ValueError(
                 "Expected states of shape batch_shape x T x state_dim and actions of shape "
-                f"batch_shape x T x action_dim, got {tuple(states.shape)} and "
-                f"{tuple(actions.shape)}."
+                "batch_shape x T x action_dim, of at least one step, got "
+                f"{tuple(states.shape)} and {tuple(actions.shape)}."
             )
         if counted is not None and (counted.dtype != torch.bool or counted.shape != batch):
             raise ValueError(

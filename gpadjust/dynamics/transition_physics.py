@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.next_state_physics import next_values
-from gpadjust.physics import Physics
+from gpadjust.dynamics.next_state_physics import check_next_values
+from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.memo import RowMemo, row_keys
 from gpadjust.states import StateSpec
 
@@ -83,7 +85,15 @@ class TransitionPhysics(Physics):
         num_states = len(targets.spec.moving)
         states = X[:, :num_states]
         read = X[:, : num_states + targets.spec.action_dim]
-        change = next_values(self.physics, read, num_states) - states
+        try:
+            # Not forward: an error's rows are then still those of X.
+            self.physics._check_input(read)
+            following = self.physics._evaluate_rows(self.physics._columns(read))
+        except PhysicsError as error:
+            error.partial = None  # next states, which are no targets
+            raise
+        check_next_values(self.physics, following, num_states)
+        change = following - states
         columns = []
         for i in targets.predicted:
             column = change[:, i]
@@ -94,14 +104,24 @@ class TransitionPhysics(Physics):
 
     def know(self, X: Tensor, values: Tensor) -> None:
         """Take the values at inputs ``N x d`` as given; they replace those known so far."""
-        self._known.clear()
         keys = dict(zip(row_keys(X), range(len(X)), strict=True))
-        self._known.store([*keys], values[list(keys.values())])
+        known = RowMemo(self._known.capacity)
+        known.store([*keys], values[list(keys.values())])
+        self._known = known
+
+    def anew(self, X: Tensor) -> Tensor:
+        """The values at ``N x d`` as the physics says them, whatever was given."""
+        known, self._known = self._known, RowMemo(self._known.capacity)
+        try:
+            values: Tensor = self(X)
+            return values
+        finally:
+            self._known = known
 
     def forget(self) -> None:
         """Empties the memo of the physics, too."""
         super().forget()
-        self._known.clear()
+        self._known = RowMemo(self._known.capacity)
         self.physics.forget()
 
     def _recall(self, rows: Tensor) -> Tensor:
@@ -113,8 +133,25 @@ class TransitionPhysics(Physics):
             return super()._recall(rows)
         values = self._known.gather(slots.clamp_min(0)).to(rows)
         if new.any():
-            values[new] = super()._recall(rows[new])
+            try:
+                values[new] = super()._recall(rows[new])
+            except PhysicsError as error:
+                error.relocate((new.cumsum(0) - 1).masked_fill(~new, -1))
+                raise
         return values
+
+    @contextmanager
+    def restored_on_error(self) -> Iterator[None]:
+        """Take back what it was given, and its parameters, if there is an error."""
+        known, state = self._known, [(tensor, tensor.detach().clone()) for tensor in self._state()]
+        try:
+            yield
+        except BaseException:
+            self._known = known
+            with torch.no_grad():
+                for tensor, before in state:
+                    tensor.copy_(before)
+            raise
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""

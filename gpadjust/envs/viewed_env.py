@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
 import gymnasium as gym
@@ -85,18 +84,3 @@ class ViewedEnv(gym.Env[Array, Array], Generic[V]):
         """Draw in the window, if there is one."""
         if self.render_mode == "human":
             self.render()
-
-
-def checked_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
-    """The options of ``reset``.
-
-    Raises:
-        ValueError: If there is an unknown one.
-    """
-    options = options or {}
-    for name in options:
-        if name not in known:
-            raise ValueError(
-                f"Unknown option {name!r}; the known ones: {', '.join(map(repr, known))}."
-            )
-    return options

@@ -18,6 +18,7 @@ from gpadjust.gp import SumOfTerms, Term
 from gpadjust.gp.gaussian import noise_variances
 from gpadjust.models.cholesky_strategy import covariances, prepare
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.physics.base import whole_number
 
 
 class SampledFunctions(Module):
@@ -256,6 +257,7 @@ def draw_functions(model: Any, num_functions: int, seed: int | None, num_feature
     """Draw functions from a model's posterior; see :meth:`~gpadjust.CKA.sample_functions`."""
     check_number(num_functions, "num_functions")
     check_number(num_features, "num_features")
+    seed = None if seed is None else whole_number("seed", seed)
     if num_features % 2:
         raise ValueError(
             f"Expected num_features to be even (sines and cosines), got {num_features}."
@@ -280,5 +282,5 @@ def seeded(seed: int | None) -> Iterator[None]:
 
 def check_number(number: int, name: str) -> None:
     """Raise a ValueError unless ``number`` is a whole number of at least 1."""
-    if not isinstance(number, int) or number < 1:
+    if not isinstance(number, int) or isinstance(number, bool) or number < 1:
         raise ValueError(f"Expected {name} to be a whole number >= 1, got {number!r}.")

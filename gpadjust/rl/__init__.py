@@ -7,12 +7,14 @@ except ImportError as error:
         'gpadjust.rl needs Stable-Baselines3 and Gymnasium; run `pip install "gpadjust[rl]"`.'
     ) from error
 
+from gpadjust.rl.agents import DynaSAC, DynaTD3
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
 from gpadjust.rl.checkpoint import EpisodeCheckpoint, resume, save_checkpoint
-from gpadjust.rl.dyna import Dyna, DynaSAC, DynaTD3
+from gpadjust.rl.dyna import Dyna
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
+from gpadjust.rl.task_learner import TaskLearner
 
 __all__ = [
     "Dyna",
@@ -23,6 +25,7 @@ __all__ = [
     "EpisodeCheckpoint",
     "MixedReplayBuffer",
     "ModelVecEnv",
+    "TaskLearner",
     "resume",
     "save_checkpoint",
 ]

@@ -20,8 +20,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from gpadjust.control import Task
+from gpadjust.rl.agents import DynaSAC
 from gpadjust.rl.buffer import CompactReplayBuffer
-from gpadjust.rl.dyna import Dyna, DynaSAC
+from gpadjust.rl.dyna import Dyna
 from gpadjust.rl.random_state import RandomState
 
 _FORMAT = "gpadjust episode checkpoint, version 2"
@@ -186,7 +187,7 @@ def resume(path: str | Path, env: GymEnv, task: Task, algorithm: type[Dyna] = Dy
     return agent
 
 
-def _locked(path: Path) -> AcquireReturnProxy:
+def _locked(path: Path) -> AcquireReturnProxy[Any]:
     """Acquire the lock of a file, which a process may have more than once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path.absolute().with_name(f"{path.name}.lock"), is_singleton=True)

@@ -3,46 +3,34 @@
 from __future__ import annotations
 
 import io
+import math
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
-from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import (
     GymEnv,
-    MaybeCallback,
-    TensorDict,
-    TrainFreq,
-    TrainFrequencyUnit,
 )
 from torch import Tensor
 
 from gpadjust.control import Task
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
-from gpadjust.rl.model_vec_env import ModelVecEnv, check_spaces
+from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 from gpadjust.rl.planned_episodes import PlannedEpisode, PlannedEpisodes
-from gpadjust.rl.random_state import RandomState
 from gpadjust.rl.recorded_episodes import RecordedEpisodes
+from gpadjust.rl.task_learner import TaskLearner
 
-_NOT_SAVED = ("task", "model_hooks", "_random_state", "_unread_dynamics")
 
-
-class Dyna(OffPolicyAlgorithm):
+class Dyna(TaskLearner):
     r"""What an off-policy learner needs to learn from real episodes and from those in a model.
 
     After each real episode it updates on what it has, as the learner does; teaches the real
@@ -79,8 +67,7 @@ class Dyna(OffPolicyAlgorithm):
 
     Attributes:
         num_episodes: Real episodes that have ended and were learnt from.
-        wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"update"``; with
-            ``exploration`` on ``"plan"``, too.
+        wall_time: Seconds spent on ``"fit"``, ``"rollout"``, ``"update"`` and ``"plan"``.
         planned: The real episodes that go by plans; ``planned.num_planned`` is their number.
         notes: What you want to keep with the agent, in plain values; saved and resumed with it.
 
@@ -94,10 +81,6 @@ class Dyna(OffPolicyAlgorithm):
         AssertionError: By Stable-Baselines3, if the actions are no box.
     """
 
-    replay_buffer: MixedReplayBuffer
-    observation_space: spaces.Box
-    action_space: spaces.Box
-
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -109,7 +92,6 @@ class Dyna(OffPolicyAlgorithm):
         learning_starts: int = 0,
         train_freq: int | tuple[int, str] = (1, "episode"),
         gradient_steps: int = -1,
-        _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
         if kwargs.get("n_steps", 1) != 1:
@@ -128,29 +110,23 @@ class Dyna(OffPolicyAlgorithm):
                 "replay_buffer_class must be MixedReplayBuffer or a subclass of it; found "
                 f"{buffer_class.__name__}."
             )
-        self.task = task
         self.options = DynaOptions() if options is None else options
         self.num_episodes = 0
-        self.wall_time = {"fit": 0.0, "rollout": 0.0, "update": 0.0}
         self.planned = PlannedEpisodes()
-        self.notes: dict[str, Any] = {}
         self.owed_updates = 0.0
         self.model_hooks: list[DynaCallback] = []
-        self._num_stored = 0  # of the time steps, how many came into the buffer
-        self._random_state: RandomState | None = None
-        self._unread_dynamics: dict[str, Any] = {}  # of an agent that was loaded without a task
-        self._known = [] if task is None else _known(task)
-        if _init_setup_model:
-            self._ready_task()
-        given: dict[str, Any] = {
-            "buffer_size": buffer_size,
-            "learning_starts": learning_starts,
-            "train_freq": train_freq,
-            "gradient_steps": gradient_steps,
-            "replay_buffer_class": buffer_class,
-            "_init_setup_model": _init_setup_model,
-        }
-        super().__init__(policy, env, **given, **kwargs)
+        super().__init__(
+            task,
+            policy,
+            env,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            replay_buffer_class=buffer_class,
+            **kwargs,
+        )
+        self.wall_time = dict.fromkeys(("fit", "rollout", "update", "plan"), 0.0)
 
     # One iteration
 
@@ -161,7 +137,7 @@ class Dyna(OffPolicyAlgorithm):
         serves = self.options.uses_model(self.num_episodes)
         new = self._new_episodes()
         if serves and new is not None and self.options.reward_tolerance is not None:
-            new.check(self._ready_task(), self.options.reward_tolerance)
+            new.check(self.ready_task(), self.options.reward_tolerance)
         self.replay_buffer.mix = self.options.keep_model_data or serves
         with self.timed("update"):
             super().train(gradient_steps, batch_size)
@@ -182,15 +158,15 @@ class Dyna(OffPolicyAlgorithm):
         if not self.replay_buffer.num_new:
             return None
         new = self.recorded_episodes(newest=self.replay_buffer.num_new)
-        least = 1 if self._ready_task().dynamics.is_fitted else 2  # a first fit needs two
+        least = 1 if self.ready_task().dynamics.is_fitted else 2  # a first fit needs two
         return new if new.num_ended and new.num_transitions >= least else None
 
     def _learn_dynamics(self, new: RecordedEpisodes) -> None:
         """Score the dynamics on new transitions, and teach them these."""
-        dynamics = self._ready_task().dynamics
+        dynamics = self.ready_task().dynamics
         transitions = (new.states, new.actions, new.next_states)
         metrics: dict[str, float] = {}
-        before = self.wall_time["fit"]
+        start = time.perf_counter()
         with self.timed("fit"):
             if dynamics.is_fitted:
                 score = dynamics.score(*transitions)
@@ -201,7 +177,9 @@ class Dyna(OffPolicyAlgorithm):
                 names = [dynamics.spec.states[i] for i in dynamics.spec.moving]
                 metrics |= {f"rmse/{n}": float(e) for n, e in zip(names, score.rmse, strict=True)}
             dynamics.update(*transitions)
-        metrics["fit_seconds"] = self.wall_time["fit"] - before
+        metrics["fit_seconds"] = time.perf_counter() - start
+        # Dynamics without variances have no NLPD.
+        metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         for name, value in metrics.items():
             self.logger.record(f"model/{name}", value)
         for hook in self.model_hooks:
@@ -245,7 +223,7 @@ class Dyna(OffPolicyAlgorithm):
                 hook.on_model_episodes(returns)
         self.logger.record("model/ep_rew_mean", float(np.concatenate(all_returns).mean()))
         self.logger.record("model/left_bounds", num_left)
-        if num_steps == num_left == num_episodes:
+        if num_steps == num_left == self.replay_buffer.model_buffer.size():
             warnings.warn(
                 "All model episodes left the bounds of the states at once, so the agent has learnt "
                 "nothing of use from the model. Check the task's initial_states, or pass "
@@ -265,41 +243,23 @@ class Dyna(OffPolicyAlgorithm):
             with self.timed("update"):
                 super().train(updates, batch_size)
 
-    # What it knows
-
-    def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
-        """The real transitions in the buffer; or the newest steps of each environment only."""
-        spec = self._ready_task().dynamics.spec
-        return RecordedEpisodes(self.replay_buffer, self.policy, spec, newest)
-
-    def model_task(self) -> Task:
-        """The task, with what environment and real episodes tell where it says nothing.
-
-        Raises:
-            ValueError: If there are neither real episodes nor ``initial_states``, or nobody says
-                how long an episode is.
-        """
-        task = self._ready_task()
-        recorded = self.recorded_episodes()
-        found: dict[str, Any] = {"episode_length": self._episode_length()}
-        if recorded.num_transitions:
-            found |= {"initial_states": recorded.draw_starts, "state_bounds": recorded.bounds()}
-        elif task.initial_states is None:
-            raise ValueError(
-                "There are no real episodes yet that particles could start from; give the task "
-                "initial_states, or call learn() first."
-            )
-        return replace(task, **{k: v for k, v in found.items() if getattr(task, k) is None})
+    # The model
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
         """The dynamics, as they stand, as an environment of ``num_envs`` particles.
 
         Raises:
-            ValueError: As :meth:`model_task`.
+            ValueError: If there are neither real episodes nor ``initial_states``, or nobody says
+                how long an episode is.
         """
-        recorded = self.recorded_episodes()
+        task, recorded = self.model_task(), self.recorded_episodes()
+        if task.initial_states is None:
+            raise ValueError(
+                "There are no real episodes yet that particles could start from; give the task "
+                "initial_states, or call learn() first."
+            )
         return ModelVecEnv(
-            self.model_task(),
+            task,
             num_envs,
             self.observation_space,
             self.action_space,
@@ -326,62 +286,6 @@ class Dyna(OffPolicyAlgorithm):
         scaled = np.clip(self.policy.scale_action(actions) + noise(), -1, 1)
         return self.policy.unscale_action(scaled).astype(actions.dtype)
 
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add what is done inside to a part of ``wall_time``."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            spent = time.perf_counter() - start
-            self.wall_time[part] = self.wall_time.get(part, 0.0) + spent
-
-    def _ready_task(self) -> Task:
-        """The task, if the agent can learn with it.
-
-        Raises:
-            ValueError: If it is missing, or lacks what it had when the agent was made.
-            TypeError: If it is of another kind, or cannot tell what ``exploration`` asks.
-        """
-        name = type(self).__name__
-        if self.task is None:
-            raise ValueError(
-                f"{name} needs a task to learn; found None. Pass task=Task(dynamics, reward, ...) "
-                f"to {name} or, as it is not saved, to {name}.load. Without it the agent can only "
-                "predict."
-            )
-        if not isinstance(self.task, Task):
-            raise TypeError(f"task must be a Task(dynamics, reward, ...); found {self.task!r}.")
-        if not isinstance(self.options, DynaOptions):
-            raise TypeError(f"options must be DynaOptions(...); found {self.options!r}.")
-        missing = [part for part in self._known if part not in _known(self.task)]
-        if missing:
-            raise ValueError(
-                f"{name} was made with a task that has {missing[0]}, which is None now; give it to "
-                "the task again."
-            )
-        if self.options.exploration is not None:
-            self.options.exploration.objective.check(self.task)
-        return self.task
-
-    def _episode_length(self) -> int:
-        task = self._ready_task()
-        if task.episode_length is not None:
-            return task.episode_length
-        assert self.env is not None, "checked when learning starts"
-        spec = self.env.get_attr("spec")[0]
-        length = None if spec is None else spec.max_episode_steps
-        if length is None:
-            # A TimeLimit that was put around an environment by hand.
-            with suppress(AttributeError):
-                length = self.env.get_attr("_max_episode_steps")[0]
-        if length is None:
-            raise ValueError(
-                "The environment has no time limit that could be read; give the task an "
-                "episode_length, the number of steps of an episode."
-            )
-        return int(length)
-
     def _model_noise(self, num_envs: int) -> ActionNoise | None:
         """Action noise as the real steps have it, begun anew for each particle."""
         noise = self.action_noise
@@ -405,7 +309,7 @@ class Dyna(OffPolicyAlgorithm):
         taken = [
             self.planned.act(i, state, action, self._plans, self._plan, planner.replan_every)
             for i, (state, action) in enumerate(
-                zip(self._last_states(), torch.from_numpy(actions), strict=True)
+                zip(self.last_states(), torch.from_numpy(actions), strict=True)
             )
         ]
         scaled = self.policy.scale_action(torch.stack(taken).numpy())
@@ -414,14 +318,14 @@ class Dyna(OffPolicyAlgorithm):
     def _plans(self) -> bool:
         """Whether an episode that begins is to be planned."""
         # The first is the policy's, even of dynamics that have learnt from other data.
-        ready = self.num_episodes > 0 and self._ready_task().dynamics.is_fitted
+        ready = self.num_episodes > 0 and self.ready_task().dynamics.is_fitted
         left = self.options.explore_episodes - self.planned.num_planned
         return ready and left > 0 and self.options.uses_model(self.num_episodes)
 
     def _plan(self, episode: PlannedEpisode, state: Tensor) -> Tensor:
         """Plan the steps that are left of an episode, from where it is."""
         planner, task = self.options.exploration, self.model_task()
-        num_steps = self._episode_length() - len(episode.states)
+        num_steps = self.episode_length() - len(episode.states)
         if num_steps < 1 or planner is None:
             return episode.ahead
 
@@ -443,14 +347,6 @@ class Dyna(OffPolicyAlgorithm):
         self.logger.record("model/planned_value", plan.value)
         return plan.actions.clamp(bounds[0], bounds[1])
 
-    def _last_states(self) -> Tensor:
-        """Where the real environments are, ``n_envs x state_dim``."""
-        seen = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
-        assert isinstance(seen, np.ndarray), "observations are boxes"
-        return self._ready_task().dynamics.spec.decode(_doubles(seen))
-
-    # What SB3 calls
-
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -465,102 +361,36 @@ class Dyna(OffPolicyAlgorithm):
         for i in dones.nonzero()[0]:
             self.planned.end(int(i))
 
-    def _on_step(self) -> None:
-        """Remember that the step was stored."""
-        super()._on_step()
-        self._num_stored = self.num_timesteps
+    def environments_reset(self) -> None:
+        """No plan holds any more."""
+        self.planned.forget()
+
+    def ready_task(self) -> Task:
+        """The task, if the agent can learn with it; see :class:`TaskLearner`.
+
+        Raises:
+            TypeError: If options are of another kind, or the dynamics cannot tell what
+                ``exploration`` asks.
+        """
+        task = super().ready_task()
+        if not isinstance(self.options, DynaOptions):
+            raise TypeError(f"options must be DynaOptions(...); found {self.options!r}.")
+        if self.options.exploration is not None:
+            self.options.exploration.objective.check(task)
+        return task
 
     def _setup_model(self) -> None:
-        """Check the spaces before SB3 builds its networks on them."""
-        if self.task is not None:
-            check_spaces(self.task.dynamics.spec, self.observation_space, self.action_space)
         self.replay_buffer_kwargs |= {
             "real_fraction": self.options.real_fraction,
             "model_buffer_size": self.options.model_buffer_size,
         }
         super()._setup_model()
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        """Refuse to spend a real episode on an agent that could not learn from it."""
-        task = self._ready_task()
-        if self.env is None:
-            raise ValueError(
-                f"There is no environment to learn in; pass env to {type(self).__name__}.load, or "
-                "use set_env()."
-            )
-        assert isinstance(self.train_freq, TrainFreq), "converted when the agent was made"
-        if self.n_envs > 1 and self.train_freq.unit is TrainFrequencyUnit.EPISODE:
-            raise ValueError(
-                f"With {self.n_envs} environments Stable-Baselines3 cannot train by episodes; pass "
-                f"a number of steps as train_freq, such as ({self._episode_length()}, 'step')."
-            )
-        self._episode_length()
-        if self.options.exploration is not None:
-            self.wall_time.setdefault("plan", 0.0)
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         self.model_hooks = []  # callbacks that have some add themselves
-        if self._num_stored != self.num_timesteps:
-            # A callback stopped the last call at a step that SB3 made, but did not store.
-            self._last_obs = None
-        if reset_num_timesteps or self._last_obs is None:
-            self.planned.forget()  # the episodes under way, which SB3 ends
-        result = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        self._num_stored = self.num_timesteps
-        random_state = self._random_state or RandomState.capture()
-        self._random_state = None
-        task.rehearse(self._last_states())
-        random_state.restore()
-        return result
+        return super()._setup_learn(*args, **kwargs)
 
-    # Saving
-
-    def get_parameters(self) -> dict[str, dict[str, Any]]:
-        """As in SB3, with the state of the dynamics."""
-        task = self.task
-        learnt = self._unread_dynamics if task is None else task.dynamics.state_dict()
-        return {**super().get_parameters(), "dynamics": learnt}
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | TensorDict,
-        exact_match: bool = True,
-        device: torch.device | str = "auto",
-    ) -> None:
-        """As in SB3; without a task, the state of the dynamics is kept for the next ``save``.
-
-        Raises:
-            ValueError: As in SB3, if something is missing, unless ``exact_match`` is False.
-            RuntimeError: If the state is of other dynamics, or of another physics.
-        """
-        if isinstance(load_path_or_dict, dict):
-            parameters: dict[str, Any] = dict(load_path_or_dict)
-        else:
-            parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
-        if exact_match and "dynamics" not in parameters:
-            raise ValueError(
-                "Expected parameters with the state of the dynamics, 'dynamics'; found "
-                f"{sorted(parameters)}. Pass exact_match=False to take the networks alone."
-            )
-        state = _on_cpu(parameters.pop("dynamics", None))
-        if state is None or self.task is None:
-            super().set_parameters(parameters, exact_match, device)
-            self._unread_dynamics = state or {}
-            return
-        before = self.task.dynamics.state_dict()
-        self.task.dynamics.load_state_dict(state)
-        try:
-            super().set_parameters(parameters, exact_match, device)
-        except BaseException:
-            self.task.dynamics.load_state_dict(before)
-            raise
+    # What SB3 calls
 
     def load_replay_buffer(
         self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
@@ -570,66 +400,8 @@ class Dyna(OffPolicyAlgorithm):
         self.replay_buffer.model_buffer.device = self.device
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *_NOT_SAVED]
-
-
-class DynaSAC(Dyna, SAC):
-    """Soft actor-critic that also trains inside a dynamics model, see :class:`Dyna`.
-
-    One whose model never serves (``DynaOptions(last_model_episode=0)``) is Stable-Baselines3's
-    ``SAC``, bit for bit.
-
-    Example:
-        >>> import gymnasium
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-        >>> from gpadjust.rl import DynaOptions, DynaSAC
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
-        >>> task = Task(dynamics, cart_pole_reward)
-        >>> agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), seed=0)
-        >>> agent.learn(total_timesteps=2 * 25).num_episodes
-        2
-    """
-
-
-class DynaTD3(Dyna, TD3):
-    """TD3 that also trains inside a dynamics model, see :class:`Dyna`.
-
-    Its policy is deterministic: pass ``action_noise``, without which it explores neither the real
-    system nor the model. Particles have noise of their own.
-
-    Example:
-        >>> import gymnasium
-        >>> import numpy as np
-        >>> from stable_baselines3.common.noise import NormalActionNoise
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import PhysicsDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-        >>> from gpadjust.rl import DynaOptions, DynaTD3
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
-        >>> task = Task(dynamics, cart_pole_reward)
-        >>> noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
-        >>> options = DynaOptions(model_episodes=2)
-        >>> agent = DynaTD3("MlpPolicy", env, task, options, action_noise=noise, seed=0)
-        >>> agent.learn(total_timesteps=25).num_episodes
-        1
-    """
-
-
-def _known(task: Task) -> list[str]:
-    """The functions that a task may have and this one has."""
-    return [name for name in ("terminated", "initial_states") if getattr(task, name) is not None]
+        return [*super()._excluded_save_params(), "model_hooks"]
 
 
 def _doubles(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.asarray(values, dtype=np.float64))
-
-
-def _on_cpu(state: Any) -> Any:
-    """A state of dynamics, which SB3 loads to the device of the networks, where they compute."""
-    if isinstance(state, dict):
-        return {name: _on_cpu(part) for name, part in state.items()}
-    return state.cpu() if torch.is_tensor(state) else state

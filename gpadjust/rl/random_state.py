@@ -60,13 +60,7 @@ class RandomState:
         cuda = (f"cuda{i}" for i in range(len(arrays)))
         return cls(
             (version, tuple(python), gauss[0] if gauss else None),
-            (
-                "MT19937",
-                np.array(keys, dtype=np.uint32),
-                pos,
-                has_gauss,
-                float(arrays["numpy_gauss"]),
-            ),
+            ("MT19937", *legacy),
             torch.from_numpy(arrays["torch"]),
             [torch.from_numpy(arrays[name]) for name in cuda if name in arrays],
         )

@@ -76,7 +76,7 @@ class StateSpec:
         for name in ("states", "actions"):
             if not getattr(self, name):
                 raise ValueError(f"{name} must be one or more different names; found none.")
-        if self.step is not None and not isinstance(self.step, Real):
+        if isinstance(self.step, bool) or not isinstance(self.step, Real | None):
             raise TypeError(f"step must be a number or None; found {self.step!r}.")
         named = (*self.angles, *self.exogenous, *self.integrated, *self.integrated.values())
         named = (*named, *self.previous)
@@ -211,6 +211,11 @@ class StateSpec:
         """
         check_columns(states, self.state_dim, "states")
         check_columns(next_states, self.state_dim, "next_states")
+        if states.shape != next_states.shape:
+            raise ValueError(
+                "Expected states and next_states with as many rows, got shapes "
+                f"{tuple(states.shape)} and {tuple(next_states.shape)}."
+            )
         change = self.change(states, next_states)
         size = torch.maximum(states.abs(), next_states.abs())
         size[..., self.angle_columns] = size[..., self.angle_columns].clamp_min(1)
@@ -277,9 +282,12 @@ def check_columns(tensor: Tensor, columns: int, name: str) -> None:
     """Raise an error unless a tensor is floating-point and has the last dimension expected."""
     if not torch.is_tensor(tensor) or not tensor.is_floating_point():
         found = tensor.dtype if torch.is_tensor(tensor) else type(tensor).__name__
-        raise TypeError(f"Expected {name} as a floating-point tensor, got {found}.")
+        raise TypeError(
+            f"Expected {name} as a floating-point tensor, got {found}; convert with "
+            f"`torch.as_tensor({name}, dtype=torch.float64)`."
+        )
     if tensor.dim() < 1 or tensor.shape[-1] != columns:
         raise ValueError(
-            f"Expected {name} of shape ... x {columns}, as the spec says, got "
+            f"Expected {name} of shape ... x {columns}, got "
             f"{tuple(tensor.shape)}."
         )

@@ -1,10 +1,12 @@
 """The loop: what it measures, what it survives, and how it goes on."""
 
 import json
+import math
 import os
-import signal
+import random
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -14,7 +16,9 @@ from botorch.models.transforms import Normalize
 
 from gpadjust import fit
 from gpadjust.active import (
+    Collection,
     CollectionError,
+    LogError,
     MeasurementWarning,
     collect,
     qAdjustmentInformationGain,
@@ -114,12 +118,12 @@ class TestMeasuring:
 
     def test_warm_started_fits(self, laboratory, monkeypatch):
         started = []
-        from gpadjust.active import refitting
+        from gpadjust.active import warm_refit
 
         def watch(model, previous):
             started.append((len(model.train_targets), len(previous.train_targets)))
 
-        monkeypatch.setattr(refitting, "warm_start", watch)
+        monkeypatch.setattr(warm_refit, "warm_start", watch)
         collect(**laboratory(budget=7)).model  # noqa: B018
         assert started == [(5, 4), (6, 5), (7, 6)]
 
@@ -161,9 +165,6 @@ class TestFailures:
             (throw(OSError("no gas")), "OSError: no gas"),
             (lambda Y: Y * float("nan"), r"measured \[nan\]"),
             (lambda Y: Y + float("inf"), r"measured \[inf\]"),
-            (lambda Y: torch.ones(2, 1), r"Expected measured values of shape 1 x 1, .* \(2, 1\)"),
-            (lambda Y: torch.ones(1, 2), r"Expected measured values of shape 1 x 1, .* \(1, 2\)"),
-            (lambda Y: None, "Expected numbers"),
         ],
     )
     def test_they_are_skipped_and_counted(self, laboratory, tmp_path, what, message):
@@ -270,7 +271,76 @@ class TestFailures:
         assert (len(result.X), len(result.failed_X)) == (5, 3)
 
 
+class TestResultsThatCannotBeTaken:
+    @pytest.mark.parametrize(
+        ("what", "message", "logged"),
+        [
+            (lambda Y: torch.ones(2, 1), r"of shape 1 x 1, .* \(2, 1\)", [[1.0], [1.0]]),
+            (lambda Y: [1.5, math.nan], r"of shape 1 x 1, .* \(2,\)", [1.5, "NaN"]),
+            (lambda Y: {"Y": Y[0].numpy() * 0}, "to be real numbers", {"Y": [0.0]}),
+            (lambda Y: 2j, "to be real numbers", "2j"),
+            (lambda Y: None, "to be real numbers, got None", None),
+            (lambda Y: {(1, 2): 3}, "to be real numbers", "{(1, 2): 3}"),
+        ],
+    )
+    def test_nothing_is_lost(self, laboratory, tmp_path, what, message, logged):
+        path = tmp_path / "log.jsonl"
+        oracle = Oracle(n3=what)
+        with pytest.raises(CollectionError, match=f"{message}.*still pending") as caught:
+            collect(**laboratory(oracle=oracle, log=path))
+        error = caught.value
+        assert torch.equal(error.X, oracle.asked[2])
+        assert str(error.result) == str(what(truth(error.X)))
+        assert torch.equal(error.collection.pending, error.X)
+        assert len(error.collection.failed_X) == 0
+        (record,) = [r for r in map(json.loads, path.read_text().splitlines()) if "refused" in r]
+        assert record["refused"] == logged
+        assert record["of"] == error.X.tolist()
+
+    def test_it_goes_on_by_hand_or_anew(self, laboratory, tmp_path):
+        path = tmp_path / "log.jsonl"
+        with pytest.raises(CollectionError) as caught:
+            collect(**laboratory(oracle=Oracle(n3=lambda Y: None), log=path))
+        error, whole = caught.value, collect(**laboratory())
+        with error.collection as collection:
+            collection.tell(error.X, truth(error.X))
+            collection.run(truth, 5)
+        assert collection.num_measured == 5
+        assert same(collect(**laboratory(log=path)), whole)
+
+    def test_a_full_disk(self, laboratory, tmp_path, monkeypatch):
+        def full(file):
+            raise OSError(28, "No space left on device")
+
+        def fill(Y):
+            monkeypatch.setattr(os, "fsync", full)
+            return Y
+
+        path = tmp_path / "log.jsonl"
+        oracle = Oracle(n3=fill)
+        with pytest.raises(CollectionError, match=r"are in this error's `.result`.*No space") as e:
+            collect(**laboratory(oracle=oracle, log=path))
+        monkeypatch.undo()
+        assert torch.equal(e.value.result, truth(e.value.X))
+        e.value.collection.tell(e.value.X, e.value.result)
+        e.value.collection.close()
+        again = Oracle()
+        result = collect(**laboratory(oracle=again, log=path))
+        assert len(again.asked) == 4
+        assert same(result, collect(**laboratory()))
+
+
 class TestResuming:
+    def test_a_collection_runs_on(self, laboratory):
+        arguments = laboratory()
+        oracle, budget = arguments.pop("oracle"), arguments.pop("budget")
+        collection = Collection(**arguments)
+        X = collection.ask()
+        collection.tell(X, oracle(X))
+        assert collection.run(oracle, 3) is collection
+        assert collection.num_measured == 3
+        assert same(collection.run(oracle, budget), collect(**laboratory()))
+
     @pytest.mark.parametrize(
         ("batch_size", "at", "fit"),
         [(1, 1, "given"), (1, 6, "given"), (2, 4, "given"), (2, 3, "default")],
@@ -349,30 +419,57 @@ class TestResuming:
         with pytest.raises(ValueError, match=r"log\.jsonl is no log of measurements"):
             collect(**laboratory(log=path))
 
+    def test_a_log_is_free_when_it_is_done(self, laboratory, tmp_path):
+        path = tmp_path / "log.jsonl"
+        first = collect(**laboratory(log=path, budget=2))
+        second = collect(**laboratory(log=path, budget=3))
+        assert first.num_measured == 2
+        with pytest.raises(KeyboardInterrupt) as kept:
+            collect(**laboratory(oracle=Oracle(n1=throw(KeyboardInterrupt())), log=path))
+        assert kept.value.__traceback__
+        with pytest.raises(LogError, match="something else has written to it"):
+            first.ask()
+        assert same(collect(**laboratory(log=path, budget=3)), second)
+
     @pytest.mark.slow
     def test_a_killed_process(self, tmp_path):
+        """At random moments; while it lives, no other takes the log."""
         code = """
-import os, signal, sys, torch
+import sys, torch
 from gpadjust import CKA
 from gpadjust.active import collect, qAdjustmentInformationGain
 def oracle(X):
-    if os.path.exists("first") or open("log.jsonl").read().count('"y"') < 5:
-        return 2 * X.sin() + X
-    open("first", "w").close()
-    os.kill(os.getpid(), signal.SIGKILL)
+    print(X.flatten().tolist(), flush=True)
+    return 2 * X.sin() + X
 result = collect(lambda X, Y: CKA(X, Y, physics=torch.sin), oracle, [[0.0], [3.0]],
-    qAdjustmentInformationGain, budget=7, log="log.jsonl",
+    qAdjustmentInformationGain, budget=12, log=sys.argv[1],
     optimizer_options={"num_restarts": 1, "raw_samples": 4})
-print(result.X.flatten().tolist())
+print("end", result.X.flatten().tolist(), flush=True)
 """
-        run = [sys.executable, "-c", code]
         env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        first = subprocess.run(run, cwd=tmp_path, env=env, capture_output=True, check=False)
-        assert first.returncode == -signal.SIGKILL
-        second = subprocess.run(run, cwd=tmp_path, env=env, capture_output=True, check=True)
-        (tmp_path / "log.jsonl").unlink()
-        whole = subprocess.run(run, cwd=tmp_path, env=env, capture_output=True, check=True)
-        assert second.stdout == whole.stdout
+
+        def start(log):
+            run = [sys.executable, "-c", code, str(tmp_path / log)]
+            pipe = subprocess.PIPE
+            return subprocess.Popen(run, env=env, stdout=pipe, stderr=pipe, text=True)
+
+        whole = start("whole").communicate()[0].splitlines()
+        draw, lines = random.Random(0), []
+        for kills in range(4):
+            process = start("log")
+            lines.append(process.stdout.readline().strip())
+            if kills == 0:
+                refused = start("log").communicate()[1]
+                assert f"log is held by process {process.pid} on" in refused
+            if kills < 3:
+                time.sleep(draw.uniform(0, 0.2))
+                process.kill()
+            lines += process.communicate()[0].splitlines()
+        assert lines[-1] == whole[-1]
+        # All was measured, in this order, and again only what a kill came in the way of.
+        calls = [line for line in lines if line.startswith("[")]
+        assert list(dict.fromkeys(calls)) == whole[:-1]
+        assert len(calls) <= len(whole) - 1 + 3
 
 
 def _parameters(model):
@@ -401,10 +498,12 @@ class TestErrors:
             ([[0.0, 0.0]], r"got \(1, 2\)"),
             ([[0.0, 1.0], [1.0, 0.0]], "each lower one below its upper one"),
             ([[0.0, float("nan")], [1.0, 1.0]], "Expected finite bounds"),
+            ([[0.0, 1.0], [1.0]], "Expected bounds to be real numbers"),
+            (None, "Expected bounds to be real numbers, got None"),
         ],
     )
     def test_bounds(self, laboratory, bounds, message):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((TypeError, ValueError), match=message):
             collect(**laboratory(bounds=bounds))
 
     @pytest.mark.parametrize("name", ["model_factory", "acquisition", "oracle", "fit"])
@@ -427,7 +526,7 @@ class TestErrors:
         with pytest.raises(ValueError, match=r"LogExpectedImprovement takes one .* got q = 2"):
             collect(**laboratory(acquisition=analytic, batch_size=2))
 
-    @pytest.mark.parametrize("initial", [1, 0, "three"])
+    @pytest.mark.parametrize("initial", [1, 0, 3.0, "three"])
     def test_initial(self, laboratory, initial):
         with pytest.raises(ValueError, match="Expected initial to be a number of points >= 2"):
             collect(**laboratory(initial=initial))
@@ -435,6 +534,8 @@ class TestErrors:
     def test_initial_points(self, laboratory):
         with pytest.raises(ValueError, match=r"Expected initial of shape n x 2"):
             collect(**laboratory(initial=torch.ones(3, 1)))
+        with pytest.raises(ValueError, match="points of initial to differ"):
+            collect(**laboratory(initial=[[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]))
 
     def test_data(self, laboratory, uniform):
         X = uniform(4, 2)
@@ -445,6 +546,25 @@ class TestErrors:
         with pytest.raises(ValueError, match=r"shape 4 x m, .* got \(3, 1\)"):
             collect(**laboratory(data=(X, X[:3, :1])))
 
-    def test_seed(self, laboratory):
+    def test_a_pair(self, laboratory, uniform):
+        with pytest.raises(TypeError, match=r"data to be a pair \(X, Y\), got tensor"):
+            collect(**laboratory(data=uniform(3, 2)))
+
+    @pytest.mark.parametrize("seed", [-1, 2**63, 1.0])
+    def test_seed(self, laboratory, seed):
         with pytest.raises(ValueError, match="seed to be a whole number >= 0"):
-            collect(**laboratory(seed=-1))
+            collect(**laboratory(seed=seed))
+
+    def test_optimizer_options(self, laboratory):
+        with pytest.raises(TypeError, match=r"to be a dictionary, got \[1\]"):
+            collect(**laboratory(optimizer_options=[1]))
+        with pytest.raises(ValueError, match=r"without \['q'\]"):
+            collect(**laboratory(optimizer_options={"q": 2}))
+
+    def test_no_model(self, laboratory):
+        with pytest.raises(TypeError, match=r"model_factory.* to be a BoTorch model, got int"):
+            collect(**laboratory(model_factory=lambda X, Y: 3))
+
+    def test_log(self, laboratory):
+        with pytest.raises(TypeError, match="log to be the path of a file, got 3"):
+            collect(**laboratory(log=3))

@@ -1,11 +1,14 @@
 """Asking and telling in any order."""
 
+import copy
 import json
+import os
+import shutil
 
 import pytest
 import torch
 
-from gpadjust.active import Collection, MeasurementWarning
+from gpadjust.active import Collection, LogError, MeasurementWarning
 
 
 def truth(X):
@@ -104,7 +107,10 @@ def test_some_of_the_outputs(make, tmp_path, missing):
         collection.tell(X, torch.tensor([[50.0, missing], [float("nan")] * 2]))
     records = [json.loads(line) for line in path.read_text().splitlines()[-2:]]
     assert [record["y"] for record in records] == [[50.0, None], [None, None]]
-    for each in (collection, make(log=path, num_outputs=2), make(log=path)):
+    collection.close()
+    with make(log=path, num_outputs=2) as second:
+        pass
+    for each in (collection, second, make(log=path)):
         assert torch.equal(each.X, X[:1])
         assert torch.equal(each.Y.isnan(), torch.tensor([[False, True]]))
         assert torch.equal(each.failed_X, X[1:])
@@ -129,11 +135,11 @@ def test_first_points_out_of_bounds(make):
         make(initial=torch.tensor([[1.0, 0.0], [5.0, 0.0]]))
 
 
-def test_failing_and_withdrawing(make):
-    collection = make()
+def test_failing_and_withdrawing(make, tmp_path):
+    collection = make(log=tmp_path / "log.jsonl")
     X = collection.ask(4)
-    with pytest.warns(MeasurementWarning, match="1 of 1 measurements failed.*the pump leaks"):
-        collection.fail(X[:1], "the pump leaks")
+    with pytest.warns(MeasurementWarning, match="1 of 1 measurements failed.*OSError: leaks"):
+        collection.fail(X[:1], OSError("leaks"))
     assert torch.equal(collection.failed_X, X[:1])
     collection.withdraw(X[1:2])
     assert torch.equal(collection.pending, X[2:])
@@ -152,7 +158,7 @@ def test_all_of_it_comes_back_from_the_log(make, tmp_path, uniform):
     collection.withdraw(X[1:2])
     other = uniform(1, 2)
     collection.tell(other, truth(other))
-    again = make(log=path)
+    again = make(log=shutil.copy(path, tmp_path / "copy.jsonl"))
     for name in ("X", "Y", "failed_X", "pending"):
         assert torch.equal(getattr(again, name), getattr(collection, name))
     assert again.num_measured == collection.num_measured == 6
@@ -183,14 +189,126 @@ def test_a_model_needs_data(make):
         (torch.ones(1, 3), torch.ones(1), r"got \(1, 3\)"),
         (torch.ones(2, 2), torch.ones(3, 1), r"shape 2 x 1, .* got \(3, 1\)"),
         (torch.ones(2, 2), torch.ones(2, 2), r"shape 2 x 1, .* got \(2, 2\)"),
+        (torch.ones(2, 2), torch.ones(1), r"shape 2 x 1, .* got \(1,\)"),
         (torch.full((1, 2), float("nan")), torch.ones(1), "Expected X to be finite"),
+        ("here", 1.0, "Expected X to be real numbers, got 'here'"),
+        (torch.ones(1, 2), torch.ones(1) * 1j, "measured values to be real numbers, .*complex"),
+        (torch.ones(2, 2), [[1.0], [1.0, 2.0]], "measured values to be real numbers, got"),
     ],
 )
 def test_bad_tellings_change_nothing(make, tmp_path, X, Y, message):
     path = tmp_path / "log.jsonl"
     collection = filled(make(log=path), 1)
     before = path.read_bytes()
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         collection.tell(X, Y)
     assert path.read_bytes() == before
     assert len(collection.X) == 1
+
+
+class TestOneCollectionOfALog:
+    def test_another_is_refused_until_it_is_closed(self, make, tmp_path):
+        path = tmp_path / "log.jsonl"
+        with make(log=path) as first:
+            X = first.ask()
+            with pytest.raises(LogError, match=r"log\.jsonl is held by process .*, this one: two"):
+                make(log=path)
+        second = make(log=path)
+        assert torch.equal(second.pending, X)
+        with pytest.raises(LogError, match="is held by process"):
+            first.tell(X, truth(X))
+        assert torch.equal(first.pending, X)
+        second.close()
+        first.tell(X, truth(X))
+        first.close()
+        with pytest.raises(LogError, match="something else has written to it"):
+            second.tell(X, truth(X))
+
+    def test_out_of_scope_it_holds_nothing(self, make, tmp_path, bounds):
+        path = tmp_path / "log.jsonl"
+        filled(make(log=path), 1)
+        with pytest.raises(ValueError, match="within the bounds") as kept:
+            make(log=path, bounds=2 * bounds)
+        assert kept.value.__traceback__
+        assert len(make(log=path).X) == 1
+
+    @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy])
+    def test_a_copy_has_to_wait(self, make, tmp_path, copied):
+        first = filled(make(log=tmp_path / "log.jsonl"), 1)
+        second = copied(first)
+        with pytest.raises(LogError, match="is held by process"):
+            second.ask()
+        first.close()
+        assert second.ask().shape == (1, 2)
+
+
+def test_what_cannot_be_logged_is_not_taken(make, tmp_path, monkeypatch):
+    path = tmp_path / "log.jsonl"
+    collection = filled(make(log=path), 1)
+    X, before = collection.ask(2), path.read_bytes()
+
+    def full(file):
+        raise OSError(28, "No space left on device")
+
+    calls = [
+        lambda: collection.tell(X, truth(X)),
+        lambda: collection.fail(X, "no"),
+        lambda: collection.withdraw(),
+        lambda: collection.ask(),
+    ]
+    for call in calls:
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(LogError, match=r"No space left .* is not on the disk, and the coll"):
+            call()
+        monkeypatch.undo()
+        assert path.read_bytes() == before
+        assert len(collection.X) == 1
+        assert torch.equal(collection.pending, X)
+    collection.tell(X, truth(X))
+    collection.close()
+    assert torch.equal(make(log=path).X, collection.X)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('{"x": [0.5], "y": [1.0]}', r"Expected X of shape n x 2"),
+        ('{"x": [0.5, 0.0], "y": [null]}', "nothing but NaN"),
+        ('{"x": [0.5, 0.0], "y": ["a"]}', "to be real numbers"),
+        ('{"x": [0.5, 0.0]}', "KeyError: 'y'"),
+        ('{"z": 1}', "KeyError: 'x'"),
+        ('{"asked": "abc"}', "Expected X to be real numbers"),
+    ],
+)
+def test_a_record_that_does_not_belong(make, tmp_path, line, message):
+    path = tmp_path / "log.jsonl"
+    filled(make(log=path), 1)
+    with path.open("a") as file:
+        file.write(line + "\n")
+    with pytest.raises(
+        ValueError, match=rf"Line 4 of the log .*log\.jsonl, .* 2 inputs.*{message}"
+    ):
+        make(log=path)
+
+
+@pytest.mark.parametrize("parameters", ["abc", {"a": "b"}, {"a": [[1.0], [1.0, 2.0]]}])
+def test_parameters_that_are_none_are_no_hindrance(make, tmp_path, parameters):
+    path = tmp_path / "log.jsonl"
+    filled(make(log=path), 4)
+    with path.open("a") as file:
+        file.write(json.dumps({"asked": [[0.5, 0.5]], "parameters": parameters}) + "\n")
+    assert make(log=path).ask().shape == (1, 2)
+
+
+@pytest.mark.slow
+def test_a_log_cut_at_any_byte_has_lost_nothing_before(make, tmp_path):
+    path, cut = tmp_path / "log.jsonl", tmp_path / "cut.jsonl"
+    with filled(make(log=path), 6) as whole:
+        whole.ask(2)
+    content = path.read_bytes()
+    for size in range(len(content) + 1):
+        cut.write_bytes(content[:size])
+        n = content[: size + 1].count(b'"y"', 0, content.rfind(b"\n", 0, size + 1) + 1)
+        with make(log=cut) as collection:
+            assert torch.equal(collection.X, whole.X[:n])
+            assert torch.equal(collection.Y, whole.Y[:n]) or not n

@@ -1,41 +1,57 @@
 """Records that survive."""
 
+import copy
+import gc
+import multiprocessing
 import os
+import pickle
 
 import pytest
 
+from gpadjust.active import LogError
 from gpadjust.active.measurement_log import MeasurementLog
 
+BOUNDS = [[0.0], [1.0]]
 RECORDS = [{"x": [0.1, 1 / 3], "y": [2e-300]}, {"x": [1.0, 2.0], "failed": "no ü\nhere"}]
 
 
 @pytest.fixture
 def log(tmp_path):
     log = MeasurementLog(tmp_path / "new" / "log.jsonl")
+    assert log.open(BOUNDS) == []
     log.append(RECORDS[:1])
     log.append(RECORDS[1:])
     return log
 
 
+def read(log):
+    """What another one finds in the file, after this one is done with it."""
+    log.close()
+    other = MeasurementLog(log.path)
+    try:
+        return other.open(BOUNDS)
+    finally:
+        other.close()
+
+
 def test_records_come_back(log):
-    assert MeasurementLog(log.path).read() == RECORDS
-    assert len(log.path.read_text().splitlines()) == 2
-
-
-def test_nothing_is_no_records(tmp_path):
-    assert MeasurementLog(tmp_path / "none").read() == []
+    assert read(log) == RECORDS
+    assert len(log.path.read_text().splitlines()) == 3
 
 
 def test_torn_anywhere_in_the_last_line(log):
+    log.close()
     whole = log.path.read_bytes()
-    first = whole.index(b"\n") + 1
-    for size in range(first, len(whole) + 1):
+    header, first, _, _ = (len(line) for line in whole.split(b"\n"))
+    within = (0, 1, header - 1, header, header + 1, header + 2)
+    for size in (*within, *range(header + first + 2, len(whole) + 1)):
         log.path.write_bytes(whole[:size])
-        expected = RECORDS if size >= len(whole) - 1 else RECORDS[:1]
-        assert log.read() == expected
+        expected = RECORDS if size >= len(whole) - 1 else RECORDS[: size > header + 2]
+        other = MeasurementLog(log.path)
+        assert other.open(BOUNDS) == expected
         # What is appended next starts a line of its own.
-        log.append([{"x": [5.0]}])
-        assert log.read() == [*expected, {"x": [5.0]}]
+        other.append([{"x": [5.0]}])
+        assert read(other) == [*expected, {"x": [5.0]}]
 
 
 def test_it_is_on_the_disk_when_append_returns(log, monkeypatch):
@@ -45,7 +61,141 @@ def test_it_is_on_the_disk_when_append_returns(log, monkeypatch):
     assert synced == [log.path.stat().st_size]
 
 
-def test_a_line_that_is_no_record(log):
-    log.path.write_text('{"x": [1.0]}\n[1, 2]\n{"x": [2.0]}\n')
-    with pytest.raises(ValueError, match=r"found b'\[1, 2\]' in line 2"):
-        log.read()
+@pytest.mark.parametrize("line", [b"[1, 2]", b'{"x": [NaN]}', b"\xff", b"[" * 100_000])
+def test_a_line_that_is_no_record(log, line):
+    log.close()
+    log.path.write_bytes(log.path.read_bytes() + line + b"\n{}\n")
+    with pytest.raises(ValueError, match=r"each line of .*log\.jsonl, found b'.* in line 4"):
+        log.open(BOUNDS)
+
+
+@pytest.mark.parametrize("content", [b"my diary", b"{}", b'{"loss": 1.0}\n', b"\n\n", b"a\nb"])
+def test_another_file_is_left_as_it_is(tmp_path, content):
+    path = tmp_path / "notes"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"notes"):
+        MeasurementLog(path).open(BOUNDS)
+    assert path.read_bytes() == content
+
+
+class TestFailures:
+    @pytest.fixture
+    def limited(self):
+        """A limit on the size of files, which the kernel keeps as a full disk does."""
+        resource = pytest.importorskip("resource")
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+        def limit(size=before[0]):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+
+        yield limit
+        limit()
+
+    def test_a_full_disk_leaves_whole_records(self, log, limited):
+        whole = log.path.read_bytes()
+        for room in (0, 7, 50):
+            limited(len(whole) + room)
+            with pytest.raises(LogError, match=r"log\.jsonl cannot be written: .*Make room"):
+                log.append(RECORDS)
+            limited()
+            assert log.path.read_bytes() == whole
+        log.append(RECORDS)
+        assert read(log) == 2 * RECORDS
+
+    @pytest.mark.parametrize("error", [OSError(28, "No space left"), KeyboardInterrupt()])
+    def test_what_is_not_synced_is_not_kept(self, log, monkeypatch, error):
+        def fsync(file):
+            monkeypatch.undo()
+            raise error
+
+        whole = log.path.read_bytes()
+        monkeypatch.setattr(os, "fsync", fsync)
+        with pytest.raises((LogError, KeyboardInterrupt)):
+            log.append(RECORDS)
+        assert log.path.read_bytes() == whole
+
+    def test_a_torn_end_that_stays_is_removed_before_the_next(self, log, monkeypatch):
+        def fsync(file):
+            raise OSError(5, "Input/output error")
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        with pytest.raises(LogError, match="Input/output error"):
+            log.append([{"x": [9.0]}])
+        with log.path.open("ab") as file:
+            file.write(b'{"x": [9.')  # as if it could not be cut off
+        monkeypatch.undo()
+        log.append(RECORDS)
+        assert read(log) == 2 * RECORDS
+
+    def test_a_place_where_nothing_can_be_written(self, tmp_path):
+        (tmp_path / "file").touch()
+        for path in (tmp_path, tmp_path / "file" / "log.jsonl"):
+            with pytest.raises(LogError, match=r"cannot be opened: .*Name a file in a folder"):
+                MeasurementLog(path).open(BOUNDS)
+
+
+class TestHolding:
+    def test_one_at_a_time(self, log):
+        other = MeasurementLog(log.path)
+        with pytest.raises(LogError, match=rf"log\.jsonl is held by process {os.getpid()} .*this"):
+            other.open(BOUNDS)
+        log.close()
+        assert other.open(BOUNDS) == RECORDS
+        with pytest.raises(LogError, match="is held by process"):
+            log.append(RECORDS)
+
+    def test_by_any_name(self, log, tmp_path, monkeypatch):
+        (tmp_path / "link").symlink_to(log.path)
+        monkeypatch.chdir(log.path.parent)
+        for name in (tmp_path / "link", "log.jsonl"):
+            with pytest.raises(LogError, match="is held by process"):
+                MeasurementLog(name).open(BOUNDS)
+
+    def test_until_it_is_deleted(self, tmp_path):
+        log = MeasurementLog(tmp_path / "log.jsonl")
+        log.open(BOUNDS)
+        del log
+        gc.collect()
+        MeasurementLog(tmp_path / "log.jsonl").open(BOUNDS)
+
+    def test_again_if_nobody_else_has_written(self, log):
+        log.close()
+        log.append(RECORDS)
+        other = MeasurementLog(log.path)
+        assert read(log) == 2 * RECORDS
+        other.open(BOUNDS)
+        other.append(RECORDS)
+        other.close()
+        with pytest.raises(LogError, match="something else has written to it"):
+            log.append(RECORDS)
+        assert read(other) == 3 * RECORDS
+
+    @pytest.mark.parametrize("copied", [copy.copy, lambda log: pickle.loads(pickle.dumps(log))])
+    def test_not_by_a_copy(self, log, copied):
+        other = copied(log)
+        with pytest.raises(LogError, match="is held by process"):
+            other.append(RECORDS)
+        log.close()
+        other.append(RECORDS)
+        assert read(other) == 2 * RECORDS
+
+    @pytest.mark.slow
+    @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
+    def test_not_by_a_fork(self, log):
+        def child(queue):
+            try:
+                log.append(RECORDS)
+            except LogError as error:
+                queue.put(str(error))
+            log.close()
+
+        context = multiprocessing.get_context("fork")
+        queue = context.SimpleQueue()
+        process = context.Process(target=child, args=(queue,))
+        process.start()
+        assert f"is held by process {os.getpid()}" in queue.get()
+        process.join()
+        with pytest.raises(LogError, match="is held by process"):
+            MeasurementLog(log.path).open(BOUNDS)
+        log.append(RECORDS)
+        assert read(log) == 2 * RECORDS

@@ -74,14 +74,22 @@ def test_a_single_sequence_is_taken():
 # Trials in functions
 
 
-def half_steps(fails_beyond=None):
+def reward(states, actions, next_states):
+    return -(next_states[:, 0] - 1).abs()
+
+
+def task_of(dynamics, **parts):
+    return Task(dynamics, reward, **parts)
+
+
+def half_steps(fails_beyond=None, **parts):
     def physics(X):
         if fails_beyond is not None and (X[:, 0] > fails_beyond).any():
             bad = (X[:, 0] > fails_beyond).nonzero().flatten().tolist()
             raise PhysicsError("too far", rows=bad)
         return X[:, :1] + 0.5 * X[:, 1:]
 
-    return PhysicsDynamics(SPEC, physics)
+    return task_of(PhysicsDynamics(SPEC, physics), **parts)
 
 
 def test_sequences_are_followed(origin):
@@ -91,6 +99,8 @@ def test_sequences_are_followed(origin):
     assert torch.equal(steps.actions, sequences.expand(3, 2, 3, 1))
     expected = torch.tensor([[0, 0.5, 1.5], [0, 0, -0.5]], dtype=torch.float64)
     torch.testing.assert_close(steps.states.squeeze(-1), expected.expand(3, 2, 3))
+    torch.testing.assert_close(steps.next_states[:, :, :-1], steps.states[:, :, 1:])
+    torch.testing.assert_close(steps.rewards, -(steps.next_states.squeeze(-1) - 1).abs())
 
 
 @pytest.mark.parametrize(
@@ -105,19 +115,18 @@ def test_sequences_are_followed(origin):
 )
 def test_episodes_end_in_the_model(origin, options, made):
     sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
-    steps = Rollouts(half_steps(), 2, **options).follow(origin, sequences)
+    steps = Rollouts(half_steps(**options), 2).follow(origin, sequences)
     assert steps.made[:, 1].all()
     assert steps.made[:, 0].tolist() == [made] * 2
-    lost = ~steps.made
-    assert (steps.states[lost] == 0).all()
-    assert (steps.actions[lost] == 1).all()
+    assert steps.left_bounds.tolist() == [["state_bounds" in options, False]] * 2
 
 
 def test_episodes_end_where_the_physics_fails(origin):
     sequences = torch.stack([torch.ones(5, 1), -torch.ones(5, 1)]).double()
     steps = Rollouts(half_steps(fails_beyond=0.9), 2).follow(origin, sequences)
     assert steps.made[0].tolist() == [[True, True, False, False, False], [True] * 5]
-    assert steps.states.max() <= 0.9
+    assert steps.states[steps.made].max() <= 0.9
+    assert steps.left_bounds.tolist() == [[True, False]] * 2
 
 
 def test_all_episodes_may_end_at_once_but_not_at_the_start(origin):
@@ -141,7 +150,7 @@ def test_the_policy_proposes(origin):
 
 def test_a_plan_goes_where_little_is_known(known_left, origin):
     plan = CrossEntropyPlanner(Information(), num_random=24, rounds=1).plan(
-        known_left, origin, 4, BOUNDS
+        task_of(known_left), origin, BOUNDS, 4
     )
     assert plan.actions.shape == (4, 1)
     assert ((plan.actions >= BOUNDS[0]) & (plan.actions <= BOUNDS[1])).all()
@@ -149,7 +158,7 @@ def test_a_plan_goes_where_little_is_known(known_left, origin):
     information = TrajectoryInformation(known_left)
     actions = torch.full((4, 1), -0.5, dtype=torch.float64)
     states = actions.cumsum(0) / 2 - actions / 2
-    assert plan.information > 3 * information(states, actions)
+    assert plan.value > 3 * information(states, actions)
 
 
 def test_more_rounds_teach_more(known_left, origin):
@@ -157,45 +166,49 @@ def test_more_rounds_teach_more(known_left, origin):
     for rounds in (0, 4):
         torch.manual_seed(0)
         options = CrossEntropyPlanner(Information(), num_random=16, num_policy=0, rounds=rounds)
-        values.append(options.plan(known_left, origin, 4, BOUNDS).information)
+        values.append(options.plan(task_of(known_left), origin, BOUNDS, 4).value)
     assert values[1] > values[0]
 
 
 def test_a_plan_may_be_the_policys(known_left, origin):
     options = CrossEntropyPlanner(Information(), num_random=0, num_policy=4, rounds=0)
-    plan = options.plan(known_left, origin, 3, BOUNDS, policy=lambda s: torch.full_like(s, 9.0))
+    plan = options.plan(
+        task_of(known_left), origin, BOUNDS, 3, policy=lambda s: torch.full_like(s, 9.0)
+    )
     assert (plan.actions == 2).all()
-    without = options.plan(known_left, origin, 3, BOUNDS)
+    without = options.plan(task_of(known_left), origin, BOUNDS, 3)
     assert without.actions.unique().numel() > 1
 
 
-def test_the_rest_of_a_episode_counts_what_the_episode_told(known_left):
-    """Of what only the first steps can tell, the rest of a episode that repeats them tells less."""
+def test_the_rest_of_an_episode_counts_what_the_episode_told(known_left):
+    """Of what only the first steps can tell, a rest that repeats them tells less."""
     state = torch.zeros(1, dtype=torch.float64)
     held = torch.full((2, 1), 1.5, dtype=torch.float64)
     options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
-    alone = options.plan(known_left, state, 2, BOUNDS, policy=lambda s: s * 0 + 1.5)
+    alone = options.plan(task_of(known_left), state, BOUNDS, 2, policy=lambda s: s * 0 + 1.5)
     states = torch.tensor([[0.0], [0.75]], dtype=torch.float64)
     both = options.plan(
-        known_left, state, 2, BOUNDS, policy=lambda s: s * 0 + 1.5, past=(states, held)
+        task_of(known_left), state, BOUNDS, 2, policy=lambda s: s * 0 + 1.5, past=(states, held)
     )
     first = TrajectoryInformation(known_left)(states, held)
-    assert first < both.information < alone.information + 0.7 * first
+    assert first < both.value < alone.value + 0.7 * first
 
 
 def test_a_known_sequence_is_kept_if_nothing_is_better(known_left, origin):
     known = torch.full((4, 1), 2.0, dtype=torch.float64)
     options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
-    plan = options.plan(known_left, origin, 4, BOUNDS, policy=lambda s: s * 0 - 0.5, known=known)
+    plan = options.plan(
+        task_of(known_left), origin, BOUNDS, 4, policy=lambda s: s * 0 - 0.5, known=known
+    )
     assert torch.equal(plan.actions, known)
 
 
 def test_a_state_from_which_every_step_leaves_the_bounds(known_left, origin):
     bounds = torch.tensor([[5.0], [6.0]], dtype=torch.float64)
     plan = CrossEntropyPlanner(Information(), num_random=4).plan(
-        known_left, origin, 3, BOUNDS, state_bounds=bounds
+        task_of(known_left, state_bounds=bounds), origin, BOUNDS, 3
     )
-    assert plan.information == 0
+    assert plan.value == 0
 
 
 def test_plans_are_those_of_the_generator(known_left, origin):
@@ -203,7 +216,7 @@ def test_plans_are_those_of_the_generator(known_left, origin):
     plans = []
     for seed in (0, 0, 1):
         torch.manual_seed(seed)
-        plans.append(options.plan(known_left, origin, 3, BOUNDS).actions)
+        plans.append(options.plan(task_of(known_left), origin, BOUNDS, 3).actions)
     assert torch.equal(plans[0], plans[1])
     assert not torch.equal(plans[0], plans[2])
 
@@ -227,10 +240,49 @@ def test_bad_options_are_refused(options, error, message):
 def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
     options = CrossEntropyPlanner(Information())
     with pytest.raises(ValueError, match=r"state of shape 1, found \(2,\)"):
-        options.plan(known_left, origin.repeat(2), 3, BOUNDS)
+        options.plan(task_of(known_left), origin.repeat(2), BOUNDS, 3)
     with pytest.raises(ValueError, match=r"finite action_bounds of shape 2 x 1, found .*inf"):
-        options.plan(known_left, origin, 3, BOUNDS * torch.inf)
+        options.plan(task_of(known_left), origin, BOUNDS * torch.inf, 3)
     with pytest.raises(TypeError, match="found PhysicsDynamics"):
-        options.plan(half_steps(), origin, 3, BOUNDS)
+        options.plan(half_steps(), origin, BOUNDS, 3)
     with pytest.raises(RuntimeError, match="has not learnt"):
-        options.plan(LearnedDynamics(SPEC, model=ZeroMeanGP), origin, 3, BOUNDS)
+        options.plan(task_of(LearnedDynamics(SPEC, model=ZeroMeanGP)), origin, BOUNDS, 3)
+    with pytest.raises(ValueError, match="num_steps as a number of steps >= 1, found None"):
+        options.plan(task_of(known_left), origin, BOUNDS)
+
+
+def test_an_objective_is_asked_for():
+    with pytest.raises(TypeError, match=r"Information\(\) or Return\(\); found 'return'"):
+        CrossEntropyPlanner("return")
+
+
+# Returns
+
+
+def test_a_plan_of_the_greatest_return(origin):
+    """From x = 0 the way to x = 1 and to stay there, by steps of v / 2 with v at most 2."""
+    planner = CrossEntropyPlanner(Return(), num_random=200, rounds=12, max_hold=1)
+    plan = planner.plan(half_steps(), origin, BOUNDS, 4)
+    assert plan.value > -0.1
+    reached = (plan.actions[:, 0] / 2).cumsum(0)
+    torch.testing.assert_close(reached, torch.ones(4).double(), atol=0.05, rtol=0)
+
+
+def test_a_return_is_the_sum_of_the_rewards_that_are_made(origin):
+    sequences = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
+    for parts, expected in [
+        ({}, [-0.5 - 0.5 - 0.5, -1.0 - 1.5 - 1.0]),
+        ({"terminated": lambda states: states[:, 0] > 1.2}, [-0.5 - 0.5, -1.0 - 1.5 - 1.0]),
+        ({"state_bounds": torch.tensor([[-9.0], [1.2]])}, [-0.5 - 2 * 1.5, -1.0 - 1.5 - 1.0]),
+    ]:
+        task = half_steps(**parts)
+        score = Return().of(task)(Rollouts(task, 2).follow(origin, sequences), None)
+        torch.testing.assert_close(score, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_leaving_the_bounds_never_pays(origin):
+    """Rewards are negative: an episode that ended early would have the greatest sum of them."""
+    task = half_steps(state_bounds=torch.tensor([[-0.3], [0.9]]))
+    plan = CrossEntropyPlanner(Return(), num_random=100, rounds=6).plan(task, origin, BOUNDS, 5)
+    rollout = Rollouts(task, 1).follow(origin, plan.actions.unsqueeze(0))
+    assert rollout.made.all()

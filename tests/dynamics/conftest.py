@@ -67,6 +67,17 @@ def kind(request):
     return request.param
 
 
+_QUICK = ["GP", "CKA"]
+
+
+@pytest.fixture(
+    params=[pytest.param(k, marks=() if k in _QUICK else pytest.mark.slow) for k in _MODELS]
+)
+def costly_kind(request):
+    """As `kind`, for what takes long."""
+    return request.param
+
+
 @pytest.fixture
 def make():
     """Makes dynamics by the name of their model, with a quick search."""

@@ -7,6 +7,9 @@ import torch
 
 from gpadjust import CKA, ScaleGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.gp import Term
+from gpadjust.models import AdjustedGP, Adjustment
+from gpadjust.models.hyperparameters import scaled_rbf
 from gpadjust.physics import ODEPhysics
 
 pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
@@ -161,6 +164,45 @@ def test_model_sees_the_physics_of_the_user(cart_pole_system, make):
     assert isinstance(dynamics.model, CKA)
     assert dynamics.physics is system.crude
     assert dynamics.model.physics.physics is system.crude
+
+
+class WavyCKA(AdjustedGP):
+    """A structure of a user's: CKA with a term more."""
+
+    def __init__(self, train_X, train_Y, train_Yvar=None, *, physics, waves=1, **options):
+        def more_terms(num_inputs, batch_shape, scale):
+            kernels = [scaled_rbf(num_inputs, batch_shape) for _ in range(waves)]
+            zero = torch.zeros_like(scale)
+            return [Term(f"wave_{i}", k, num_inputs, None, zero) for i, k in enumerate(kernels)]
+
+        adjustment = Adjustment(scaled_rbf, None), Adjustment(scaled_rbf, 0.0)
+        super().__init__(
+            train_X, train_Y, train_Yvar, physics, *adjustment, more_terms=more_terms, **options
+        )
+
+
+def test_a_model_of_the_user(cart_pole_system):
+    system = cart_pole_system
+
+    def dynamics(**options):
+        fit_options = {"num_starts": 1, "num_screened": 8}
+        options.setdefault("model_options", {"waves": 2, "center": 0.0})
+        return LearnedDynamics(
+            system.spec, system.crude, model=WavyCKA, fit_options=fit_options, **options
+        )
+
+    one, other = dynamics(), dynamics()
+    one.update(*system.trial(0, 10))
+    one.update(*system.trial(1, 10))
+    assert one.model.term_names == ("rho", "delta", "wave_0", "wave_1")
+    assert one.describe()["model"] == "WavyCKA"
+    other.load_state_dict(one.state_dict())
+    states, actions, _ = system.trial(2)
+    assert torch.equal(one.predict(states, actions).mean, other.predict(states, actions).mean)
+    with pytest.raises(RuntimeError, match=r"model_options is .*waves.* in the state"):
+        dynamics(model_options={}).load_state_dict(one.state_dict())
+    with pytest.raises(ValueError, match=r"WavyCKA does not take 'wave'.* waves, rho, delta"):
+        dynamics(model_options={"wave": 2})
 
 
 def test_each_transition_costs_one_row_of_the_physics(uniform):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gpadjust import ZeroMeanGP
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import ODEPhysics
 
 SPEC = StateSpec(["x", "v"], ["a"])
@@ -34,6 +34,32 @@ def test_it_predicts_the_physics_without_doubt():
     assert torch.equal(dynamics.sample(states, actions), following)
     blocks = dynamics.sample_functions(2)(states.view(2, 10, 2), actions.view(2, 10, 1))
     assert torch.equal(blocks, following.view(2, 10, 2))
+
+
+class Wider(Dynamics):
+    """A user's own: push, and a doubt about the velocity."""
+
+    is_fitted = True
+    update = sample = sample_functions = describe = state_dict = load_state_dict = None
+
+    def predict(self, states, actions):
+        mean = push(torch.cat([states, actions], -1))
+        return mean, torch.tensor([0.0, 0.04], dtype=torch.float64).expand_as(mean)
+
+
+def test_all_dynamics_are_scored():
+    states, actions, following = transitions()
+    following = following + 0.1
+    following[3] = torch.tensor([0.0, torch.nan])
+    for dynamics in (PhysicsDynamics(SPEC, push), Wider(SPEC)):
+        scores = dynamics.score(states, actions, following)
+        torch.testing.assert_close(scores.rmse[1], torch.tensor(0.1).double())
+        assert scores.rmse[0] > 0.1
+        doubts = [False, isinstance(dynamics, Wider)]  # a variance of zero says nothing
+        assert scores.nlpd.isfinite().tolist() == scores.coverage.isfinite().tolist() == doubts
+    density = torch.distributions.Normal(0, 0.2).log_prob(torch.tensor(0.1)).double()
+    torch.testing.assert_close(scores.nlpd[1], -density)
+    assert scores.coverage[1] == 1
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,13 @@ from gpadjust.envs import (
     CART_POLE_SPEC,
     REAL_CART_POLE,
     CartPoleEquation,
+    arm_start,
     cart_pole_cost,
     cart_pole_physics,
     cart_pole_reward,
     cart_pole_start,
+    hand_distance_cm,
+    hand_position,
     random_cart_pole_physics,
 )
 from gpadjust.physics import ODEPhysics
@@ -130,6 +133,25 @@ def test_impossible_parameters_are_refused(name, value):
     good = {"cart_mass": 0.5, "pole_mass": 0.5, "pole_length": 0.6, "damping": 0.1}
     with pytest.raises(ValueError, match=name):
         cart_pole_physics(**{**good, name: value})
+
+
+def test_what_is_no_number_or_state_is_refused():
+    with pytest.raises(TypeError, match="cart_mass must be a number; found 'heavy'"):
+        cart_pole_physics("heavy", 0.5, 0.6, 0.1)
+    with pytest.raises(TypeError, match=r"seed must be a whole number; found 1\.5"):
+        random_cart_pole_physics(1.5)
+    with pytest.raises(ValueError, match="seed must not be negative; found -1"):
+        random_cart_pole_physics(-1)
+    for start in (cart_pole_start, arm_start):
+        with pytest.raises(ValueError, match="n must not be negative; found -1"):
+            start(-1)
+        with pytest.raises(TypeError, match="n must be a whole number"):
+            start(0.5)
+    for function, columns in ((cart_pole_cost, 5), (hand_distance_cm, 4), (hand_position, 3)):
+        with pytest.raises(ValueError, match=rf"of shape \.\.\. x \d, got \(2, {columns}\)"):
+            function(torch.zeros(2, columns))
+        with pytest.raises(TypeError, match=r"convert with `torch\.as_tensor"):
+            function(np.zeros((2, columns)))
 
 
 def test_random_physics_is_in_its_ranges_and_follows_its_seed():

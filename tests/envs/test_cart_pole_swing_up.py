@@ -194,7 +194,7 @@ def test_missing_pygame_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.float32(1.0)]
+    "action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.float32(1.0), "left"]
 )
 def test_bad_action_is_refused_and_changes_nothing(action):
     env = upright()
@@ -203,7 +203,9 @@ def test_bad_action_is_refused_and_changes_nothing(action):
     assert np.array_equal(env.state, np.zeros(4))
 
 
-@pytest.mark.parametrize("state", [[0.0, 1.0], [0.0, math.nan, 0.0, 0.0], [[0.0] * 4]])
+@pytest.mark.parametrize(
+    "state", [[0.0, 1.0], [0.0, math.nan, 0, 0], [[0.0] * 4], "up", [[1], [2, 3]], [0, 0, 1e39, 0]]
+)
 def test_bad_start_is_refused(state):
     with pytest.raises(ValueError, match="four finite numbers"):
         CartPoleSwingUpEnv().reset(options={"state": state})
@@ -212,8 +214,22 @@ def test_bad_start_is_refused(state):
 def test_unknown_option_and_render_mode_are_refused():
     with pytest.raises(ValueError, match="'start'"):
         CartPoleSwingUpEnv().reset(options={"start": [0.0] * 4})
+    with pytest.raises(TypeError, match=r"options must be a dictionary.*found \['state'\]"):
+        CartPoleSwingUpEnv().reset(options=["state"])
     with pytest.raises(ValueError, match="'ascii'"):
         CartPoleSwingUpEnv(render_mode="ascii")
+    with pytest.raises(TypeError, match="encode_angle must be True or False; found 'no'"):
+        CartPoleSwingUpEnv(encode_angle="no")
+    with pytest.raises(TypeError, match=r"equation must be a CartPoleEquation.*found None"):
+        CartPoleSwingUpEnv(equation=None)
+
+
+def test_it_steps_from_any_start_that_it_takes():
+    env = CartPoleSwingUpEnv()
+    for state in ([100.0, 100.0, 100.0, 100.0], [-100.0, 1.0, 100.0, -100.0]):
+        env.reset(options={"state": state})
+        for force in (10.0, -10.0):
+            assert np.isfinite(env.step(np.array([force]))[0]).all()
 
 
 def test_step_and_render_need_a_reset():

@@ -201,7 +201,7 @@ def test_stronger_muscles_move_further(arm):
 
 
 @pytest.mark.parametrize(
-    "action", [np.full(4, np.nan), np.array([0.1, np.inf, 0.0, 0.0]), np.zeros(3), 0.5]
+    "action", [np.full(4, np.nan), np.array([0.1, np.inf, 0.0, 0.0]), np.zeros(3), 0.5, "up"]
 )
 def test_bad_action_is_refused_and_changes_nothing(arm, action):
     start(arm)
@@ -216,6 +216,7 @@ def test_bad_action_is_refused_and_changes_nothing(arm, action):
     [
         ({"state": [0.0, 1.0]}, "4 numbers theta_s"),
         ({"state": [0.0, np.nan, 0.0, 0.0]}, "4 numbers theta_s"),
+        ({"state": "bent"}, "4 numbers theta_s.*found 'bent'"),
         ({"state": [0.0, 0.0, 1e4, 0.0]}, "at most 6.283, 6.283, 100, 100"),
         ({"target": [0.0, 1.0, 2.0]}, "2 numbers target_s"),
         ({"start": START}, "Unknown option 'start'"),
@@ -227,11 +228,18 @@ def test_bad_options_are_refused(arm, options, message):
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [{"strength": 0.0}, {"strength": np.nan}, {"accuracy": 1.0}, {"render_mode": "ascii"}],
+    ("arguments", "error"),
+    [
+        ({"strength": 0.0}, ValueError),
+        ({"strength": np.nan}, ValueError),
+        ({"strength": "strong"}, TypeError),
+        ({"accuracy": 1.0}, ValueError),
+        ({"accuracy": None}, TypeError),
+        ({"render_mode": "ascii"}, ValueError),
+    ],
 )
-def test_bad_arguments_are_refused(arguments):
-    with pytest.raises(ValueError, match=next(iter(arguments))):
+def test_bad_arguments_are_refused(arguments, error):
+    with pytest.raises(error, match=next(iter(arguments))):
         MuscleArmEnv(**arguments)
 
 
@@ -241,6 +249,24 @@ def test_step_and_render_need_a_reset():
         env.step(GENTLE)
     with pytest.raises(gym.error.ResetNeeded, match="reset"):
         env.render()
+
+
+def test_a_failed_step_is_no_data_and_still_an_observation(arm, monkeypatch):
+    before = start(arm).state
+
+    def fail(*arguments):
+        raise RuntimeError("no convergence")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(arm.simulation, "step", fail)
+        with pytest.warns(UserWarning, match="no convergence"):
+            observation, _, terminated, truncated, info = arm.step(GENTLE)
+    assert info["step_failed"] is True
+    assert truncated
+    assert not terminated
+    assert arm.observation_space.contains(observation)
+    assert np.array_equal(observation, before.astype(np.float32))
+    assert start(arm).step(GENTLE)[4]["step_failed"] is False
 
 
 @pytest.mark.parametrize("speed", [1e3, 1e9])

@@ -115,6 +115,14 @@ def test_add_rows_is_for_one_environment(buffer):
         buffer(n_envs=2).add_rows(*rows(np.arange(3)))
 
 
+def test_extend_is_that_of_stable_baselines(buffer):
+    made = buffer()
+    steps = [real_row(i) for i in range(1, 4)]
+    made.extend(*zip(*steps, strict=True))
+    assert made.size() == 3
+    np.testing.assert_array_equal(made.rewards[:3, 0], [1, 2, 3])
+
+
 def test_several_real_environments(buffer):
     made = buffer(6, 6, n_envs=2, buffer_size=20, real_fraction=0.5)
     assert made.model_buffer.n_envs == 1

@@ -1,5 +1,6 @@
 """Runs that are interrupted, and go on as if they had not been."""
 
+import io
 import os
 import pickle
 import random
@@ -8,22 +9,25 @@ import sys
 import textwrap
 import threading
 import time
+import zipfile
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from gpadjust.control import Task
-from gpadjust.dynamics import LearnedDynamics
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.envs import (
     CART_POLE_SPEC,
     cart_pole_reward,
     random_cart_pole_physics,
 )
-from gpadjust.rl import DynaOptions, DynaSAC, EpisodeCheckpoint, resume, save_checkpoint
+from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3, EpisodeCheckpoint, resume, save_checkpoint
 
 TOTAL = 20  # four episodes of the point
 
@@ -252,9 +256,7 @@ def test_other_files_are_refused(point_agent, point_task, point_env, tmp_path):
     other.write_bytes(pickle.dumps(agent.replay_buffer))
     agent.save(saved)
     for path in (cut, other, saved):
-        with pytest.raises(
-            ValueError, match=f"{path.name} is not a checkpoint of"
-        ):
+        with pytest.raises(ValueError, match=f"{path.name} is not a checkpoint of"):
             resume(path, point_env(), point_task())
     with pytest.raises(FileNotFoundError):
         resume(tmp_path / "none", point_env(), point_task())
@@ -304,6 +306,139 @@ def test_other_wrappers_are_refused(before, after, point_agent, wrapped, point_t
     save_checkpoint(point_agent(wrapped(before)).learn(5), tmp_path / "run.ckpt")
     with pytest.raises(ValueError, match="of another environment: wrappers is"):
         resume(tmp_path / "run.ckpt", wrapped(after), point_task())
+
+
+class Shouting(gymnasium.Wrapper):
+    """Another wrapper."""
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
+    point_agent, point_env, point_task, learnt_dynamics, tmp_path, monkeypatch
+):
+    path = tmp_path / "run.ckpt"
+    task = point_task(dynamics=learnt_dynamics(), terminated=lambda states: states[:, 0] > 99)
+    save_checkpoint(point_agent(task=task).learn(5), path)
+
+    def unpickled(*_, **__):
+        raise AssertionError("unpickled")
+
+    for name in ("pickle.load", "pickle.loads", "cloudpickle.load", "cloudpickle.loads"):
+        monkeypatch.setattr(name, unpickled)
+    wide = point_env()
+    wide.action_space = gymnasium.spaces.Box(-3, 3, (1,))
+    for env, given, algorithm, message in [
+        (
+            Shouting(point_env()),
+            task,
+            DynaSAC,
+            "wrappers is .*, DummyVecEnv of Monitor of Shout",
+        ),
+        (wide, task, DynaSAC, r"of another environment: action_space is Box\(-2"),
+        (point_env(), task, DynaTD3, "of another algorithm: algorithm is DynaSAC .*, DynaTD3 here"),
+        (
+            point_env(),
+            point_task(),
+            DynaSAC,
+            "of another task: .*terminated is True .*, False here",
+        ),
+        (point_env(), point_task(episode_length=9), DynaSAC, "episode_length is 5 .*, 9 here"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            resume(path, env, given, algorithm)
+    with pytest.raises(TypeError, match="task must be a Task"):
+        resume(path, point_env(), task.dynamics)
+
+
+def test_another_physics_is_refused(point_agent, point_env, point_task, point_dynamics, tmp_path):
+    path = tmp_path / "run.ckpt"
+
+    def learns(slope):
+        spec = point_dynamics.spec
+        return point_task(dynamics=LearnedDynamics(spec, lambda X: X[:, :1] + slope * X[:, 1:]))
+
+    for known in (learns(0.4), point_task()):
+        save_checkpoint(point_agent(task=known).learn(5), path)
+        other = learns(0.41)
+        if known.dynamics is point_dynamics:
+            spec = point_dynamics.spec
+            other = point_task(dynamics=PhysicsDynamics(spec, lambda X: X[:, :1] + 0.6 * X[:, 1:]))
+        with pytest.raises(RuntimeError, match="physics"):
+            resume(path, point_env(), other)
+
+
+@pytest.mark.parametrize("part", ["replay_buffer.npz", "model_buffer.npz", "random.npz"])
+def test_numbers_are_read_without_pickle(point_agent, point_env, point_task, tmp_path, part):
+    """A planted pickle in the place of arrays does not run."""
+    path = tmp_path / "run.ckpt"
+    save_checkpoint(point_agent().learn(5), path)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    planted = io.BytesIO()
+    np.savez(planted, observations=np.array([Planted()], dtype=object))
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**parts, part: planted.getvalue()}.items():
+            archive.writestr(name, content)
+    with pytest.raises(ValueError, match=r"allow_pickle=False"):
+        resume(path, point_env(), point_task())
+    assert not Planted.ran
+
+
+class Planted:
+    ran = False
+
+    def __reduce__(self):
+        return setattr, (Planted, "ran", True)
+
+
+OTHER = """
+    import sys
+    from pathlib import Path
+
+    from gpadjust.rl.checkpoint import _locked
+
+    lock = _locked(Path(sys.argv[1]))
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_two_processes_do_not_write_one_file(point_agent, tmp_path):
+    path = tmp_path / "run.ckpt"
+    command = [sys.executable, "-c", textwrap.dedent(OTHER), str(path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as other:
+        assert other.stdout.readline() == "locked\n"
+        agent = point_agent()
+        for write in (
+            lambda: agent.learn(5, EpisodeCheckpoint(path)),
+            lambda: save_checkpoint(agent, path),
+        ):
+            with pytest.raises(RuntimeError, match=r"Another process writes .*run.ckpt"):
+                write()
+        assert agent.num_timesteps == 0
+        other.kill()  # which releases it
+    agent.learn(5, EpisodeCheckpoint(path))
+    assert path.exists()
+
+
+def test_notes_are_kept_with_the_agent(point_agent, point_env, point_task, tmp_path):
+    agent = point_agent()
+    agent.notes["costs"] = [1.0]
+    save_checkpoint(agent.learn(5), tmp_path / "run.ckpt")
+    assert resume(tmp_path / "run.ckpt", point_env(), point_task()).notes == {"costs": [1.0]}
+
+
+def test_td3_goes_on(point_agent, point_env, point_task, assert_same, tmp_path):
+    def agent():
+        noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
+        return point_agent(algorithm=DynaTD3, action_noise=noise)
+
+    path, whole = tmp_path / "run.ckpt", agent().learn(TOTAL)
+    with pytest.raises(PowerCut):
+        agent().learn(TOTAL, [EpisodeCheckpoint(path), CutAt(13)])
+    scramble()
+    assert_same(whole, go_on(resume(path, point_env(), point_task(), DynaTD3)))
 
 
 def test_another_number_of_environments_is_refused(point_agent, point_env, point_task, tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CheckpointCallback,
@@ -17,13 +18,22 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import Task
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-from gpadjust.models import ZeroMeanGP
-from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.envs import (
+    CART_POLE_SPEC,
+    cart_pole_reward,
+    cart_pole_start,
+    random_cart_pole_physics,
+)
+from gpadjust.models import Prediction, ZeroMeanGP
+from gpadjust.physics import PhysicsError
+from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC, DynaTD3, ModelVecEnv
+
+POINT_SPEC = StateSpec(["x"], ["v"])
 
 
 @pytest.fixture
@@ -183,20 +193,25 @@ def test_each_episode_that_ended_is_followed_by_model_episodes(point_agent):
 def test_states_beyond_the_bounds_are_not_followed(point_agent):
     bounds = torch.tensor([[0.9], [1.1]])
     agent = point_agent(state_bounds=bounds, initial_states=lambda n: torch.ones(n, 1)).learn(10)
-    assert 0 < model_rows(agent) < 2 * 2 * 5
-    following = agent.replay_buffer.model_buffer.next_observations[: model_rows(agent)]
+    rows, n = agent.replay_buffer.model_buffer, model_rows(agent)
+    assert 0 < n < 2 * 2 * 5
+    following = rows.next_observations[:n]
     assert ((following > 0.9) & (following < 1.1)).all()
+    left = (rows.dones * (1 - rows.timeouts))[:n, 0].astype(bool)
+    assert left.any()
+    worst = min(agent.replay_buffer.rewards[:10].min(), rows.rewards[:n, 0][~left].min(initial=0))
+    assert rows.rewards[:n, 0][left].max() <= worst  # for one step; they are for many
+    assert rows.rewards[:n, 0][left].min() < 50 * worst
 
 
 def test_model_episodes_that_teach_nothing_are_warned_of(point_agent):
-    bounds = torch.tensor([[0.99], [1.01]])
     agent = point_agent(
-        state_bounds=bounds,
+        state_bounds=torch.tensor([[0.99], [1.01]]),
         initial_states=lambda n: torch.ones(n, 1),
         dynamics=PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + 5),
         reward_tolerance=None,
     )
-    with pytest.warns(UserWarning, match="has learnt nothing from the model"):
+    with pytest.warns(UserWarning, match="has learnt nothing of use from the model"):
         agent.learn(5)
 
 
@@ -256,7 +271,7 @@ def test_cart_pole(cart_pole):
     ).learn(50)
     assert dynamics.num_transitions == 50
     assert 2 <= model_rows(agent) <= 50
-    assert all(seconds > 0 for seconds in agent.wall_time.values())
+    assert all(agent.wall_time[part] > 0 for part in ("fit", "rollout", "update"))
 
 
 def pendulum_step(X):
@@ -293,9 +308,8 @@ def test_several_environments(point_agent, point_env, learnt_dynamics):
     assert agent.num_timesteps == 40
     assert agent.num_episodes == 8
     assert dynamics.num_transitions == 40
-    assert torch.equal(
-        dynamics._data.states.sort(0).values, agent.recorded_episodes().states.sort(0).values
-    )
+    learnt = dynamics.state_dict()["transitions"]["states"]
+    assert torch.equal(learnt.sort(0).values, agent.recorded_episodes().states.sort(0).values)
 
 
 def test_normalised_environments(point_agent, normalised, learnt_dynamics):
@@ -357,10 +371,10 @@ def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynam
         point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
     )
     starts = torch.tensor([[0.6], [1.4], [0.8]])
-    agent = point_agent(dynamics=runaway, model_episodes=3, initial_states=lambda n: starts)
+    agent = point_agent(dynamics=runaway, model_episodes=3, initial_states=lambda n: starts[:n])
     agent.learn(5)
     assert agent.logger.name_to_value["model/left_bounds"] == 1
-    assert model_rows(agent) == 2 * 5
+    assert model_rows(agent) == 1 + 2 * 5
     assert agent._n_updates == 5 + 1 + 2 * 5
 
 
@@ -532,11 +546,322 @@ def test_parameters_can_be_moved(saved, point_agent, learnt_dynamics):
     for source in (agent.get_parameters(), str(path)):
         other = point_agent(dynamics=learnt_dynamics(), seed=9)
         other.set_parameters(source)
-        assert other.dynamics.num_transitions == 10
+        assert other.task.dynamics.num_transitions == 10
         obs = np.zeros((1, 1), dtype=np.float32)
         np.testing.assert_array_equal(
             other.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
         )
+
+
+def test_parameters_without_dynamics_are_refused_unless_told(saved, point_agent, learnt_dynamics):
+    agent, _ = saved
+    networks = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
+    other = point_agent(dynamics=learnt_dynamics(), seed=9)
+    with pytest.raises(
+        ValueError, match=r"with the state of the dynamics, 'dynamics'; found \['act"
+    ):
+        other.set_parameters(networks)
+    other.set_parameters(networks, exact_match=False)
+    assert not other.task.dynamics.is_fitted
+
+
+def test_parameters_are_taken_as_a_whole(saved, point_agent, learnt_dynamics, tensors_of):
+    agent, _ = saved
+    broken = agent.get_parameters()
+    broken["policy"] = {}
+    other = point_agent(dynamics=learnt_dynamics(), seed=9).learn(5)
+    with pytest.raises(RuntimeError, match="Missing key"):
+        other.set_parameters(broken)
+    assert other.task.dynamics.num_transitions == 5
+
+
+def test_another_physics_is_not_loaded(saved, point_task, point_dynamics):
+    _, path = saved
+    other = LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.1 * X[:, 1:])
+    with pytest.raises(RuntimeError, match="physics"):
+        DynaSAC.load(path, task=point_task(dynamics=other))
+
+
+# Errors lose nothing
+
+
+def test_a_wrong_reward_is_mended_and_nothing_is_lost(point_agent, point_task, learnt_dynamics):
+    dynamics = learnt_dynamics()
+    wrong = point_task(dynamics=dynamics, reward=lambda states, actions, following: states[:, 0])
+    agent = point_agent(task=wrong)
+    before = [p.clone() for p in agent.policy.parameters()]
+    with pytest.raises(ValueError, match="is not the environment's"):
+        agent.learn(5)
+    assert all(torch.equal(*pair) for pair in zip(before, agent.policy.parameters(), strict=True))
+    agent.task = point_task(dynamics=dynamics)
+    agent.learn(5, reset_num_timesteps=False)
+    assert torch.equal(
+        dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
+    )
+    assert agent.num_episodes == 2
+    assert model_rows(agent) == 2 * 2 * 5
+
+
+@pytest.mark.parametrize("fails", ["fit", "rollout"])
+def test_a_physics_that_fails_for_a_while_loses_no_transition(
+    point_agent, point_dynamics, fails, monkeypatch
+):
+    """Where the dynamics learn, or after that, where particles move."""
+    broken = []
+
+    def physics(X):
+        if broken:
+            raise PhysicsError("the simulator's licence has expired")
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    dynamics = LearnedDynamics(point_dynamics.spec, physics)
+    agent = point_agent(dynamics=dynamics)
+    agent.learn(5)
+    if fails == "rollout":
+        monkeypatch.setattr(ModelVecEnv, "reset", lambda env: broken.append(1) or env._states)
+    breaks = BreaksAt(8, broken) if fails == "fit" else None
+    with pytest.raises(PhysicsError, match="licence"):
+        agent.learn(5, breaks, reset_num_timesteps=False)
+    assert dynamics.num_transitions == (5 if fails == "fit" else 10)
+    broken.clear()
+    monkeypatch.undo()
+    agent.learn(5, reset_num_timesteps=False)
+    assert torch.equal(
+        dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
+    )
+    assert agent.num_episodes == 3
+
+
+class BreaksAt(BaseCallback):
+    """At a step, what was empty is not any more."""
+
+    def __init__(self, step, broken):
+        super().__init__()
+        self.step, self.broken = step, broken
+
+    def _on_step(self):
+        self.broken += [True] * (self.num_timesteps == self.step)
+        return True
+
+
+class Jams(gymnasium.Wrapper):
+    """At some steps the system does not move, and says so."""
+
+    def __init__(self, env, jams):
+        super().__init__(env)
+        self.jams, self.steps = jams, 0
+
+    def step(self, action):
+        before = self.env.unwrapped.x.copy()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        failed = self.steps in self.jams
+        self.steps += 1
+        if failed:
+            self.env.unwrapped.x = observation = before
+        return observation, reward, terminated, truncated or failed, info | {"step_failed": failed}
+
+
+@pytest.mark.parametrize("jams", [(0,), (3,), (5, 6), (4, 9)])
+def test_a_step_that_failed_is_no_data(point_agent, point_env, learnt_dynamics, jams):
+    dynamics = learnt_dynamics()
+    agent = point_agent(Jams(point_env(), jams), dynamics=dynamics, reward_tolerance=None)
+    agent.learn(15)
+    assert agent.replay_buffer.size() == agent.num_timesteps - len(jams)
+    recorded = agent.recorded_episodes()
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+    follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
+    starts = 1 + follows.logical_not().nonzero().flatten()
+    assert recorded.num_ended == len(starts) + int(recorded.num_transitions > int(starts[-1]) + 4)
+    assert dynamics.num_transitions <= recorded.num_transitions
+
+
+def test_of_several_environments_one_may_fail(point_agent, point_env):
+    env = DummyVecEnv([lambda: Jams(point_env(), (3,)), point_env])
+    agent = point_agent(env, train_freq=(5, "step"), reward_tolerance=None).learn(20)
+    recorded = agent.recorded_episodes()
+    assert recorded.num_transitions == 19
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+    batch = agent.replay_buffer.sample(200)
+    moved = batch.next_observations - batch.observations
+    torch.testing.assert_close(moved, batch.actions, atol=0.1, rtol=0)
+
+
+class Counts(gymnasium.Wrapper):
+    num_steps = 0
+
+    def step(self, action):
+        Counts.num_steps += 1
+        return super().step(action)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(1\) must return .* 1 x 1"),
+        ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
+        ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(1,\)"),
+        ({"terminated": lambda s: s}, r"terminated must return one value per row"),
+        (
+            {"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)},
+            "next values of the 1 states .* got 2 columns",
+        ),
+    ],
+)
+def test_wrong_functions_are_found_before_the_first_real_step(
+    point_agent, point_env, parts, message
+):
+    Counts.num_steps = 0
+    agent = point_agent(Counts(point_env()), **parts)
+    with pytest.raises((ValueError, PhysicsError), match=message):
+        agent.learn(5)
+    assert Counts.num_steps == 0
+
+
+# A family
+
+
+def test_one_that_never_uses_its_model_is_the_learner(point_agent, point_env, normalised):
+    for algorithm, learner, noisy in [(DynaSAC, SAC, False), (DynaTD3, TD3, True)]:
+        noise = NormalActionNoise(np.zeros(1), np.full(1, 0.3)) if noisy else None
+        shared = {
+            "batch_size": 8,
+            "buffer_size": 500,
+            "learning_starts": 3,
+            "train_freq": (1, "episode"),
+            "gradient_steps": -1,
+            "policy_kwargs": {"net_arch": [8]},
+            "action_noise": noise,
+            "device": "cpu",
+            "seed": 0,
+        }
+        ours = point_agent(normalised(), algorithm, last_model_episode=0, **shared).learn(25)
+        theirs = learner("MlpPolicy", normalised(), **shared).learn(25)
+        assert ours._n_updates == theirs._n_updates == 25
+        pairs = zip(
+            ours.policy.state_dict().items(), theirs.policy.state_dict().items(), strict=True
+        )
+        for (name, weights), (other, expected) in pairs:
+            assert name == other
+            assert torch.equal(weights, expected), name
+        for name in (
+            "observations",
+            "next_observations",
+            "actions",
+            "rewards",
+            "dones",
+            "timeouts",
+        ):
+            one, other = (getattr(agent.replay_buffer, name) for agent in (ours, theirs))
+            np.testing.assert_array_equal(one, other)
+        assert model_rows(ours) == 0
+
+
+def test_td3_learns_in_the_model(point_agent):
+    def cost(agent):
+        x = np.linspace(0.5, 1.5, 11, dtype=np.float32)[:, None]
+        action, _ = agent.predict(x, deterministic=True)
+        return float(((x + 0.5 * action) ** 2).mean())
+
+    agent = point_agent(
+        algorithm=DynaTD3,
+        action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.3)),
+        learning_rate=1e-2,
+        model_episodes=10,
+        batch_size=32,
+        gamma=0.5,
+        tau=0.05,
+        policy_kwargs={"net_arch": [16]},
+    )
+    before = cost(agent)
+    agent.learn(30)
+    assert cost(agent) < 0.2 * before
+
+
+@pytest.mark.slow
+def test_td3_swings_up_the_cart_pole(cart_pole, cart_pole_dynamics):
+    """In the known system, after 12 episodes; to hang costs .95, to swing up some .3."""
+    agent = DynaTD3(
+        "MlpPolicy",
+        cart_pole(),
+        Task(cart_pole_dynamics, cart_pole_reward, initial_states=cart_pole_start),
+        DynaOptions(model_episodes=20, num_particles=5),
+        action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.2)),
+        learning_rate=1e-3,
+        gamma=0.95,
+        tau=0.02,
+        policy_kwargs={"net_arch": [128, 128]},
+        device="cpu",
+        seed=0,
+    ).learn(12 * 25)
+    torch.manual_seed(1)
+    env = agent.model_env(20)
+    obs, costs = env.reset(), []
+    for _ in range(25):
+        obs, rewards, _, _ = env.step(agent.predict(obs, deterministic=True)[0])
+        costs.append(-rewards.mean())
+    assert np.mean(costs) < 0.6
+
+
+def test_particles_have_action_noise_of_their_own(point_agent):
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
+    agent = point_agent(algorithm=DynaTD3, action_noise=noise, model_episodes=3)
+    agent.learn(5)
+    first = agent.replay_buffer.model_buffer.actions[:3, 0, 0]  # at the same start
+    assert len(set(first.tolist())) == 3
+    assert (np.abs(first) <= 1).all()
+    silent = point_agent(algorithm=DynaTD3, model_episodes=3).learn(5)
+    assert len(set(silent.replay_buffer.model_buffer.actions[:3, 0, 0].tolist())) == 1
+
+
+def test_target_networks_are_updated_as_seldom_as_told(point_agent, monkeypatch):
+    """Steps of 2 particles in the model owe 2 updates; 10 of them are made together."""
+    chunks = []
+    train = SAC.train
+    monkeypatch.setattr(
+        SAC, "train", lambda agent, n, batch: chunks.append(n) or train(agent, n, batch)
+    )
+    agent = point_agent(target_update_interval=10).learn(10)
+    assert chunks == [5, 10, 5, 10]
+    assert agent.owed_updates == 0
+
+
+class Own(Dynamics):
+    """Dynamics of a user's, that know the point but for a shift."""
+
+    is_fitted = True
+
+    def predict(self, states, actions):
+        mean = states + 0.5 * actions + 0.1
+        return Prediction(mean, torch.full_like(mean, 0.2**2))
+
+    def sample(self, states, actions):
+        mean, variance = self.predict(states, actions)
+        return mean + variance.sqrt() * torch.randn_like(mean)
+
+    def sample_functions(self, num_functions, seed=None):
+        return lambda states, actions: self.predict(states, actions).mean
+
+    def update(self, states, actions, next_states):
+        pass
+
+    def describe(self):
+        return {"class": "Own"}
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        pass
+
+
+def test_the_foresight_of_a_users_own_dynamics_is_logged(point_agent, point_dynamics):
+    agent = point_agent(dynamics=Own(point_dynamics.spec)).learn(5, log_interval=100)
+    logged = agent.logger.name_to_value
+    assert logged["model/rmse/x"] == pytest.approx(0.1, abs=0.03)
+    assert logged["model/coverage"] == 1
+    assert np.isfinite(logged["model/nlpd"])
 
 
 # Bad input
@@ -689,5 +1014,5 @@ def test_states_that_are_no_numbers_never_reach_the_buffer(point_agent, point_dy
     point_dynamics.sample = broken
     agent = point_agent(model_episodes=3).learn(10)
     assert np.isfinite(agent.replay_buffer.model_buffer.next_observations).all()
-    assert model_rows(agent) == 2 * 2 * 5
+    assert model_rows(agent) == 2 * (1 + 2 * 5)
     assert all(p.isfinite().all() for p in agent.policy.parameters())

@@ -1,12 +1,13 @@
 """The model as a vectorised environment."""
 
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecMonitor
 
 from gpadjust.control import Task
@@ -105,6 +106,37 @@ def test_soft_actor_critic_learns_in_it(point_particles):
     assert agent._n_updates > 0
     assert [info["l"] for info in agent.ep_info_buffer] == [5] * 6
     assert np.isfinite([info["r"] for info in agent.ep_info_buffer]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "learner",
+    [
+        partial(SAC, learning_starts=64, train_freq=8, gradient_steps=8, learning_rate=3e-3),
+        partial(PPO, n_steps=64, batch_size=64, learning_rate=3e-3),
+    ],
+    ids=["SAC", "PPO"],
+)
+def test_leaving_the_bounds_is_not_learnt(point_particles, learner):
+    """Rewards are below zero, so that an episode that ended early would have the best return."""
+    env = point_particles(
+        num_envs=8,
+        reward=lambda states, actions, following: -1 - following[:, 0].square(),
+        initial_states=lambda n: 1 + torch.rand(n, 1),
+        episode_length=10,
+        state_bounds=torch.tensor([[-2.5], [2.5]]),
+        discount=0.95,
+    )
+    agent = learner("MlpPolicy", env, gamma=0.95, policy_kwargs={"net_arch": [32]}, seed=0)
+    agent.learn(8_000)
+    assert env.num_left_bounds > 0
+    env.num_left_bounds = 0
+    obs, total = env.reset(), 0.0
+    for _ in range(10):
+        obs, rewards, _, _ = env.step(agent.predict(obs, deterministic=True)[0])
+        total += rewards.mean()
+    assert env.num_left_bounds == 0
+    assert total > -14  # to stay at zero is worth 10; to stay where it starts 33
 
 
 def test_seed_repeats_what_particles_meet(point_particles, rise):

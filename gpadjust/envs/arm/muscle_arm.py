@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gpadjust.envs.argument_checks import checked_options, finite_numbers
 from gpadjust.envs.arm.opensim_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION, build_muscle_arm
 from gpadjust.envs.arm.simulation import ArmSimulation
 from gpadjust.envs.arm.task import MAX_TARGET, START_MEAN, START_STD, angle_error, hand_distance_cm
 from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, REAL_ARM
 from gpadjust.envs.arm.view import ArmView
-from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv, checked_options
+from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv
 
 # The arm itself stays within 3 rad and 20 rad/s.
 HIGH = np.array([2 * math.pi, 2 * math.pi, 100, 100, 2 * math.pi, 2 * math.pi], dtype=np.float32)
@@ -58,6 +59,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
 
     Raises:
         ImportError: If ``opensim`` is missing.
+        TypeError: If ``strength`` or ``accuracy`` is no number.
         ValueError: If an argument is out of its range.
 
     Example:
@@ -100,6 +102,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
             The observation and an empty ``info``.
 
         Raises:
+            TypeError: If ``options`` is no dictionary.
             ValueError: If ``options`` has another key, or its numbers are too few, too many or out
                 of the bounds of the observation.
         """
@@ -139,10 +142,10 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
         if self.state is None or self._failed:
             why = "after a failed integration" if self._failed else "before the first step"
             raise gym.error.ResetNeeded(f"Call reset {why}.")
-        excitations = np.array(action, dtype=np.float64)
-        if excitations.shape != (NUM_EXCITED,) or not np.isfinite(excitations).all():
+        excitations = finite_numbers(action, (NUM_EXCITED,))
+        if excitations is None:
             raise ValueError(
-                f"The action must be four finite excitations, of shape (4,); found {action}."
+                f"The action must be four finite excitations, of shape (4,); found {action!r}."
             )
         start = np.concatenate([self.state[:4], self.activations])
         try:
@@ -175,11 +178,11 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
 
 
 def _checked(value: Any, option: str, names: str, high: NDArray[np.float32]) -> NDArray[np.float64]:
-    numbers = np.array(value, dtype=np.float64)
-    if numbers.shape != high.shape or not (np.abs(numbers) <= high).all():  # NaN is not, either
+    numbers = finite_numbers(value, high.shape)
+    if numbers is None or (np.abs(numbers) > high).any():
         bounds = ", ".join(f"{bound:.4g}" for bound in high)
         raise ValueError(
             f"options[{option!r}] must be the {len(high)} numbers {names}, of magnitude at most "
-            f"{bounds} (rad and rad/s); found {value}."
+            f"{bounds} (rad and rad/s); found {value!r}."
         )
     return numbers

@@ -8,6 +8,7 @@ from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
+from gpadjust.envs.argument_checks import check_number
 from gpadjust.envs.arm.torque_arm import ArmEquation
 
 JOINTS = ("shoulder", "elbow")
@@ -90,8 +91,10 @@ def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
 
     Raises:
         ImportError: If ``opensim`` is missing.
+        TypeError: If strength is no number.
         ValueError: If strength is not in (0, 2].
     """
+    check_number(strength, "strength")
     if not 0 < strength <= MAX_STRENGTH:
         raise ValueError(
             f"strength must be in (0, {MAX_STRENGTH:g}], where 1 is a healthy arm's; found "

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from gpadjust.envs.argument_checks import finite_numbers
 from gpadjust.physics import ODEPhysics
 
 ARM_TIME_STEP = 0.2
@@ -63,20 +63,21 @@ class ArmEquation:
 
     def __post_init__(self) -> None:
         """Check the parameters."""
-        for name in ("masses", "lengths", "centres", "inertias", "gains"):
-            # Hashable, also when given as a list.
-            pair = tuple(np.ravel(getattr(self, name)).tolist())
-            if len(pair) != 2:
-                raise ValueError(f"{name} must be a pair, of two links or joints; found {pair}.")
-            object.__setattr__(self, name, pair)
         for entry in fields(self):
-            values = np.array(getattr(self, entry.name))
-            positive = entry.name in ("masses", "lengths", "inertias")
-            if not (np.isfinite(values) & (values > 0 if positive else values >= 0)).all():
-                least = "positive" if positive else "not negative"
+            given, single = getattr(self, entry.name), entry.name == "damping"
+            numbers = finite_numbers(given, () if single else (2,))
+            if numbers is None:
+                expected = "a finite number" if single else "a pair of finite numbers"
                 raise ValueError(
-                    f"{entry.name} must be finite and {least}; found {getattr(self, entry.name)}."
+                    f"{entry.name} must be {expected}, of the two links or joints; found {given!r}."
                 )
+            positive = entry.name in ("masses", "lengths", "inertias")
+            if not (numbers > 0 if positive else numbers >= 0).all():
+                least = "positive" if positive else "not negative"
+                raise ValueError(f"{entry.name} must be finite and {least}; found {given!r}.")
+            # Hashable, also when given as a list.
+            value = float(numbers) if single else tuple(numbers.tolist())
+            object.__setattr__(self, entry.name, value)
 
     def __call__(self, state: Tensor, action: Tensor) -> Tensor:
         """The time derivative of the state.

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gpadjust.envs.argument_checks import checked_options, finite_numbers
 from gpadjust.envs.cart_pole.system import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
@@ -21,9 +22,10 @@ from gpadjust.envs.cart_pole.system import (
     equation_physics,
 )
 from gpadjust.envs.cart_pole.view import CartPoleView
-from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv, checked_options
+from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv
 
 MAX_FORCE = 10.0
+MAX_START = 100.0  # far beyond what forces do; the equation can be integrated there
 
 
 class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
@@ -48,6 +50,10 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
             it is the state :math:`[x, \theta, \dot{x}, \dot\theta]`, the angle not wrapped.
         equation: The system. Default: the real one.
 
+    Raises:
+        TypeError: If ``encode_angle`` is no bool or ``equation`` no equation.
+        ValueError: If there is no such render mode.
+
     Example:
         >>> import gymnasium
         >>> env = gymnasium.make("gpadjust.envs:gpadjust/CartPoleSwingUp-v0")
@@ -69,6 +75,12 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         equation: CartPoleEquation = REAL_CART_POLE,
     ) -> None:
         super().__init__(render_mode)
+        if not isinstance(encode_angle, bool):
+            raise TypeError(f"encode_angle must be True or False; found {encode_angle!r}.")
+        if not isinstance(equation, CartPoleEquation):
+            raise TypeError(
+                f"equation must be a CartPoleEquation, such as REAL_CART_POLE; found {equation!r}."
+            )
         self.equation = equation
         self.physics = equation_physics(equation)
         self.state_spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
@@ -85,24 +97,27 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
 
         Args:
             seed: For the random start, and those that follow.
-            options: ``{"state": ...}``, the four entries of the state to start from. Default: drawn
-                around the hanging pole at rest, with standard deviation 0.2.
+            options: ``{"state": ...}``, the four entries of the state to start from, of magnitude
+                at most 100. Default: drawn around the hanging pole at rest, with standard
+                deviation 0.2.
 
         Returns:
             The observation and an empty ``info``.
 
         Raises:
-            ValueError: If ``options`` has another key, or the state is not four finite numbers.
+            TypeError: If ``options`` is no dictionary.
+            ValueError: If ``options`` has another key, or the state is not four such numbers.
         """
         super().reset(seed=seed)
         options = checked_options(options, ("state",))
         if "state" in options:
-            state = np.array(options["state"], dtype=np.float64)
-            if state.shape != (4,) or not np.isfinite(state).all():
+            given = finite_numbers(options["state"], (4,))
+            if given is None or (np.abs(given) > MAX_START).any():
                 raise ValueError(
-                    "options['state'] must be four finite numbers, x, theta, x_dot and theta_dot; "
-                    f"found {options['state']}."
+                    "options['state'] must be four finite numbers, x, theta, x_dot and theta_dot, "
+                    f"of magnitude at most {MAX_START:g}; found {options['state']!r}."
                 )
+            state = given
         else:
             state = self.np_random.normal(START_MEAN, START_STD)
         self.state = state
@@ -127,9 +142,11 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         """
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset before the first step.")
-        force = np.array(action, dtype=np.float64)
-        if force.shape != (1,) or not np.isfinite(force).all():
-            raise ValueError(f"The action must be one finite force, of shape (1,); found {action}.")
+        force = finite_numbers(action, (1,))
+        if force is None:
+            raise ValueError(
+                f"The action must be one finite force, of shape (1,); found {action!r}."
+            )
         force = force.clip(-MAX_FORCE, MAX_FORCE)
         with torch.no_grad():
             row = torch.from_numpy(np.concatenate([self.state, force]))

@@ -9,8 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpadjust.envs.argument_checks import check_count
 from gpadjust.physics import ODEPhysics
+from gpadjust.physics.base import whole_number
 from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import check_columns
 
 TIME_STEP = 0.1
 SUBSTEPS = 5  # of 0.02 s: a single Euler step of 0.1 s errs by 0.3 rad/s
@@ -51,6 +54,7 @@ class CartPoleEquation:
         gravity: The acceleration :math:`g` of gravity, in m/s²; as Deisenroth has it, 9.82.
 
     Raises:
+        TypeError: If one of them is no number.
         ValueError: If a mass, the length or the gravity is not positive, or the damping negative.
 
     Example:
@@ -70,7 +74,11 @@ class CartPoleEquation:
         for entry in fields(self):
             value = getattr(self, entry.name)
             least = "not negative" if entry.name == "damping" else "positive"
-            if not math.isfinite(value) or value < 0 or (value == 0 and least == "positive"):
+            try:
+                finite = math.isfinite(value)
+            except TypeError:
+                raise TypeError(f"{entry.name} must be a number; found {value!r}.") from None
+            if not finite or value < 0 or (value == 0 and least == "positive"):
                 raise ValueError(f"{entry.name} must be finite and {least}; found {value}.")
 
     def __call__(self, state: Tensor, action: Tensor) -> Tensor:
@@ -165,7 +173,13 @@ def random_cart_pole_physics(seed: int) -> ODEPhysics:
 
     Returns:
         A physics as :func:`cart_pole_physics` builds it; ``physics.rhs`` has the parameters.
+
+    Raises:
+        TypeError: If ``seed`` is no whole number.
+        ValueError: If it is negative.
     """
+    if whole_number("seed", seed) < 0:
+        raise ValueError(f"seed must not be negative; found {seed}.")
     cart_mass, pole_mass, pole_length = np.random.default_rng(seed).uniform(
         [0.4, 0.5, 0.5], [0.6, 0.7, 0.7]
     )
@@ -188,6 +202,7 @@ def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_leng
     Returns:
         ``...``.
     """
+    check_columns(states, 4, "states")
     x, theta = states[..., 0], states[..., 1]
     across = x - pole_length * theta.sin()
     up = pole_length * (theta.cos() - 1)
@@ -204,5 +219,6 @@ def cart_pole_start(n: int) -> Tensor:
 
     Each is from :math:`\mathcal{N}([0, \pi, 0, 0], 0.2^2 I)`.
     """
+    check_count(n)
     mean = torch.tensor(START_MEAN, dtype=torch.float64)
     return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)

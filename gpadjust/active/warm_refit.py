@@ -49,7 +49,10 @@ def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
     if not isinstance(model, ExactGPBase):
         return False
     named = dict(model.named_parameters())
-    tensors = {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()}
+    try:
+        tensors = {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()}
+    except (AttributeError, TypeError, ValueError):  # a log may have been edited
+        return False
     if {name: p.shape for name, p in named.items()} != {n: t.shape for n, t in tensors.items()}:
         return False
     with torch.no_grad():

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpadjust.dynamics import StateSpec
+from gpadjust.states import StateSpec
 
 ARM = StateSpec(
     ["goal", "q", "v"],

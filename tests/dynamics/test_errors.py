@@ -1,0 +1,362 @@
+"""Dynamics after an error: what was learnt stands, and what is wrong is said at once."""
+
+import copy
+import math
+
+import pytest
+import torch
+from botorch.models import SingleTaskGP
+
+from gpadjust import CKA, RRA, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.models import AdjustedGP, PaperRRA
+from gpadjust.physics import FunctionPhysics, PhysicsError
+
+SPEC = StateSpec(["x", "v"], ["a"])
+
+
+def push(X, strength=0.1):
+    x, v, a = X.split(1, -1)
+    return torch.cat([x + 0.1 * v, v + strength * a], -1)
+
+
+def stronger(X):
+    return push(X, 0.11)
+
+
+def transitions(n=12, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    X = torch.rand(n, 3, generator=generator, dtype=torch.float64) + 1
+    return X[:, :2], X[:, 2:], push(X) + 0.02 * X[:, :2].sin()
+
+
+class Gain(torch.nn.Module):
+    """A physics that learns."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.tensor(0.05, dtype=torch.float64))
+
+    def forward(self, X):
+        return push(X, self.gain)
+
+
+@pytest.fixture
+def learnt():
+    """Makes dynamics that have learnt from 12 transitions, then were conditioned on 4."""
+
+    def learnt(physics=push, **options):
+        options.setdefault("fit_options", {"num_starts": 1, "num_screened": 8})
+        dynamics = LearnedDynamics(SPEC, physics, **options)
+        dynamics.update(*transitions())
+        dynamics.condition(*transitions(4, seed=1))
+        return dynamics
+
+    return learnt
+
+
+def equal(one, other):
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
+    return torch.equal(one, other) if torch.is_tensor(one) else one == other
+
+
+def unchanged(dynamics, before, twin):
+    """Whether dynamics are those of a state, and learn as a twin does."""
+    assert equal(dynamics.state_dict(), before)
+    states, actions, _ = transitions(seed=5)
+    for _ in range(2):
+        pairs = zip(dynamics.predict(states, actions), twin.predict(states, actions), strict=True)
+        assert all(torch.equal(one, other) for one, other in pairs)
+        for each in (dynamics, twin):
+            each.update(*transitions(6, seed=2))
+
+
+# States
+
+
+def damaged(change):
+    def damage(state):
+        change(state)
+        return state
+
+    return damage
+
+
+DAMAGES = [
+    (lambda state: None, TypeError, "dictionary that `state_dict` gave, found None"),
+    (lambda state: {"weights": 1}, RuntimeError, "does not say of what dynamics"),
+    (damaged(lambda s: s.pop("model")), RuntimeError, "it lacks 'model'"),
+    (
+        damaged(lambda s: s["transitions"].update(states=s["transitions"]["states"][:, :1])),
+        RuntimeError,
+        "in its transitions. Expected states of shape",
+    ),
+    (
+        damaged(lambda s: s["transitions"]["actions"][3].fill_(math.nan)),
+        RuntimeError,
+        r"in its transitions.*\(row 3\)",
+    ),
+    (
+        damaged(lambda s: s.update(physics=s["physics"][1:])),
+        RuntimeError,
+        r"'physics' as finite float64 values of shape \(20, 2\)",
+    ),
+    (damaged(lambda s: s.update(chunks=[12, 3])), RuntimeError, "20 in all"),
+    (damaged(lambda s: s.update(searched_at=0)), RuntimeError, "'searched_at'"),
+    (
+        damaged(lambda s: s["model"].update({"likelihood.noise_covar.raw_noise": torch.ones(9)})),
+        RuntimeError,
+        "of another model than this CKA",
+    ),
+    (
+        damaged(lambda s: s["model"].pop("likelihood.noise_covar.raw_noise")),
+        RuntimeError,
+        "of another model than this CKA",
+    ),
+    (
+        damaged(lambda s: s["model"]["likelihood.noise_covar.raw_noise"].fill_(math.nan)),
+        RuntimeError,
+        "tensors without NaN",
+    ),
+    (
+        damaged(lambda s: s.update(physics=None)),
+        RuntimeError,
+        "without a physics, but there is one here",
+    ),
+    (
+        damaged(lambda s: s["physics"].mul_(1.1)),
+        RuntimeError,
+        r"another physics than 'push' here.* Load the state into .* not deterministic",
+    ),
+]
+
+
+def test_a_state_that_cannot_be_loaded_changes_nothing(learnt):
+    dynamics = learnt()
+    before = dynamics.state_dict()
+    other = LearnedDynamics(SPEC, push)
+    other.update(*transitions(20, seed=3))
+    for change, error, message in DAMAGES:
+        with pytest.raises(error, match=message):
+            dynamics.load_state_dict(change(copy.deepcopy(other.state_dict())))
+    unchanged(dynamics, before, learnt())
+
+
+def test_a_physics_that_learns_is_stored_and_restored(learnt):
+    physics = Gain()
+    dynamics = learnt(physics)
+    gain = physics.gain.item()
+    assert gain != 0.05
+    state = dynamics.state_dict()
+    other = LearnedDynamics(SPEC, Gain())
+    other.load_state_dict(state)
+    states, actions, _ = transitions(seed=5)
+    assert torch.equal(other.predict(states, actions).mean, dynamics.predict(states, actions).mean)
+    changed = copy.deepcopy(state)
+    changed["physics"] += 1
+    key = next(name for name in changed["model"] if name.endswith("gain"))
+    changed["model"][key] += 1
+    with pytest.raises(RuntimeError, match="another physics"):
+        dynamics.load_state_dict(changed)
+    assert physics.gain.item() == gain
+
+
+def test_dynamics_of_another_physics_are_refused(learnt):
+    seen = PhysicsDynamics(SPEC, push)
+    seen.update(*transitions())
+    for one in (learnt(), seen):
+        other = type(one)(SPEC, stronger)
+        with pytest.raises(
+            RuntimeError, match=r"another physics than 'stronger'.* of 'v', this one"
+        ):
+            other.load_state_dict(one.state_dict())
+        type(one)(SPEC, push).load_state_dict(one.state_dict())
+        other.load_state_dict(type(one)(SPEC, push).state_dict())  # it has seen nothing
+
+
+def test_loading_asks_the_physics_at_three_rows(learnt):
+    rows = []
+
+    def counted(X):
+        rows.append(len(X))
+        return push(X)
+
+    LearnedDynamics(SPEC, counted).load_state_dict(learnt().state_dict())
+    assert sum(rows) == 3
+    seen = PhysicsDynamics(SPEC, push)
+    seen.update(*transitions())
+    PhysicsDynamics(SPEC, counted).load_state_dict(seen.state_dict())
+    assert sum(rows) == 6
+
+
+def test_a_physics_may_differ_by_rounding(learnt):
+    state = learnt().state_dict()
+    LearnedDynamics(SPEC, lambda X: push(X) * (1 + 1e-9)).load_state_dict(state)
+
+    def still(X):
+        return X[:, :2]
+
+    dynamics = LearnedDynamics(SPEC, still, model=PhysicsMeanGP)
+    dynamics.update(*transitions())
+    again = LearnedDynamics(SPEC, still, model=PhysicsMeanGP)
+    again.load_state_dict(dynamics.state_dict())
+    assert again.num_transitions == 12
+
+
+def test_a_whole_turn_is_no_difference():
+    spec = StateSpec(["theta"], ["rate"], angles=["theta"])
+    states = torch.linspace(0, 6, 9, dtype=torch.float64).unsqueeze(-1)
+    turn = torch.full_like(states, torch.pi)
+
+    def physics(sign):
+        return lambda X: X[:, :1] + sign * (torch.pi - 1e-12)
+
+    seen = PhysicsDynamics(spec, physics(1))
+    seen.update(states, turn, states + turn)
+    PhysicsDynamics(spec, physics(-1)).load_state_dict(seen.state_dict())
+    with pytest.raises(RuntimeError, match="another physics"):
+        PhysicsDynamics(spec, physics(0.9)).load_state_dict(seen.state_dict())
+
+
+def test_a_loaded_state_is_a_copy(learnt):
+    state = learnt().state_dict()
+    dynamics = LearnedDynamics(SPEC, push)
+    dynamics.load_state_dict(state)
+    before = copy.deepcopy(state)
+    state["transitions"]["states"].zero_()
+    state["physics"].zero_()
+    assert equal(dynamics.state_dict(), before)
+
+
+@pytest.mark.parametrize(
+    "probes", [3, [], [torch.ones(2)] * 4, [torch.ones(2, 2), torch.ones(2, 1)]], ids=str
+)
+def test_damaged_probes_are_refused(probes):
+    dynamics = PhysicsDynamics(SPEC, push)
+    with pytest.raises(RuntimeError, match="expected 'probes' as float64 tensors"):
+        dynamics.load_state_dict({**dynamics.state_dict(), "probes": probes})
+
+
+# Transitions
+
+
+@pytest.mark.parametrize("where", ["physics", "model", "fit"])
+def test_an_error_while_learning_changes_nothing(learnt, monkeypatch, where):
+    broken = False
+
+    def physics(X):
+        if broken and where == "physics":
+            raise OSError("no licence")
+        return push(X)
+
+    def fail(*arguments, **options):
+        raise RuntimeError("no licence")
+
+    dynamics, twin = learnt(physics), learnt(physics)
+    before, result = dynamics.state_dict(), dynamics.fit_result
+    rows = transitions(40, seed=7)
+    broken = True
+    with monkeypatch.context() as patch:
+        if where == "model":
+            patch.setattr(CKA, "__init__", fail)
+        if where == "fit":
+            patch.setattr("gpadjust.dynamics.incremental_fit.fit", fail)
+        if where != "physics":
+            patch.setattr(CKA, "condition_on_observations", fail)
+        for call in (dynamics.fit, dynamics.update, dynamics.condition):
+            with pytest.raises(RuntimeError, match="no licence"):
+                call(*rows)
+    broken = False
+    assert dynamics.fit_result is result
+    unchanged(dynamics, before, twin)
+
+
+def test_rows_of_a_failing_physics_are_those_that_were_asked_for(learnt):
+    broken = False
+
+    def physics(X):
+        return push(X).where(X[:, 2:] < 1.5, torch.nan) if broken else push(X)
+
+    physics = FunctionPhysics(physics, memo=0)
+    dynamics = learnt(physics)
+    states, actions, _ = transitions()  # known
+    states, actions = states.repeat(2, 1), actions.repeat(2, 1)
+    states[[3, 8, 9, 17]] += 0.5  # not known
+    actions[[8, 17]] = 1.9
+    actions[[3, 9]] = 1.1
+    broken = True
+    with pytest.raises(PhysicsError, match=r"2 of 4 row\(s\)") as caught:
+        dynamics.predict(states, actions)
+    assert caught.value.rows == (8, 17)
+    expected = torch.cat([states, actions], -1)[[8, 17]]
+    assert torch.equal(caught.value.inputs, expected)
+
+
+def test_an_integrated_state_hides_no_failure():
+    spec = StateSpec(["x", "v"], ["a"], integrated={"x": "v"}, step=0.1)
+    physics = FunctionPhysics(lambda X: push(X).where(X[:, 2:] < 2.1, torch.nan), memo=0)
+    states, actions, _ = transitions()
+    velocity = states[:, 1:] + 0.1 * actions
+    following = torch.cat([states[:, :1] + 0.05 * (states[:, 1:] + velocity), velocity], -1)
+    actions[7] = 2.5
+    with pytest.raises(PhysicsError, match=r"NaN or inf in 1 of 12 row") as caught:
+        LearnedDynamics(spec, physics).update(states, actions, following)
+    assert caught.value.rows == (7,)
+
+
+# Arguments
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"physics": None}, TypeError, "CKA adjusts a physics.*model=ZeroMeanGP"),
+        ({"model": ZeroMeanGP}, TypeError, "ZeroMeanGP takes no physics.*model=CKA"),
+        ({"model": "CKA"}, TypeError, "class of gpadjust.models.*found 'CKA'"),
+        ({"model": SingleTaskGP}, TypeError, "class of gpadjust.models"),
+        ({"model": AdjustedGP}, ValueError, "needs rho, delta besides"),
+        ({"model_options": [1]}, TypeError, r"dictionary of arguments of CKA, found \[1\]"),
+        ({"model_options": {"seed": 1}}, ValueError, "CKA does not take 'seed'.*rho_mean"),
+        ({"model_options": {"train_X": 1}}, ValueError, "may not hold 'train_X'"),
+        (
+            {"model": PaperRRA, "model_options": {"rho_mean": 1.0}},
+            ValueError,
+            "PaperRRA does not take 'rho_mean'",
+        ),
+        ({"fit_options": {"method": "hmc"}}, ValueError, "leave 'method' out"),
+        ({"fit_options": {"num_samples": 8}}, ValueError, "it is one of method 'hmc'"),
+        ({"fit_options": {"starts": 8}}, ValueError, "no option 'starts'; expected num_starts"),
+        ({"fit_options": [8]}, TypeError, r"dictionary of options of gpadjust.fit, found \[8\]"),
+        ({"encode_angles": "no"}, TypeError, "encode_angles to be True or False, found 'no'"),
+        ({"target": 3}, ValueError, "Unknown target 3"),
+        ({"spec": ["x", "v"]}, TypeError, "Expected spec as a StateSpec"),
+    ],
+)
+def test_bad_arguments_are_found_at_once(options, error, message):
+    with pytest.raises(error, match=message):
+        LearnedDynamics(**{"spec": SPEC, "physics": push, **options})
+
+
+@pytest.mark.parametrize("model", [RRA, None])
+def test_bad_tensors_are_refused(learnt, model):
+    dynamics = PhysicsDynamics(SPEC, push) if model is None else learnt(model=model)
+    states, actions, following = transitions()
+    convert = r"convert with `torch.as_tensor\(states, dtype=torch.float64\)`"
+    for call in (dynamics.predict, dynamics.sample):
+        with pytest.raises(TypeError, match=convert):
+            call(states.numpy(), actions)
+        with pytest.raises(TypeError, match=r"float32; use `states.double\(\)`"):
+            call(states.float(), actions)
+        with pytest.raises(ValueError, match="an action for each state, or one for all"):
+            call(states, actions[:3])
+        one, each = (call(states, a)[0] for a in (actions[:1], actions[:1].expand(12, 1)))
+        assert one.shape == each.shape
+    for call in (dynamics.update, dynamics.score):
+        with pytest.raises(TypeError, match=convert):
+            call(states.numpy(), actions, following)
+    for number in (0, 1.5, True, "2"):
+        with pytest.raises(ValueError, match="num_functions to be a whole number >= 1"):
+            dynamics.sample_functions(number)
+    with pytest.raises(ValueError, match="a block for each function"):
+        dynamics.sample_functions(2)(states, actions)
