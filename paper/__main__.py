@@ -23,16 +23,17 @@ _OTHER = {"report": "copy the results that are committed into the READMEs"}
 def main() -> None:
     """Run what the command line names; nothing that it does not need is imported."""
     name, *arguments = sys.argv[1:] or ["--help"]
-    if name == "report":
-        import_module("paper.report").report()
-    elif name in EXPERIMENTS:
+    if name in EXPERIMENTS:
         _run(name, arguments)
+    elif name == "report" and not arguments:
+        import_module("paper.report").report()
     else:
         lines = [f"  {known:<15}{what}" for known, (_, what) in EXPERIMENTS.items()]
         lines += [f"  {known:<15}{what}" for known, what in _OTHER.items()]
         usage = f"usage: python -m paper experiment [options]\n\n{__doc__}\n" + "\n".join(lines)
-        if name in ("-h", "--help"):
-            raise SystemExit(print(usage))
+        if {"-h", "--help"} & {name, *arguments}:
+            print(usage)
+            raise SystemExit(0)
         raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
 
 

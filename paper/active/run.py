@@ -22,7 +22,7 @@ from torch import Tensor
 from gpadjust import fit
 from gpadjust.active import collect, qAdjustmentInformationGain
 from gpadjust.active.adjustment_information_gain import About
-from gpadjust.active.refitting import refit
+from gpadjust.active.warm_refit import refit
 from gpadjust.validation import coverage, rmse
 from paper.active import Active, LearnerName, Settings
 from paper.active.problems import Model, Problem, problem

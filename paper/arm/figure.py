@@ -23,6 +23,7 @@ BOUND_LABEL = "policy trained on the true system, all steps"
 HELD = 34.0  # cm, all steps
 BACKDROP = "mf"  # in every panel, for comparison
 _COLUMNS = 4
+_WORST = 60  # cm, the end of the colours
 _WIDEST = 10  # cm, the end of the sizes
 
 
@@ -67,7 +68,6 @@ def _map(maps: pd.DataFrame, experiment: Control) -> Path:
     titles = _titles(maps, experiment)
     figure, axes = panels([*titles.values()], _COLUMNS, (2.9, 2.0))
     targets = 100 * hand_position(arm_targets()).numpy()
-    worst = maps.groupby(["scenario", "target"])["all_steps"].mean().max()
     for name, ax in zip(titles, axes, strict=True):
         by_target = maps[maps["scenario"] == name].groupby("target")["all_steps"]
         mean, sd = by_target.mean().to_numpy(), by_target.std().fillna(0).to_numpy()
@@ -79,13 +79,14 @@ def _map(maps: pd.DataFrame, experiment: Control) -> Path:
             s=6 + 6 * sd.clip(max=_WIDEST),
             cmap="viridis_r",
             vmin=0,
-            vmax=10 * math.ceil(worst / 10),
+            vmax=_WORST,
             zorder=2,
         )
         ax.set_aspect("equal")
     figure.supxlabel("along the upper arm at 0°, cm", fontsize="medium")
     figure.supylabel("across, cm", fontsize="medium")
-    figure.colorbar(dots, ax=axes, label=f"RMSE after trial {MAP_AFTER}, cm", shrink=0.9)
+    label = f"RMSE after trial {MAP_AFTER}, cm"
+    figure.colorbar(dots, ax=axes, label=label, shrink=0.9, extend="max")
     sizes = [
         ax.scatter([], [], s=6 + 6 * sd, color="0.4", label=f"sd of runs {sd} cm{more}")
         for sd, more in ((0, ""), (5, ""), (_WIDEST, " or more"))

@@ -43,7 +43,7 @@ def tables(records: Sequence[Record], experiment: Control) -> dict[str, Table]:
         found[actions] = Table(f"Cost, {actions} actions", _costs(of[measure], experiment))
     labels = {name: SCENARIOS[name].label for name in _SHORT}
     short = short_summary(
-        of["cost"], labels, _columns(of["cost"]), "mean cost of trials", 0.5, "", 2
+        of["cost"], labels, _columns(of["cost"]), "mean cost", 0.5, "", 2
     )
     found["short"] = Table("Cost, sampled actions", short)
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))

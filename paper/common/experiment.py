@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -79,9 +80,27 @@ class Experiment:
 
     def run(self, *task: Any, unfinished: Path) -> Record:
         """Run a task."""
-        found: Record = self.part("run").run(self, *task, unfinished=unfinished)
+        found: Record = self._part("run").run(self, *task, unfinished=unfinished)
         return found
 
-    def part(self, name: str) -> Any:
+    def first_look(self, records: Sequence[Record]) -> str | None:
+        """A short table of the first few runs, if the experiment has one and they are enough."""
+        look = getattr(self._part("tables"), "first_look", None)
+        text: str | None = look(records) if look and records else None
+        return text
+
+    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
+        """The tables of all runs, by name."""
+        found: dict[str, Table] = self._part("tables").tables(records, self)
+        return found
+
+    def draw(self, records: Sequence[Record]) -> list[Path]:
+        """Draw the figures, if there are any, and return their files."""
+        if find_spec(f"{type(self).__module__}.figure") is None:
+            return []
+        found: list[Path] = self._part("figure").draw(records, self)
+        return found
+
+    def _part(self, name: str) -> Any:
         """A module of the experiment's folder, imported when it is needed."""
         return import_module(f"{type(self).__module__}.{name}")

@@ -10,7 +10,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -63,14 +62,12 @@ def main(experiment: Experiment) -> None:
     for table in tables.values():
         print(f"\n{table.title}\n\n{aligned(table.text)}")
     (experiment.out / TABLES).write_text(as_document(tables))
-    print(experiment.out / TABLES)
-    if find_spec(f"{type(experiment).__module__}.figure"):
-        print(*experiment.part("figure").draw(records, experiment), sep="\n")
+    print(experiment.out / TABLES, *experiment.draw(records), sep="\n")
 
 
 def tables_of(experiment: Experiment, records: Sequence[Record]) -> dict[str, Table]:
     """Settings and results, by the names of their markers in the READMEs."""
-    found = experiment.part("tables").tables(records, experiment)
+    found = experiment.tables(records)
     settings = getattr(experiment, "settings", None)
     if settings is not None:
         found["settings"] = Table("Settings", settings_table({"value": asdict(settings)}))
@@ -192,8 +189,7 @@ def _described(experiment: Experiment, kind: Task) -> dict[str, Any]:
 
 def _first_look(experiment: Experiment, records: Any) -> bool:
     """Show a short table as soon as there are runs enough; tell whether there were."""
-    look = getattr(experiment.part("tables"), "first_look", None)
-    text = look(list(records)) if look and records else None
+    text = experiment.first_look(list(records))
     if text:
         tqdm.write(f"\n{aligned(text)}\n")
     return bool(text)

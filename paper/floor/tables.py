@@ -12,7 +12,7 @@ from paper.floor import SYSTEMS, Floor
 
 _WHAT = {
     SYSTEMS[0]: "cart-pole, mean start: cost of the best open loop found",
-    SYSTEMS[1]: "cart-pole, 20 fixed starts: cost of the best open loop found for each",
+    SYSTEMS[1]: "cart-pole, fixed starts: cost of the best open loop found for each",
     SYSTEMS[2]: "arm: hand's error in cm, all steps, of SAC for long on the true arm, its best",
 }
 
