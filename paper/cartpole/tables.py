@@ -42,9 +42,7 @@ def tables(records: Sequence[Record], experiment: Control) -> dict[str, Table]:
     for measure, actions in MEASURES.items():
         found[actions] = Table(f"Cost, {actions} actions", _costs(of[measure], experiment))
     labels = {name: SCENARIOS[name].label for name in _SHORT}
-    short = short_summary(
-        of["cost"], labels, _columns(of["cost"]), "mean cost", 0.5, "", 2
-    )
+    short = short_summary(of["cost"], labels, _columns(of["cost"]), "mean cost", 0.5, "", 2)
     found["short"] = Table("Cost, sampled actions", short)
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
     parts = {

@@ -116,17 +116,18 @@ def run_missing(experiment: Experiment) -> None:
 def run_one(experiment: Experiment, task: Task) -> Task:
     """Run a task and add it to the file; return it."""
     torch.set_num_threads(1)
-    unfinished = experiment.out / "unfinished"
-    unfinished.mkdir(parents=True, exist_ok=True)
-    found = experiment.run(*task, unfinished=unfinished / _title(task))
-    runs_file(experiment).append(
-        {
-            **dict(zip(experiment.key, task, strict=True)),
-            "settings": _described(experiment, task[:-1]),
-            "versions": versions(experiment.packages),
-            **rounded(found),
-        }
-    )
+    file, made_by = runs_file(experiment), versions(experiment.packages)
+    unfinished = experiment.out / "unfinished" / _title(task)
+    unfinished.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(f"{unfinished}.lock")
+    with lock:  # a worker may outlive a call that was killed
+        before = file.read().get(task)
+        if before is None or differences(before["versions"], made_by):
+            found = experiment.run(*task, unfinished=unfinished)
+            described = _described(experiment, task[:-1])
+            named = dict(zip(experiment.key, task, strict=True))
+            file.append({**named, "settings": described, "versions": made_by, **rounded(found)})
+        Path(lock.lock_file).unlink(missing_ok=True)
     return task
 
 

@@ -37,7 +37,7 @@ from paper.floor import Floor
 from paper.floor import Settings as FloorSettings
 
 SHORT = {"episodes": 3, "model_episodes": 2, "batch_size": 16, "net_arch": (16,)}
-TINY = CartPoleSettings(**SHORT, last_model_episode=2, later_updates=5)
+TINY = CartPoleSettings(**SHORT, last_model_episode=2, later_updates=5, updates_per_model_step=0.2)
 TINY_ARM = ArmSettings(
     **{**SHORT, "episodes": 2},
     episode_length=5,
@@ -124,20 +124,16 @@ def test_a_fingerprint_holds_what_the_settings_do_not_say():
 
 class TestCartPole:
     def test_smoke(self, tmp_path, capsys):
-        experiment = CartPole(
-            out=tmp_path, runs=2, jobs=1, scenarios=("mf", "gp", "phy"), settings=TINY
-        )
+        experiment = CartPole(out=tmp_path, runs=2, jobs=1, scenarios=("mf", "gp"), settings=TINY)
         main(experiment)
         assert "P4  Dyna-CKA" in capsys.readouterr().out
         assert (tmp_path / "curves.png").stat().st_size > 5_000
         found = runs_file(experiment).read()
         episodes = {name: found[name, 1]["episodes"] for name in experiment.scenarios}
-        in_model = 2 * 2 * 25
-        assert episodes["phy"]["updates"] == [25 + in_model, 25 + in_model, 5]
+        in_model = 10
         assert episodes["mf"]["updates"] == [25 + in_model, 25 + in_model, 5]
         assert [value is None for value in episodes["gp"]["nlpd"]] == [True, False, True]
         assert len(episodes["gp"]["rmse"][1]) == 4
-        assert episodes["phy"]["nlpd"] == [None] * 3
         assert all(0 < cost <= 1 for of in episodes.values() for cost in of["cost"])
 
     @pytest.mark.slow
@@ -185,14 +181,15 @@ class TestCartPole:
         found = judged(
             [*CLAIMS, *TARGETS],
             {
-                "mf": lambda e: 0.9 if e < 30 else 0.4,
+                "mf": lambda e: 0.9 if e < 30 else 0.39,
                 "phy": lambda e: 0.49 if e < 9 else 0.7,
                 "gp-paper": lambda e: 0.9,
                 "cka": lambda e: 0.9 if e < 6 else 0.45 if e < 12 else 0.39,
                 "rra-paper": lambda e: 0.8 if e < 26 else 0.4,
             },
         )
-        assert {found[name].verdict for name in ("P1", "P2", "P3", "P4")} == {"reproduced"}
+        verdicts = {name: claim.verdict for name, claim in found.items()}
+        assert [verdicts[f"P{i}"] for i in (1, 2, 3, 4)] == ["reproduced"] * 4, found
         assert found["P5"].verdict == "not reproduced"  # always 0.01 above CKA
         assert found["T1"].measured.startswith("4 runs: at trial 6; at 6 0.45")
         assert found["T5"].verdict == found["T6"].verdict == "not run"
@@ -247,6 +244,7 @@ class TestArm:
         assert hundred().sum() == 100
         assert np.sqrt(np.square(distance_from_start()).mean()) == pytest.approx(34, abs=0.5)
 
+    @pytest.mark.usefixtures("_few_targets")
     def test_smoke(self, tmp_path, capsys):
         settings = replace(TINY_ARM, episodes=2, evaluate_every=2, map_after=9)
         experiment = Arm(out=tmp_path, runs=2, jobs=1, scenarios=("cka", "mf"), settings=settings)
@@ -255,7 +253,7 @@ class TestArm:
         assert (tmp_path / "curves.png").stat().st_size > 5_000
         record = runs_file(experiment).read()["cka", 1]
         assert record["evaluations"]["episode"] == [0, 2]
-        assert len(record["maps"]["2"]["last_five"]) == 121
+        assert len(record["maps"]["2"]["last_five"]) == 4
         assert record["episodes"]["updates"] == [5 + 2 * 5] * 2
 
     @pytest.mark.slow
@@ -329,7 +327,8 @@ class TestExploration:
 
     def test_smoke(self, tmp_path, capsys):
         experiment = Exploration(
-            out=tmp_path, runs=2, jobs=1, scenarios=("gp-sac", "gp-info"), settings=TINY_PLANS
+            out=tmp_path, runs=2, jobs=1, scenarios=("gp-sac", "gp-info"),
+            settings=replace(TINY_PLANS, episodes=2)
         )  # fmt: skip
         main(experiment)
         assert "Mean error on swing-ups, after trials" in capsys.readouterr().out
