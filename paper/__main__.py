@@ -1,43 +1,53 @@
-"""Run one of the paper's experiments."""
+"""Run one of the paper's experiments, or one of ours; `python -m paper report` fills the READMEs.
+
+Each says its options: `python -m paper forrester --help`.
+"""
 
 from __future__ import annotations
 
-import argparse
+import sys
+from importlib import import_module
 
-from paper import active, arm, cartpole, exploration, forrester, multifidelity
-from paper.report import report
+EXPERIMENTS = {
+    "forrester": ("Forrester", "eight models of Forrester's function (figure 1)"),
+    "multifidelity": ("Multifidelity", "eight methods on functions of low and high fidelity"),
+    "active": ("Active", "error over measurements, by who chooses them"),
+    "cartpole": ("CartPole", "learners that swing up a cart-pole"),
+    "arm": ("Arm", "learners that reach with a muscle arm"),
+    "exploration": ("Exploration", "cart-poles whose trials are random, SAC's or informative"),
+    "floor": ("Floor", "what the control tasks cost at best"),
+}
+_OTHER = {"report": "copy the results that are committed into the READMEs"}
 
 
 def main() -> None:
-    """Parse the command line and run the experiment that it names."""
-    parser = argparse.ArgumentParser(prog="python -m paper", description=__doc__)
-    experiments = parser.add_subparsers(dest="experiment", required=True, metavar="experiment")
-    forrester.add_arguments(
-        experiments.add_parser("forrester", help="eight models of Forrester's function (figure 1)")
-    )
-    multifidelity.add_arguments(
-        experiments.add_parser(
-            "multifidelity", help="eight methods on functions of low and high fidelity"
-        )
-    )
-    cartpole.add_arguments(
-        experiments.add_parser("cartpole", help="learners that swing up a cart-pole")
-    )
-    arm.add_arguments(experiments.add_parser("arm", help="learners that reach with a muscle arm"))
-    active.add_arguments(
-        experiments.add_parser("active", help="error over measurements, by who chooses them")
-    )
-    exploration.add_arguments(
-        experiments.add_parser(
-            "exploration", help="cart-poles whose real trials are random, SAC's or informative"
-        )
-    )
-    experiments.add_parser(
-        "report", help="copy the results that are committed into the READMEs"
-    ).set_defaults(run=lambda arguments: report())
-    arguments = parser.parse_args()
+    """Run what the command line names; nothing that it does not need is imported."""
+    name, *arguments = sys.argv[1:] or ["--help"]
+    if name in EXPERIMENTS:
+        _run(name, arguments)
+    elif name == "report" and not arguments:
+        import_module("paper.report").report()
+    else:
+        lines = [f"  {known:<15}{what}" for known, (_, what) in EXPERIMENTS.items()]
+        lines += [f"  {known:<15}{what}" for known, what in _OTHER.items()]
+        usage = f"usage: python -m paper experiment [options]\n\n{__doc__}\n" + "\n".join(lines)
+        if {"-h", "--help"} & {name, *arguments}:
+            print(usage)
+            raise SystemExit(0)
+        raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
+
+
+def _run(name: str, arguments: list[str]) -> None:
+    import tyro
+
+    kind = getattr(import_module(f"paper.{name}"), EXPERIMENTS[name][0])
+    config = [tyro.conf.FlagCreatePairsOff, *([tyro.conf.OmitArgPrefixes] if kind.flat else [])]
+    experiment = tyro.cli(kind, prog=f"python -m paper {name}", args=arguments, config=config)
+    runner = import_module("paper.common.runner")
     try:
-        arguments.run(arguments)
+        runner.main(experiment)
+    except runner.Refused as error:
+        raise SystemExit(str(error)) from error
     except KeyboardInterrupt:
         raise SystemExit(
             "\nInterrupted. The same command goes on where this one stopped."

@@ -2,49 +2,105 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
 
-from paper.active.figure import draw
-from paper.active.learners import LEARNERS
-from paper.active.problems import NAMES, problem
-from paper.active.results import load, tabulate, verdicts
-from paper.active.runs import make_tasks, run_all
-from paper.options import add_names, add_only_tables, add_options, check_names, check_options
+from paper.common.experiment import Experiment, Task
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this experiment to its command line."""
-    add_options(parser, "active", num_runs=20)
-    add_names(parser, "--problems", NAMES, "problems")
-    add_names(parser, "--learners", tuple(LEARNERS), "learners")
-    add_only_tables(parser)
-    parser.set_defaults(run=run)
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Run the experiment; write and print its tables, verdicts and figure."""
-    check_names("--problems", "problem", arguments.problems, NAMES)
-    check_names("--learners", "learner", arguments.learners, tuple(LEARNERS))
-    check_options(arguments)
-    tasks = make_tasks(arguments.problems, arguments.learners, arguments.runs, arguments.seed)
-    if not arguments.only_tables:
-        run_all(tasks, arguments.out, arguments.jobs)
-    summarise(arguments.out)
+ProblemName = Literal["forrester", "currin", "park91a", "cartpole"]
+PROBLEMS: tuple[ProblemName, ...] = get_args(ProblemName)
+LearnerName = Literal["f_p", "phy", "random", "sobol", "gp", "cka", "both", "rho"]
+LABELS: dict[str, str] = {
+    "f_p": "f_p alone",
+    "phy": "physics mean, Sobol points",
+    "random": "CKA, random points",
+    "sobol": "CKA, Sobol points",
+    "gp": "GP, integrated variance",
+    "cka": "CKA, integrated variance",
+    "both": "CKA, information on both",
+    "rho": "CKA, information on rho",
+}
 
 
-def summarise(out: Path) -> None:
-    """Write and print tables, verdicts and the figure of all the runs in a folder."""
-    runs = load(out)
-    table, claims = tabulate(runs), verdicts(runs)
-    table.to_csv(out / "table.csv", index=False, float_format="%.4g")
-    claims.to_csv(out / "claims.csv", index=False)
-    for name, rows in table.groupby("problem", sort=False):
-        print(f"\n{name}:")
-        rows = rows.drop(columns="problem").replace({"needed": float("inf")}, "never")
-        print(rows.to_string(index=False, float_format="%.3g", na_rep="-"))
-    for claim in claims.itertuples():
-        print(f"  {claim.id} {claim.verdict}: {claim.claim} ({claim.measured})")
-    path = out / "errors.png"
-    draw(runs, {name: problem(name, 0).title for name in NAMES}, path)
-    print(f"\nFigure: {path}")
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What decides the numbers of a problem, shared by all its learners."""
+
+    initial: int = 4
+    """measurements of the initial design, the same for all learners of a seed"""
+    budget: int = 20
+    """measurements in all"""
+    every: int = 1
+    """measurements between two scores"""
+    num_test: int = 500
+    """points that the model is scored at"""
+    integration_points: int = 64
+    """of the integrated variance"""
+    raw_samples: int = 32
+    """points among which the optimisation of an acquisition function starts"""
+    num_restarts: int = 2
+    """of that optimisation"""
+    maxiter: int = 20
+    """of that optimisation"""
+    num_screened: int = 64
+    """starts of a fit, beside the hyper-parameters of the last one"""
+    num_starts: int = 4
+    """of these, how many are optimised"""
+    max_iterations: int = 100
+    """of a fit"""
+
+    def counts(self) -> range:
+        """The numbers of measurements that there is a score of."""
+        return range(self.initial, self.budget + 1, self.every)
+
+
+_FOUR_OUTPUTS = Settings(  # more to compute at every step
+    initial=8,
+    budget=48,
+    every=4,
+    integration_points=32,
+    raw_samples=16,
+    num_restarts=1,
+    maxiter=8,
+    num_screened=16,
+    num_starts=2,
+    max_iterations=30,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Active(Experiment):
+    """How many measurements physics and the choice of points save, on four problems."""
+
+    runs: int = 20
+    """number of runs, each with an initial design of its own"""
+    out: Path = Path("results/active")
+    problems: tuple[ProblemName, ...] = PROBLEMS
+    learners: tuple[LearnerName, ...] = get_args(LearnerName)
+    forrester: Settings = field(default_factory=Settings)
+    currin: Settings = field(default_factory=lambda: Settings(initial=6, budget=30))
+    park91a: Settings = field(default_factory=lambda: Settings(initial=10, budget=40, every=2))
+    cartpole: Settings = field(default_factory=lambda: replace(_FOUR_OUTPUTS))
+
+    name: ClassVar[str] = "active"
+    key: ClassVar[tuple[str, ...]] = ("problem", "learner", "seed")
+    flat: ClassVar[bool] = False
+
+    def tasks(self) -> list[Task]:
+        """All combinations, seed by seed, so that what is done first can be compared."""
+        return [
+            (problem, learner, seed)
+            for seed in self.seeds
+            for problem in self.problems
+            for learner in self.learners
+        ]
+
+    def settings_of(self, problem: str) -> Settings:
+        """The settings of a problem."""
+        settings: Settings = getattr(self, problem)
+        return settings
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings of the problem."""
+        return asdict(self.settings_of(kind[0]))

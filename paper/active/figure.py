@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from paper.active.learners import LABELS
-from paper.active.results import REFERENCE
-from paper.control.claims import counted
-from paper.control.figure import one_legend, save
+from paper.active import LABELS, Active
+from paper.active.tables import REFERENCE, load
+from paper.common.claims import counted
+from paper.common.experiment import Record
+from paper.common.figures import draw_quartiles, one_legend, panels, save
 
 COLORS = {
+    "phy": "tab:brown",
     "random": "0.6",
     "sobol": "black",
     "gp": "tab:orange",
@@ -22,47 +23,39 @@ COLORS = {
     "both": "tab:green",
     "rho": "tab:purple",
 }
+TITLES = {"forrester": "Forrester, reading B", "cartpole": "cart-pole transitions"}
 
 
-def draw(runs: pd.DataFrame, titles: dict[str, str], path: Path) -> None:
-    """Draw the median and the quartiles of the error over the number of measurements.
-
-    Args:
-        runs: The scores of all runs.
-        titles: The titles of the problems, by name.
-        path: Where to save the PNG.
-    """
-    names = list(runs["problem"].unique())
-    columns = min(2, len(names))
-    rows = math.ceil(len(names) / columns)
-    figure = Figure(figsize=(max(8.0, 5 * columns), 3.3 * rows + 0.8), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).flatten()
-    for ax in axes[len(names) :]:
-        ax.set_visible(False)
-    for ax, name in zip(axes, names, strict=False):
-        part = runs[runs["problem"] == name]
+def draw(records: Sequence[Record], experiment: Active) -> list[Path]:
+    """Draw the median and the quartiles of the error over the number of measurements."""
+    runs = load(records)
+    by_problem = {str(name): part for name, part in runs.groupby("problem", sort=False)}
+    titles = [
+        f"{TITLES.get(name, name)} ({counted(part['seed'].nunique())})"
+        for name, part in by_problem.items()
+    ]
+    figure, axes = panels(titles, 2, (5, 3.3), share=False, width=8)
+    for ax, part in zip(axes, by_problem.values(), strict=True):
         _panel(ax, part)
-        runs_of = counted(part["seed"].nunique())
-        ax.set_title(f"{titles[name]} ({runs_of})", loc="left", fontsize=10)
-    for ax in axes[::columns]:
+    for ax in axes[::2]:
         ax.set_ylabel("RMSE / sd of the truth")
     figure.supxlabel("measurements, those of the initial design included", fontsize="medium")
     one_legend(figure, axes)
-    save(figure, path)
+    return [save(figure, experiment.out / "errors.png")]
 
 
 def _panel(ax: Axes, runs: pd.DataFrame) -> None:
-    for learner, part in runs.groupby("learner", sort=False):
-        errors = part.groupby("measurements")["nrmse"]
-        low, middle, high = (errors.quantile(q) for q in (0.25, 0.5, 0.75))
-        color = COLORS[str(learner)]
-        ax.fill_between(middle.index, low, high, color=color, alpha=0.15, lw=0)
-        ax.plot(middle.index, middle, color=color, lw=1.6, label=LABELS[str(learner)])
+    for name, part in runs.groupby("learner", sort=False):
+        learner, errors = str(name), part.groupby("measurements")["nrmse"].median()
+        if learner == "f_p":
+            ax.axhline(errors.iloc[0], color="tab:red", lw=1.2, ls="--", label=LABELS[learner])
+            continue
+        color, label = COLORS[learner], LABELS[learner]
+        draw_quartiles(ax, part, "nrmse", by="measurements", color=color, label=label)
         if learner == REFERENCE:
-            ax.axhline(middle.iloc[-1], color=color, lw=1, ls=":")
+            ax.axhline(errors.iloc[-1], color=color, lw=1, ls=":", label="its final error")
     budget = runs["measurements"].max()
     ax.axvline(budget / 2, color="0.7", lw=1, ls="--", zorder=0, label="half the measurements")
     ax.set_yscale("log")
     ax.grid(axis="y", color="0.9", lw=0.6)
     ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,14 +13,16 @@ from botorch.utils.sampling import draw_sobol_samples
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust import CKA, BlackBoxPhysics, ZeroMeanGP
+from gpadjust import CKA, BlackBoxPhysics, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import AngleInput
 from gpadjust.envs import REAL_CART_POLE, CartPoleEquation, random_cart_pole_physics
-from gpadjust.envs.cart_pole import SUBSTEPS, TIME_STEP
+from gpadjust.envs.cart_pole.system import SUBSTEPS, TIME_STEP
 from gpadjust.physics import ODEPhysics
+from paper.active import PROBLEMS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
 from paper.multifidelity.problem import pair
 
+Model = Literal["CKA", "physics mean", "GP"]
 CART_POLE_LIMITS = (1.0, math.pi, 3.0, 8.0, 10.0)  # m, rad, m/s, rad/s, N, to either side
 _TEST_SEED = 20_000  # beyond those of runs, so that their points are others
 
@@ -29,14 +32,12 @@ class Problem:
     """A system to measure, and what is believed of it.
 
     Attributes:
-        title: Its name in tables and figures.
         bounds: Lower and upper bounds of the inputs, ``2 x d``.
         truth: Maps ``n x d`` to ``n x m``, without noise.
         physics: f_p, of the same shapes.
         angles: The inputs that are angles.
     """
 
-    title: str
     bounds: Tensor
     truth: Callable[[Tensor], Tensor]
     physics: Callable[[Tensor], Tensor]
@@ -57,32 +58,33 @@ class Problem:
         X = self.sobol(n, _TEST_SEED)
         return X, self.truth(X)
 
-    def model(self, X: Tensor, Y: Tensor, with_physics: bool) -> CKA | ZeroMeanGP:
-        """A new model of measurements: CKA, or a Gaussian process without physics."""
+    def model(self, X: Tensor, Y: Tensor, kind: Model) -> CKA | PhysicsMeanGP | ZeroMeanGP:
+        """A new model of measurements."""
         transform = AngleInput(self.angles) if self.angles else None
-        if with_physics:
-            return CKA(X, Y, physics=self.physics, input_transform=transform)
-        return ZeroMeanGP(X, Y, input_transform=transform)
+        if kind == "GP":
+            return ZeroMeanGP(X, Y, input_transform=transform)
+        made = CKA if kind == "CKA" else PhysicsMeanGP
+        return made(X, Y, physics=self.physics, input_transform=transform)
 
 
 def problem(name: str, seed: int) -> Problem:
     """The problem of a given name.
 
     Args:
-        name: One of ``NAMES``.
+        name: One of ``PROBLEMS``.
         seed: Of the physics, where it is random.
 
     Raises:
         ValueError: If there is no such problem.
     """
     if name not in _MAKE:
-        raise ValueError(f"There is no problem {name!r}; there are {', '.join(NAMES)}.")
+        raise ValueError(f"There is no problem {name!r}; there are {', '.join(PROBLEMS)}.")
     return _MAKE[name](seed)
 
 
 def _forrester(seed: int) -> Problem:
     bounds = torch.tensor([[LOWER], [UPPER]], dtype=torch.float64)
-    return Problem("Forrester, reading B", bounds, truth, crude_b)
+    return Problem(bounds, truth, crude_b)
 
 
 def _pair(name: str) -> Callable[[int], Problem]:
@@ -97,7 +99,7 @@ def _pair(name: str) -> Callable[[int], Problem]:
             return functions.low(np.clip(X, lower, upper))
 
         physics = BlackBoxPhysics(low, name=f"{name}, low fidelity")
-        return Problem(name, functions.bounds, functions.truth, physics)
+        return Problem(functions.bounds, functions.truth, physics)
 
     return make
 
@@ -106,7 +108,6 @@ def _cart_pole(seed: int) -> Problem:
     upper = torch.tensor(CART_POLE_LIMITS, dtype=torch.float64)
     believed = random_cart_pole_physics(seed).rhs
     return Problem(
-        "cart-pole transitions",
         torch.stack([-upper, upper]),
         _change(REAL_CART_POLE),
         _change(believed),
@@ -127,4 +128,3 @@ _MAKE: dict[str, Callable[[int], Problem]] = {
     "park91a": _pair("park91a"),
     "cartpole": _cart_pole,
 }
-NAMES = tuple(_MAKE)

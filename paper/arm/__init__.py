@@ -2,59 +2,83 @@
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
-from paper.arm.claims import claims
-from paper.arm.figure import BOUND, BOUND_LABEL, draw_curves, draw_map
-from paper.arm.results import (
-    LAST_TRIAL,
-    MEASURES,
-    load,
-    load_evaluations,
-    load_maps,
-    tabulate,
-    tabulate_memory,
-    tabulate_seconds,
-)
-from paper.arm.runs import ARM
-from paper.arm.targets import targets
-from paper.control import options
-from paper.control.claims import judge
-from paper.control.curves import Curves
-from paper.control.figure import draw_iqm, draw_time
-from paper.control.summary import Summary, verdicts
+from paper.control import Control, Scenario
+from paper.control import Settings as ControlSettings
 
-FIGURES = ("curves", "iqm", "map", "time")
-ENDS = {(t, t): f"after trial {t}" for t in (6, 15, LAST_TRIAL)}
+if TYPE_CHECKING:
+    from paper.control.learner import System
+
+MODEL_FREE_UPDATES = 100  # per episode; the best of 30, 100, 300
+SUBSET = 3  # seeds of some scenarios
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this experiment to its command line."""
-    options.add_arguments(parser, ARM, summarise)
+@dataclass(frozen=True, kw_only=True)
+class Settings(ControlSettings):
+    """What decides the numbers, for all learners, unless one says otherwise."""
+
+    episodes: int = 30
+    episode_length: int = 15
+    last_model_episode: int = 30
+    later_updates: int = 15
+    evaluate_every: int = 3
+    """episodes between two evaluations; the first is before all"""
+    map_after: int = 9
+    """episodes after which, as at the end, the errors at each target are kept"""
+    strength: float = 0.5
+    """of the muscles; a healthy arm's is 1"""
+    memory: bool = False
+    """whether policy and model see the previous action"""
+    black_box: bool = False
+    """whether OpenSim computes f_p, row by row, in place of the equation of motion"""
 
 
-def summarise(out: Path) -> None:
-    """Write and print tables, verdicts and figures of all the runs in a folder."""
-    trials, evaluations, maps = load(out), load_evaluations(out), load_maps(out)
-    judged = {
-        label: judge(claims(maps), Curves(evaluations, measure), LAST_TRIAL)
-        for measure, label in MEASURES.items()
+_MEMORY = {"memory": True}
+SCENARIOS = {
+    "mf": Scenario("model-free"),
+    "mf-best": Scenario("model-free, fewer updates", changes={"updates": MODEL_FREE_UPDATES}),
+    "phy": Scenario("Dyna-Phy", "physics"),
+    "gp": Scenario("Dyna-GP", "ZeroMeanGP"),
+    "cka": Scenario("Dyna-CKA", "CKA"),
+    "rra": Scenario("Dyna-RRA", "RRA"),
+    "mf-memory": Scenario("model-free, memory", None, _MEMORY, SUBSET),
+    "gp-memory": Scenario("Dyna-GP, memory", "ZeroMeanGP", _MEMORY, SUBSET),
+    "cka-memory": Scenario("Dyna-CKA, memory", "CKA", _MEMORY),
+    "cka-opensim": Scenario("Dyna-CKA, f_p a simulator", "CKA", {"black_box": True}, 1),
+}
+PAPER = ("mf", "phy", "gp", "cka", "rra")  # those that the paper compares
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arm(Control):
+    """Learners reach with an arm of six muscles, computed by OpenSim."""
+
+    out: Path = Path("results/arm")
+    settings: Settings = field(default_factory=Settings)
+
+    name: ClassVar[str] = "arm"
+    packages: ClassVar[tuple[str, ...]] = (*Control.packages, "opensim")
+    known: ClassVar[Mapping[str, Scenario]] = SCENARIOS
+    rmses: ClassVar[Mapping[str, str]] = {
+        "theta_s": "theta_s, rad",
+        "theta_e": "theta_e, rad",
+        "theta_s_dot": "theta_s', rad/s",
+        "theta_e_dot": "theta_e', rad/s",
     }
-    every = Curves(evaluations, "all_steps")
-    judged[MEASURES["all_steps"]] += judge(targets(trials, evaluations), every, LAST_TRIAL)
-    times = tabulate_seconds(trials, evaluations)
-    summary = Summary("steps", tabulate(evaluations), times, verdicts("steps", judged))
-    summary.write(out)
-    summary.show("Hand's RMSE in cm", digits=1)
-    memory = tabulate_memory(evaluations)
-    if len(memory):
-        print("\nWith and without the previous action, all steps, cm:")
-        print(memory.to_string(index=False, float_format="%.1f", na_rep="-"))
-    memory.to_csv(out / "memory.csv", index=False, float_format="%.4g")
-    draw_curves(evaluations, out / "curves.png")
-    line = (BOUND, BOUND_LABEL)
-    draw_iqm(evaluations, ARM.labels, MEASURES, ENDS, line, "hand's RMSE, cm", out / "iqm.png")
-    draw_map(maps, out / "map.png")
-    draw_time(times, ARM.labels, out / "time.png")
-    print(f"\nFigures: {', '.join(str(out / f'{name}.png') for name in FIGURES)}")
+
+    def check(self) -> None:
+        """Whether there are the learners, and OpenSim."""
+        from gpadjust.envs.arm.opensim_model import load_opensim
+
+        super().check()
+        load_opensim()
+
+    def system(self, name: str, seed: int) -> System:
+        """The arm; nothing in f_p is random."""
+        from paper.arm.system import system
+
+        return system(self.known[name], self.settings_of(name))

@@ -1,43 +1,53 @@
-"""The paper's claims about this experiment, each with the number that decides it.
+"""The paper's claims about this experiment, and our own targets, with the numbers that decide.
 
 "In 6 trials" and "after 12" allow one trial more, "at trial 30" five more or less. Phy's decay is a
 mean of trials 13-25 above that of the trials from the first at 0.5 or below to 12, and no recovery
-a mean of 41-50 above 0.5. Never to learn, and to fail, is to stay above 0.5 (RRA's in trials 1-25).
-CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up if its mean of 41-50 is no more
-than two standard errors of the paired difference above CKA's.
+a mean of 41-50 above 0.5. Never to learn, and to fail, is to stay above 0.5 on average (RRA's in
+trials 1-25). CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up if the 95 % interval
+of the paired difference of 41-50 reaches down to CKA's.
+
+Targets are judged by the mean over runs; an ± is a standard error. T6 takes the best of three
+settings on the seeds that it reports; all three are said. T4 and T5 are the same for either.
 """
 
 from __future__ import annotations
 
-import math
+from gpadjust.envs.cart_pole.system import TIME_STEP
+from paper.cartpole import SCENARIOS, Settings
+from paper.common.claims import Claim, Finding, counted, met, reached, reproduced
+from paper.common.curves import Curves
+from paper.control.tables import PARTS, seconds_of_a_run
 
-from paper.cartpole.scenarios import SCENARIOS
-from paper.control.claims import Claim, Finding, counted, reached, reproduced, signed
-from paper.control.curves import Curves
+_SETTINGS = Settings()
+_SECONDS = _SETTINGS.episode_length * TIME_STEP
+_LAST, _SERVES = _SETTINGS.episodes, _SETTINGS.last_model_episode
+_LATE = _SERVES - 4  # the first of the last five episodes in which the model serves
 
 
 def _model_free(curves: Curves) -> Finding:
-    first, touch = curves.first("mf", 0.5), curves.first("mf", 0.4)
+    first, touch = curves.first_below("mf", 0.5), curves.first_below("mf", 0.4)
     held = first is not None and touch is not None and first <= 35
     verdict = reproduced(held, beaten=first is not None and first < 25)
     return verdict, _described(curves, "mf") + _beside(curves, "mf-best")
 
 
 def _physics_alone(curves: Curves) -> Finding:
-    first = curves.first("phy", 0.5)
-    early, late = (_mean(curves, "phy", *trials) for trials in ((13, 25), (41, 50)))
+    first = curves.first_below("phy", 0.5)
+    early, late = (_mean(curves, "phy", *episodes) for episodes in ((13, 25), (41, 50)))
     held = first is not None and first <= 7 and late > 0.5
     held = held and early > _mean(curves, "phy", first or 1, 12)
     return reproduced(held), f"{_described(curves, 'phy')}, mean of 13-25 {early:.3f}"
 
 
 def _gp(curves: Curves) -> Finding:
-    held = curves.first("gp-paper", 0.5) is None
-    return reproduced(held), _described(curves, "gp-paper") + _beside(curves, "gp")
+    held = curves.first_below("gp-paper", 0.5) is None
+    ends = curves.window("gp-paper", 41, 50)
+    learnt = f", at most 0.5 in {(ends <= 0.5).sum()} runs"
+    return reproduced(held), _described(curves, "gp-paper") + learnt + _beside(curves, "gp")
 
 
 def _cka(curves: Curves) -> Finding:
-    first, touch = curves.first("cka", 0.5), curves.first("cka", 0.4)
+    first, touch = curves.first_below("cka", 0.5), curves.first_below("cka", 0.4)
     late = _mean(curves, "cka", 41, 50)
     held = first is not None and touch is not None and first <= 7 and touch <= 13 and late <= 0.45
     beaten = held and (first or 0) < 6 and (touch or 0) < 12 and late <= 0.4
@@ -45,12 +55,54 @@ def _cka(curves: Curves) -> Finding:
 
 
 def _rra(curves: Curves) -> Finding:
-    first = curves.first("rra-paper", 0.5)
-    more, error = curves.more("rra-paper", 41, 50)
-    caught = more <= 2 * (0 if math.isnan(error) else error)
+    first = curves.first_below("rra-paper", 0.5)
+    gap = curves.paired_difference("rra-paper", 41, 50)
     failed = first is None or first > 25
-    measured = f"{_described(curves, 'rra-paper')}, {signed(more, error)} of CKA's"
-    return reproduced(failed and caught), measured + _beside(curves, "rra")
+    measured = f"{_described(curves, 'rra-paper')}, {gap.text()} of CKA's"
+    return reproduced(failed and not gap.low > 0), measured + _beside(curves, "rra")
+
+
+def _soon(curves: Curves) -> Finding:
+    first = curves.first_below("cka", 0.5)
+    return met(first is not None and first <= 6), f"{reached(first)}; at 6 {_costs(curves, 6, 6)}"
+
+
+def _while_it_serves(curves: Curves) -> Finding:
+    return _at_most(curves, 0.4, 13, 25)
+
+
+def _at_the_end(curves: Curves) -> Finding:
+    return _at_most(curves, 0.4, 41, 50)
+
+
+def _cheap(curves: Curves) -> Finding:
+    fit, rollout, update = _seconds(curves, "cka")
+    measured = (
+        f"{(fit + rollout) / update:.2f} of it (fits {fit:.0f} s, model steps {rollout:.0f} s, "
+        f"updates {update:.0f} s); in trials {_LATE}-{_SERVES} {_late(curves, 'cka'):.2f}"
+    )
+    if curves.seeds("cka-1", _LAST):
+        few = _seconds(curves, "cka-1")
+        measured += (
+            f"; with 1 update a step {(few[0] + few[1]) / few[2]:.2f}, in those trials "
+            f"{_late(curves, 'cka-1'):.2f}"
+        )
+    return met(fit + rollout <= update), measured
+
+
+def _fast(curves: Curves) -> Finding:
+    seconds = sum(_seconds(curves, "cka-1"))
+    return met(seconds < 120), f"{seconds:.0f} s"
+
+
+def _few_episodes(curves: Curves) -> Finding:
+    found = {name: _stays_from(curves, name) for name in ("cka", "cka-1", "cka-4")}
+    parts = [
+        f"{SCENARIOS[name].label}: "
+        + ("never" if first is None else f"from trial {first} ({first * _SECONDS:.1f} s)")
+        for name, first in found.items()
+    ]
+    return met(any(first is not None and first <= 7 for first in found.values())), "; ".join(parts)
 
 
 CLAIMS = (
@@ -72,6 +124,29 @@ CLAIMS = (
         _rra,
     ),
 )
+TARGETS = (
+    Claim("T1", "Dyna-CKA's mean cost is at most 0.5 at trial 6 or before", ("cka",), _soon),
+    Claim(
+        "T2", "Dyna-CKA's mean cost is at most 0.40 over trials 13-25", ("cka",), _while_it_serves
+    ),
+    Claim("T3", "Dyna-CKA's mean cost is at most 0.40 over trials 41-50", ("cka",), _at_the_end),
+    Claim(
+        "T4", "Dyna-CKA's fits and model steps take no longer than SAC's updates", ("cka",), _cheap
+    ),
+    Claim(
+        "T5",
+        "fits, model steps and updates of Dyna-CKA with 1 update a step take less than 120 s",
+        ("cka-1",),
+        _fast,
+    ),
+    Claim(
+        "T6",
+        "with the best number of updates, Dyna-CKA's mean cost stays at most 0.5 from trial 7 "
+        "(PILCO's published figure: about 7 trials, 17.5 s) to 25",
+        ("cka", "cka-1", "cka-4"),
+        _few_episodes,
+    ),
+)
 
 
 def _mean(curves: Curves, name: str, first: int, last: int) -> float:
@@ -79,7 +154,7 @@ def _mean(curves: Curves, name: str, first: int, last: int) -> float:
 
 
 def _described(curves: Curves, name: str) -> str:
-    parts = [f"{level} {reached(curves.first(name, level))}" for level in (0.5, 0.4)]
+    parts = [f"{level} {reached(curves.first_below(name, level))}" for level in (0.5, 0.4)]
     return f"{', '.join(parts)}, mean of 41-50 {_mean(curves, name, 41, 50):.3f}"
 
 
@@ -88,3 +163,35 @@ def _beside(curves: Curves, name: str) -> str:
     if not runs:
         return ""
     return f"; {SCENARIOS[name].label}, {counted(runs)}: {_described(curves, name)}"
+
+
+def _at_most(curves: Curves, threshold: float, first: int, last: int) -> Finding:
+    mean = float(curves.window("cka", first, last).mean())
+    return met(mean <= threshold), _costs(curves, first, last)
+
+
+def _costs(curves: Curves, first: int, last: int) -> str:
+    costs = curves.window("cka", first, last)
+    return f"{costs.mean():.3f} ± {costs.sem():.3f}, the worst run {costs.max():.3f}"
+
+
+def _stays_from(curves: Curves, name: str) -> int | None:
+    """The first episode from which the mean cost stays at most 0.5 while the model serves."""
+    by_episode = curves.mean(name).loc[:_SERVES]
+    above = by_episode.index[by_episode > 0.5]
+    first = int(above[-1]) + 1 if len(above) else 1
+    return first if first <= _SERVES else None
+
+
+def _seconds(curves: Curves, name: str, first: int = 1, last: int = _LAST) -> list[float]:
+    """Median seconds of a run in fits, model steps and updates."""
+    chosen = curves.records[
+        (curves.records["scenario"] == name) & curves.records["episode"].between(first, last)
+    ]
+    return [float(seconds) for seconds in seconds_of_a_run(chosen, PARTS).loc[name]]
+
+
+def _late(curves: Curves, name: str) -> float:
+    """Seconds of fits and model steps over those of updates, in the model's last episodes."""
+    fit, rollout, update = _seconds(curves, name, _LATE, _SERVES)
+    return (fit + rollout) / update

@@ -1,40 +1,53 @@
-"""The curves of the runs that there are."""
+"""The figures of the runs that there are."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.axes import Axes
 
-from paper.cartpole.runs import CART_POLE
-from paper.control.figure import draw_backdrop, draw_mean, one_legend, panels, save
+from paper.common.experiment import Record
+from paper.common.figures import draw_quartiles, one_legend, panels, save
+from paper.control import Control
+from paper.control.tables import load_episodes
 
-FLOOR = 0.315
-FLOOR_LABEL = "best open loop, known system (feedback can be lower)"
-BACKDROP = "oracle"  # in every panel, for comparison
+FLOOR = 0.289  # python -m paper floor
+FLOOR_LABEL = "best open loop found from the mean start"
+COLORS = {
+    "mf": "0.55",
+    "mf-best": "0.55",
+    "phy": "tab:orange",
+    "gp": "tab:red",
+    "gp-paper": "tab:red",
+    "cka": "navy",
+    "rra": "tab:green",
+    "rra-paper": "tab:green",
+    "oracle": "black",
+}
+PANELS = {
+    "As the paper has them": ("mf", "phy", "gp-paper", "cka", "rra-paper"),
+    "As we would do it": ("mf-best", "phy", "gp", "cka", "rra", "oracle"),
+}
 
 
-def draw_curves(trials: pd.DataFrame, model_until: int, path: Path) -> None:
-    """Draw the cost over the trials, mean and standard deviation, a panel for each scenario.
-
-    A deterministic policy is evaluated after the updates that follow a trial, and so is drawn at
-    the next one, the first that is made with what it has learnt.
-    """
-    figure, axes = panels(trials, CART_POLE.labels, columns=5, size=(2.8, 2.5))
-    label = f"{CART_POLE.labels[BACKDROP]}, sampled, mean"
-    draw_backdrop(axes, trials, BACKDROP, "cost", label)
-    for name, ax in axes.items():
-        own = trials[trials["scenario"] == name]
-        draw_mean(ax, own, "cost", "navy", "sampled actions")
-        evaluation = own.groupby("trial")["evaluation"].mean()
-        label = "deterministic, mean of runs"
-        ax.plot(evaluation.index + 1, evaluation, color="tab:red", lw=1, label=label)
-        ax.axhline(FLOOR, color="tab:green", lw=1, ls="--", label=FLOOR_LABEL)
-        if CART_POLE.scenarios[name].dynamics is not None:
-            label = "the model's last trial"
-            ax.axvline(model_until + 0.5, color="0.5", lw=0.8, ls=":", label=label)
+def draw(records: Sequence[Record], experiment: Control) -> list[Path]:
+    """Draw the cost of sampled actions over the episodes, learners over each other."""
+    episodes, until = load_episodes(records, experiment), experiment.settings.last_model_episode
+    figure, axes = panels([*PANELS], 2, (6, 4.2))
+    for ax, names in zip(axes, PANELS.values(), strict=True):
+        for name in names:
+            _learner(ax, episodes[episodes["scenario"] == name], name, experiment.labels[name])
+        ax.axhline(FLOOR, color="tab:brown", lw=1, ls="--", label=FLOOR_LABEL)
+        ax.axvline(until + 0.5, color="0.5", lw=0.8, ls=":", label="the model's last trial")
         ax.set_ylim(0.15, 1.02)
-    figure.supxlabel("trial")
-    figure.supylabel("mean cost of a trial")
-    one_legend(figure, axes.values())
-    save(figure, path)
+    figure.supxlabel("trial", fontsize="medium")
+    figure.supylabel("cost, median and quartiles", fontsize="medium")
+    one_legend(figure, axes, ncols=4)
+    return [save(figure, experiment.out / "curves.png")]
+
+
+def _learner(ax: Axes, own: pd.DataFrame, name: str, label: str) -> None:
+    if len(own):
+        draw_quartiles(ax, own, "cost", color=COLORS[name], label=label)

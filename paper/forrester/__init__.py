@@ -2,67 +2,52 @@
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import get_args
+from typing import Any, ClassVar
 
-import pandas as pd
+from paper.common.experiment import Experiment, Task
 
-from paper.forrester.claims import judge
-from paper.forrester.figure import draw
-from paper.forrester.models import Protocol
-from paper.forrester.runs import run_all
-from paper.options import add_options, check_options
-
-FIGURE_SEED = 3  # the data set of the six fits
+FIRST_LOOK = 3  # data sets
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this experiment to its command line."""
-    add_options(parser, "forrester", num_runs=100)
-    parser.set_defaults(run=run)
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What decides the numbers."""
+
+    observations: int = 8
+    """noise-free observations of a data set"""
+    noise: float = 0.01
+    """the fixed noise variance of the paper's protocol, and its ridge"""
+    steps: int = 50
+    """of Adam, in the paper's protocol"""
+    rate: float = 0.1
+    """of Adam, in the paper's protocol"""
+    lengthscales: tuple[float, ...] = (0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
+    """of the literal closed form of RRA, on a grid"""
+    ridges: tuple[float, ...] = (1e-6, 1e-4, 1e-2, 1.0)
+    """of the literal closed form of RRA, on a grid"""
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Run the experiment; write and print its table, verdicts and figures."""
-    check_options(arguments)
-    out: Path = arguments.out
-    runs = run_all(arguments.runs, arguments.seed, arguments.jobs, out)
-    table, claims = tabulate(runs), verdicts(runs)
-    table.to_csv(out / "table.csv", float_format="%.4g")
-    claims.to_csv(out / "claims.csv", index=False)
-    for (reading, protocol), part in table.groupby(["reading", "protocol"], sort=False):
-        print(f"\nReading {reading} of the crude function, protocol '{protocol}':")
-        print(part.droplevel(["reading", "protocol"]).to_string(float_format="%.4g", na_rep="-"))
-        chosen = (claims["reading"] == reading) & (claims["protocol"] == protocol)
-        for claim in claims[chosen].itertuples():
-            print(f"  {claim.id} {claim.verdict}: {claim.claim} ({claim.measured})")
-    for protocol in get_args(Protocol):
-        path = out / f"forrester_{protocol}.png"
-        draw(runs, protocol, "B", FIGURE_SEED, path)
-        print(f"\nFigure: {path}")
+@dataclass(frozen=True, kw_only=True)
+class Forrester(Experiment):
+    """Eight models learn Forrester's function (figure 1), by two protocols of training."""
 
+    runs: int = 100
+    """data sets; the number is the seed"""
+    out: Path = Path("results/forrester")
+    settings: Settings = field(default_factory=Settings)
 
-def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
-    """Summarise the runs: a row for each reading, protocol and model."""
-    groups = runs.groupby(["reading", "protocol", "model"], sort=False)
-    return groups.agg(
-        rmse_mean=("rmse", "mean"),
-        rmse_sd=("rmse", "std"),
-        rmse_median=("rmse", "median"),
-        nlpd=("nlpd", "mean"),
-        crps=("crps", "mean"),
-        coverage=("coverage", "mean"),
-        seconds=("seconds", "median"),
-    )
+    name: ClassVar[str] = "forrester"
+    key: ClassVar[tuple[str, ...]] = ("reading", "protocol", "seed")
 
+    def tasks(self) -> list[Task]:
+        """Readings of the crude function and protocols, data set by data set."""
+        parts = [("B", "gpadjust"), ("B", "paper")]
+        early = [(*part, seed) for seed in self.seeds[:FIRST_LOOK] for part in parts]
+        parts += [("A", "gpadjust"), ("A", "paper"), ("B", "closed form")]
+        return [*dict.fromkeys([*early, *((*part, seed) for seed in self.seeds for part in parts)])]
 
-def verdicts(runs: pd.DataFrame) -> pd.DataFrame:
-    """Judge the paper's claims on each reading and protocol."""
-    rows = [
-        {"reading": reading, "protocol": protocol, **asdict(claim)}
-        for (reading, protocol), part in runs.groupby(["reading", "protocol"], sort=False)
-        for claim in judge(part)
-    ]
-    return pd.DataFrame(rows)
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings."""
+        return asdict(self.settings)

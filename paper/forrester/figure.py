@@ -2,53 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from gpadjust import RRA
-from paper.forrester.models import MODELS, Protocol, trained
+from paper.common.experiment import Record
+from paper.common.figures import save
+from paper.forrester import Forrester, Settings
 from paper.forrester.problem import CRUDE, LOWER, UPPER, Reading, observations, truth
+from paper.forrester.run import MODELS, Protocol, trained
+from paper.forrester.tables import PROTOCOLS, load
 
+READING: Reading = "B"
+SEED = 3  # the data set of the six fits
 PANELS = ("Zero-mean GP", "Phy-mean GP", "GP-scale", "AR1", "CKA", "RRA")
 
 
-def draw(runs: pd.DataFrame, protocol: Protocol, reading: Reading, seed: int, path: Path) -> None:
-    """Draw the figure for one protocol and reading and save it.
+def draw(records: Sequence[Record], experiment: Forrester) -> list[Path]:
+    """Draw the figure for each protocol, of reading B."""
+    runs = load(records)
+    return [_draw(runs, protocol, experiment) for protocol in PROTOCOLS]
 
-    Args:
-        runs: The scores of all runs.
-        protocol: Which protocol to show.
-        reading: Which reading of the crude function.
-        seed: The data set of the six fits.
-        path: Where to save the PNG.
-    """
+
+def _draw(runs: pd.DataFrame, protocol: Protocol, experiment: Forrester) -> Path:
     figure = Figure(figsize=(13, 6), layout="constrained")
     axes: dict[str, Axes] = figure.subplot_mosaic(
         [["a", "b", "c", "g"], ["d", "e", "f", "g"]], width_ratios=[1, 1, 1, 1.2]
     )
     for letter, name in zip("abcdef", PANELS, strict=True):
-        _fit_panel(axes[letter], name, protocol, reading, seed)
+        _fit_panel(axes[letter], name, protocol, experiment.settings)
         axes[letter].set_title(f"({letter}) {name}", loc="left")
     figure.legend(*axes["a"].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     for letter in "ad":
         axes[letter].set_ylabel("y")
     for letter in "def":
         axes[letter].set_xlabel("x")
-    chosen = runs[(runs["protocol"] == protocol) & (runs["reading"] == reading)]
-    _error_panel(axes["g"], chosen)
-    with mpl.rc_context({"savefig.dpi": 110}):
-        figure.savefig(path)
+    _error_panel(axes["g"], runs[(runs["protocol"] == protocol) & (runs["reading"] == READING)])
+    return save(figure, experiment.out / f"forrester_{protocol}.png")
 
 
-def _fit_panel(ax: Axes, name: str, protocol: Protocol, reading: Reading, seed: int) -> None:
+def _fit_panel(ax: Axes, name: str, protocol: Protocol, settings: Settings) -> None:
     x = torch.linspace(LOWER, UPPER, 200, dtype=torch.float64).unsqueeze(-1)
-    X, Y = observations(seed)
-    model = trained(name, protocol, reading, X, Y)
+    X, Y = observations(SEED, settings.observations)
+    model = trained(name, protocol, READING, X, Y, settings)
     with torch.no_grad():
         posterior = model.posterior(x, observation_noise=True)
         mean, sd = posterior.mean.squeeze(-1), posterior.variance.sqrt().squeeze(-1)
@@ -56,32 +58,36 @@ def _fit_panel(ax: Axes, name: str, protocol: Protocol, reading: Reading, seed: 
         x.squeeze(-1), mean - 2 * sd, mean + 2 * sd, color="navy", alpha=0.15, lw=0, label="2 sd"
     )
     if isinstance(model, RRA):
-        torch.manual_seed(seed)
+        torch.manual_seed(SEED)
         functions = model.sample_functions(20)(x).squeeze(-1)
         ax.plot(x.squeeze(-1), functions.mT, color="navy", lw=0.4, alpha=0.6)
+    ax.plot(x, CRUDE[READING](x), color="black", ls="--", lw=1, label="f_p")
+    ax.plot(x.squeeze(-1), mean, color="tab:blue", lw=3.5, label="mean")
     ax.plot(x, truth(x), color="black", lw=1, label="truth")
-    ax.plot(x, CRUDE[reading](x), color="black", ls="--", lw=1, label="f_p")
-    ax.plot(x.squeeze(-1), mean, color="navy", lw=1.6, label="mean")
     ax.plot(X, Y, "o", color="red", ms=4, label="data")
     ax.set_ylim(-9, 9)
 
 
 def _error_panel(ax: Axes, runs: pd.DataFrame) -> None:
-    by_model = runs.groupby("model")["rmse"]
+    """The error of each run, on a logarithmic axis, with mean and median."""
     names = ["f_p", *MODELS]
-    mean, sd = by_model.mean()[names], by_model.std()[names]
-    ax.barh(names, mean, color=["0.6", *["tab:blue"] * len(MODELS)])
-    # The lower half of a bar cannot fall below zero.
-    ax.errorbar(mean, names, xerr=[sd.clip(upper=mean), sd], fmt="none", color="black", capsize=3)
-    for name in names:
-        ax.annotate(
-            f"{mean[name]:.2g}",
-            (mean[name] + sd[name], name),
-            xytext=(5, 0),
-            textcoords="offset points",
-            va="center",
+    for row, name in enumerate(names):
+        values = runs[runs["model"] == name]["rmse"]
+        label = "a run" if name == "CKA" else None
+        ax.plot(
+            values, [row] * len(values), "o", color="tab:blue", ms=4, mew=0, alpha=0.2, label=label
         )
+        for value, mark, what in ((values.mean(), "D", "mean"), (values.median(), "|", "median")):
+            label = what if name == "CKA" else None
+            ax.plot(
+                value, row, mark, color="black", ms=5 if mark == "D" else 13, mew=1.5, label=label
+            )
+    ax.set_yticks(range(len(names)), names)
+    ax.set_xscale("log")
+    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.invert_yaxis()
-    ax.margins(x=0.15)
-    ax.set_xlabel("mean RMSE and sd")
+    ax.grid(axis="x", color="0.9", lw=0.6)
+    ax.set_axisbelow(True)
+    ax.legend(loc="upper left", fontsize="small")
+    ax.set_xlabel("RMSE")
     ax.set_title(f"(g) {runs['seed'].nunique()} runs", loc="left")

@@ -36,7 +36,7 @@ def crude_b(X: Tensor) -> Tensor:
 CRUDE = {"A": crude_a, "B": crude_b}
 
 
-def observations(seed: int, n: int = 8) -> tuple[Tensor, Tensor]:
+def observations(seed: int, n: int) -> tuple[Tensor, Tensor]:
     """Draw ``n`` noise-free observations at uniform inputs: two ``n x 1`` tensors."""
     generator = torch.Generator().manual_seed(seed)
     X = LOWER + (UPPER - LOWER) * torch.rand(n, 1, generator=generator, dtype=torch.float64)

@@ -2,64 +2,65 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
 
-import pandas as pd
+from paper.common.experiment import Experiment, Task
 
-from paper.multifidelity.figure import draw
-from paper.multifidelity.models import METHODS
-from paper.multifidelity.problem import names
-from paper.multifidelity.runs import run_all
-from paper.options import add_names, add_options, check_names, check_options
-
+Method = Literal["GP", "Phy", "AR1", "SMT MFK", "CKA", "CKA Bayes", "chosen", "RRA"]
+METHODS: tuple[Method, ...] = get_args(Method)
 PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
+FIRST_LOOK = 8  # runs
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this experiment to its command line."""
-    add_options(parser, "multifidelity", num_runs=10)
-    add_names(parser, "--pairs", PAIRS, "pairs of mf2")
-    add_names(parser, "--methods", METHODS, "methods")
-    parser.set_defaults(run=run)
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What decides the numbers."""
+
+    sizes: tuple[int, ...] = (5, 10)
+    """observations per input"""
+    num_test: int = 1000
+    """points that all runs are scored at"""
+    num_low: int = 20
+    """samples of the low level per input, for the methods that need them"""
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Run the experiment; write and print its tables and figures."""
-    check_names("--pairs", "pair", arguments.pairs, names())
-    check_names("--methods", "method", arguments.methods, METHODS)
-    check_options(arguments)
-    out: Path = arguments.out
-    runs = run_all(
-        arguments.pairs, arguments.methods, arguments.runs, arguments.seed, arguments.jobs, out
-    )
-    table = tabulate(runs)
-    table.to_csv(out / "table.csv", float_format="%.4g")
-    for (name, _, N), part in table.groupby(["pair", "per_input", "N"], sort=False):
-        print(f"\n{name}, {N} observations:")
-        print(part.droplevel([0, 1, 2]).to_string(float_format="%.3g", na_rep=""))
-    for column in ("nrmse", "nlpd", "coverage"):
-        path = out / f"{column}.png"
-        draw(runs, column, path)
-        print(f"\nFigure: {path}")
+@dataclass(frozen=True, kw_only=True)
+class Multifidelity(Experiment):
+    """Eight methods learn textbook functions of high fidelity; f_p is that of low fidelity."""
 
+    runs: int = 10
+    """data sets; the number is the seed"""
+    out: Path = Path("results/multifidelity")
+    pairs: tuple[str, ...] = PAIRS
+    """problems of mf2"""
+    methods: tuple[Method, ...] = METHODS
+    settings: Settings = field(default_factory=Settings)
 
-def tabulate(runs: pd.DataFrame) -> pd.DataFrame:
-    """Summarise the runs: a row for each pair, number of observations and method."""
-    groups = runs.groupby(["pair", "per_input", "N", "method"], sort=False)
-    return groups.agg(
-        nrmse_median=("nrmse", "median"),
-        nrmse_mean=("nrmse", "mean"),
-        nlpd_median=("nlpd", "median"),
-        nlpd_mean=("nlpd", "mean"),
-        crps_median=("crps", "median"),
-        crps_mean=("crps", "mean"),
-        coverage=("coverage", "mean"),
-        seconds=("seconds", "median"),
-        chosen=("chosen", _counted),
-    )
+    name: ClassVar[str] = "multifidelity"
+    key: ClassVar[tuple[str, ...]] = ("pair", "per_input", "method", "seed")
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "smt", "mf2")
 
+    def check(self) -> None:
+        """Whether mf2 has the pairs."""
+        from paper.multifidelity.problem import pair
 
-def _counted(chosen: pd.Series[str]) -> str:
-    """How often each structure was chosen, the most frequent first."""
-    return ", ".join(f"{name} {count}" for name, count in chosen.dropna().value_counts().items())
+        for name in self.pairs:
+            pair(name)
+
+    def tasks(self) -> list[Task]:
+        """Each method on each data set."""
+        return [
+            (name, per_input, method, seed)
+            for name in self.pairs
+            for per_input in self.settings.sizes
+            for seed in self.seeds
+            for method in self.methods
+        ]
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings that a run depends on, which are all but the sizes of others."""
+        settings = asdict(self.settings)
+        del settings["sizes"]
+        return settings

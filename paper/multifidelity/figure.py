@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-Column = Literal["nrmse", "nlpd", "coverage"]
+from paper.common.experiment import Record
+from paper.common.figures import panels, save
+from paper.multifidelity import Multifidelity
+from paper.multifidelity.tables import load
 
-LABELS = {
+COLUMNS = {
     "nrmse": "RMSE / sd of the truth",
     "nlpd": "negative log predictive density, nats",
     "coverage": "coverage of the central 95 % interval",
@@ -22,28 +24,22 @@ LABELS = {
 COLORS = ("tab:orange", "tab:blue")  # of the smaller and the larger number of observations
 
 
-def draw(runs: pd.DataFrame, column: Column, path: Path) -> None:
-    """Draw a score of all runs, with the medians, and save it.
+def draw(records: Sequence[Record], experiment: Multifidelity) -> list[Path]:
+    """Draw three scores of all runs, with the medians."""
+    runs = load(records)
+    return [_draw(runs, column, experiment.out / f"{column}.png") for column in COLUMNS]
 
-    Args:
-        runs: The scores of all runs.
-        column: Which score.
-        path: Where to save the PNG.
-    """
-    pairs, methods = runs["pair"].unique(), list(runs["method"].unique())
-    num_columns = min(3, len(pairs))
-    num_rows = math.ceil(len(pairs) / num_columns)
-    figure = Figure(
-        figsize=(1.4 + 3.6 * num_columns, 1.1 + (0.6 + 0.3 * len(methods)) * num_rows),
-        layout="constrained",
-    )
-    axes = list(figure.subplots(num_rows, num_columns, sharey=True, squeeze=False).flat)
-    for ax in axes:
-        ax.set_visible(False)
-    for ax, name in zip(axes, pairs, strict=False):
-        _panel(ax, runs[runs["pair"] == name], column, methods)
-        ax.set_title(name, loc="left")
-    figure.supxlabel(LABELS[column], fontsize="medium")
+
+def _draw(runs: pd.DataFrame, column: str, path: Path) -> Path:
+    methods = list(runs["method"].unique())
+    names = list(runs["pair"].unique())
+    figure, axes = panels(names, 3, (3.6, 0.6 + 0.3 * len(methods)), share=False, width=9)
+    for ax, name in zip(axes, names, strict=True):
+        if _panel(ax, runs[runs["pair"] == name], column, methods):
+            ax.set_title(f"{name} (beyond 10 logarithmic)", loc="left", fontsize=10)
+    for i, ax in enumerate(axes):
+        ax.tick_params(labelleft=i % 3 == 0)
+    figure.supxlabel(COLUMNS[column], fontsize="medium")
     per_input = sorted(runs["per_input"].unique())
     handles = [
         Line2D([], [], color=color, marker="|", ms=11, mew=2.5, lw=0, label=f"N = {size} d")
@@ -52,11 +48,12 @@ def draw(runs: pd.DataFrame, column: Column, path: Path) -> None:
     dot = Line2D([], [], color="0.5", marker="o", ms=3.5, lw=0, label="a run")
     median = Line2D([], [], color="0.5", marker="|", ms=11, mew=2.5, lw=0, label="median")
     figure.legend(handles=[*handles, dot, median], loc="outside upper right", ncols=4)
-    figure.savefig(path, dpi=110)
+    return save(figure, path)
 
 
-def _panel(ax: Axes, runs: pd.DataFrame, column: Column, methods: list[str]) -> None:
-    ax.set_visible(True)
+def _panel(ax: Axes, runs: pd.DataFrame, column: str, methods: list[str]) -> bool:
+    """Draw a pair; tell whether the axis turns logarithmic beyond 10."""
+    bent = False
     for row, method in enumerate(methods):
         if row % 2 == 0:
             ax.axhspan(row - 0.5, row + 0.5, color="0.95", lw=0, zorder=-1)
@@ -68,7 +65,7 @@ def _panel(ax: Axes, runs: pd.DataFrame, column: Column, methods: list[str]) -> 
     ax.set_yticks(range(len(methods)), methods)
     ax.set_ylim(len(methods) - 0.5, -0.5)
     ax.tick_params(axis="y", length=0)
-    ax.spines[["top", "right", "left"]].set_visible(False)
+    ax.spines["left"].set_visible(False)
     if column == "nrmse":
         ax.set_xscale("log")
         decades = math.log10(runs[column].max() / runs[column].min())
@@ -78,9 +75,11 @@ def _panel(ax: Axes, runs: pd.DataFrame, column: Column, methods: list[str]) -> 
     elif column == "nlpd":
         ax.margins(x=0.08)
         if runs[column].abs().max() > 20:
+            bent = True
             ax.set_xscale("symlog", linthresh=10)
     else:
         ax.set_xlim(-0.03, 1.03)
         ax.axvline(0.95, color="0.3", lw=1, ls="--", zorder=0)
     ax.grid(axis="x", color="0.85", lw=0.6)
     ax.set_axisbelow(True)
+    return bent

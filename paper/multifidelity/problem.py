@@ -19,9 +19,6 @@ with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "pkg_resources is deprecated", UserWarning)
     import mf2
 
-NUM_TEST = 1000
-NUM_LOW = 20  # samples of the low level per input, for the methods that need them
-
 
 @dataclass(frozen=True)
 class Pair:
@@ -92,12 +89,6 @@ def observations(pair: Pair, n: int, seed: int) -> tuple[Tensor, Tensor]:
     return X, pair.truth(X)
 
 
-def low_inputs(pair: Pair, X: Tensor, seed: int) -> Tensor:
-    """Where the low level is sampled: at ``X``, and on a Sobol sequence up to ``20 d`` points."""
-    return torch.cat([X, pair.sobol(NUM_LOW * pair.d - len(X), seed)])
-
-
-def test_points(pair: Pair) -> tuple[Tensor, Tensor]:
-    """The points that all runs are scored at, and the truth there."""
-    X = pair.sobol(NUM_TEST, seed=0)
-    return X, pair.truth(X)
+def low_inputs(pair: Pair, X: Tensor, n: int, seed: int) -> Tensor:
+    """Where the low level is sampled: at ``X``, and on a Sobol sequence up to ``n`` points."""
+    return torch.cat([X, pair.sobol(n - len(X), seed)])

@@ -1,0 +1,174 @@
+"""The arm that is learnt, how well a policy reaches with it, and what is written down."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from functools import lru_cache, partial
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpadjust.control import Task
+from gpadjust.envs import (
+    ARM_MEMORY_SPEC,
+    ARM_SPEC,
+    REAL_ARM,
+    MuscleArmEnv,
+    RememberAction,
+    arm_reward,
+    arm_start,
+    arm_targets,
+    hand_distance_cm,
+    opensim_arm_physics,
+    torque_arm_physics,
+)
+from gpadjust.envs.arm.opensim_model import MUSCLES, REST_ACTIVATION, build_muscle_arm
+from gpadjust.envs.arm.simulation import ArmSimulation
+from gpadjust.envs.arm.task import START_MEAN
+from gpadjust.physics import Physics
+from paper.arm import Settings
+from paper.control import Scenario
+from paper.control.learner import System, dynamics
+from paper.control.recorder import Recorder
+
+NUM_LAST_STEPS = 5  # of the second score
+ACCURACY = 1e-5  # the environment's
+
+
+def system(scenario: Scenario, settings: Settings) -> System:
+    """A run's arm, its task, and its recorder."""
+    env: gym.Env[Any, Any] = MuscleArmEnv(strength=settings.strength)
+    if settings.memory:
+        env = RememberAction(env)
+    physics: Physics = opensim_arm_physics() if settings.black_box else torque_arm_physics()
+    spec = ARM_MEMORY_SPEC if settings.memory else ARM_SPEC
+    task = Task(
+        dynamics(scenario, settings, spec, physics, physics),
+        arm_reward,
+        initial_states=memory_start if settings.memory else arm_start,
+        episode_length=settings.episode_length,
+    )
+    recorder = ArmRecorder(settings, scenario.model is None)
+    return System(gym.wrappers.TimeLimit(env, settings.episode_length), task, recorder)
+
+
+def memory_start(n: int) -> Tensor:
+    """Draw ``n x 10`` start states, with no action before them, from PyTorch's generator."""
+    return torch.cat([arm_start(n), torch.zeros(n, 4, dtype=torch.float64)], dim=-1)
+
+
+class Policy(Protocol):
+    """What is evaluated."""
+
+    def predict(
+        self, observation: NDArray[np.float32], *, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Actions for a batch of observations."""
+        ...
+
+
+def reach(policy: Policy, settings: Settings) -> NDArray[np.float64]:
+    """The distance of the hand, ``121 x episode_length`` in cm, by the deterministic policy.
+
+    The real arm starts at rest at 35° and 65° for each target. All go a step at a time, so that the
+    policy is asked once a step. No random number is drawn. An arm whose integration fails stays
+    where it is for the rest of its episode, with a warning.
+
+    Args:
+        policy: The agent.
+        settings: Length of an episode, strength of the muscles, and whether the policy remembers.
+    """
+    simulation = _simulation(settings.strength)
+    targets = arm_targets().numpy()
+    rest = [*START_MEAN, 0.0, 0.0, *[REST_ACTIVATION] * len(MUSCLES)]
+    arms = np.tile(np.array(rest), (len(targets), 1))
+    actions = np.zeros((len(targets), 4))
+    failed = np.zeros(len(targets), dtype=bool)
+    distances = []
+    for _ in range(settings.episode_length):
+        remembered = [actions] if settings.memory else []
+        seen = np.concatenate([arms[:, :4], targets, *remembered], axis=1)
+        chosen, _ = policy.predict(seen.astype(np.float32), deterministic=True)
+        actions = np.asarray(chosen, dtype=np.float64).clip(0, 1)
+        for i in np.flatnonzero(~failed):
+            try:
+                arms[i] = simulation.step(arms[i], actions[i])
+            except RuntimeError as error:
+                failed[i] = True
+                warnings.warn(f"The arm of target {i} stays: {error}", UserWarning, stacklevel=2)
+        reached = torch.from_numpy(np.concatenate([arms[:, :4], targets], axis=1))
+        distances.append(hand_distance_cm(reached).numpy())
+    return np.stack(distances, axis=1)
+
+
+@lru_cache(maxsize=1)
+def _simulation(strength: float) -> ArmSimulation:
+    return ArmSimulation(partial(build_muscle_arm, REAL_ARM, strength), ACCURACY)
+
+
+def score(distances: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Root mean squares of distances ``121 x steps``, for each target: over all and the last."""
+    squares = np.square(distances)
+    return {
+        "all_steps": np.sqrt(squares.mean(1)),
+        "last_five": np.sqrt(squares[:, -NUM_LAST_STEPS:].mean(1)),
+    }
+
+
+def hundred() -> NDArray[np.bool_]:
+    """Which of the 121 targets are the paper's hundred, of 10, 20, ..., 100° each."""
+    return (arm_targets() > 0.01).all(-1).numpy()
+
+
+class ArmRecorder(Recorder):
+    """Records the cost of each episode, and evaluates the policy before the first and after some.
+
+    ``"evaluations"`` of what it found has a list of numbers for each column: the root mean squares
+    over steps and targets, with ``_100`` those over the paper's hundred targets, and the seconds it
+    took. ``"maps"`` has the root mean squares over steps at each target after some episodes.
+    """
+
+    def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
+        """The mean cost of the sampled actions, in rad."""
+        return {"cost": -arm_reward(states, actions, next_states).mean().item()}
+
+    def of_policy(self, episode: int) -> dict[str, Any]:
+        """Nothing: evaluations have a log of their own, as there are fewer than episodes."""
+        if episode % self.settings.evaluate_every == 0:
+            self.evaluate(episode)
+        return {}
+
+    def found(self) -> dict[str, Any]:
+        """The evaluations, and the errors at each target after some of them; and the records."""
+        return {**self.log, **super().found()}
+
+    @property
+    def log(self) -> dict[str, Any]:
+        """The evaluations so far."""
+        log: dict[str, Any] = self.model.notes.setdefault("log", {"evaluations": {}, "maps": {}})
+        return log
+
+    def evaluate(self, episode: int) -> None:
+        """Write the scores of the agent after an episode (0: before the first) into the log."""
+        start = time.perf_counter()
+        by_target = score(reach(self.model, self.settings))
+        row: dict[str, float] = {"episode": episode}
+        for name, errors in by_target.items():
+            row[name] = float(np.sqrt(np.square(errors).mean()))
+            row[f"{name}_100"] = float(np.sqrt(np.square(errors[hundred()]).mean()))
+        row["evaluation_seconds"] = time.perf_counter() - start
+        for name, value in row.items():
+            self.log["evaluations"].setdefault(name, []).append(value)
+        if episode in (self.settings.map_after, self.settings.episodes):
+            maps = {name: errors.tolist() for name, errors in by_target.items()}
+            self.log["maps"][f"{episode}"] = maps
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        if not self.log["evaluations"]:
+            self.evaluate(0)

@@ -1,0 +1,107 @@
+"""The cart-pole that is learnt, and what is written down of each episode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpadjust.control import Task
+from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.envs import (
+    CART_POLE_RAW_SPEC,
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    CartPoleSwingUpEnv,
+    cart_pole_physics,
+    cart_pole_reward,
+    cart_pole_start,
+    random_cart_pole_physics,
+)
+from gpadjust.envs.cart_pole.system import START_MEAN, START_STD
+from gpadjust.physics import ODEPhysics
+from gpadjust.rl import DynaSAC, ModelVecEnv
+from paper.cartpole import Settings
+from paper.control import Scenario
+from paper.control.learner import System, dynamics
+from paper.control.recorder import Recorder
+
+NUM_STARTS = 20
+
+
+def system(scenario: Scenario, settings: Settings, seed: int) -> System:
+    """A run's cart-pole, its task, and its recorder."""
+    env = gym.wrappers.TimeLimit(
+        CartPoleSwingUpEnv(encode_angle=settings.encode_angle), settings.episode_length
+    )
+    spec = CART_POLE_SPEC if settings.encode_angle else CART_POLE_RAW_SPEC
+    model = dynamics(scenario, settings, spec, random_cart_pole_physics(seed), true_physics())
+    task = Task(
+        model,
+        cart_pole_reward,
+        initial_states=cart_pole_start,
+        episode_length=settings.episode_length,
+    )
+    return System(env, task, CartPoleRecorder(settings, scenario.model is None, seed))
+
+
+def true_physics() -> ODEPhysics:
+    """The system as it is."""
+    real = REAL_CART_POLE
+    return cart_pole_physics(real.cart_mass, real.pole_mass, real.pole_length, real.damping)
+
+
+def fixed_starts(n: int) -> Tensor:
+    """The first ``n`` start states of the evaluation, from a generator of their own."""
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(NUM_STARTS, 4, generator=generator, dtype=torch.float64)
+    return (torch.tensor(START_MEAN, dtype=torch.float64) + START_STD * noise)[:n]
+
+
+def evaluate(agent: DynaSAC, settings: Settings) -> float:
+    """The mean cost of the deterministic policy over the fixed starts; draws no random number."""
+    spec = CART_POLE_SPEC if settings.encode_angle else CART_POLE_RAW_SPEC
+    task = Task(
+        PhysicsDynamics(spec, true_physics()),
+        cart_pole_reward,
+        initial_states=fixed_starts,
+        episode_length=settings.episode_length,
+    )
+    spaces: Any = (agent.observation_space, agent.action_space)
+    env = ModelVecEnv(task, NUM_STARTS, *spaces)
+    observations: Any = env.reset()
+    costs = []
+    for _ in range(settings.episode_length):
+        actions, _ = agent.predict(observations, deterministic=True)
+        observations, rewards, _, _ = env.step(actions)
+        costs.append(-rewards.mean())
+    return float(np.mean(costs))
+
+
+class CartPoleRecorder(Recorder):
+    """Records the cost of each episode, and that of the deterministic policy after it.
+
+    Args:
+        settings: Of the learner.
+        model_free: Whether it has no model.
+        seed: Of f_p.
+    """
+
+    def __init__(self, settings: Settings, model_free: bool, seed: int) -> None:
+        super().__init__(settings, model_free)
+        self.seed = seed
+
+    def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
+        """The mean cost of the sampled actions."""
+        return {"cost": -cart_pole_reward(states, actions, next_states).mean().item()}
+
+    def of_policy(self, episode: int) -> dict[str, Any]:
+        """The mean cost of the deterministic policy."""
+        return {"evaluation": evaluate(self.model, self.settings)}
+
+    def found(self) -> dict[str, Any]:
+        """The records, and the parameters of f_p, which are random."""
+        return {"physics": vars(random_cart_pole_physics(self.seed).rhs), **super().found()}

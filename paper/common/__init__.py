@@ -1,0 +1,1 @@
+"""What all experiments share: how they are run, kept, judged, tabulated and drawn."""

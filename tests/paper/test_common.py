@@ -1,0 +1,153 @@
+"""Curves, statistics, verdicts and tables."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from paper.__main__ import EXPERIMENTS
+from paper.common.claims import Claim, Judged, all_of, judge, met, reproduced, within
+from paper.common.curves import Curves
+from paper.common.statistics import Difference, interquartile_mean
+from paper.common.tables import (
+    aligned,
+    best_in_bold,
+    claims_table,
+    filled,
+    fragments,
+    markdown,
+)
+from paper.report import PAPER, READMES, results
+
+
+def curves(**runs):
+    """Of scenarios whose values are given by seed, each a list over the episodes from 1."""
+    rows = [
+        {"scenario": name, "seed": seed, "episode": episode, "cost": value}
+        for name, by_seed in runs.items()
+        for seed, values in by_seed.items()
+        for episode, value in enumerate(values, 1)
+    ]
+    return Curves(pd.DataFrame(rows), "cost")
+
+
+def test_curves_over_the_episodes():
+    of = curves(cka={0: [4.0, 2.0, 1.0], 1: [6.0, 4.0]}, mf={1: [7.0]})
+    assert of.names == ["cka", "mf"]
+    assert of.mean("cka").tolist() == [5, 3, 1]
+    assert of.spread("cka")[1] == pytest.approx(math.sqrt(2))
+    assert of.mean_at("cka", 2) == 3
+    assert math.isnan(of.mean_at("mf", 2))
+    assert of.first_below("cka", 3) == 2
+    assert of.first_below("cka", 0.5) is None
+    assert of.window("cka", 1, 2).to_dict() == {0: 3, 1: 5}
+    assert of.seeds("cka", last=3) == {0}
+    assert of.restricted({1}).mean("cka").tolist() == [6, 4]
+
+
+def test_differences_are_of_the_seeds_that_both_have():
+    of = curves(cka={0: [1.0], 1: [2.0], 2: [9.0]}, mf={0: [2.0], 1: [5.0]}, gp={2: [10.0]})
+    assert of.paired_difference("mf", 1, 1) == Difference(2, pytest.approx(1), 2)
+    assert of.paired_difference("gp", 1, 1).text() == "+1.000"
+    assert of.paired_difference("gp", 1, 1, reference="mf").text() == ""
+    assert of.paired_difference("cka", 1, 1).n == 0
+
+
+def test_intervals_are_students():
+    values = np.random.default_rng(0).normal(size=10)
+    found = Difference.of([*values, np.nan])
+    low, high = stats.ttest_1samp(values, 0).confidence_interval()
+    assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
+    assert found.half_width == pytest.approx(2.262 * found.error, rel=1e-3)
+    assert (found / -2).error == found.error / 2
+    assert Difference(0.12345, 0.0456, 4).text(".1%") == "+12.3% ± 4.6%"
+
+
+def test_interquartile_means_are_the_same_each_time():
+    values = np.random.default_rng(0).normal(size=7)
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    middle, low, high = interquartile_mean(values)
+    assert low < middle == np.sort(values)[1:-1].mean() < high
+    assert interquartile_mean(values) == (middle, low, high)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+    assert np.isnan(interquartile_mean([1.0, 2.0])[1])
+    assert np.isnan(interquartile_mean([])[0])
+
+
+def test_a_verdict_whose_bound_lies_in_the_interval_is_inconclusive():
+    assert within(Difference(-1, 0.1, 10), high=0) == "reproduced"
+    assert within(Difference(1, 0.1, 10), high=0) == "not reproduced"
+    assert within(Difference(-0.1, 0.1, 10), high=0) == "inconclusive"
+    assert within(Difference(-0.3, 0.1, 10), -0.4, -0.2) == "inconclusive"
+    assert within(Difference(-0.3, 0.01, 10), -0.4, -0.2) == "reproduced"
+    assert within(Difference(-1, math.nan, 1), high=0) == "reproduced"
+    assert all_of("beaten", "inconclusive", "reproduced") == "inconclusive"
+    assert [reproduced(True), reproduced(True, True), reproduced(False, True), met(False)] == [
+        "reproduced",
+        "beaten",
+        "not reproduced",
+        "missed",
+    ]
+
+
+def test_claims_are_judged_by_the_seeds_that_all_their_scenarios_have():
+    of = curves(
+        cka={0: [1.0, 1.0], 1: [1.0, 1.0], 2: [9.0, 9.0]},
+        mf={0: [2.0, 2.0], 1: [2.0, 2.0], 2: [2.0]},
+    )
+
+    def better(shared):
+        held = shared.mean_at("cka", 2) < shared.mean_at("mf", 2)
+        return met(held), f"{shared.mean_at('cka', 2):g}"
+
+    claims = [
+        Claim("T1", "CKA is better", ("cka", "mf"), better),
+        Claim("T2", "all of three runs", ("cka", "mf"), better, fewest=3),
+        Claim("T3", "GP is better", ("cka", "gp"), better),
+    ]
+    found = {claim.id: (claim.verdict, claim.measured) for claim in judge(claims, of, last=2)}
+    assert found == {
+        "T1": ("met", "2 runs: 1"),
+        "T2": ("not run", "too few runs of mf"),
+        "T3": ("not run", "no results of gp"),
+    }
+
+
+def test_tables():
+    table = markdown(["a", "b"], [["1", "long"], ["22", ""]])
+    assert aligned(f"title\n\n{table}") == "title\n\na   b\n--  ----\n1   long\n22"
+    assert best_in_bold(pd.Series([0.121, 0.119, 0.5])) == ["**0.12**", "**0.12**", "0.5"]
+    one, other = Judged("F1", "c", "beaten", "x"), Judged("F1", "c", "beaten", "y")
+    assert "| **beaten**: x | **beaten**: y |" in claims_table("claim", {"p": [one], "q": [other]})
+    assert "| **beaten**: x | the same |" in claims_table("claim", {"p": [one], "q": [one]})
+
+
+def test_fragments_replace_what_stands_between_their_markers():
+    text = "a\n<!-- x -->\nold\n<!-- end -->\nb"
+    assert fragments(text) == {"x": "old"}
+    assert filled(text, {"x": "new"}) == "a\n<!-- x -->\nnew\n<!-- end -->\nb"
+    with pytest.raises(ValueError, match="No result is called 'y'"):
+        filled("<!-- y -->\nold\n<!-- end -->", {"x": "new"})
+
+
+@pytest.mark.parametrize("path", READMES, ids=["README.md", "paper/README.md"])
+def test_readmes_show_the_committed_results(path):
+    text = path.read_text()
+    assert filled(text, results(PAPER / "results")) == text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_tables_are_those_of_the_committed_runs(name):
+    from importlib import import_module
+
+    from paper.common.runner import runs_file, tables_of
+
+    kind = getattr(import_module(f"paper.{name}"), EXPERIMENTS[name][0])
+    experiment = kind(out=PAPER / "results" / name)
+    records = list(runs_file(experiment).read().values())
+    committed = results(PAPER / "results")
+    for marker, table in tables_of(experiment, records).items():
+        assert committed[marker] == table.text

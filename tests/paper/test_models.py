@@ -1,0 +1,328 @@
+"""The experiments on models: Forrester's function, pairs, where to measure."""
+
+import math
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+import torch
+
+from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.envs import random_cart_pole_physics
+from paper.active import Active
+from paper.active import Settings as ActiveSettings
+from paper.active import run as active_run
+from paper.active.problems import problem
+from paper.active.run import LEARNERS, integrated_variance, measured, scored
+from paper.active.tables import needed, verdicts
+from paper.common.runner import main, run_missing, runs_file
+from paper.forrester import Forrester
+from paper.forrester import Settings as ForresterSettings
+from paper.forrester.problem import CRUDE, GRID, observations, truth
+from paper.forrester.tables import NAMES, judge
+from paper.multifidelity import Multifidelity
+from paper.multifidelity import Settings as MultifidelitySettings
+from paper.multifidelity import problem as pairs
+from paper.multifidelity.run import SMTModel
+from paper.multifidelity.tables import judge_intervals, load
+from paper.report import PAPER
+
+RESULTS = PAPER / "results"
+
+# The tiny settings stop optimisations early.
+pytestmark = pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.BotorchWarning")
+
+
+class TestForrester:
+    def test_readings_of_the_crude_function(self):
+        torch.testing.assert_close(truth(GRID), 2 * CRUDE["B"](GRID) - 5 * GRID)
+        torch.testing.assert_close(truth(GRID), 8 * CRUDE["A"](GRID) - 20 * GRID)
+        error = {r: (CRUDE[r](GRID) - truth(GRID)).square().mean().sqrt().item() for r in "AB"}
+        assert error["A"] == pytest.approx(2.47, abs=0.01)
+        assert error["B"] == pytest.approx(1.77, abs=0.01)
+        X, Y = observations(3, 8)
+        assert X.shape == Y.shape == (8, 1)
+        assert ((X >= -0.6) & (X <= 1)).all()
+
+    def test_smoke(self, tmp_path):
+        """One data set for each protocol; the tables of the runs that are committed."""
+        settings = ForresterSettings(steps=2, lengthscales=(0.5, 1.0), ridges=(0.01,))
+        experiment = Forrester(out=tmp_path, settings=settings)
+        found = {
+            protocol: experiment.run("B", protocol, 1, unfinished=tmp_path)
+            for protocol in ("gpadjust", "paper", "closed form")
+        }
+        assert found["closed form"]["model"] == ["f_p", "0.5, 0.01", "1, 0.01"]
+        error = dict(zip(found["gpadjust"]["model"], found["gpadjust"]["rmse"], strict=True))
+        assert error["CKA"] < 0.05 < error["Phy-mean GP"]
+        assert error["Phy-mean GP"] == error["GP-bias"]
+        records = list(runs_file(Forrester(out=RESULTS / "forrester")).read().values())[:50]
+        assert "F7 | RRA about 50 %" in experiment.tables(records)["claims-B"].text
+        assert "CKA | " in experiment.first_look(records)
+
+    @pytest.mark.slow
+    def test_command(self, tmp_path, capsys):
+        settings = ForresterSettings(steps=2, lengthscales=(0.5, 1.0), ridges=(0.01,))
+        main(Forrester(out=tmp_path, runs=2, jobs=1, settings=settings))
+        assert "Claims, on reading B" in capsys.readouterr().out
+        for protocol in ("paper", "gpadjust"):
+            assert (tmp_path / f"forrester_{protocol}.png").stat().st_size > 20_000
+
+    @pytest.mark.parametrize(
+        ("claim", "rmse", "verdict"),
+        [
+            ("F1", {"Zero-mean GP": 0.9}, "reproduced"),
+            ("F1", {"Zero-mean GP": 1.1}, "not reproduced"),
+            ("F1", {"Zero-mean GP": 0.999}, "inconclusive"),
+            ("F2", {"GP-scale": 0.9}, "reproduced"),
+            ("F3", {"GP-bias": 1.1}, "not reproduced"),
+            ("F4", {"GP-scale": 1.2}, "reproduced"),
+            ("F4", {"GP-scale": 1.2, "AR1": 1.3}, "not reproduced"),
+            ("F6", {"CKA": 0.7}, "reproduced"),
+            ("F6", {"CKA": 0.9}, "not reproduced"),
+            ("F6", {"CKA": 0.1}, "beaten"),
+            ("F7", {"RRA": 0.5}, "reproduced"),
+            ("F7", {"RRA": 0.5, "CKA": 0.4}, "not reproduced"),
+        ],
+    )
+    def test_verdicts(self, claim, rmse, verdict):
+        """Two runs of all models, whose differences vary by a hundredth."""
+        runs = pd.DataFrame(
+            {
+                "seed": seed,
+                "model": name,
+                "rmse": rmse.get(name, 1) + seed * (0.3 if name == "GP-scale" else 0.1)
+                - seed * 0.2 * (name == "GP-scale") + seed * 0.001 * NAMES.index(name),
+            }
+            for seed in (0, 1)
+            for name in NAMES
+        )  # fmt: skip
+        f_p = pd.DataFrame({"seed": [0, 1], "model": "f_p", "rmse": [1.0, 1.101]})
+        found = judge(pd.concat([runs, f_p]))
+        assert next(c.verdict for c in found if c.id == claim) == verdict
+
+    def test_a_closed_form_that_gives_both_verdicts_leaves_the_claim_undetermined(self):
+        rows = [("f_p", 1.0), *((name, 1.0) for name in NAMES)]
+        runs = pd.DataFrame([{"seed": s, "model": m, "rmse": e} for s in (0, 1) for m, e in rows])
+        cells = [{"model": "0.5, 0.01", "rmse": 0.5}, {"model": "1, 0.01", "rmse": 1.2}]
+        cells.append({"model": "f_p", "rmse": 1.0})
+        grid = pd.DataFrame(
+            [{**c, "seed": s, "protocol": "closed form"} for s in (0, 1) for c in cells]
+        )
+        found = judge(runs, grid)[-1]
+        assert found.verdict == "undetermined"
+        assert "-50% to +20%" in found.measured
+
+
+class TestPairs:
+    @pytest.mark.parametrize(
+        ("name", "x", "high", "low"),
+        [
+            ("booth", [1.0, 3.0], 0.0, 11.9),
+            ("bohachevsky", [0.0, 0.0], 0.0, -12.0),
+            ("currin", [0.5, 0.5], (1 - math.exp(-1)) * 1868.5 / 159.5, 7.4425),
+        ],
+    )
+    def test_pairs_have_known_values(self, name, x, high, low):
+        pair, X = pairs.pair(name), torch.tensor([x], dtype=torch.float64)
+        assert pair.truth(X).item() == pytest.approx(high, abs=1e-4)
+        assert pair.physics()(X).item() == pytest.approx(low, abs=1e-4)
+
+    def test_data(self):
+        pair = pairs.pair("branin")
+        X, Y = pairs.observations(pair, 10, 3)
+        cells = (10 * (X - pair.bounds[0]) / (pair.bounds[1] - pair.bounds[0])).floor()
+        for column in cells.sort(0).values.T:
+            assert torch.equal(column, torch.arange(10.0, dtype=torch.float64))
+        assert torch.equal(Y, pair.truth(X))
+        low_X = pairs.low_inputs(pair, X, 40, 0)
+        assert low_X.shape == (40, 2)
+        assert torch.equal(low_X[:10], X)
+
+    @pytest.mark.slow
+    def test_mfk_predicts_in_the_units_of_the_data(self):
+        pair = pairs.pair("booth")
+        X, Y = pairs.observations(pair, 10, 0)
+        low_X = pairs.low_inputs(pair, X, 40, 0)
+        posterior = SMTModel(low_X, pair.physics()(low_X), X, Y).posterior(X)
+        torch.testing.assert_close(posterior.mean, Y, rtol=1e-2, atol=1e-2)
+        assert (posterior.variance > 0).all()
+
+    def test_smoke(self, tmp_path, capsys):
+        settings = MultifidelitySettings(num_test=50, sizes=(5,))
+        experiment = Multifidelity(
+            out=tmp_path,
+            runs=4,
+            jobs=1,
+            pairs=("forrester",),
+            methods=("GP", "CKA"),
+            settings=settings,
+        )
+        main(experiment)
+        printed = capsys.readouterr().out
+        assert "The first runs" in printed
+        assert "U1" in printed
+        assert (tmp_path / "nrmse.png").stat().st_size > 10_000
+        runs = load(list(runs_file(experiment).read().values()))
+        assert (runs.groupby("seed")["N"].nunique() == 1).all()
+        assert runs[runs["method"] == "CKA"]["nrmse"].median() < 0.1
+
+    def test_unknown_pair(self, tmp_path):
+        with pytest.raises(ValueError, match="mf2 has no pair 'curin'; it has bohachevsky, "):
+            Multifidelity(out=tmp_path, pairs=("curin",)).check()
+
+    def test_intervals_are_judged_by_their_distance_from_95(self):
+        rows = [
+            {"pair": "booth", "seed": seed, "method": name, "coverage": value + seed / 1000}
+            for seed in range(4)
+            for name, value in {"CKA": 0.94, "RRA": 0.93, "GP": 0.6, "AR1": 0.7}.items()
+        ]
+        assert judge_intervals(pd.DataFrame(rows)).verdict == "reproduced"
+        assert judge_intervals(pd.DataFrame(rows[:2])).verdict == "not run"
+
+
+TINY = ActiveSettings(
+    budget=6,
+    every=2,
+    num_test=20,
+    integration_points=4,
+    raw_samples=4,
+    num_restarts=1,
+    maxiter=2,
+    num_screened=4,
+    num_starts=1,
+    max_iterations=5,
+)
+
+
+def scores(**errors):
+    """Runs of Forrester's function: learner=[errors after 1, 2, ... of a seed, ...]."""
+    rows = [
+        {"problem": "forrester", "learner": name, "seed": seed, "measurements": n, "nrmse": error}
+        for name, by_seed in errors.items()
+        for seed, curve in enumerate(by_seed)
+        for n, error in enumerate(curve, 1)
+    ]
+    return pd.DataFrame(rows)
+
+
+class TestWhereToMeasure:
+    @pytest.mark.parametrize("name", ["forrester", "currin", "park91a", "cartpole"])
+    def test_problems(self, name):
+        system = problem(name, 0)
+        X = torch.cat([system.sobol(8, 1), system.uniform(8, 1), system.bounds])
+        assert ((system.bounds[0] <= X) & (system.bounds[1] >= X)).all()
+        assert system.truth(X).shape == (18, 4 if name == "cartpole" else 1)
+        assert (system.physics(X) - system.truth(X)).abs().max() > 1e-3
+        X.requires_grad_()
+        system.physics(X).sum().backward()
+        assert X.grad.isfinite().all()
+
+    def test_the_cart_pole(self):
+        system, X = problem("cartpole", 3), torch.tensor([[0.3, 0.1, 0.2, -0.5, 4.0]]).double()
+        believed = random_cart_pole_physics(3)(X) - X[:, :4]
+        torch.testing.assert_close(system.physics(X), believed)
+        X = system.sobol(6, 0)
+        for kind, expected in (("CKA", CKA), ("physics mean", PhysicsMeanGP), ("GP", ZeroMeanGP)):
+            model = system.model(X, system.truth(X), kind)
+            assert isinstance(model, expected)
+            once_round = X + torch.tensor([0, 2 * math.pi, 0, 0, 0], dtype=torch.float64)
+            torch.testing.assert_close(model.predict(X).mean, model.predict(once_round).mean)
+
+    @pytest.mark.parametrize("kind", ["CKA", "GP"])
+    def test_integrated_variance_of_outputs_is_the_sum_in_their_units(self, kind):
+        system = problem("cartpole", 0)
+        X, points, x = system.sobol(7, 0), system.sobol(3, 5), system.sobol(1, 9)
+        Y = system.truth(X)
+        model = system.model(X, Y, kind)
+        found = -integrated_variance(model, points)(x)
+        with torch.no_grad():
+            left = model.condition_on_observations(x, system.truth(x)).predict(points).variance
+        expected = (left / Y.std(0).square()).sum(-1).mean()
+        torch.testing.assert_close(found.detach(), expected.reshape(1), rtol=1e-3, atol=0)
+
+    def test_all_learners_of_a_seed_begin_alike(self, tmp_path):
+        system = problem("forrester", 0)
+        points = {
+            name: measured(system, learner, learner.model, TINY, 2, tmp_path / f"{name}.jsonl")
+            for name, learner in LEARNERS.items()
+            if learner.model is not None
+        }
+        assert all(torch.equal(X[:4], system.sobol(4, 2)) for X in points.values())
+        assert all(X.shape == (6, 1) for X in points.values())
+        assert torch.equal(points["sobol"], system.sobol(6, 2))
+        assert not torch.equal(points["cka"][4:], points["gp"][4:])
+
+    def test_scores(self):
+        system = problem("forrester", 0)
+        found = scored(
+            system, "CKA", replace(ActiveSettings(), budget=6, every=2), system.sobol(6, 0)
+        )
+        assert found["measurements"] == [4, 6]
+        assert found["nrmse"][1] < found["nrmse"][0] < 2
+
+    def test_smoke(self, tmp_path, capsys):
+        experiment = Active(
+            out=tmp_path,
+            runs=2,
+            jobs=1,
+            problems=("forrester",),
+            learners=("f_p", "phy", "gp", "cka"),
+            forrester=TINY,
+        )
+        main(experiment)
+        assert "M1" in capsys.readouterr().out
+        assert (tmp_path / "errors.png").stat().st_size > 10_000
+        assert not list((tmp_path / "unfinished").glob("*.jsonl"))
+
+    def test_an_interrupted_run_goes_on(self, tmp_path, monkeypatch):
+        whole, cut = (
+            Active(out=tmp_path / name, runs=1, jobs=1, problems=("forrester",), learners=("both",),
+                   forrester=TINY) for name in ("whole", "cut")
+        )  # fmt: skip
+        run_missing(whole)
+        asked = []
+
+        def interrupted(name, seed):
+            system = problem(name, seed)
+
+            def measure(X):
+                if len(X) == 1:
+                    asked.append(X)
+                    if len(asked) == 5:
+                        raise KeyboardInterrupt
+                return system.truth(X)
+
+            return replace(system, truth=measure)
+
+        monkeypatch.setattr(active_run, "problem", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_missing(cut)
+        run_missing(cut)
+        expected, found = (
+            next(iter(runs_file(experiment).read().values())) for experiment in (whole, cut)
+        )
+        assert found["scores"] == expected["scores"]
+        assert found["choice_seconds"] is None
+        assert len(asked) == 7  # the one it was interrupted at twice
+        assert torch.equal(asked[4], asked[5])
+
+    def test_measurements_that_are_needed(self):
+        runs = scores(gp=[[3.0, 2.0, 1.0]] * 2, cka=[[2.0, 1.0, 2.0], [2.0, 1.5, 1.1]])
+        assert needed(runs, "cka").tolist() == [2, math.inf]
+        assert needed(runs, "gp").tolist() == [3, 3]
+        assert needed(runs[runs["learner"] == "cka"], "cka").empty
+
+    @pytest.mark.parametrize(
+        ("cka", "verdict", "said"),
+        [
+            ([[2.0, 1.0, 1.0, 1.0]] * 2, "met", "2 runs: with 2 of 4 (median), in 2 of them"),
+            ([[2.0, 2.0, 1.0, 1.0]] * 2, "missed", "with 3 of 4"),
+            ([[2.0, 2.0, 2.0, 2.0]] * 2, "missed", "never of 4 (median), in 0 of them"),
+            ([[2.0, 1.0, 1.0, 1.0]], "not run", "too few runs"),
+        ],
+    )
+    def test_verdicts(self, cka, verdict, said):
+        (claim,) = verdicts(scores(gp=[[3.0, 2.0, 1.5, 1.0]] * 2, cka=cka))
+        assert (claim.id, claim.verdict) == ("M1", verdict)
+        assert said in claim.measured

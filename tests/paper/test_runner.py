@@ -1,0 +1,230 @@
+"""How runs are made and kept, whatever the experiment."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+from cloudpickle import register_pickle_by_value, unregister_pickle_by_value
+from filelock import FileLock
+
+from paper.common import runner
+from paper.common.experiment import Experiment, Table
+from paper.common.runner import Refused, check_settings, main, run_missing, runs_file, versions
+from paper.common.runs_file import RunsFile
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Toy(Experiment):
+    """Squares; tasks write down that they were run."""
+
+    runs: int = 3
+    jobs: int = 1
+    scale: float = 1.0
+
+    name: ClassVar[str] = "toy"
+    key: ClassVar[tuple[str, ...]] = ("kind", "seed")
+    packages: ClassVar[tuple[str, ...]] = ("gpadjust", "numpy")
+
+    def tasks(self):
+        return [(kind, seed) for seed in self.seeds for kind in ("a", "b")]
+
+    def describe(self, *kind):
+        return {"scale": self.scale, "inner": {"kind": kind[0]}}
+
+    def run(self, *task, unfinished):
+        if (self.out / "stop").exists() and task == ("a", 1):
+            raise KeyboardInterrupt
+        with open(self.out / "log", "a") as log:
+            log.write(f"{task} {unfinished.name}\n")
+        return {"value": self.scale * task[1] ** 2, "nothing": float("nan")}
+
+    def first_look(self, records):
+        return "a first look" if len(records) == 2 else None
+
+    def tables(self, records):
+        return {"runs": Table("Runs", f"{len(records)}")}
+
+    def draw(self, records):
+        return []
+
+
+def calls(out):
+    return (out / "log").read_text().splitlines()
+
+
+def test_all_tasks_are_run_once_and_shown(tmp_path, capsys):
+    toy = Toy(out=tmp_path)
+    main(toy)
+    first = capsys.readouterr()
+    assert "a first look" in first.out
+    assert "Runs\n\n6\n" in first.out
+    assert "<!-- toy:runs -->\n6\n<!-- end -->" in (tmp_path / "tables.md").read_text()
+    assert calls(tmp_path)[0] == "('a', 0) a-0"
+    record = runs_file(toy).read()["b", 2]
+    assert (record["value"], record["nothing"]) == (4, None)
+    assert record["settings"] == {"scale": 1.0, "inner": {"kind": "b"}}
+    assert record["versions"] == versions(Toy.packages)
+    main(toy)
+    assert len(calls(tmp_path)) == 6
+    assert "a first look" not in capsys.readouterr().out
+
+
+def test_an_interrupted_call_goes_on_and_a_larger_one_adds(tmp_path):
+    (tmp_path / "stop").touch()
+    with pytest.raises(KeyboardInterrupt):
+        main(Toy(out=tmp_path))
+    assert len(calls(tmp_path)) == 2
+    (tmp_path / "stop").unlink()
+    main(Toy(out=tmp_path))
+    main(Toy(out=tmp_path, runs=4))
+    assert len(calls(tmp_path)) == len(set(calls(tmp_path))) == 8
+
+
+def test_runs_in_other_processes(tmp_path):
+    register_pickle_by_value(sys.modules[__name__])  # which they cannot import
+    try:
+        main(Toy(out=tmp_path, jobs=2, runs=2))
+    finally:
+        unregister_pickle_by_value(sys.modules[__name__])
+    assert len(runs_file(Toy(out=tmp_path)).read()) == 4
+
+
+def test_only_tables_runs_nothing(tmp_path):
+    with pytest.raises(Refused, match="There are no results"):
+        main(Toy(out=tmp_path, only_tables=True))
+    main(Toy(out=tmp_path, runs=2))
+    main(Toy(out=tmp_path, only_tables=True, scale=7.0))
+    assert len(calls(tmp_path)) == 4
+
+
+@pytest.mark.parametrize("option", ["runs", "jobs"])
+def test_options_out_of_range(tmp_path, option):
+    with pytest.raises(Refused, match=f"--{option}: expected at least"):
+        main(replace(Toy(out=tmp_path), **{option: 0}))
+
+
+def test_runs_of_other_settings_are_refused(tmp_path):
+    main(Toy(out=tmp_path))
+    with pytest.raises(Refused, match=r"a-0 was made with other settings: scale was 1\.0 and is "):
+        main(Toy(out=tmp_path, scale=2.0))
+    with pytest.raises(Refused, match=r"inner\.kind was a and is now not there"):
+        check_settings(tmp_path, ("a", 0), {"inner": {"kind": "a"}}, {"inner": {}})
+
+
+def test_runs_of_other_versions_are_refused_kept_or_run_again(tmp_path, monkeypatch, capsys):
+    main(Toy(out=tmp_path))
+    later = {**versions(Toy.packages), "numpy": "99"}
+    monkeypatch.setattr(runner, "versions", lambda packages: later)
+    main(Toy(out=tmp_path))  # nothing is missing
+    assert "6 of the runs were made by other versions" in capsys.readouterr().out
+    more = Toy(out=tmp_path, runs=4)
+    with pytest.raises(Refused, match=r"other versions: numpy was .* and is now 99\. Pass --other"):
+        main(more)
+    main(replace(more, other_versions="keep"))
+    assert len(calls(tmp_path)) == 8
+    main(replace(more, other_versions="replace"))
+    assert len(calls(tmp_path)) == 14
+    assert {r["versions"]["numpy"] for r in runs_file(more).read().values()} == {"99"}
+
+
+def test_a_second_process_is_refused(tmp_path):
+    (tmp_path / "unfinished").mkdir()
+    with (
+        FileLock(tmp_path / "unfinished" / "process.lock"),
+        pytest.raises(Refused, match="Another process adds runs to"),
+    ):
+        main(Toy(out=tmp_path))
+
+
+def test_what_is_missing_is_said(tmp_path, monkeypatch):
+    def check(self):
+        raise ImportError("It needs a simulator; install it.")
+
+    monkeypatch.setattr(Toy, "check", check)
+    with pytest.raises(Refused, match="It needs a simulator"):
+        main(Toy(out=tmp_path))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_torn_line_is_not_read_and_not_glued_to_the_next(tmp_path):
+    toy = Toy(out=tmp_path, runs=2)
+    run_missing(toy)
+    path = tmp_path / runner.RUNS
+    whole = path.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    for cut in (1, 10, len(lines[-1]) - 1):  # of the last run
+        path.write_bytes(whole[: -len(lines[-1])] + lines[-1][:cut])
+        assert len(runs_file(toy).read()) == 3
+        run_missing(toy)
+        assert path.read_bytes() == whole
+
+
+def test_other_lines_are_an_error(tmp_path):
+    path = tmp_path / "runs.jsonl"
+    path.write_text('{"kind": "a", "seed": 0}\nnonsense\n')
+    with pytest.raises(ValueError, match=r"found b'nonsense' in line 2\. Remove that line"):
+        RunsFile(path, Toy.key).read()
+
+
+def test_a_full_disk_loses_only_what_is_being_written(tmp_path, monkeypatch):
+    file = RunsFile(tmp_path / "runs.jsonl", ("seed",))
+    file.append({"seed": 0})
+    before = file.path.read_bytes()
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left on device; the run is not written"):
+        file.append({"seed": 1})
+    assert file.path.read_bytes() == before
+
+
+def test_a_killed_process_leaves_whole_runs(tmp_path):
+    code = (
+        "import os, sys\nfrom pathlib import Path\n"
+        "from paper.common.runs_file import RunsFile\n"
+        "file = RunsFile(Path(sys.argv[1]), ('seed',))\n"
+        "for seed in range(200):\n    file.append({'seed': seed, 'x': [0.5] * 1000})\n"
+        "    if seed == 20:\n        os.kill(os.getpid(), 9)\n"
+    )
+    path = tmp_path / "runs.jsonl"
+    made = subprocess.run([sys.executable, "-c", code, str(path)], cwd=ROOT, check=False)
+    assert made.returncode == -9
+    assert len(RunsFile(path, ("seed",)).read()) == 21
+    RunsFile(path, ("seed",)).append({"seed": 21})  # the lock went with the process
+    assert [json.loads(line)["seed"] for line in path.read_text().splitlines()] == [*range(22)]
+
+
+def test_help_is_quick_and_imports_nothing_slow():
+    code = (
+        "import sys\nsys.argv = ['paper', 'arm', '--help']\nfrom paper.__main__ import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "slow = {'torch', 'smt', 'mf2', 'opensim', 'pandas', 'gpadjust'} & {*sys.modules}\n"
+        "assert not slow, slow\n"
+    )
+    made = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert "--gamma" in made.stdout
+    assert "--evaluate-every" in made.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of Ray
+def test_runs_on_ray(tmp_path):
+    pytest.importorskip("ray")
+    from paper.forrester import Forrester, Settings
+
+    settings = Settings(steps=1, lengthscales=(0.5,), ridges=(0.01,))
+    experiment = Forrester(out=tmp_path, runs=2, jobs=2, backend="ray", settings=settings)
+    run_missing(experiment)
+    assert len(runs_file(experiment).read()) == 10
