@@ -71,19 +71,22 @@ class Information(Objective):
 class Return(Objective):
     """The sum of rewards of the steps ahead, averaged over the functions.
 
-    An episode that leaves the bounds gets the worst reward among all rollouts for each step that it
-    does not make, so that leaving never pays.
+    Leaving the bounds never pays: each step that an episode does not make for that costs a million
+    times the largest reward, so that sequences that leave come after all others, and those that
+    leave later first. There is no discount.
     """
 
     def of(self, task: Task) -> Score:
         """The return of rollouts; what has been is the same for all."""
+        largest = torch.zeros((), dtype=torch.float64)
 
         def score(rollout: Rollout, past: Past | None) -> Tensor:
-            made = rollout.made
-            worst = rollout.rewards[made].min() if made.any() else rollout.rewards.new_zeros(())
-            lost = rollout.left_bounds.unsqueeze(-1) & ~made
-            rewards = rollout.rewards.masked_fill(~made, 0.0)
-            return torch.where(lost, worst, rewards).double().sum(-1).mean(0)
+            nonlocal largest
+            if not largest:  # of the first rollouts, so that later ones compare
+                largest = rollout.rewards.double().abs().max().clamp_min(1e-12)
+            lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
+            rewards = rollout.rewards.double().masked_fill(~rollout.made, 0.0)
+            return (rewards - 1e6 * largest * lost).sum(-1).mean(0)
 
         return score
 

@@ -144,6 +144,11 @@ class CrossEntropyPlanner:
                 f"Expected num_steps as a number of steps >= 1, found {num_steps}; pass it, or "
                 "give the task an episode_length."
             )
+        if known is not None and known.shape != (num_steps, spec.action_dim):
+            raise ValueError(
+                f"Expected known of shape {num_steps} x {spec.action_dim}, found "
+                f"{tuple(known.shape)}."
+            )
         score = self.objective.of(task)
         rollouts = Rollouts(task, self.num_functions)
         num_random = self.num_random + (self.num_policy if policy is None else 0)

@@ -76,6 +76,7 @@ class Rollouts:
         self, state: Tensor, n: int, num_steps: int, choose: Callable[[int, Tensor], Tensor]
     ) -> Rollout:
         """Run episodes of actions that are chosen by the number of the step and the states."""
+        task = self.task.widened(state.unsqueeze(0))
         states = state.expand(self.num_functions, n, -1).clone()
         running = torch.ones(states.shape[:2], dtype=torch.bool)
         left = torch.zeros_like(running)
@@ -85,7 +86,7 @@ class Rollouts:
             # Where the episodes start the physics has to work; later, all may have come to where
             # it does not.
             rows = states.flatten(0, 1), actions.flatten(0, 1)
-            step = self.task.step(*rows, self._move, some_must_succeed=t == 0)
+            step = task.step(*rows, self._move, some_must_succeed=t == 0)
             following, rewards, ended, lost = (part.unflatten(0, running.shape) for part in step)
             made = running & ~lost
             left |= running & lost

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -46,7 +46,7 @@ class Task:
 
     All tensors are float64, in the units of ``dynamics.spec``. What is left out a learner takes
     from its environment and the real episodes that it has seen. To change a part, make another one
-    by ``dataclasses.replace``.
+    by ``dataclasses.replace``. Dynamics learn: make others for another run.
 
     Args:
         dynamics: The model of the real system.
@@ -178,6 +178,21 @@ class Task:
         following = torch.where(left.unsqueeze(-1), states, following)
         rewards = self.rewards(states, actions, following)
         return Step(following, rewards, self.terminations(following) & ~left, left)
+
+    def widened(self, states: Tensor) -> Task:
+        """This task, or one whose bounds give way to states ``N x state_dim`` beyond them."""
+        if self.state_bounds is None:
+            return self
+        low, high = self.state_bounds
+        span = torch.where((high - low).isfinite(), high - low, 0.0)
+        slack = 1e-5 * span  # observations have single precision
+        wider = ((states < low - slack) | (states > high + slack)).any(0)
+        if not wider.any():
+            return self
+        room = span / 2
+        low = torch.where(wider, torch.minimum(low, states.amin(0) - room), low)
+        high = torch.where(wider, torch.maximum(high, states.amax(0) + room), high)
+        return replace(self, state_bounds=torch.stack([low, high]))
 
     def describe(self) -> dict[str, Any]:
         """What the task is, in plain values: of functions, whether there is one."""

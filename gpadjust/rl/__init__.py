@@ -14,7 +14,6 @@ from gpadjust.rl.checkpoint import EpisodeCheckpoint, resume, save_checkpoint
 from gpadjust.rl.dyna import Dyna
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
-from gpadjust.rl.task_learner import TaskLearner
 
 __all__ = [
     "Dyna",
@@ -25,7 +24,6 @@ __all__ = [
     "EpisodeCheckpoint",
     "MixedReplayBuffer",
     "ModelVecEnv",
-    "TaskLearner",
     "resume",
     "save_checkpoint",
 ]

@@ -121,6 +121,7 @@ class MixedReplayBuffer(CompactReplayBuffer):
         failed: Which places repeat another transition, ``buffer_size x n_envs`` booleans.
         mix: Whether batches hold model transitions.
         num_new: Steps that were added since this was last set to zero, by whom reads them.
+        num_ended: Episodes that ended since then.
         real_fraction: Share of real samples in a batch.
 
     Raises:
@@ -162,7 +163,7 @@ class MixedReplayBuffer(CompactReplayBuffer):
         )
         self.real_fraction = real_fraction
         self.mix = True
-        self.num_new = 0
+        self.num_new = self.num_ended = 0
         self.failed = np.zeros((self.buffer_size, n_envs), dtype=bool)
         self.model_buffer = CompactReplayBuffer(
             buffer_size if model_buffer_size is None else model_buffer_size,
@@ -189,12 +190,15 @@ class MixedReplayBuffer(CompactReplayBuffer):
         pos = self.pos
         super().add(obs, next_obs, action, reward, done, infos)
         self.num_new += 1
+        self.num_ended += int((done.astype(bool) & ~failed).sum())
         self.failed[pos] = failed
         for i in failed.nonzero()[0]:
             # Its place in the row is taken by a transition that is sampled once more.
             row, env = (pos - 1, i) if self.size() > 1 else (pos, int(failed.argmin()))
             for name in CompactReplayBuffer.rows:
                 getattr(self, name)[pos, i] = getattr(self, name)[row, env]
+            if not self.dones[pos, i]:
+                self.dones[pos, i] = self.timeouts[pos, i] = 1
 
     def end_episodes(self, environments: np.ndarray) -> None:
         """Let the newest steps of some environments be the last ones of episodes, truncated.
@@ -205,6 +209,7 @@ class MixedReplayBuffer(CompactReplayBuffer):
         if not self.size():
             return
         ended = environments & (self.dones[self.pos - 1] == 0)
+        self.num_ended += int(ended.sum())
         self.dones[self.pos - 1][ended] = self.timeouts[self.pos - 1][ended] = 1
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
@@ -234,4 +239,4 @@ class MixedReplayBuffer(CompactReplayBuffer):
         super().reset()
         self.model_buffer.reset()
         self.failed[:] = False
-        self.num_new = 0
+        self.num_new = self.num_ended = 0

@@ -9,12 +9,12 @@ import pickle
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cloudpickle
 import gymnasium as gym
 import numpy as np
-from filelock import AcquireReturnProxy, BaseFileLock, FileLock, Timeout
+from filelock import AcquireReturnProxy, FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
@@ -25,6 +25,7 @@ from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.rl.dyna import Dyna
 from gpadjust.rl.random_state import RandomState
 
+Agent = TypeVar("Agent", bound=Dyna)
 _FORMAT = "gpadjust episode checkpoint, version 2"
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")
 _BUFFERS = ("replay_buffer", "model_buffer")
@@ -37,14 +38,15 @@ class EpisodeCheckpoint(BaseCallback):
     environment, and all random generators, so that an interrupted run ends with the same weights,
     bit for bit, as one that was not (on the same machine and versions). It is replaced atomically:
     whenever the process dies, a whole checkpoint is on the disk. While it learns, a run holds a
-    lock beside the file (``.lock``): another process that would write there is refused.
+    lock beside the file (``.lock``): another run that would write there is refused.
 
     Callbacks keep their own state: it is not in the file, unless they write it into
     ``agent.notes``. One that draws random numbers (an ``EvalCallback`` with
     ``deterministic=False``) or counts steps begins anew, and may so change what follows.
 
     The environment must be picklable for this; one that is not (a real robot) is reset when the
-    run goes on, which is then another run, and a warning says so.
+    run goes on, which is then another run, and a warning says so; wrappers such as
+    ``VecNormalize`` keep their statistics.
 
     Args:
         path: The file.
@@ -53,7 +55,7 @@ class EpisodeCheckpoint(BaseCallback):
 
     Raises:
         ValueError: If ``every`` is not positive.
-        RuntimeError: When learning starts, if another process writes to this file.
+        RuntimeError: When learning starts, if another run writes to this file.
 
     Example:
         >>> checkpoint = EpisodeCheckpoint("run.ckpt")  # agent.learn(1250, callback=checkpoint)
@@ -67,10 +69,9 @@ class EpisodeCheckpoint(BaseCallback):
         if every < 1:
             raise ValueError(f"every must be at least 1; found {every}.")
         super().__init__()
-        self.path = Path(path)
+        self.path = Path(path).absolute()
         self.every = every
         self._rollouts = 0
-        self._lock: BaseFileLock | None = None
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, Dyna):
@@ -83,7 +84,7 @@ class EpisodeCheckpoint(BaseCallback):
                 "EpisodeCheckpoint cannot resume generalised state-dependent exploration exactly; "
                 f"use {type(self.model).__name__} with use_sde=False."
             )
-        self._lock = _locked(self.path).lock
+        self.model.held.enter_context(_locked(self.path))
 
     def _on_step(self) -> bool:
         return True
@@ -91,24 +92,26 @@ class EpisodeCheckpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         # The updates of the last episode are done, and the next has not begun.
         if self._rollouts % self.every == 0:
-            save_checkpoint(self.model, self.path)
+            _write(self.model, self.path)
         self._rollouts += 1
 
     def _on_training_end(self) -> None:
         if self.model.num_timesteps >= self.model._total_timesteps:
-            save_checkpoint(self.model, self.path)
+            _write(self.model, self.path)
         # Otherwise a callback stopped the run within an episode.
-        if self._lock is not None:
-            self._lock.release()
 
 
 def save_checkpoint(agent: Dyna, path: str | Path) -> None:
     """Write the state of a run between two episodes to a file, atomically; see :func:`resume`.
 
     Raises:
-        RuntimeError: If another process writes to this file.
+        RuntimeError: If a run writes to this file.
     """
-    path = Path(path)
+    with _locked(Path(path)):
+        _write(agent, Path(path))
+
+
+def _write(agent: Dyna, path: Path) -> None:
     saved = io.BytesIO()
     agent.save(saved)
     env = agent.get_env()
@@ -120,6 +123,7 @@ def save_checkpoint(agent: Dyna, path: str | Path) -> None:
         "environment": _described(env),
         "task": None if agent.task is None else agent.task.describe(),
         "num_new": agent.replay_buffer.num_new,
+        "num_ended": agent.replay_buffer.num_ended,
         "action_space": agent.action_space.np_random.bit_generator.state,
     }
     parts = {
@@ -127,24 +131,28 @@ def save_checkpoint(agent: Dyna, path: str | Path) -> None:
         "agent.zip": saved.getvalue(),
         **{f"{name}.npz": _packed(_buffer(agent, name).filled()) for name in _BUFFERS},
         "random.npz": _packed(RandomState.capture().as_arrays()),
-        **({"environment.pkl": environment} if environment else {}),
+        "environment.pkl": environment,
     }
-    with _locked(path):
-        temporary = path.with_name(f".{path.name}.part")  # one of a killed process is overwritten
-        try:
-            with open(temporary, "wb") as file:
-                with zipfile.ZipFile(file, "w") as archive:
-                    for name, content in parts.items():
-                        archive.writestr(name, content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+    temporary = path.with_name(f".{path.name}.part")  # one of a killed process is overwritten
+    try:
+        with open(temporary, "wb") as file:
+            with zipfile.ZipFile(file, "w") as archive:
+                for name, content in parts.items():
+                    archive.writestr(name, content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
-def resume(path: str | Path, env: GymEnv, task: Task, algorithm: type[Dyna] = DynaSAC) -> Dyna:
+def resume(
+    path: str | Path,
+    env: GymEnv,
+    task: Task,
+    algorithm: type[Agent] = DynaSAC,  # type: ignore[assignment]
+) -> Agent:
     """Read the agent of a run that :class:`EpisodeCheckpoint` wrote, ready to go on.
 
     Go on with ``agent.learn(total - agent.num_timesteps, reset_num_timesteps=False)``.
@@ -177,25 +185,23 @@ def resume(path: str | Path, env: GymEnv, task: Task, algorithm: type[Dyna] = Dy
     )
     for name in _BUFFERS:
         _buffer(agent, name).fill(_unpacked(parts[f"{name}.npz"]))
-    agent.replay_buffer.num_new = manifest["num_new"]
+    for name in ("num_new", "num_ended"):
+        setattr(agent.replay_buffer, name, manifest[name])
     agent.action_space.np_random.bit_generator.state = manifest["action_space"]
     agent._random_state = RandomState.from_arrays(_unpacked(parts["random.npz"]))
-    if "environment.pkl" in parts:
-        _restore_environment(vec_env, *pickle.loads(parts["environment.pkl"]))
-    else:
-        agent._last_obs = None  # the environment is reset
+    _restore_environment(agent, vec_env, *pickle.loads(parts["environment.pkl"]))
     return agent
 
 
 def _locked(path: Path) -> AcquireReturnProxy[Any]:
-    """Acquire the lock of a file, which a process may have more than once."""
+    """Acquire the lock of a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path.absolute().with_name(f"{path.name}.lock"), is_singleton=True)
+    lock = FileLock(path.absolute().with_name(f"{path.name}.lock"))
     try:
         return lock.acquire(blocking=False)
     except Timeout as error:
         raise RuntimeError(
-            f"Another process writes checkpoints to {path}, and holds the lock {lock.lock_file}. "
+            f"Another run writes checkpoints to {path}, and holds the lock {lock.lock_file}. "
             "Wait for it, or give this run a file of its own."
         ) from error
 
@@ -206,6 +212,14 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, bytes]]:
         with zipfile.ZipFile(path) as archive:
             parts = {name: archive.read(name) for name in archive.namelist()}
             manifest = json.loads(parts.pop("manifest.json"))
+        missing = {
+            "agent.zip",
+            "environment.pkl",
+            "random.npz",
+            *(f"{name}.npz" for name in _BUFFERS),
+        } - {*parts}
+        if missing:
+            raise ValueError(f"it has no {min(missing)}")
         if manifest["format"] != _FORMAT:
             raise ValueError(f"its format is {manifest['format']!r}, expected {_FORMAT!r}")
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
@@ -291,15 +305,15 @@ def _described(env: VecEnv) -> dict[str, Any]:
 
 
 def _environment_state(vec_env: VecEnv) -> bytes:
-    """The pickled state of the environment; empty if it has none that can be pickled."""
+    """The pickled state of the environment; of its wrappers alone, if it cannot be pickled."""
     layers = _layers(vec_env)
     inner = layers[-1]
     problem = f"a {type(inner).__name__} keeps its environments elsewhere"
+    kept = [
+        {name: value for name, value in vars(layer).items() if name not in _OF_ALL}
+        for layer in layers
+    ]
     if isinstance(inner, DummyVecEnv):
-        kept = [
-            {name: value for name, value in vars(layer).items() if name not in _OF_ALL}
-            for layer in layers
-        ]
         try:
             return bytes(cloudpickle.dumps((kept, inner.envs)))
         except Exception as error:  # pickling runs the user's code
@@ -310,12 +324,17 @@ def _environment_state(vec_env: VecEnv) -> bytes:
         UserWarning,
         stacklevel=4,
     )
-    return b""
+    return bytes(cloudpickle.dumps((kept[:-1], None)))
 
 
-def _restore_environment(vec_env: VecEnv, kept: list[dict[str, Any]], envs: list[Any]) -> None:
+def _restore_environment(
+    agent: Dyna, vec_env: VecEnv, kept: list[dict[str, Any]], envs: list[Any] | None
+) -> None:
     layers = _layers(vec_env)
-    assert isinstance(layers[-1], DummyVecEnv), "as described"
-    for layer, attributes in zip(layers, kept, strict=True):
+    for layer, attributes in zip(layers, kept, strict=envs is not None):
         vars(layer).update(attributes)
-    layers[-1].envs = envs
+    if envs is None:
+        agent._last_obs = None  # the environment is reset
+    else:
+        assert isinstance(layers[-1], DummyVecEnv), "as described"
+        layers[-1].envs = envs

@@ -22,6 +22,8 @@ from stable_baselines3.common.type_aliases import (
 from torch import Tensor
 
 from gpadjust.control import Task
+from gpadjust.dynamics import Dynamics
+from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
 from gpadjust.rl.model_vec_env import ModelVecEnv
@@ -45,7 +47,10 @@ class Dyna(TaskLearner):
 
     An error on the way (a wrong reward, a physics that fails, a fit that does not converge) loses
     nothing: the episodes are in the buffer, and the dynamics learn them after the next one. Mend
-    what is wrong, in ``agent.task`` for example, and call ``learn`` again.
+    what is wrong, set ``agent.task`` to a task with other functions or dynamics, for example, and
+    call ``learn`` again; dynamics that know nothing learn all that is in the buffer. (Where the
+    environment was wrong, ``agent.replay_buffer.reset()`` forgets what it said.) Transitions at
+    which the physics fails are left out of what the dynamics learn, with a warning.
 
     A step that did not happen is no data: environments tell of one, as where a simulator failed, by
     a true ``info["step_failed"]``.
@@ -152,31 +157,33 @@ class Dyna(TaskLearner):
         if new is None:
             return
         metrics = self._learn_dynamics(new) if serves else {}
-        self.replay_buffer.num_new = 0
-        self.num_episodes += new.num_ended
+        num_ended = self.replay_buffer.num_ended
+        self.replay_buffer.num_new = self.replay_buffer.num_ended = 0
+        self.num_episodes += num_ended
         if serves:
             for hook in self.model_hooks:
                 hook.on_model_fit(metrics)
-            self._train_in_model(self.options.model_episodes * new.num_ended, batch_size)
+            self._train_in_model(self.options.model_episodes * num_ended, batch_size)
             total = sum(self.wall_time.values())
             for name, seconds in self.wall_time.items():
                 self.logger.record(f"model/share_{name}", seconds / total)
 
     def _new_episodes(self) -> RecordedEpisodes | None:
-        """The real steps that the dynamics have not learnt, if an episode ended among them."""
-        if not self.replay_buffer.num_new:
+        """The real steps that the dynamics have not learnt, if an episode has ended."""
+        buffer, is_fitted = self.replay_buffer, self.ready_task().dynamics.is_fitted
+        if not buffer.num_ended:
             return None
-        new = self.recorded_episodes(newest=self.replay_buffer.num_new)
-        least = 1 if self.ready_task().dynamics.is_fitted else 2  # a first fit needs two
-        return new if new.num_ended and new.num_transitions >= least else None
+        new = self.recorded_episodes(newest=buffer.num_new if is_fitted else None)
+        least = 1 if is_fitted else 2  # a first fit needs two
+        return new if new.num_transitions >= least else None
 
     def _learn_dynamics(self, new: RecordedEpisodes) -> dict[str, float]:
         """Score the dynamics on new transitions, and teach them these; return what is logged."""
         dynamics = self.ready_task().dynamics
-        transitions = (new.states, new.actions, new.next_states)
         metrics: dict[str, float] = {}
         start = time.perf_counter()
         with self.timed("fit"):
+            transitions = without_failures(dynamics, new)
             if dynamics.is_fitted:
                 score = dynamics.score(*transitions)
                 metrics = {
@@ -218,7 +225,7 @@ class Dyna(TaskLearner):
                     kept = (values[running] for values in (*rows, *ends))
                     self.replay_buffer.model_buffer.add_rows(*kept)
                     # Of an episode that left the bounds the rest counts as the worst that was seen.
-                    lost = env.worst_reward * ahead
+                    lost = np.minimum(env.worst_reward * ahead, env.worst_reward)
                     returns += np.where(step.left_bounds, lost, step.rewards) * running
                     num_left += int((step.left_bounds & running).sum())
                     made = int(running.sum())
@@ -272,7 +279,6 @@ class Dyna(TaskLearner):
             self.observation_space,
             self.action_space,
             sampling=self.options.sampling,
-            discount=self.gamma,
             worst_reward=float(recorded.rewards.min()) if recorded.num_transitions else np.inf,
         )
 
@@ -410,6 +416,31 @@ class Dyna(TaskLearner):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "model_hooks"]
+
+
+def without_failures(dynamics: Dynamics, new: RecordedEpisodes) -> tuple[Tensor, Tensor, Tensor]:
+    """States, actions and next states, but for those at which the physics fails.
+
+    Raises:
+        PhysicsError: If it does not say where, or everywhere.
+    """
+    works = torch.ones(new.num_transitions, dtype=torch.bool)
+    while True:
+        try:
+            dynamics.rehearse(new.states[works], new.actions[works])
+        except PhysicsError as error:
+            rows = works.nonzero().flatten()[list(error.rows)]
+            if not len(rows) or len(rows) == works.sum():
+                raise
+            warnings.warn(
+                f"The physics fails at {len(rows)} of {len(works)} new transitions, which the "
+                f"dynamics do not learn: {error}",
+                UserWarning,
+                stacklevel=4,
+            )
+            works[rows] = False
+        else:
+            return new.states[works], new.actions[works], new.next_states[works]
 
 
 def _doubles(values: np.ndarray) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from gpadjust.control import Step, Task
 from gpadjust.dynamics import TransitionFunctions
+from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.states import StateSpec
 
@@ -29,8 +29,8 @@ class ModelStep(NamedTuple):
     Args:
         observations: ``num_envs x observation_dim``.
         rewards: ``num_envs``, as all that follows.
-        terminated: Whether the state ended the episode, or the particle left the bounds.
-        truncated: Whether the time limit alone did.
+        terminated: Whether the state ended the episode.
+        truncated: Whether the time limit or the bounds did.
         left_bounds: Whether the particle would have left the bounds.
     """
 
@@ -48,10 +48,11 @@ class ModelVecEnv(VecEnv):
     model. Its randomness is PyTorch's global generator.
 
     **Leaving the bounds never pays.** A particle that would leave the bounds of the task or the
-    finite numbers, or meets a failure of the physics, stays where it is, and its episode is
-    terminated, with ``info["left_bounds"]`` (which stands in the ``info`` of every episode's last
-    step). Its reward is :math:`r_{\min} / (1 - \gamma)`, the
-    return of the worst reward seen so far if that went on for ever.
+    finite numbers, or meets a failure of the physics, stays where it is, and its episode ends, with
+    ``info["left_bounds"]`` (which the last step of every episode has). Its reward is the worst that
+    was seen. If that is negative the episode is truncated: who learns in it goes on valuing the
+    state where it stayed, so that leaving again and again is as bad as can be, and leaving once
+    costs a step. If all rewards were positive, it is terminated: there is nothing more to earn.
 
     Args:
         task: What is known; its dynamics must be fitted, and it must say where episodes start and
@@ -64,8 +65,6 @@ class ModelVecEnv(VecEnv):
             transition function of its own, drawn from the posterior, so that what it meets is
             consistent along its trajectory. (In the terms of PETS, trajectory sampling 1 and
             infinity; Chua et al. 2018. Stable-Baselines3 calls ``reset`` once in ``learn``.)
-        discount: The discount :math:`\gamma`, that of who learns in it; with 1 the worst reward
-            goes on for an episode.
         worst_reward: The worst reward seen elsewhere, such as in real episodes.
 
     Attributes:
@@ -86,7 +85,6 @@ class ModelVecEnv(VecEnv):
         action_space: spaces.Box,
         *,
         sampling: Sampling = "step",
-        discount: float = 0.99,
         worst_reward: float = np.inf,
     ) -> None:
         spec = task.dynamics.spec
@@ -103,13 +101,10 @@ class ModelVecEnv(VecEnv):
                 raise ValueError(f"A ModelVecEnv needs a task with {name}; found None.")
         if sampling not in get_args(Sampling):
             raise ValueError(f"Unknown sampling {sampling!r}; use 'step' or 'trajectory'.")
-        if not 0 <= discount <= 1:
-            raise ValueError(f"discount must lie in [0, 1]; found {discount}.")
         self.render_mode = None
         super().__init__(num_envs, observation_space, action_space)
         self.task = task
         self.sampling = sampling
-        self.discount = discount
         self.worst_reward = worst_reward
         self.num_left_bounds = 0
         self._states = torch.empty(num_envs, spec.state_dim, dtype=torch.float64)
@@ -159,7 +154,7 @@ class ModelVecEnv(VecEnv):
         self._states = step.next_states
         self._steps += 1
         self.num_left_bounds += int(step.left_bounds.sum())
-        truncated = (self._steps >= self.episode_length) & ~step.terminated
+        truncated = ((self._steps >= self.episode_length) | step.left_bounds) & ~step.terminated
         return ModelStep(
             self._observe(self._states),
             step.rewards.numpy().astype(np.float32),
@@ -189,9 +184,12 @@ class ModelVecEnv(VecEnv):
             obs = torch.from_numpy(buffer.observations[rows, 0].astype(np.float64))
             scaled = buffer.actions[rows, 0].astype(np.float64)
             actions = torch.from_numpy(low + (scaled + 1) / 2 * (high - low))
-            step = self._step(self.task.dynamics.spec.decode(obs), actions)
+            states = self.task.dynamics.spec.decode(obs)
+            self.task = self.task.widened(states)
+            step = self._step(states, actions)
             terminated = step.terminated.numpy()
-            timeouts = buffer.timeouts[rows, 0].astype(bool) & ~terminated
+            limits = buffer.timeouts[rows, 0].astype(bool) | step.left_bounds.numpy()
+            timeouts = limits & ~terminated
             buffer.next_observations[rows, 0] = self._observe(step.next_states)
             buffer.rewards[rows, 0] = step.rewards.numpy()
             buffer.dones[rows, 0] = terminated | timeouts
@@ -200,13 +198,14 @@ class ModelVecEnv(VecEnv):
     def _step(self, states: Tensor, actions: Tensor) -> Step:
         """A step of the task, in which leaving the bounds is the worst that can be."""
         step = self.task.step(states, actions, self._move)
-        left = step.left_bounds
         self.worst_reward = min(self.worst_reward, float(step.rewards.min()))
-        if not left.any():
+        if not step.left_bounds.any():
             return step
-        lasting = 1 / (1 - self.discount) if self.discount < 1 else self.episode_length
-        rewards = step.rewards.double().masked_fill(left, self.worst_reward * lasting)
-        return step._replace(rewards=rewards, terminated=step.terminated | left)
+        rewards = step.rewards.double().masked_fill(step.left_bounds, self.worst_reward)
+        terminated = (
+            step.terminated | step.left_bounds if self.worst_reward >= 0 else step.terminated
+        )
+        return step._replace(rewards=rewards, terminated=terminated)
 
     def _draw_functions(self) -> None:
         if self.sampling == "trajectory":
@@ -220,7 +219,11 @@ class ModelVecEnv(VecEnv):
         n, k = len(states), self.num_envs
         filled = torch.arange(-(-n // k) * k).clamp_max(n - 1)
         blocks = (rows[filled].reshape(k, -1, rows.shape[-1]) for rows in (states, actions))
-        return functions(*blocks).flatten(0, 1)[:n]
+        try:
+            return functions(*blocks).flatten(0, 1)[:n]
+        except PhysicsError as error:
+            error.rows = tuple(sorted({min(row, n - 1) for row in error.rows}))
+            raise
 
     def close(self) -> None:
         """Nothing to close."""
@@ -259,14 +262,7 @@ class ModelVecEnv(VecEnv):
 
     def _draw_initial(self, n: int) -> Tensor:
         states = self.task.draw_initial_states(n)
-        bounds = self.task.state_bounds
-        if bounds is not None and ((states < bounds[0]) | (states > bounds[1])).any():
-            low, high = bounds
-            room = torch.where((high - low).isfinite(), (high - low) / 2, 0.0)
-            wider = ((states < low) | (states > high)).any(0)
-            low = torch.where(wider, torch.minimum(low, states.amin(0) - room), low)
-            high = torch.where(wider, torch.maximum(high, states.amax(0) + room), high)
-            self.task = replace(self.task, state_bounds=torch.stack([low, high]))
+        self.task = self.task.widened(states)
         return states
 
     def _observe(self, states: Tensor) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import get_args
 
 from gpadjust.control import CrossEntropyPlanner
@@ -74,7 +75,7 @@ class DynaOptions:
             value = getattr(self, name)
             if value is None and name in optional:
                 continue
-            if not isinstance(value, int) or isinstance(value, bool):
+            if not isinstance(value, Integral) or isinstance(value, bool):
                 raise TypeError(f"{name} must be a whole number; found {value!r}.")
             if value < least:
                 raise ValueError(f"{name} must be at least {least}; found {value}.")
@@ -82,9 +83,9 @@ class DynaOptions:
             value = getattr(self, name)
             if value is None and name == "reward_tolerance":
                 continue
-            if not isinstance(value, (int, float)) or isinstance(value, bool):
+            if not isinstance(value, Real) or isinstance(value, bool):
                 raise TypeError(f"{name} must be a number; found {value!r}.")
-            if not 0 <= value <= most or math.isinf(value):
+            if not 0 <= float(value) <= most or math.isinf(value):
                 bounds = "finite and at least 0" if most == math.inf else f"in [0, {most}]"
                 raise ValueError(f"{name} must be {bounds}; found {value}.")
         for name in ("keep_model_data", "refresh_model_data"):

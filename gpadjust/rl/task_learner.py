@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Self
 
@@ -28,7 +29,7 @@ from gpadjust.rl.model_vec_env import check_spaces
 from gpadjust.rl.random_state import RandomState
 from gpadjust.rl.recorded_episodes import RecordedEpisodes
 
-_NOT_SAVED = ("task", "_random_state", "_unread_dynamics")
+_NOT_SAVED = ("task", "held", "_random_state", "_unread_dynamics", "_is_learning")
 
 
 class TaskLearner(OffPolicyAlgorithm):
@@ -45,6 +46,7 @@ class TaskLearner(OffPolicyAlgorithm):
     Attributes:
         task: The task; to change a part of it, set another one.
         wall_time: Seconds spent on each part of the work.
+        held: While it learns, what is closed in the end, such as locks of callbacks.
         notes: What you want to keep with the agent, in plain values; saved and resumed with it.
     """
 
@@ -59,6 +61,8 @@ class TaskLearner(OffPolicyAlgorithm):
         self._known = _known(task)
         self._num_stored = 0  # of the time steps, how many came into the buffer
         self._random_state: RandomState | None = None
+        self._is_learning = False
+        self.held = ExitStack()
         self._unread_dynamics: dict[str, Any] = {}  # of an agent that was loaded without a task
         if kwargs.get("_init_setup_model", True):
             self.ready_task()
@@ -178,38 +182,56 @@ class TaskLearner(OffPolicyAlgorithm):
                 f"a number of steps as train_freq, such as ({self.episode_length()}, 'step')."
             )
         self.episode_length()
+        if self.replay_buffer.buffer_size < self.episode_length():
+            raise ValueError(
+                f"buffer_size must hold an episode of {self.episode_length()} steps, for the "
+                "dynamics to learn it; found room for "
+                f"{self.replay_buffer.buffer_size} of each environment."
+            )
         if self._num_stored != self.num_timesteps:
             # A callback stopped the last call at a step that SB3 made, but did not store.
             self._last_obs = None
         if reset_num_timesteps or self._last_obs is None:
             self.environments_reset()  # SB3 ends the episodes under way
+        if self._unread_dynamics:
+            task.dynamics.load_state_dict(self._unread_dynamics)
+            self._unread_dynamics = {}
+        noise = deepcopy(self.action_noise)  # which SB3 resets
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         self._num_stored = self.num_timesteps
-        random_state = self._random_state or RandomState.capture()
+        before = RandomState.capture()
+        states = self.last_states()
+        # Of a single state much would look right that is not.
+        twice = torch.cat([states, states])
+        task.rehearse(twice, self._middle_action().expand(len(twice), -1))
+        before.restore()
+        if self._random_state is not None:  # a run that goes on
+            self._random_state.restore()
+            self.action_noise = noise
         self._random_state = None
-        task.rehearse(self.last_states(), self._middle_actions())
-        random_state.restore()
+        self._is_learning = True
         return result
 
     def learn(self, *args: Any, **kwargs: Any) -> Self:
         """As in SB3; after an error the next call resets the environments, wherever they are."""
-        try:
-            return super().learn(*args, **kwargs)
-        except BaseException:
-            self._last_obs = None
-            raise
+        self._is_learning = False
+        with ExitStack() as self.held:
+            try:
+                return super().learn(*args, **kwargs)
+            except BaseException:
+                if self._is_learning:
+                    self._last_obs = None
+                raise
 
     def environments_reset(self) -> None:
         """Called before all environments are reset, wherever they are."""
         self.replay_buffer.end_episodes(np.ones(self.n_envs, dtype=bool))
 
-    def _middle_actions(self) -> Tensor:
-        """An action for each environment, in the middle of the action space."""
-        low, high = self.action_space.low, self.action_space.high
-        middle = np.where(np.isfinite(low + high), (low + high) / 2, 0.0)
-        return torch.from_numpy(middle).double().expand(self.n_envs, -1)
+    def _middle_action(self) -> Tensor:
+        """An action in the middle of the action space."""
+        return torch.from_numpy((self.action_space.low + self.action_space.high) / 2).double()
 
     # Saving
 
@@ -243,7 +265,7 @@ class TaskLearner(OffPolicyAlgorithm):
         state = _on_cpu(parameters.pop("dynamics", None))
         if state is None or self.task is None:
             super().set_parameters(parameters, exact_match, device)
-            self._unread_dynamics = state or {}
+            self._unread_dynamics = self._unread_dynamics if state is None else state
             return
         before = self.task.dynamics.state_dict()
         self.task.dynamics.load_state_dict(state)

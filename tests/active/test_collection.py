@@ -312,3 +312,16 @@ def test_a_log_cut_at_any_byte_has_lost_nothing_before(make, tmp_path):
         with make(log=cut) as collection:
             assert torch.equal(collection.X, whole.X[:n])
             assert torch.equal(collection.Y, whole.Y[:n]) or not n
+
+
+def test_pending_points_of_the_acquisition_functions_own_count_too(make):
+    own, made = torch.tensor([[0.3, 0.4]], dtype=torch.float64), []
+
+    def acquisition(model):
+        made.append(qAdjustmentInformationGain(model, X_pending=own))
+        return made[-1]
+
+    collection = filled(make(acquisition=acquisition))
+    first = collection.ask(1)
+    collection.ask(1)
+    assert torch.equal(made[-1].X_pending, torch.cat([own, first]))

@@ -204,9 +204,9 @@ def test_a_known_sequence_is_kept_if_nothing_is_better(known_left, origin):
 
 
 def test_a_state_from_which_every_step_leaves_the_bounds(known_left, origin):
-    bounds = torch.tensor([[5.0], [6.0]], dtype=torch.float64)
+    bounds = torch.tensor([[-0.1], [0.1]], dtype=torch.float64)
     plan = CrossEntropyPlanner(Information(), num_random=4).plan(
-        task_of(known_left, state_bounds=bounds), origin, BOUNDS, 3
+        task_of(known_left, state_bounds=bounds), origin, 10 + BOUNDS, 3
     )
     assert plan.value == 0
 
@@ -251,6 +251,39 @@ def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
         options.plan(task_of(known_left), origin, BOUNDS)
 
 
+def test_bounds_give_way_to_where_an_episode_is(origin):
+    task = half_steps(state_bounds=torch.tensor([[5.0], [6.0]]))
+    steps = Rollouts(task, 1).follow(origin, torch.zeros(1, 3, 1).double())
+    assert steps.made.all()
+
+
+def test_the_best_sequence_of_all_rounds_is_kept():
+    bounds = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    first = 2 * torch.rand(16, 4, 1, dtype=torch.float64) - 1
+    first[3] = 0.7  # as good as can be, and never drawn again
+    found, score = cross_entropy(
+        lambda sequences: -(sequences - 0.7).square().sum((1, 2)), first, bounds, 3, 4
+    )
+    assert score == 0
+    assert torch.equal(found, first[3])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_staying_is_better_than_leaving_however_few_the_sequences(origin, seed):
+    """The first ones may all leave at once, so that there is nothing to compare them with."""
+    torch.manual_seed(seed)
+    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+    task = Task(
+        dynamics,
+        lambda s, a, n: -10 - n[:, 0].abs(),
+        state_bounds=torch.tensor([[-0.2], [0.2]]),
+    )
+    bounds = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    planner = CrossEntropyPlanner(Return(), num_random=2, num_policy=1, rounds=3)
+    known = torch.zeros(3, 1, dtype=torch.float64)
+    assert planner.plan(task, origin, bounds, 3, known=known).value >= -30.6
+
+
 def test_an_objective_is_asked_for():
     with pytest.raises(TypeError, match=r"Information\(\) or Return\(\); found 'return'"):
         CrossEntropyPlanner("return")
@@ -273,7 +306,7 @@ def test_a_return_is_the_sum_of_the_rewards_that_are_made(origin):
     for parts, expected in [
         ({}, [-0.5 - 0.5 - 0.5, -1.0 - 1.5 - 1.0]),
         ({"terminated": lambda states: states[:, 0] > 1.2}, [-0.5 - 0.5, -1.0 - 1.5 - 1.0]),
-        ({"state_bounds": torch.tensor([[-9.0], [1.2]])}, [-0.5 - 2 * 1.5, -1.0 - 1.5 - 1.0]),
+        ({"state_bounds": torch.tensor([[-9.0], [1.2]])}, [-0.5 - 2 * 1.5e6, -1.0 - 1.5 - 1.0]),
     ]:
         task = half_steps(**parts)
         score = Return().of(task)(Rollouts(task, 2).follow(origin, sequences), None)

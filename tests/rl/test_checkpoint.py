@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
@@ -139,7 +140,7 @@ def test_steps_in_the_middle_of_episodes(point_agent, point_task, point_env, ass
 def test_checkpoints_come_every_so_many_episodes(point_agent, tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(
-        "gpadjust.rl.checkpoint.save_checkpoint", lambda agent, _: saved.append(agent.num_timesteps)
+        "gpadjust.rl.checkpoint._write", lambda agent, _: saved.append(agent.num_timesteps)
     )
     point_agent().learn(25, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
     assert saved == [0, 10, 20, 25]
@@ -414,12 +415,61 @@ def test_two_processes_do_not_write_one_file(point_agent, tmp_path):
             lambda: agent.learn(5, EpisodeCheckpoint(path)),
             lambda: save_checkpoint(agent, path),
         ):
-            with pytest.raises(RuntimeError, match=r"Another process writes .*run.ckpt"):
+            with pytest.raises(RuntimeError, match=r"Another run writes .*run.ckpt"):
                 write()
         assert agent.num_timesteps == 0
         other.kill()  # which releases it
     agent.learn(5, EpisodeCheckpoint(path))
     assert path.exists()
+
+
+def test_a_lock_is_released_after_an_error_and_held_by_one_run(point_agent, tmp_path):
+    path = tmp_path / "run.ckpt"
+    checkpoint = EpisodeCheckpoint(path)
+    with pytest.raises(PowerCut):
+        point_agent().learn(10, [checkpoint, CutAt(3)])
+    lock = FileLock(f"{path}.lock")
+    lock.acquire(blocking=False)
+    lock.release()
+    agent, other = point_agent(), point_agent(seed=1)
+
+    class WritesToo(BaseCallback):
+        def _on_step(self):
+            with pytest.raises(RuntimeError, match="Another run writes"):
+                save_checkpoint(other, path)
+            return True
+
+    agent.learn(5, [checkpoint, WritesToo()])
+    lock.acquire(blocking=False)
+    lock.release()
+
+
+def test_a_refused_call_does_not_spend_the_generators(
+    point_agent, point_env, point_task, assert_same, tmp_path
+):
+    path = tmp_path / "run.ckpt"
+    whole = point_agent().learn(TOTAL)
+    with pytest.raises(PowerCut):
+        point_agent().learn(TOTAL, [EpisodeCheckpoint(path), CutAt(13)])
+    agent = resume(path, point_env(), point_task())
+    with FileLock(f"{path}.lock"), pytest.raises(RuntimeError, match="Another run writes"):
+        go_on(agent, EpisodeCheckpoint(path))
+    scramble()
+    assert_same(whole, go_on(agent, EpisodeCheckpoint(path)))
+
+
+def test_wrappers_of_a_robot_keep_their_statistics(point_agent, point_env, point_task, tmp_path):
+    def robot():
+        env = point_env()
+        env.unwrapped.lock = threading.Lock()
+        return VecNormalize(DummyVecEnv([lambda: env]))
+
+    path = tmp_path / "run.ckpt"
+    agent = point_agent(robot()).learn(10)
+    with pytest.warns(UserWarning, match="cannot be saved"):
+        save_checkpoint(agent, path)
+    again = resume(path, robot(), point_task())
+    assert again.get_vec_normalize_env().obs_rms.count == agent.env.obs_rms.count
 
 
 def test_notes_are_kept_with_the_agent(point_agent, point_env, point_task, tmp_path):
@@ -432,13 +482,16 @@ def test_notes_are_kept_with_the_agent(point_agent, point_env, point_task, tmp_p
 def test_td3_goes_on(point_agent, point_env, point_task, assert_same, tmp_path):
     def agent():
         noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
-        return point_agent(algorithm=DynaTD3, action_noise=noise)
+        return point_agent(algorithm=DynaTD3, action_noise=noise, train_freq=(3, "step"))
 
-    path, whole = tmp_path / "run.ckpt", agent().learn(TOTAL)
+    path, whole = tmp_path / "run.ckpt", agent().learn(TOTAL + 1)
     with pytest.raises(PowerCut):
-        agent().learn(TOTAL, [EpisodeCheckpoint(path), CutAt(13)])
+        agent().learn(TOTAL + 1, [EpisodeCheckpoint(path), CutAt(14)])
     scramble()
-    assert_same(whole, go_on(resume(path, point_env(), point_task(), DynaTD3)))
+    second = resume(path, point_env(), point_task(), DynaTD3)
+    assert second.num_timesteps % 5  # within an episode
+    second.learn(TOTAL + 1 - second.num_timesteps, reset_num_timesteps=False)
+    assert_same(whole, second)
 
 
 def test_another_number_of_environments_is_refused(point_agent, point_env, point_task, tmp_path):

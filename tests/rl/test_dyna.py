@@ -197,11 +197,10 @@ def test_states_beyond_the_bounds_are_not_followed(point_agent):
     assert 0 < n < 2 * 2 * 5
     following = rows.next_observations[:n]
     assert ((following > 0.9) & (following < 1.1)).all()
-    left = (rows.dones * (1 - rows.timeouts))[:n, 0].astype(bool)
-    assert left.any()
-    worst = min(agent.replay_buffer.rewards[:10].min(), rows.rewards[:n, 0][~left].min(initial=0))
-    assert rows.rewards[:n, 0][left].max() <= worst  # for one step; they are for many
-    assert rows.rewards[:n, 0][left].min() < 50 * worst
+    stayed = (following == rows.observations[:n]).all(-1)[:, 0]
+    assert stayed.any()
+    assert rows.timeouts[:n, 0][stayed].all()
+    assert rows.rewards[:n, 0][stayed].max() <= rows.rewards[:n, 0][~stayed].min(initial=0)
 
 
 def test_model_episodes_that_teach_nothing_are_warned_of(point_agent):
@@ -565,6 +564,17 @@ def test_parameters_without_dynamics_are_refused_unless_told(saved, point_agent,
     assert not other.task.dynamics.is_fitted
 
 
+def test_a_task_that_is_given_after_loading_knows_what_was_learnt(saved, point_env, point_task):
+    agent, path = saved
+    loaded = DynaSAC.load(path, env=point_env())
+    known = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
+    loaded.set_parameters(known, exact_match=False)
+    spec = agent.task.dynamics.spec
+    loaded.task = point_task(dynamics=LearnedDynamics(spec, agent.task.dynamics.physics))
+    loaded.learn(5, reset_num_timesteps=False)
+    assert loaded.task.dynamics.num_transitions == 15
+
+
 def test_parameters_are_taken_as_a_whole(saved, point_agent, learnt_dynamics, tensors_of):
     agent, _ = saved
     broken = agent.get_parameters()
@@ -630,6 +640,35 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(
         dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
     )
     assert agent.num_episodes == 3
+
+
+def test_other_dynamics_learn_all_that_there_is(point_agent, point_task, learnt_dynamics):
+    agent = point_agent(dynamics=learnt_dynamics()).learn(10)
+    other = learnt_dynamics()
+    agent.task = point_task(dynamics=other)
+    agent.learn(5, reset_num_timesteps=False)
+    assert other.num_transitions == 15
+
+
+def test_transitions_at_which_the_physics_fails_are_left_out(point_agent, point_dynamics):
+    def physics(X):
+        bad = (X[:, 0] < 0.4).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError("not below .4", bad)
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    dynamics = LearnedDynamics(point_dynamics.spec, physics)
+    agent = point_agent(dynamics=dynamics)
+    with pytest.warns(UserWarning, match=r"fails at \d of \d new transitions"):
+        agent.learn(20)
+    states = agent.recorded_episodes().states
+    assert agent.num_episodes == 4
+    assert dynamics.num_transitions == int((states >= 0.4).sum()) < 20
+
+
+def test_a_buffer_that_holds_no_episode_is_refused(point_agent):
+    with pytest.raises(ValueError, match="buffer_size must hold an episode of 5 steps"):
+        point_agent(buffer_size=3).learn(5)
 
 
 class Falls(gymnasium.Wrapper):
@@ -725,9 +764,9 @@ class Counts(gymnasium.Wrapper):
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(1\) must return .* 1 x 1"),
+        ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
         ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
-        ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(1,\)"),
+        ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
         ({"terminated": lambda s: s}, r"terminated must return one value per row"),
         (
             {"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)},

@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.vec_env import VecMonitor
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
@@ -108,26 +108,30 @@ def test_soft_actor_critic_learns_in_it(point_particles):
     assert np.isfinite([info["r"] for info in agent.ep_info_buffer]).all()
 
 
+LEARNERS = {
+    "SAC": partial(SAC, learning_starts=64, train_freq=8, gradient_steps=8, learning_rate=3e-3),
+    "PPO": partial(PPO, n_steps=64, batch_size=64, learning_rate=3e-3),
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "learner",
-    [
-        partial(SAC, learning_starts=64, train_freq=8, gradient_steps=8, learning_rate=3e-3),
-        partial(PPO, n_steps=64, batch_size=64, learning_rate=3e-3),
-    ],
-    ids=["SAC", "PPO"],
-)
-def test_leaving_the_bounds_is_not_learnt(point_particles, learner):
-    """Rewards are below zero, so that an episode that ended early would have the best return."""
+@pytest.mark.parametrize("learner", [*LEARNERS])
+@pytest.mark.parametrize("task", ["costs", "normalised costs", "survival"])
+def test_leaving_the_bounds_is_not_learnt(point_particles, learner, task):
+    """Neither where it would end costs, nor where it would end the danger of an early end."""
+    survival = task == "survival"
     env = point_particles(
         num_envs=8,
-        reward=lambda states, actions, following: -1 - following[:, 0].square(),
+        reward=(lambda s, a, n: 1 + 0 * n[:, 0])
+        if survival
+        else (lambda s, a, n: -1 - n[:, 0].square()),
+        terminated=(lambda states: states[:, 0] < -0.5) if survival else None,
         initial_states=lambda n: 1 + torch.rand(n, 1),
         episode_length=10,
         state_bounds=torch.tensor([[-2.5], [2.5]]),
-        discount=0.95,
     )
-    agent = learner("MlpPolicy", env, gamma=0.95, policy_kwargs={"net_arch": [32]}, seed=0)
+    seen = VecNormalize(env, norm_obs=False) if task == "normalised costs" else env
+    agent = LEARNERS[learner]("MlpPolicy", seen, policy_kwargs={"net_arch": [32]}, seed=0)
     agent.learn(8_000)
     assert env.num_left_bounds > 0
     env.num_left_bounds = 0
@@ -136,7 +140,8 @@ def test_leaving_the_bounds_is_not_learnt(point_particles, learner):
         obs, rewards, _, _ = env.step(agent.predict(obs, deterministic=True)[0])
         total += rewards.mean()
     assert env.num_left_bounds == 0
-    assert total > -14  # to stay at zero is worth 10; to stay where it starts 33
+    # To stay at zero is worth -10, to stay where it starts -33; to survive 10.
+    assert total > (9 if survival else -14)
 
 
 def test_seed_repeats_what_particles_meet(point_particles, rise):
@@ -177,7 +182,7 @@ def test_independent_particles_do_not(point_particles, unsure_dynamics, rise):
     assert (first != second).all()
 
 
-def test_termination_ends_a_episode(point_particles, rise):
+def test_termination_ends_an_episode(point_particles, rise):
     particles = point_particles(num_envs=2, terminated=lambda states: states[:, 0] > 1.7)
     particles.reset()
     _, _, dones, _ = particles.step(rise(2))
@@ -209,24 +214,20 @@ def test_each_particle_has_its_own_clock(point_particles, rise):
 
 
 def test_particles_that_leave_the_bounds_end_and_are_counted(point_particles, rise):
-    particles = point_particles(
-        num_envs=2, discount=0.9, state_bounds=torch.tensor([[-5.0], [1.3]])
-    )
+    particles = point_particles(num_envs=2, state_bounds=torch.tensor([[-5.0], [1.3]]))
     particles.reset()
     obs, rewards, dones, infos = particles.step(np.array([[1.0], [0.1]], dtype=np.float32))
     assert dones.tolist() == [True, False]
     assert infos[0]["left_bounds"]
-    assert not infos[0]["TimeLimit.truncated"]
+    assert infos[0]["TimeLimit.truncated"]
     assert infos[0]["terminal_observation"].tolist() == [1.0]
-    assert rewards.tolist() == pytest.approx([-(1.05**2) / (1 - 0.9), -(1.05**2)])
+    assert rewards.tolist() == pytest.approx([-(1.05**2)] * 2)
     assert obs[:, 0].tolist() == pytest.approx([1.0, 1.05])
     assert particles.num_left_bounds == 1
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_particles_that_leave_the_numbers_are_truncated(
-    point_particles, point_dynamics, value, rise
-):
+def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics, value, rise):
     def broken(states, actions):
         following = states + actions
         following[1] = value
@@ -244,9 +245,7 @@ def test_particles_that_leave_the_numbers_are_truncated(
 
 
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
-def test_particles_at_which_the_physics_fails_are_truncated(
-    point_particles, unsure_dynamics, sampling, rise
-):
+def test_particles_at_which_the_physics_fails_end(point_particles, unsure_dynamics, sampling, rise):
     def choosy(X):
         if (X[:, 1] > 1.5).any():
             rows = (X[:, 1] > 1.5).nonzero().flatten().tolist()
@@ -264,6 +263,40 @@ def test_particles_at_which_the_physics_fails_are_truncated(
     _, _, dones, infos = env.step(np.full((3, 1), 2.0, dtype=np.float32))
     assert dones.all()
     assert all(info["left_bounds"] for info in infos)
+
+
+def test_where_all_rewards_are_positive_leaving_terminates(point_particles, rise):
+    particles = point_particles(
+        reward=lambda s, a, n: 2 + n[:, 0], state_bounds=torch.tensor([[-1.0], [1.3]])
+    )
+    particles.reset()
+    _, rewards, dones, infos = particles.step(rise(3) * np.array([[1], [0.1], [-2]]))
+    assert dones.tolist() == [True, False, False]
+    assert not infos[0]["TimeLimit.truncated"]
+    assert rewards[0] == rewards[2] == 2.0
+
+
+@pytest.mark.parametrize("failing", [0, 3, 6])
+def test_functions_whose_physics_fails_at_any_row(point_particles, unsure_dynamics, failing):
+    """Rows are filled up to blocks of one size, which the physics may blame."""
+
+    def choosy(X):
+        bad = (X[:, 1] > 1.5).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError("too fast", bad)
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    dynamics = PhysicsDynamics(unsure_dynamics.spec, choosy)
+    env = point_particles(dynamics=dynamics, sampling="trajectory", num_envs=3)
+    env.reset()
+    space = spaces.Box(-2, 2, (1,))
+    buffer = CompactReplayBuffer(20, spaces.Box(-np.inf, np.inf, (1,)), space, "cpu")
+    scaled = np.where(np.arange(7) == failing, 1.0, 0.1)[:, None]
+    zeros = np.zeros(7, dtype=np.float32)
+    buffer.add_rows(np.ones((7, 1)), np.ones((7, 1)), scaled, zeros, zeros, zeros)
+    env.refresh(buffer)
+    left = buffer.dones[:7, 0].astype(bool)
+    assert left.nonzero()[0].tolist() == [failing]
 
 
 def test_bounds_give_way_to_the_starts(point_particles, rise):
@@ -312,11 +345,11 @@ def test_rewards_may_carry_gradients(point_particles, rise):
 def test_attributes_are_those_of_all_particles(point_particles):
     particles = point_particles()
     assert particles.get_attr("episode_length", indices=[0, 2]) == [5, 5]
-    particles.set_attr("discount", 0.5)
-    assert particles.get_attr("discount") == [0.5, 0.5, 0.5]
+    particles.set_attr("worst_reward", 0.5)
+    assert particles.get_attr("worst_reward") == [0.5, 0.5, 0.5]
     assert particles.env_is_wrapped(VecMonitor) == [False] * 3
     with pytest.raises(ValueError, match="all at once"):
-        particles.set_attr("discount", 0.5, indices=0)
+        particles.set_attr("worst_reward", 0.5, indices=0)
     with pytest.raises(NotImplementedError, match="fly"):
         particles.env_method("fly")
 
@@ -361,7 +394,6 @@ def test_bad_starts_are_refused(point_particles):
         ({"num_envs": 0}, "num_envs must be at least 1; found 0"),
         ({"episode_length": 0}, "episode_length must be at least 1; found 0"),
         ({"sampling": "swarm"}, "Unknown sampling 'swarm'"),
-        ({"discount": 1.5}, r"discount must lie in \[0, 1\]; found 1.5"),
         ({"initial_states": None}, "needs a task with initial_states"),
     ],
 )
