@@ -14,8 +14,8 @@ def check_exogenous(name: str, change: Tensor, rounding: Tensor) -> None:
     if len(moved):
         row = int(moved[0])
         raise ValueError(
-            f"State {name!r} is said to be exogenous, which stays as it is during an episode, but it "
-            f"changes by {float(change[row]):.3g} in row {row}. Take it out of `exogenous`, so "
+            f"State {name!r} is said to be exogenous, which stays as it is during an episode, but "
+            f"it changes by {float(change[row]):.3g} in row {row}. Take it out of `exogenous`, so "
             "that the model predicts it, or leave out transitions from one episode into the next."
         )
 
