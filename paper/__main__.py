@@ -6,6 +6,7 @@ Each says its options: `python -m paper forrester --help`.
 from __future__ import annotations
 
 import sys
+import warnings
 from importlib import import_module
 
 EXPERIMENTS = {
@@ -44,6 +45,8 @@ def _run(name: str, arguments: list[str]) -> None:
     config = [tyro.conf.FlagCreatePairsOff, *([tyro.conf.OmitArgPrefixes] if kind.flat else [])]
     experiment = tyro.cli(kind, prog=f"python -m paper {name}", args=arguments, config=config)
     runner = import_module("paper.common.runner")
+    # joblib's word on an interruption, of which the user knows.
+    warnings.filterwarnings("ignore", ".*still being processed by the workers.*")
     try:
         runner.main(experiment)
     except runner.Refused as error:

@@ -1,6 +1,8 @@
 """Curves, statistics, verdicts and tables."""
 
+import json
 import math
+from importlib import import_module
 
 import numpy as np
 import pandas as pd
@@ -10,6 +12,7 @@ from scipy import stats
 from paper.__main__ import EXPERIMENTS
 from paper.common.claims import Claim, Judged, all_of, judge, met, reproduced, within
 from paper.common.curves import Curves
+from paper.common.runner import differences, runs_file, tables_of
 from paper.common.statistics import Difference, interquartile_mean
 from paper.common.tables import (
     aligned,
@@ -138,16 +141,27 @@ def test_readmes_show_the_committed_results(path):
     assert filled(text, results(PAPER / "results")) == text
 
 
+def committed(name):
+    """An experiment, and its runs that are committed."""
+    kind = getattr(import_module(f"paper.{name}"), EXPERIMENTS[name][0])
+    experiment = kind(out=PAPER / "results" / name)
+    return experiment, runs_file(experiment).read()
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_committed_runs_have_the_settings_of_today(name):
+    """If this fails, a default has changed: run them again, or say in a setting what it was."""
+    experiment, runs = committed(name)
+    today = {kind: experiment.describe(*kind) for kind in {task[:-1] for task in runs}}
+    for task, record in runs.items():
+        expected = json.loads(json.dumps(today[task[:-1]]))
+        assert not differences(record["settings"], expected), task
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_tables_are_those_of_the_committed_runs(name):
-    from importlib import import_module
-
-    from paper.common.runner import runs_file, tables_of
-
-    kind = getattr(import_module(f"paper.{name}"), EXPERIMENTS[name][0])
-    experiment = kind(out=PAPER / "results" / name)
-    records = list(runs_file(experiment).read().values())
-    committed = results(PAPER / "results")
-    for marker, table in tables_of(experiment, records).items():
-        assert committed[marker] == table.text
+    experiment, runs = committed(name)
+    shown = results(PAPER / "results")
+    for marker, table in tables_of(experiment, list(runs.values())).items():
+        assert shown[marker] == table.text
