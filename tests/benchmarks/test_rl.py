@@ -1,39 +1,41 @@
 """What the model costs beside the updates that it makes possible."""
 
+from dataclasses import replace
+
 import gymnasium
 import pytest
 
-from gpadjust.dynamics import CKADynamics
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics
 from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-from gpadjust.rl import DynaSAC
+from gpadjust.rl import DynaOptions, DynaSAC
 
 
 @pytest.fixture
 def agent():
-    """Of the cart-pole; 20 model trials after each real one, as in the paper."""
+    """Of the cart-pole; 20 model episodes after each real one, as in the paper."""
     return DynaSAC(
         "MlpPolicy",
         gymnasium.make("gpadjust/CartPoleSwingUp-v0"),
-        CKADynamics(CART_POLE_SPEC, random_cart_pole_physics(0)),
-        cart_pole_reward,
-        num_particles=5,
+        Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward),
+        DynaOptions(num_particles=5, updates_per_model_step=0),
         policy_kwargs={"net_arch": [128, 128]},
         seed=0,
         device="cpu",
     )
 
 
-@pytest.mark.parametrize("trial", [2, 25])
+@pytest.mark.parametrize("episode", [2, 25])
 @pytest.mark.parametrize("updates", [1, 2])
-def test_model_beside_updates(benchmark, agent, trial, updates):
+def test_model_beside_updates(benchmark, agent, episode, updates):
     benchmark.group = "Dyna-CKA on the cart-pole"
-    agent.model_updates = 0  # until then, model trials alone
-    agent.learn(25 * (trial - 1))
-    agent.model_updates = updates
+    agent.learn(25 * (episode - 1))  # model episodes alone
+    agent.options = replace(agent.options, updates_per_model_step=updates)
     before = agent.wall_time.copy()
     benchmark.pedantic(agent.learn, args=(25,), kwargs={"reset_num_timesteps": False}, rounds=1)
-    fit, rollout, sac = (agent.wall_time[part] - before[part] for part in before)
-    name = f"(fit + rollout) / updates, trial {trial}, {updates} a model step"
-    benchmark.extra_info[name] = round((fit + rollout) / sac, 3)
+    parts = ("fit", "rollout", "update")
+    fit, rollout, update = (agent.wall_time[part] - before[part] for part in parts)
+    name = f"(fit + rollout) / updates, episode {episode}, {updates} a model step"
+    benchmark.extra_info[name] = round((fit + rollout) / update, 3)
     print(f"{name}: {benchmark.extra_info[name]} (fit {fit:.2f} s, rollout {rollout:.2f} s)")
-    assert fit + rollout <= sac
+    assert fit + rollout <= update
