@@ -8,7 +8,12 @@ import shutil
 import pytest
 import torch
 
-from gpadjust.active import Collection, LogError, MeasurementWarning
+from gpadjust.active import (
+    Collection,
+    LogError,
+    MeasurementWarning,
+    qAdjustmentInformationGain,
+)
 
 
 def truth(X):

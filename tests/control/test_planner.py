@@ -206,7 +206,7 @@ def test_a_known_sequence_is_kept_if_nothing_is_better(known_left, origin):
 def test_a_state_from_which_every_step_leaves_the_bounds(known_left, origin):
     bounds = torch.tensor([[-0.1], [0.1]], dtype=torch.float64)
     plan = CrossEntropyPlanner(Information(), num_random=4).plan(
-        task_of(known_left, state_bounds=bounds), origin, 10 + BOUNDS, 3
+        task_of(known_left, state_bounds=bounds), origin, BOUNDS.new_tensor([[-1.0], [-0.5]]), 3
     )
     assert plan.value == 0
 
