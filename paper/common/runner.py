@@ -47,6 +47,10 @@ def main(experiment: Experiment) -> None:
         raise Refused(f"--runs: expected at least 2 (for a spread), got {experiment.runs}")
     if experiment.jobs < 1:
         raise Refused(f"--jobs: expected at least 1 process, got {experiment.jobs}")
+    if experiment.key[-1] != "seed":
+        raise Refused(
+            f"{experiment.name}: the last part of key must be 'seed', got {experiment.key}"
+        )
     file = runs_file(experiment)
     if not experiment.only_tables:
         try:
@@ -88,13 +92,13 @@ def run_missing(experiment: Experiment) -> None:
         if task[:-1] in kinds:
             check_settings(file.path, task, record["settings"], _described(experiment, task[:-1]))
     made_by = versions(experiment.packages)
-    others = {task for task, record in done.items() if differences(record["versions"], made_by)}
+    others = {task for task, record in done.items() if _by_others(record, made_by)}
     missing = [task for task in tasks if task not in done]
     if others and experiment.other_versions == "replace":
         missing = [task for task in tasks if task not in done or task in others]
     elif others and missing and experiment.other_versions == "refuse":
         task = next(iter(others))
-        differ = differences(done[task]["versions"], made_by)
+        differ = _by_others(done[task], made_by)
         raise Refused(
             f"{file.path} has runs of other versions: {differ}. Pass --other-versions keep to add "
             "to them, --other-versions replace to run them again, or another --out."
@@ -122,13 +126,19 @@ def run_one(experiment: Experiment, task: Task) -> Task:
     lock = FileLock(f"{unfinished}.lock")
     with lock:  # a worker may outlive a call that was killed
         before = file.read().get(task)
-        if before is None or differences(before["versions"], made_by):
+        if before is None or _by_others(before, made_by):
             found = experiment.run(*task, unfinished=unfinished)
             described = _described(experiment, task[:-1])
             named = dict(zip(experiment.key, task, strict=True))
             file.append({**named, "settings": described, "versions": made_by, **rounded(found)})
         Path(lock.lock_file).unlink(missing_ok=True)
     return task
+
+
+def _by_others(record: Record, made_by: Mapping[str, str]) -> str:
+    """In which versions a run differs, of those that it tells; empty if in none."""
+    found = record["versions"]
+    return differences(found, {name: made_by.get(name, "not there") for name in found})
 
 
 def check_settings(
@@ -184,7 +194,12 @@ def _title(task: Task) -> str:
 @cache
 def _described(experiment: Experiment, kind: Task) -> dict[str, Any]:
     """The settings of a kind of tasks, as JSON has them."""
-    described: dict[str, Any] = json.loads(json.dumps(experiment.describe(*kind)))
+    try:
+        described: dict[str, Any] = json.loads(json.dumps(experiment.describe(*kind)))
+    except TypeError as error:
+        raise Refused(
+            f"{experiment.name}: describe() must return what JSON can hold: {error}"
+        ) from None
     return described
 
 

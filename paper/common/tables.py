@@ -12,7 +12,8 @@ import pandas as pd
 from paper.common.claims import Judged
 from paper.common.experiment import Table
 
-_FRAGMENT = re.compile(r"<!-- (?!end)(\S+) -->\n(.*?)\n<!-- end -->", flags=re.DOTALL)
+_START, _END = r"<!-- (?!end)(\S+) -->\n", "<!-- end -->"
+_FRAGMENT = re.compile(_START + r"((?:(?!<!-- ).*\n)*?)" + _END)
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -48,15 +49,17 @@ def as_document(tables: Mapping[str, Table]) -> str:
 
 def fragments(text: str) -> dict[str, str]:
     """What stands between the markers of a text, by their names."""
-    return dict(_FRAGMENT.findall(text))
+    _check_markers(text)
+    return {name: content.rstrip("\n") for name, content in _FRAGMENT.findall(text)}
 
 
 def filled(text: str, found: Mapping[str, str]) -> str:
     """Replace what stands between the markers of a text.
 
     Raises:
-        ValueError: If there is nothing for one of them.
+        ValueError: If there is nothing for one of them, or one has no end.
     """
+    _check_markers(text)
 
     def fragment(match: re.Match[str]) -> str:
         name = match[1]
@@ -65,6 +68,14 @@ def filled(text: str, found: Mapping[str, str]) -> str:
         return f"<!-- {name} -->\n{found[name]}\n<!-- end -->"
 
     return _FRAGMENT.sub(fragment, text)
+
+
+def _check_markers(text: str) -> None:
+    """Raise a ValueError unless each marker has an end of its own."""
+    whole = {match.start() for match in _FRAGMENT.finditer(text)}
+    for match in re.finditer(_START, text):
+        if match.start() not in whole:
+            raise ValueError(f"<!-- {match[1]} --> has no {_END} before the next marker; add it.")
 
 
 def number(value: Any, form: str = ".3g", missing: str = "") -> str:

@@ -165,3 +165,15 @@ def test_tables_are_those_of_the_committed_runs(name):
     shown = results(PAPER / "results")
     for marker, table in tables_of(experiment, list(runs.values())).items():
         assert shown[marker] == table.text
+
+
+def test_markers_keep_what_is_between_them():
+    text = "a\n<!-- one:x -->\n<!-- end -->\nprose\n<!-- two:y -->\nold\n<!-- end -->\nb\n"
+    found = {"one:x": "| 1 |", "two:y": "| 2 |"}
+    whole = filled(text, found)
+    assert whole == (
+        "a\n<!-- one:x -->\n| 1 |\n<!-- end -->\nprose\n<!-- two:y -->\n| 2 |\n<!-- end -->\nb\n"
+    )
+    assert fragments(whole) == found
+    with pytest.raises(ValueError, match="<!-- one:x --> has no <!-- end -->"):
+        filled("<!-- one:x -->\nprose\n<!-- two:y -->\n<!-- end -->\n", found)
