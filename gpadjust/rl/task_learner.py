@@ -237,8 +237,9 @@ class TaskLearner(OffPolicyAlgorithm):
 
     def get_parameters(self) -> dict[str, dict[str, Any]]:
         """As in SB3, with the state of the dynamics."""
-        task = self.task
-        learnt = self._unread_dynamics if task is None else task.dynamics.state_dict()
+        learnt = self._unread_dynamics
+        if self.task is not None and not learnt:
+            learnt = self.task.dynamics.state_dict()
         return {**super().get_parameters(), "dynamics": learnt}
 
     def set_parameters(
