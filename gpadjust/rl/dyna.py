@@ -22,8 +22,6 @@ from stable_baselines3.common.type_aliases import (
 from torch import Tensor
 
 from gpadjust.control import Task
-from gpadjust.dynamics import Dynamics
-from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
 from gpadjust.rl.model_vec_env import ModelVecEnv
@@ -183,7 +181,7 @@ class Dyna(TaskLearner):
         metrics: dict[str, float] = {}
         start = time.perf_counter()
         with self.timed("fit"):
-            transitions = without_failures(dynamics, new)
+            transitions = new.learnable(dynamics)
             if dynamics.is_fitted:
                 score = dynamics.score(*transitions)
                 metrics = {
@@ -361,6 +359,8 @@ class Dyna(TaskLearner):
         self.logger.record("model/planned_value", plan.value)
         return plan.actions.clamp(bounds[0], bounds[1])
 
+    # What SB3 calls
+
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -405,8 +405,6 @@ class Dyna(TaskLearner):
         self.model_hooks = []  # callbacks that have some add themselves
         return super()._setup_learn(*args, **kwargs)
 
-    # What SB3 calls
-
     def load_replay_buffer(
         self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
     ) -> None:
@@ -416,31 +414,6 @@ class Dyna(TaskLearner):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "model_hooks"]
-
-
-def without_failures(dynamics: Dynamics, new: RecordedEpisodes) -> tuple[Tensor, Tensor, Tensor]:
-    """States, actions and next states, but for those at which the physics fails.
-
-    Raises:
-        PhysicsError: If it does not say where, or everywhere.
-    """
-    works = torch.ones(new.num_transitions, dtype=torch.bool)
-    while True:
-        try:
-            dynamics.rehearse(new.states[works], new.actions[works])
-        except PhysicsError as error:
-            rows = works.nonzero().flatten()[list(error.rows)]
-            if not len(rows) or len(rows) == works.sum():
-                raise
-            warnings.warn(
-                f"The physics fails at {len(rows)} of {len(works)} new transitions, which the "
-                f"dynamics do not learn: {error}",
-                UserWarning,
-                stacklevel=4,
-            )
-            works[rows] = False
-        else:
-            return new.states[works], new.actions[works], new.next_states[works]
 
 
 def _doubles(values: np.ndarray) -> Tensor:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 
 from gpadjust.control import Task
+from gpadjust.dynamics import Dynamics
+from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.states import StateSpec
 
@@ -85,6 +89,30 @@ class RecordedEpisodes:
             if name in (*self.spec.angles, *self.spec.exogenous, *self.spec.previous):
                 reach[i] = torch.inf
         return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
+
+    def learnable(self, dynamics: Dynamics) -> tuple[Tensor, Tensor, Tensor]:
+        """States, actions and next states, but for those at which the physics fails.
+
+        Raises:
+            PhysicsError: If it does not say where, or everywhere.
+        """
+        works = torch.ones(self.num_transitions, dtype=torch.bool)
+        while True:
+            try:
+                dynamics.rehearse(self.states[works], self.actions[works])
+            except PhysicsError as error:
+                rows = works.nonzero().flatten()[list(error.rows)]
+                if not len(rows) or len(rows) == works.sum():
+                    raise
+                warnings.warn(
+                    f"The physics fails at {len(rows)} of {len(works)} new transitions, which the "
+                    f"dynamics do not learn: {error}",
+                    UserWarning,
+                    stacklevel=4,
+                )
+                works[rows] = False
+            else:
+                return self.states[works], self.actions[works], self.next_states[works]
 
     def check(self, task: Task, tolerance: float = 1e-3) -> None:
         """Compare the functions of a task with what was recorded.
