@@ -15,6 +15,7 @@ from paper.common.experiment import Record, Table
 from paper.common.tables import claims_table, markdown, settings_table
 
 REFERENCE = "gp"  # whose final error the others are to reach
+ALONE = "f_p"  # what needs no measurement
 CLAIMS = {"forrester": "M1", "currin": "M2", "park91a": "M3", "cartpole": "M4"}
 _SECONDS = ["choice_seconds", "score_seconds"]
 
@@ -111,6 +112,9 @@ def verdicts(runs: pd.DataFrame, learner: str = "cka") -> list[Judged]:
         reached = f"with {middle:g}" if np.isfinite(middle) else "never"
         measured = f"{counted(len(count))}: {reached} of {budget} (median), "
         measured += f"in {np.isfinite(count).sum()} of them at all"
+        alone = int((needed(part, ALONE) == 0).sum())
+        if alone:
+            measured += f"; f_p alone does it without any in {alone}"
         judged.append(Judged(CLAIMS[str(name)], text, met(middle <= budget / 2), measured))
     return judged
 

@@ -27,7 +27,7 @@ COLORS = {
     "oracle": "black",
 }
 PANELS = {
-    "As the paper has them": ("mf", "phy", "gp-paper", "cka", "rra-paper"),
+    "As the paper has them, and our CKA": ("mf", "phy", "gp-paper", "cka", "rra-paper"),
     "As we would do it": ("mf-best", "phy", "gp", "cka", "rra", "oracle"),
 }
 

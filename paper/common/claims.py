@@ -100,7 +100,13 @@ def within(difference: Difference, low: float = -np.inf, high: float = np.inf) -
 
 def all_of(*verdicts: Verdict) -> Verdict:
     """The verdict on a claim of several parts: the worst of theirs."""
-    order: tuple[Verdict, ...] = ("not reproduced", "inconclusive", "reproduced", "beaten")
+    order: tuple[Verdict, ...] = (
+        "not reproduced",
+        "inconclusive",
+        "undetermined",
+        "reproduced",
+        "beaten",
+    )
     return min(verdicts, key=order.index)
 
 
