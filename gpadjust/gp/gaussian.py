@@ -125,6 +125,7 @@ def negative_log_likelihood(
     basis: Tensor | None = None,
     least_scale: Tensor | None = None,
     derivatives: bool = False,
+    trend: Tensor | None = None,
 ) -> LikelihoodValue:
     r"""Negative log likelihood of :math:`r \sim N(H \beta, s K)`, with one Cholesky factor.
 
@@ -138,12 +139,17 @@ def negative_log_likelihood(
     The derivative by the covariance is :math:`\tfrac12 (K^{-1} - \alpha \alpha^T / s)` with
     :math:`\alpha = P r`, one inverse from the same factor.
 
+    A trend T adds :math:`\tfrac12 \log|T^T K^{-1} T|`, for s = 1: the coefficients of a regression
+    on T have the covariance :math:`(T^T K^{-1} T)^{-1}`, and all their sizes then cost the same.
+    The restricted likelihood (Harville 1974) has the same determinant, but no such coefficients.
+
     Args:
         residual: Targets less their mean, ``... x n``; NaN where there is no observation.
         covariance: The covariance K, noise included, ``... x n x n``; it is overwritten.
         basis: The basis H, ``... x n x q``, or none.
         least_scale: The least s, ``...``, or None for s = 1.
         derivatives: Whether to compute the derivatives.
+        trend: The trend T, ``... x n x q`` of full rank, or none.
     """
     size = residual.shape[-1]
     observed = ~residual.isnan()
@@ -152,6 +158,7 @@ def negative_log_likelihood(
     if not everything:
         residual = residual.nan_to_num(nan=0.0)
         basis = None if basis is None else basis * observed.unsqueeze(-1)
+        trend = None if trend is None else trend * observed.unsqueeze(-1)
     chol, failed = cholesky(covariance, None if everything else observed)
     alpha = torch.cholesky_solve(residual.unsqueeze(-1), chol)
     if basis is not None:
@@ -165,6 +172,11 @@ def negative_log_likelihood(
     if least_scale is not None:
         scale = (square / n).maximum(least_scale)
     log_det = 2 * chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+    if trend is not None:
+        trend = trend.expand(*chol.shape[:-1], trend.shape[-1])
+        # Through an orthogonal basis, as the product is ill-conditioned where K is.
+        white, triangle = torch.linalg.qr(torch.linalg.solve_triangular(chol, trend, upper=False))
+        log_det = log_det + 2 * triangle.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1)
     value = 0.5 * (square / scale + n * (scale.log() + math.log(2 * math.pi)) + log_det)
     failed = failed | ~value.isfinite()
     value = torch.where(failed, torch.full_like(value, math.inf), value)
@@ -175,6 +187,9 @@ def negative_log_likelihood(
     by_covariance.view(-1, size, size).baddbmm_(
         weight.reshape(-1, size, 1), alpha.reshape(-1, 1, size), beta=0.5, alpha=-0.5
     )
+    if trend is not None:
+        columns = torch.linalg.solve_triangular(chol.mT, white, upper=True)
+        by_covariance = by_covariance - 0.5 * columns @ columns.mT
     if not everything:
         by_covariance = by_covariance * observed.unsqueeze(-1) * observed.unsqueeze(-2)
     diagonal = by_covariance.diagonal(dim1=-1, dim2=-2)

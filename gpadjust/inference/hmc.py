@@ -15,6 +15,7 @@ Potential = Callable[[Tensor], tuple[Tensor, Tensor]]
 _TARGET = 0.8  # acceptance rate that the step size is adapted to
 _TRAJECTORY = 1.5  # mean length of a trajectory, in standard deviations
 _MOST_STEPS = 10
+_ENOUGH = 20  # positions for each coordinate, to learn a covariance that is roughly known
 _INFLATION = 1.2  # of the standard deviations of the Gaussian for long jumps
 
 
@@ -23,10 +24,12 @@ class Draws(NamedTuple):
 
     Attributes:
         positions: ``iterations x chains x B x p``.
+        values: The potential there, ``iterations x chains x B``.
         acceptance: Mean acceptance rate of each problem, ``B``.
     """
 
     positions: Tensor
+    values: Tensor
     acceptance: Tensor
 
 
@@ -37,6 +40,8 @@ def hmc(
     num_iterations: int,
     generator: torch.Generator,
     progress: Callable[[], object] = lambda: None,
+    centre: Tensor | None = None,
+    root: Tensor | None = None,
 ) -> Draws:
     r"""Sample from :math:`\exp(-U)` with ``C`` chains of each of ``B`` problems, in lockstep.
 
@@ -44,7 +49,8 @@ def hmc(
     independence Metropolis step that may jump between modes. The chains of a problem share a step
     size, adapted by dual averaging (Hoffman and Gelman 2014), and their pooled mean and covariance
     in the second half of the warm-up so far, whose inverse is the mass matrix: many chains learn it
-    in few iterations, and one evaluation of a batch costs little more than that of one chain.
+    in few iterations, and one evaluation of a batch costs little more than that of one chain. A
+    warm-up that is too short for that keeps the ones that it is given.
 
     Args:
         potential: The potential U and its gradient.
@@ -53,6 +59,9 @@ def hmc(
         num_iterations: Number of iterations that are kept.
         generator: Source of randomness.
         progress: Called after each iteration.
+        centre: A mean to begin with, ``B x p``, such as the optimum.
+        root: A root of the covariance around it, ``B x p x p``, such as that of Laplace's
+            approximation.
     """
     chains, problems, p = start.shape
 
@@ -68,11 +77,15 @@ def hmc(
 
     position = start
     value, gradient = potential(position)
-    mean: Tensor | None = None
-    root = 0.1 * torch.eye(p).to(start).expand(problems, p, p)
+    mean = centre
+    if root is None:
+        root = 0.1 * torch.eye(p).to(start).expand(problems, p, p)
     step = _DualAveraging(start.new_full((problems,), 0.5))
-    history, kept, accepted = [], [], start.new_zeros(problems)
+    history, kept, values = [], [], []
+    accepted = start.new_zeros(problems)
     updates = {num_warmup // 4, num_warmup // 2, 3 * num_warmup // 4}
+    if centre is not None and chains * num_warmup < _ENOUGH * p:
+        updates = set()
     for iteration in range(num_warmup + num_iterations):
         warm = iteration < num_warmup
         size = step.current if warm else step.average
@@ -110,9 +123,10 @@ def hmc(
                 step = _DualAveraging(start.new_full((problems,), 0.5))
         else:
             kept.append(position)
+            values.append(value)
             accepted += rate.mean(0) / num_iterations
         progress()
-    return Draws(torch.stack(kept), accepted)
+    return Draws(torch.stack(kept), torch.stack(values), accepted)
 
 
 def _rate(log_ratio: Tensor, value: Tensor) -> Tensor:

@@ -25,6 +25,11 @@ _SEARCHED = 96  # of them, which tell what optima there are
 _ROUGH = 1e-5  # tolerance of that search
 _COMPARED = 6  # of its optima that are compared on all observations
 _REFINED = 2  # of these that the search goes on from
+_NOWHERE = (
+    "The marginal likelihood could not be evaluated at any start: the covariance has no Cholesky "
+    "factor. Check for repeated inputs with different targets, or fix a larger noise through "
+    "train_Yvar."
+)
 _APART = 0.3  # by which these differ in some logarithm
 
 
@@ -67,11 +72,7 @@ def maximise(objective: Objective, search: Search) -> FitResult:
     values = objective(starts)
     if not values.amin(0).isfinite().all():
         model.eval()
-        raise RuntimeError(
-            "The marginal likelihood could not be evaluated at any start: the covariance has no "
-            "Cholesky factor. Check for repeated inputs with different targets, or fix a larger "
-            "noise through train_Yvar."
-        )
+        raise RuntimeError(_NOWHERE)
     reached, values, converged = _optimise(objective, starts, search.max_iterations)
     best = values.argmin(0), torch.arange(parameters.num_problems)
     objective.assign(reached[best])
@@ -88,11 +89,26 @@ def maximise(objective: Objective, search: Search) -> FitResult:
     return FitResult(-values[best].reshape(parameters.batch_shape), converged)
 
 
+def optima(objective: Objective, search: Search) -> tuple[Tensor, Tensor]:
+    """Rough optima, not assigned to the model: ``k x B x p`` and their values ``k x B``."""
+    parameters = objective.parameters
+    starts = parameters.clipped(parameters.current())
+    if search.num_screened != 0 and objective.num_points > _MANY:
+        starts = _best(objective, torch.cat([starts, _optima_of_some(objective, search)]))
+    elif search.num_screened != 0:
+        starts = _screened(objective, search)
+    values = objective(starts)
+    if not values.amin(0).isfinite().all():
+        raise RuntimeError(_NOWHERE)
+    reached, values, _ = _optimise(objective, starts, min(search.max_iterations, 60), _ROUGH)
+    return reached, values
+
+
 def _optima_of_some(objective: Objective, search: Search) -> Tensor:
     """Optima on some of the observations, ``k x B x p``; of each the best first."""
     generator = torch.Generator().manual_seed(search.seed)
     rows = torch.randperm(objective.num_points, generator=generator)[:_SEARCHED].sort().values
-    part = Objective(objective.model, rows=rows)
+    part = objective.of_rows(rows)
     # A search should not take longer than what follows it.
     few = 8 if objective.num_points < 4 * _SEARCHED else 16
     search = search._replace(

@@ -20,6 +20,8 @@ from gpadjust.models.hyperparameters import kernels_of
 from gpadjust.physics import PhysicsError
 
 _NOISE = "likelihood.noise_covar.raw_noise"
+_LEAST = 3  # observations, for a constant to be vague
+_FEW_INPUTS = 3  # up to which a linear trend is, too
 _AT_ONCE = 2**20  # numbers in the covariances of a batch; larger ones make memory the bottleneck
 
 
@@ -44,6 +46,11 @@ class Objective:
             of densities of these: what is to be sampled.
         autograd: Differentiate the kernel by autograd even where there is a closed form.
         rows: The observations that count, numbers of rows. Default: all.
+        vague_trend: Let all sizes of a constant and a linear trend in the observations cost the
+            same, as far as there are enough of them: a factor of the prior, such that the size of
+            a trend says nothing of how smooth a function is. A model is else the less likely, the
+            larger the functions that its prior allows beside the one that is seen, which speaks
+            against all that are nearly polynomial.
 
     Attributes:
         parameters: The vectors and their bounds.
@@ -57,9 +64,11 @@ class Objective:
         of_logs: bool = False,
         autograd: bool = False,
         rows: Tensor | None = None,
+        vague_trend: bool = False,
     ) -> None:
         model.train()
         self.model = model
+        self._kind = {"marginal": marginal, "of_logs": of_logs, "vague_trend": vague_trend}
         self.parameters = LogParameters(model)
         kept = slice(None) if rows is None else rows
         raw, noise = model.train_inputs[0], known_noise(model.likelihood)
@@ -69,6 +78,7 @@ class Objective:
             inputs = model.transform_inputs(raw)[..., kept, :]
             basis = None if marginal else _basis_of_means(model, inputs)
         self._learns_constants = basis is not None
+        self._trend = _trend(raw[..., kept, :], self.targets) if vague_trend else None
         self._inputs, self._basis, targets = inputs, basis, None
         if self.parameters.learns_inputs:
             self._inputs = raw[..., kept, :]
@@ -88,6 +98,10 @@ class Objective:
         square = square.where(square > 0, torch.ones_like(square))
         self._rounding = torch.finfo(square.dtype).eps ** 2 * square
         self.concentrated = not marginal and self._is_homogeneous()
+
+    def of_rows(self, rows: Tensor) -> Objective:
+        """The same objective of some of the observations, numbers of rows."""
+        return Objective(self.model, rows=rows, **self._kind)
 
     @property
     def num_points(self) -> int:
@@ -192,7 +206,9 @@ class Objective:
         else:
             mean, covariance = self._distribution(values)
         residual = (self.targets - mean).expand(covariance.shape[:-1])
-        found = negative_log_likelihood(residual, covariance, self._basis, least, derivatives)
+        found = negative_log_likelihood(
+            residual, covariance, self._basis, least, derivatives, self._trend
+        )
         if found.by_mean is None or found.by_covariance is None:
             return found, torch.zeros_like(vectors)
         return found, self.parameters.flatten(pull_back(found.by_mean, found.by_covariance))
@@ -268,6 +284,20 @@ class Objective:
         off = (covariance2 - 2 * covariance).abs().amax((-1, -2))
         close = (off <= 1e-9 * covariance.abs().amax((-1, -2))).all()
         return bool(close) and torch.equal(mean2, mean)
+
+
+def _trend(inputs: Tensor, targets: Tensor) -> Tensor | None:
+    """A constant and, of few inputs, a linear trend, orthogonal: ``... x n x q``, or None."""
+    n, d = int((~targets.isnan()).sum(-1).min()), inputs.shape[-1]
+    if n < _LEAST:
+        return None
+    one = torch.ones_like(inputs[..., :1])
+    if d > _FEW_INPUTS or n < 2 * (d + 1):
+        return one
+    slopes, sizes, _ = torch.linalg.svd(inputs - inputs.mean(-2, keepdim=True), full_matrices=False)
+    # Inputs that do not vary, or only together, have no slopes of their own.
+    rank = int((sizes > 1e-6 * sizes[..., :1]).sum(-1).amin())
+    return torch.cat([one, slopes[..., :rank] * math.sqrt(n)], dim=-1)
 
 
 def _basis_of_means(model: BatchedMultiOutputGPyTorchModel, inputs: Tensor) -> Tensor | None:

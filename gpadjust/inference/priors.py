@@ -26,14 +26,15 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     :math:`v` the mean square of the targets' residual from the prior mean:
 
     .. math::
-        \log \ell &\sim N(\sqrt 2 + \tfrac12 \log d - 1, \; \sqrt 3^2) \\
-        \log s_\delta &\sim N(\log v, \; 5^2), \quad
-        \log s_\rho \sim N(\log \tfrac14, \; 1.5^2) \\
-        \log \sigma^2 &\sim N(\log(10^{-4} v), \; 4^2)
+        \log \ell &\sim N(\log 3 + \tfrac12 \log d, \; 2^2) \\
+        \log s_\delta &\sim N(\log v, \; 6^2), \quad
+        \log s_\rho \sim N(\log 10^{-2}, \; 4^2) \\
+        \log \sigma^2 &\sim N(\log(10^{-3} v), \; 6^2)
 
-    The lengthscales grow with the dimension after Hvarfner et al. (2024); the prior of
-    :math:`s_\delta` is all but flat, so that near-polynomial functions, of long lengthscales and
-    large variance, are not ruled out. The constant rho of an
+    The lengthscales grow with the dimension after Hvarfner et al. (2024). All are wide: functions
+    that are nearly polynomial (long lengthscales, a large variance), a rho that is nearly constant,
+    and data without noise are not ruled out. They were chosen on other data sets
+    than those that are reported. The constant rho of an
     :class:`~gpadjust.AR1` has N(1, 1). Give a kernel or likelihood priors of your own
     (``lengthscale_prior=...``, or ``register_prior``) to replace them.
 

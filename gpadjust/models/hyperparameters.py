@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -41,16 +40,16 @@ KINDS = {
         initial=0.5,
         bounds=(1e-2, 1e3),
         starts=(0.05, 50.0),
-        prior=(math.exp(math.sqrt(2) - 1), math.sqrt(3)),
+        prior=(3.0, 2.0),
     ),
     # The mean square of the targets' residual from the prior mean, v, over that of the basis. The
     # prior is all but flat, so that near-polynomial functions, of long lengthscales and large
     # variance, are not ruled out.
-    "outputscale": Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(1.0, 5.0)),
+    "outputscale": Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(1.0, 6.0)),
     # v. Noise with an sd of less than three millionths of the residual is not told from none.
-    "noise": Kind(initial=1e-2, bounds=(1e-11, 1e1), starts=(1e-6, 1.0), prior=(1e-4, 4.0)),
+    "noise": Kind(initial=1e-2, bounds=(1e-11, 1e1), starts=(1e-6, 1.0), prior=(1e-3, 6.0)),
 }
-RHO_VARIANCE = Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(0.25, 1.5))
+RHO_VARIANCE = Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(0.01, 4.0))
 """The outputscale of a rho: its prior is one of rho itself, which has no units."""
 VAGUE_MEAN = 1e2
 """The prior variance of an unknown mean before a fit, in the typical size of an outputscale."""

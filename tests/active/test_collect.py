@@ -132,7 +132,7 @@ class TestMeasuring:
         assert result.model.num_samples is None
 
     def test_full_bayes(self, laboratory):
-        sample = {"num_samples": 4, "num_warmup": 8, "num_starts": 1, "num_screened": 8}
+        sample = {"num_samples": 4, "num_iterations": 8, "num_starts": 1, "num_screened": 8}
         result = collect(**laboratory(budget=5, fit=lambda m: _sampled(m, sample)))
         assert result.model.num_samples == 4
 

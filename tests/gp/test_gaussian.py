@@ -28,7 +28,7 @@ def least():
 
 def formula(residual, covariance, basis=None, least=None):
     """The same likelihood from inverses and determinants, for autograd."""
-    inverse = torch.linalg.inv(covariance)
+    inverse, n = torch.linalg.inv(covariance), residual.shape[-1]
     if basis is not None:
         inside = torch.linalg.inv(basis.mT @ inverse @ basis)
         inverse = inverse - inverse @ basis @ inside @ basis.mT @ inverse
@@ -84,6 +84,27 @@ def test_derivatives_are_autograds(problem, with_least, with_basis):
         expected = by_bound[0] * least()
         assert (expected != 0).tolist() == [False, True, True]
         torch.testing.assert_close(found.by_least_scale, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("with_missing", [False, True])
+def test_a_trend_adds_the_determinant_of_its_coefficients_precision(problem, with_missing):
+    residual, covariance, trend = problem
+    kept = torch.arange(n) != 3 if with_missing else torch.ones(n, dtype=torch.bool)
+    leaf = covariance.clone().requires_grad_()
+    inside = leaf[:, kept][:, :, kept]
+    precision = trend[:, kept].mT @ torch.linalg.inv(inside) @ trend[:, kept]
+    value = formula(residual[:, kept], inside) + 0.5 * torch.logdet(precision)
+    (by_covariance,) = torch.autograd.grad(value.sum(), leaf)
+    with torch.no_grad():
+        found = negative_log_likelihood(
+            residual.masked_fill(~kept, torch.nan),
+            covariance.clone(),
+            trend=trend,
+            derivatives=True,
+        )
+    torch.testing.assert_close(found.value, value.detach())
+    symmetric = (by_covariance + by_covariance.mT) / 2
+    torch.testing.assert_close(found.by_covariance, symmetric, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("with_least", [False, True])

@@ -36,10 +36,10 @@ BAD = [
     ),
     *(
         ("map", option, 64, ValueError, f"'map' has no option '{option}'; .* method 'hmc'")
-        for option in ("num_samples", "num_warmup", "progress")
+        for option in ("num_samples", "num_iterations", "progress")
     ),
     ("hmc", "num_samples", 0, ValueError, "Expected num_samples >= 1"),
-    ("hmc", "num_warmup", 7, ValueError, "Expected num_warmup >= 8"),
+    ("hmc", "num_iterations", 7, ValueError, "Expected num_iterations >= 8"),
     ("gibbs", "seed", 0, ValueError, "expected 'map' or 'hmc'"),
 ]
 

@@ -24,7 +24,7 @@ from gpadjust.validation.plots import plot_adjustment, plot_adjustment_pair
 quick = pytest.mark.filterwarnings(
     "ignore::gpadjust.inference.SamplingWarning"  # few iterations mix badly
 )
-SHORT = {"num_samples": 8, "num_warmup": 8, "num_starts": 1, "num_screened": 8}
+SHORT = {"num_samples": 8, "num_iterations": 8, "num_starts": 1, "num_screened": 8}
 
 
 def crude(X):
@@ -93,9 +93,37 @@ def test_figures(build, data):
     assert plot_adjustment_pair(model, output=1, num_points=4).shape == (2, 2)
 
 
-def test_a_warning_when_chains_do_not_mix(XY):
+def test_a_warning_when_chains_do_not_mix(uniform):
+    X = uniform(10, 2)
+    # Without noise, and exactly a line of the physics: the posterior has a sharp corner.
     with pytest.warns(SamplingWarning, match="have not mixed"):
-        fit(CKA(*XY, physics=crude), "hmc", num_warmup=8, num_samples=2000)
+        fit(CKA(X, 1.2 * crude(X) - 1, physics=crude), "hmc", num_iterations=8)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
+    # A quadratic function, of which the physics has another one; eleven points in two dimensions.
+    def truth(X):
+        return X[:, :1].square() + 2 * X[:, 1:].square() + X[:, :1] * X[:, 1:]
+
+    def physics(X):
+        return 0.5 * X[:, :1].square() + X[:, 1:]
+
+    generator = torch.Generator().manual_seed(0)
+    Z = torch.rand(200, 2, generator=generator, dtype=torch.float64)
+    covered, ratios = [], []
+    for _ in range(6):
+        X = torch.rand(11, 2, generator=generator, dtype=torch.float64)
+        Y = truth(X) + noise * torch.randn(11, 1, generator=generator, dtype=torch.float64)
+        models = [CKA(X, Y, physics=physics) for _ in range(2)]
+        fit(models[0])
+        fit(models[1], "hmc")
+        point, full = (model.predict(Z).mean - truth(Z) for model in models)
+        ratios.append((full.square().mean() / point.square().mean()).log() / 2)
+        low, high = models[1].interval(Z)
+        covered.append(((low <= truth(Z)) & (truth(Z) <= high)).double().mean())
+    assert sum(ratios) / 6 < -0.1
+    assert sum(covered) / 6 > 0.9
 
 
 class TestBadInput:
@@ -120,7 +148,7 @@ def nuts(model, num_samples, num_warmup, num_chains=2, seed=0):
     """
     target = deepcopy(model)
     register_priors(target)
-    objective = Objective(target, marginal=True, of_logs=True)
+    objective = Objective(target, marginal=True, of_logs=True, vague_trend=True)
     maximise(objective, Search())
     optimum, potential = objective.parameters.current(), potential_of(objective)
 
@@ -162,7 +190,7 @@ def test_hmc_and_nuts_agree(XY):
     prior, kernel = LogNormalPrior(-1.0, 1.0), model.terms[1].kernel
     kernel.register_prior("outputscale_prior", prior, "outputscale")
     expected = nuts(model, num_samples=600, num_warmup=200)
-    result = fit(model, "hmc", num_samples=1600, num_warmup=200)
+    result = fit(model, "hmc", num_samples=1600, num_iterations=400)
     draws = torch.cat(
         [each.reshape(*each.shape[:2], -1).log() for each in result.draws.values()], dim=-1
     )

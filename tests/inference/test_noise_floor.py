@@ -100,7 +100,7 @@ def test_from_a_users_start_below_it():
 def test_of_samples(targets):
     Y = TARGETS[targets]
     model = CKA(X, Y, physics=of(Y))
-    fit(model, "hmc", num_samples=16, num_warmup=8, **QUICK)
+    fit(model, "hmc", num_iterations=16, **QUICK)
     noise = model.likelihood.noise.squeeze(-1).reshape(16, -1)
     noise = noise * model.outcome_transform.stdvs.square().reshape(-1, Y.shape[-1])[0]
     assert (noise >= floors(model, Y) * (1 - 1e-9)).all()

@@ -245,3 +245,68 @@ class TestVectors:
         assert drawn.isfinite().all()
         for vectors in (parameters.current(), drawn):
             assert torch.equal(parameters.clipped(vectors), vectors)
+
+
+class TestVagueTrend:
+    @pytest.mark.parametrize("name", ["CKA", "AR1", "RRA", "missing", "two outputs"])
+    def test_gradient(self, name):
+        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        Y = crude(X) + X.square()
+        Y = torch.cat([Y, 2 * Y - X], -1) if name == "two outputs" else Y
+        if name == "missing":
+            Y[3] = torch.nan
+            Y = torch.cat([Y, X], -1)
+        physics = (lambda X: crude(X).expand(*X.shape[:-1], 2)) if Y.shape[-1] > 1 else crude
+        if name == "AR1":
+            model = AR1(X, Y, physics=crude, bounds=torch.tensor([[0.0], [1.0]]))
+        elif name == "RRA":
+            model = BUILD[name](X, Y)
+        else:
+            model = CKA(X, Y, physics=physics)
+        objective = Objective(model, marginal=True, vague_trend=True)
+        vector = objective.parameters.current() + 0.2
+        _, gradient = objective.value_and_gradient(vector)
+        step = 1e-5 * torch.eye(vector.shape[-1], dtype=torch.float64).unsqueeze(1)
+        numeric = (objective(vector + step) - objective(vector - step)) / 2e-5
+        torch.testing.assert_close(gradient[0], numeric.mT, rtol=1e-5, atol=1e-5)
+
+    def test_functions_that_a_wider_prior_allows_beside_cost_nothing(self):
+        # delta is nearly linear at this lengthscale, so that its variance is that of a line.
+        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        model = CKA(X, crude(X) + 3 + 2 * X, physics=crude)
+        model.terms[1].kernel.base_kernel.lengthscale = 100.0
+        model.likelihood.noise = 1e-2
+
+        def slope(**options):
+            objective = Objective(model, marginal=True, **options)
+            values = []
+            for variance in (1e5, 1e7):
+                model.terms[1].kernel.outputscale = variance
+                values.append(objective(objective.parameters.current()).item())
+            return (values[1] - values[0]) / math.log(100)
+
+        # Level and slope cost half a logarithm of the variance each.
+        assert slope() == pytest.approx(1.0, abs=0.05)
+        assert slope(vague_trend=True) == pytest.approx(0.0, abs=0.05)
+
+    def test_a_variance_that_cannot_make_the_trend_is_ruled_out(self):
+        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        model = ZeroMeanGP(X, 1 + X)
+        model.terms[0].kernel.base_kernel.lengthscale = 10.0
+        model.likelihood.noise = 1e-6
+        objective, values = Objective(model, marginal=True, vague_trend=True), []
+        for variance in (1e-4, 1e3):
+            model.terms[0].kernel.outputscale = variance
+            values.append(objective(objective.parameters.current()).item())
+        assert values[0] > values[1] + 100
+
+    @pytest.mark.parametrize("inputs", ["constant", "collinear", "one point more"])
+    def test_inputs_without_slopes_of_their_own(self, inputs):
+        X = torch.rand(12, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        X[:, 1] = {"constant": 1.0, "collinear": 2 * X[:, 0]}.get(inputs, X[:, 1])
+        X = X[:3] if inputs == "one point more" else X
+        objective = Objective(ZeroMeanGP(X, X[:, :1].sin()), marginal=True, vague_trend=True)
+        value, gradient = objective.value_and_gradient(objective.parameters.current())
+        assert value.isfinite().all()
+        assert gradient.isfinite().all()
+        assert (gradient != 0).any()

@@ -26,14 +26,14 @@ def test_densities(build, data, num_outputs):
     register_priors(model)
     found = priors(model)
     v = (Y - 3 - X[:, :1]).square().mean(0)
-    length = (X.amax(0) - X.amin(0)) * math.sqrt(2) * math.exp(math.sqrt(2) - 1)
+    length = (X.amax(0) - X.amin(0)) * math.sqrt(2) * 3
     lengths, rho, delta = length.repeat(num_outputs), "terms.0.kernel", "terms.1.kernel"
     medians = {
-        "likelihood.noise_covar.noise_prior": (1e-4 * v, 4),
-        f"covar_module.{delta}.outputscale_prior": (v, 5),
-        f"covar_module.{rho}.outputscale_prior": (v * 0 + 0.25, 1.5),
-        f"covar_module.{delta}.base_kernel.lengthscale_prior": (lengths, math.sqrt(3)),
-        f"covar_module.{rho}.base_kernel.lengthscale_prior": (lengths, math.sqrt(3)),
+        "likelihood.noise_covar.noise_prior": (1e-3 * v, 6),
+        f"covar_module.{delta}.outputscale_prior": (v, 6),
+        f"covar_module.{rho}.outputscale_prior": (v * 0 + 0.01, 4),
+        f"covar_module.{delta}.base_kernel.lengthscale_prior": (lengths, 2),
+        f"covar_module.{rho}.base_kernel.lengthscale_prior": (lengths, 2),
     }
     assert set(found) == set(medians)
     for name, (middle, sd) in medians.items():
