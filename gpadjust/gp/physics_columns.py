@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import deepcopy
 
+import gpytorch
 import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
-from torch.nn import Module
+from torch.nn import Module, Parameter
 
 from gpadjust.physics import Physics
 
@@ -96,11 +97,12 @@ def check_one_to_one(transform: InputTransform | None) -> None:
         )
 
 
-class AppendedPhysics(Module):
+class AppendedPhysics(gpytorch.Module):
     r"""Reads f_p from a column that :class:`PhysicsInput` appended: the basis of a term.
 
-    For output :math:`j` it returns :math:`(f_{p,j}(x) - \text{offset}_j) / \text{scale}_j`, in the
-    units of the model's targets.
+    For output :math:`j` it returns :math:`(f_{p,j}(x) - c_j) / \text{scale}_j`, in the units of the
+    model's targets. The centre c is the offset, or unknown: the offset and a learnt number of
+    spreads. What the prior mean of the whole function is does not depend on an unknown centre.
 
     Args:
         num_inputs: Number ``d`` of input columns before the appended ones.
@@ -108,17 +110,50 @@ class AppendedPhysics(Module):
             of the ``k`` appended columns is f_p of that output.
         offset: ``batch_shape x (m) x 1``, in the user's units.
         scale: Of the same shape.
+        spread: Of the same shape, for a centre that is learnt, or None.
+        mean: What f_p is multiplied by in the prior mean, of the same shape, if there is a spread.
     """
 
     select: Tensor
     offset: Tensor
     scale: Tensor
+    spread: Tensor
+    mean: Tensor
+    center: Parameter
 
-    def __init__(self, num_inputs: int, select: Tensor, offset: Tensor, scale: Tensor) -> None:
+    def __init__(
+        self,
+        num_inputs: int,
+        select: Tensor,
+        offset: Tensor,
+        scale: Tensor,
+        spread: Tensor | None = None,
+        mean: Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.num_inputs = num_inputs
         for name, tensor in (("select", select), ("offset", offset), ("scale", scale)):
             self.register_buffer(name, tensor.clone())
+        self.learns_center = spread is not None
+        if spread is not None:
+            self.register_buffer("spread", spread.clone())
+            self.register_buffer("mean", torch.ones_like(spread) if mean is None else mean.clone())
+            self.register_parameter("center", Parameter(torch.zeros_like(spread)))
+
+    @property
+    def origin(self) -> Tensor:
+        """The centre c, ``batch_shape x (m) x 1``, in the user's units."""
+        return self.offset + self.spread * self.center if self.learns_center else self.offset
+
+    def center_at(self, origin: Tensor) -> Tensor:
+        """The number of spreads that an origin is from the offset; 0 for f_p that is constant."""
+        away = (origin - self.offset) / self.spread
+        return away.where(self.spread > 0, torch.zeros_like(away))
+
+    @property
+    def moved_mean(self) -> Tensor | float:
+        """What a centre that has moved takes from the prior mean with a term, to be given back."""
+        return self.spread * self.center * self.mean / self.scale if self.learns_center else 0.0
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the scaled f_p of each batch as ``... x n``, from ``x``: ``... x n x (d + k)``."""
@@ -130,10 +165,11 @@ class AppendedPhysics(Module):
             )
         values = x[..., self.num_inputs :]
         values = values.squeeze(-1) if values.shape[-1] == 1 else (values * self.select).sum(-1)
-        if self.offset.any():
-            values = values - self.offset
+        if self.learns_center or self.offset.any():
+            origin = self.origin
+            values = values - origin
             # Differences of rounding errors are none: a physics that is constant has no variation.
-            rounding = 8 * torch.finfo(values.dtype).eps * self.offset.abs()
+            rounding = 8 * torch.finfo(values.dtype).eps * origin.abs()
             values = torch.where(values.abs() <= rounding, values - values.detach(), values)
         return values / self.scale
 
@@ -142,6 +178,9 @@ class AppendedPhysics(Module):
         new = deepcopy(self)
         for name, buffer in self.named_buffers():
             setattr(new, name, change(buffer))
+        if self.learns_center:
+            learnt = self.center.requires_grad
+            new.center = Parameter(change(self.center.detach()), requires_grad=learnt)
         return new
 
 

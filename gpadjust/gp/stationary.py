@@ -73,6 +73,8 @@ class StationaryTerm(NamedTuple):
         lengthscale: Name of the lengthscales.
         scale: Name of the outputscale s, or None for 1.
         profile: As in :class:`StationaryForm`.
+        center: Name of a parameter that is taken from the weight, times ``spread``; or None.
+        spread: ``... x 1``, if there is such a parameter.
     """
 
     x: Tensor
@@ -80,6 +82,8 @@ class StationaryTerm(NamedTuple):
     lengthscale: str
     scale: str | None
     profile: Profile | None
+    center: str | None = None
+    spread: Tensor | None = None
 
 
 class TermValue(NamedTuple):
@@ -89,11 +93,14 @@ class TermValue(NamedTuple):
         covariance: ``... x n x n``.
         slope: -2 times its derivative by r^2, if that is not the covariance itself, or None.
         z: The inputs in lengthscales, ``... x n x d``.
+        by_center: Half of its derivative by the centre, ``... x n x n``, but for the symmetry; None
+            if there is no centre to learn.
     """
 
     covariance: Tensor
     slope: Tensor | None
     z: Tensor
+    by_center: Tensor | None = None
 
 
 @dataclass(eq=False)
@@ -172,12 +179,17 @@ class StationarySum:
             exponent.diagonal(dim1=-1, dim2=-2).zero_()
             covariance, slope = term.profile(exponent.clamp_max_(0), derivatives)
         factors = [] if shift is None or term.profile is None else [shift.exp()]
-        if term.weight is not None:
-            factors += [term.weight.unsqueeze(-1), term.weight.unsqueeze(-2)]
+        weight, by_center = term.weight, None
+        if weight is not None and term.center is not None and term.spread is not None:
+            weight = weight - term.spread * parameters[term.center]
+        if weight is not None:
+            factors += [weight.unsqueeze(-1), weight.unsqueeze(-2)]
         for factor in factors:
+            if factor is factors[-1] and term.spread is not None and derivatives:
+                by_center = -term.spread.unsqueeze(-1) * covariance
             covariance = scaled(covariance, factor)
             slope = None if slope is None else scaled(slope, factor)
-        return TermValue(covariance, slope, rows[0])
+        return TermValue(covariance, slope, rows[0], by_center)
 
     @staticmethod
     def _pull_back(
@@ -201,6 +213,9 @@ class StationarySum:
             if total is None:
                 total = (by_covariance * value.covariance).sum((-1, -2))
             found[term.scale] = total.reshape(parameters[term.scale].shape)
+        if term.center is not None and value.by_center is not None:
+            total = 2 * (by_covariance * value.by_center).sum((-1, -2))
+            found[term.center] = total.reshape(parameters[term.center].shape)
         return found
 
 

@@ -63,6 +63,12 @@ class Term(Module):
         """Whether g is a known constant."""
         return self.kernel is None and not self.learns_mean
 
+    @property
+    def moved_mean(self) -> Tensor | float:
+        """What the prior mean has beside that of g times the basis, ``... x 1``, or 0."""
+        moved: Tensor | float = getattr(self.basis, "moved_mean", 0.0)
+        return moved
+
     def weights(self, x: Tensor) -> Tensor | None:
         """The basis at ``x`` (``... x n x (d + k)``) as ``... x n``, or None for 1."""
         values: Tensor | None = None if self.basis is None else self.basis(x)
@@ -224,9 +230,12 @@ class SumOfTerms(Kernel):
 
     def basis_of_means(self, x: Tensor) -> Tensor | None:
         """The bases of the terms whose means are unknown, ``... x n x q``, or None."""
+        one = torch.ones_like(x[..., 0])
         bases = [term.weights(x) for term in self.terms if term.learns_mean]
-        columns = [torch.ones_like(x[..., 0]) if basis is None else basis for basis in bases]
-        return torch.stack(columns, dim=-1) if columns else None
+        if not bases:
+            return None
+        columns = [one if basis is None else basis for basis in bases]
+        return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
 
     def local_load_samples(self, samples_dict: Any, memo: Any, prefix: str) -> None:
         """GPyTorch's hook for Pyro's samples; the batch shape follows the terms."""
@@ -272,5 +281,6 @@ class TermsMean(Mean):
         """Return the mean at ``x`` (``... x n x (d + k)``) as ``... x n``."""
         total = torch.zeros_like(x[..., 0])
         for term in self.covariance.terms:
-            total = total + (term.mean if term.basis is None else term.basis(x) * term.mean)
+            part = term.mean if term.basis is None else term.basis(x) * term.mean
+            total = total + part + term.moved_mean
         return total

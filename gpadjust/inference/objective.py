@@ -10,7 +10,7 @@ from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.likelihoods import GaussianLikelihood
 from torch import Tensor
 
-from gpadjust.gp import SumOfTerms, Term
+from gpadjust.gp import AppendedPhysics, SumOfTerms, Term
 from gpadjust.gp.gaussian import LikelihoodValue, known_noise, negative_log_likelihood
 from gpadjust.gp.stationary import StationarySum, StationaryTerm, stationary_form
 from gpadjust.inference.log_parameters import LogParameters
@@ -241,7 +241,9 @@ class Objective:
         model = self.model
         if noise is None and type(model.likelihood) is not GaussianLikelihood:
             return None
+        learns_means = _basis_of_means(model, inputs) is not None
         terms, names = [], set() if noise is not None else {_NOISE}
+        learnt: set[str] = set()  # centres
         origin = inputs.mean(-2, keepdim=True)
         for path, kernel, num_inputs, basis in kernels_of(model):
             d = inputs.shape[-1] if num_inputs is None else num_inputs
@@ -251,11 +253,20 @@ class Objective:
             lengthscale = f"{path}.{form.lengthscale}"
             scale = None if form.outputscale is None else f"{path}.{form.outputscale}"
             weight = None if basis is None else basis(inputs)
-            x = (inputs - origin)[..., :d]
-            terms.append(StationaryTerm(x, weight, lengthscale, scale, form.profile))
+            x, center, spread = (inputs - origin)[..., :d], None, None
             names |= {lengthscale} if scale is None else {lengthscale, scale}
-        if not terms or not names.issuperset(self.parameters.names):
+            if isinstance(basis, AppendedPhysics) and basis.learns_center:
+                center = f"{path.removesuffix('.kernel')}.basis.center"
+                spread = basis.spread / basis.scale
+                weight = basis(inputs) + spread * basis.center
+                learnt.add(center)
+            terms.append(
+                StationaryTerm(x, weight, lengthscale, scale, form.profile, center, spread)
+            )
+        if not terms or not (names | learnt).issuperset(self.parameters.names):
             return None
+        if learnt and learns_means:
+            return None  # their bases move with the centres
         mean = model.mean_module(inputs).expand(self.targets.shape)
         bases = _basis_of_means(model, inputs) if marginal else None
         constant: Tensor | None = None
@@ -268,6 +279,8 @@ class Objective:
             path, _, leaf = name.rpartition(".")
             value: Tensor = getattr(model.get_submodule(path), leaf.removeprefix("raw_"))
             values[name] = value.log()
+        for name in learnt:
+            values[name] = model.get_parameter(name)
         return StationarySum(terms, mean, constant, _NOISE if noise is None else noise, values)
 
     @torch.no_grad()

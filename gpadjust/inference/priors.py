@@ -18,6 +18,8 @@ from gpadjust.models.hyperparameters import (
     typical_sizes,
 )
 
+_CENTERS = 3.0  # the standard deviation of an unknown centre, in those of f_p
+
 
 def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     r"""Register a prior on each learnable hyper-parameter that has none.
@@ -71,6 +73,9 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         read, write = getattr(module, f"_{kind}_param"), getattr(module, f"_{kind}_closure")
         module.register_prior(f"{kind}_prior", prior, read, write)
     for module in model.covar_module.modules():
+        if getattr(module, "learns_center", False) and not module._priors:
+            zero = torch.zeros_like(module.center)
+            module.register_prior("center_prior", NormalPrior(zero, zero + _CENTERS), "center")
         if isinstance(module, Level) and module.rho is not None and not module._priors:
             one = torch.ones_like(module.rho)
             module.register_prior("rho_prior", NormalPrior(one, one), "rho")

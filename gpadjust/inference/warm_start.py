@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -12,8 +14,8 @@ from gpadjust.models.hyperparameters import constraint_of, is_rho, kernels_of, k
 def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
     """Give a model the hyper-parameters of an earlier one of the same structure.
 
-    They are the same in the user's units: lengthscales, and the variance of a scaling of the
-    physics, stay; the other variances follow the units that the outcome transforms put the
+    They are the same in the user's units: lengthscales, centres, and the variance of a scaling of
+    the physics, stay; the other variances follow the units that the outcome transforms put the
     targets in, which change with the data.
 
     Args:
@@ -29,6 +31,10 @@ def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
                 continue
             value: Tensor = source[name]
             constraint = constraint_of(model, name)
+            if kind_of(name) == "center":
+                basis: Any = model.get_submodule(name.rpartition(".")[0])
+                earlier: Any = previous.get_submodule(name.rpartition(".")[0])
+                value = basis.center_at(earlier.origin)
             follows = kind_of(name) in ("outputscale", "noise") and constraint is not None
             if follows and not any(name.startswith(f"{path}.") for path in unitless):
                 factor = ratio[(..., *[None] * (value.dim() - ratio.dim()))].exp()

@@ -62,7 +62,8 @@ class AdjustedGP(ExactGPBase):
 
     With a center c the basis of rho is :math:`f_p - c`. The bias that makes
     :math:`f_a = \rho f_p + \delta` is then :math:`\delta = \delta_0 - \sum_i c_i \rho_i` for the
-    model's own term :math:`\delta_0`.
+    model's own term :math:`\delta_0`. A centre that is learnt is a hyper-parameter, in standard
+    deviations of f_p from its mean; the prior mean stays.
 
     Args:
         physics: As in :class:`~gpadjust.CKA`, like all that are not listed here; None for a model
@@ -83,7 +84,7 @@ class AdjustedGP(ExactGPBase):
         delta: Adjustment,
         *,
         more_terms: Callable[[int, Size, Tensor], Sequence[Term]] | None = None,
-        center: float | Tensor | Literal["mean"] = 0.0,
+        center: float | Tensor | Literal["mean", "learn"] = 0.0,
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
@@ -128,7 +129,10 @@ class AdjustedGP(ExactGPBase):
         columns = torch.eye(k * m, dtype=torch.float64).split(m)  # of each physics, m x (k m)
         for i, name in enumerate(names):
             select = (columns[i].unsqueeze(-2) if m > 1 else columns[i]).expand(*batch_shape, 1, -1)
-            basis = AppendedPhysics(d, select, of_outputs(centers[i]), of_outputs(scale))
+            own = [of_outputs(centers[i]), of_outputs(scale)]
+            if isinstance(center, str) and center == "learn":
+                own += [of_outputs(f[i].std(-2, keepdim=True)), of_outputs(start[i])]
+            basis = AppendedPhysics(d, select, *own)
             terms.append(term(name, rho_kernels[i], basis, start[i], rho_means[i] == "learn"))
         known = 0.0 if delta.mean == "learn" else delta.mean
         if not isinstance(known, int | float):
@@ -207,7 +211,8 @@ class AdjustedGP(ExactGPBase):
         Of a model that holds samples of its hyper-parameters, or a batch, that of the first.
         """
         shift, scale = self._term_units(name)
-        mean = self._prior_mean(self.train_inputs[0], self._term_weights(name, or_known=True))
+        weights = self._term_weights(name, or_known=True)
+        mean = self._prior_mean(self.train_inputs[0], weights).detach()
         return float((mean[..., :1] * scale + shift).reshape(-1, self.num_outputs)[0, output])
 
     def _inputs_without_basis(self, X: Tensor) -> Tensor:
@@ -219,8 +224,10 @@ class AdjustedGP(ExactGPBase):
     def _term_weights(self, name: str, or_known: bool = False) -> Weights:
         weights = super()._term_weights(name, or_known)
         for term in self.terms if name == "delta" else ():
-            if isinstance(term.basis, AppendedPhysics) and term.basis.offset.any():
-                weights.append((term, -term.basis.offset / term.basis.scale))
+            if not isinstance(term.basis, AppendedPhysics):
+                continue
+            if term.basis.learns_center or term.basis.offset.any():
+                weights.append((term, -term.basis.origin / term.basis.scale))
         return weights
 
     def _term_units(self, name: str) -> tuple[Tensor, Tensor]:
@@ -329,7 +336,7 @@ def make_kernel(kernel: KernelLike, name: str, num_inputs: int, batch_shape: Siz
 def _center(center: float | Tensor | str, f_p: Tensor) -> Tensor:
     """The constant c of the basis ``f_p - c``, as ``batch_shape x 1 x m``."""
     mean = f_p.mean(-2, keepdim=True)
-    if isinstance(center, str) and center == "mean":
+    if isinstance(center, str) and center in ("mean", "learn"):
         return mean
     try:
         offset = torch.as_tensor(center, dtype=f_p.dtype, device=f_p.device)
@@ -337,7 +344,7 @@ def _center(center: float | Tensor | str, f_p: Tensor) -> Tensor:
         offset = f_p.new_full((), torch.nan)
     if offset.dim() > 1 or offset.numel() not in (1, f_p.shape[-1]) or not offset.isfinite().all():
         raise ValueError(
-            "Expected center to be 'mean' (the mean of f_p at the training inputs), a finite "
-            f"number, or a tensor of {f_p.shape[-1]}, one for each output, got {center!r}."
+            "Expected center to be 'mean' (the mean of f_p at the training inputs), 'learn', a "
+            f"finite number, or a tensor of {f_p.shape[-1]}, one for each output, got {center!r}."
         )
     return offset.expand(mean.shape).clone()

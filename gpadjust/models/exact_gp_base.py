@@ -399,7 +399,10 @@ class ExactGPBase(SingleTaskGP):
     @staticmethod
     def _prior_mean(inputs: Tensor, weights: Weights) -> Tensor:
         """The prior mean of a weighted sum of terms, ``... x (m) x q``."""
-        parts = [term.mean if weight is None else weight * term.mean for term, weight in weights]
+        parts = [
+            term.mean if weight is None else weight * term.mean + term.moved_mean
+            for term, weight in weights
+        ]
         total: Tensor = sum(parts, torch.zeros_like(inputs[..., 0]))
         return total
 

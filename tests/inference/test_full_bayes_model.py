@@ -33,6 +33,7 @@ VARIANTS = {
     "Normalize": ("CKA", lambda m: {"input_transform": Normalize(2)}),
     "AR1-Normalize": ("AR1", lambda m: {"input_transform": Normalize(2)}),
     "centred": ("CKA", lambda m: {"center": "mean"}),
+    "learnt centre": ("CKA", lambda m: {"center": "learn"}),
     "learnt means": (
         "CKA",
         lambda m: {"center": "mean", "rho_mean": "learn", "delta_mean": "learn"},
@@ -40,7 +41,7 @@ VARIANTS = {
     "no outcome transform": ("CKA", lambda m: {"outcome_transform": None}),
 }
 _NAMES = [*KINDS, *VARIANTS, "CKA-known", "AR1-known"]
-_QUICK = ["CKA", "AR1", "RRA", "learnt means", "Normalize", "CKA-known"]
+_QUICK = ["CKA", "AR1", "RRA", "learnt means", "learnt centre", "Normalize", "CKA-known"]
 CASES = [pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow) for name in _NAMES]
 
 

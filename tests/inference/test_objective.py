@@ -68,6 +68,10 @@ BUILD = {
     "CKA": lambda X, Y: CKA(X, Y, physics=crude),
     "known noise": lambda X, Y: CKA(X, Y, torch.full_like(Y, 0.01), physics=crude),
     "learnt means": lambda X, Y: CKA(X, Y, physics=crude, rho_mean="learn", delta_mean="learn"),
+    "learnt centre": lambda X, Y: CKA(X, Y, physics=crude, center="learn"),
+    "learnt centre and means": lambda X, Y: CKA(
+        X, Y, physics=crude, center="learn", rho_mean="learn", delta_mean="learn"
+    ),
     "two physics": lambda X, Y: CKA(X, Y, physics=[crude, lambda X: X], rho_mean=[1.0, 0.5]),
     "learnt physics": lambda X, Y: CKA(X, Y, physics=Gain()),
     "learnt physics and means": lambda X, Y: CKA(

@@ -27,6 +27,7 @@ def same(model, other, Z):
 
 BUILDS = {
     "CKA": lambda X, Y: CKA(X, Y, physics=relu, center="mean", delta_mean="learn"),
+    "learnt centre": lambda X, Y: CKA(X, Y, physics=relu, center="learn"),
     "several": lambda X, Y: CKA(X, Y, 0.01, physics={"a": relu, "b": silu}),
     "RRA": lambda X, Y: RRA(X, Y, physics=relu, num_features=16, seed=3),
     "physics mean": lambda X, Y: PhysicsMeanGP(X, Y, physics=relu, rho_mean=0.9),
