@@ -51,8 +51,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/models/adjusted_gp.py",
-        "weights.append((term, -term.basis.offset / term.basis.scale))",
-        "weights.append((term, -term.basis.offset))",
+        "weights.append((term, -term.basis.origin / term.basis.scale))",
+        "weights.append((term, -term.basis.origin))",
         "With a center, delta is in the wrong units wherever the targets are scaled.",
     ),
     Fault(

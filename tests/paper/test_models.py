@@ -15,6 +15,9 @@ from paper.active import run as active_run
 from paper.active.problems import problem
 from paper.active.run import LEARNERS, integrated_variance, measured, scored
 from paper.active.tables import needed, verdicts
+from paper.calibration import METHODS, ROWS, Calibration
+from paper.calibration import Settings as CalibrationSettings
+from paper.calibration import run as calibration_run
 from paper.common.runner import main, run_missing, runs_file
 from paper.forrester import Forrester
 from paper.forrester import Settings as ForresterSettings
@@ -326,3 +329,35 @@ class TestWhereToMeasure:
         (claim,) = verdicts(scores(gp=[[3.0, 2.0, 1.5, 1.0]] * 2, cka=cka))
         assert (claim.id, claim.verdict) == ("M1", verdict)
         assert said in claim.measured
+
+
+class TestCalibration:
+    def test_smoke(self, tmp_path):
+        settings = CalibrationSettings(num_test=20)
+        experiment = Calibration(out=tmp_path, methods=METHODS, settings=settings)
+        kinds = [("forrester", 5, 0.0), ("branin", 2, 0.05), ("pump", 6, 1.0)]
+        records = [
+            dict(zip(experiment.key, (*kind, method, 0), strict=True))
+            | experiment.run(*kind, method, 0, unfinished=tmp_path)
+            for kind in kinds
+            for method in ("map", "hmc-centre")
+        ]
+        assert all(0 <= r["half"] <= r["coverage"] <= 1 for r in records)
+        found = experiment.tables(records)
+        assert "pump, N = 12, noisy" in found["coverage"].text
+        assert "full Bayes, centre learnt" in found["summary"].text
+
+    def test_there_are_sixteen_kinds_and_the_noise_is_what_it_says(self):
+        assert len(ROWS) == 16
+        clean, noisy = (calibration_run.of_pair("branin", 500, noise, 10, 0) for noise in (0, 0.05))
+        assert torch.equal(clean.X, noisy.X)
+        assert (noisy.Y - clean.Y).std().item() == pytest.approx(noisy.noise.item(), rel=0.1)
+        assert noisy.noise.item() == pytest.approx(0.05 * noisy.truth.std().item())
+
+    def test_the_pump_has_outputs_of_very_different_units(self):
+        data = calibration_run.pump(12, 0)
+        assert data.Y.shape == (12, 2)
+        size = data.truth.std(0)
+        assert size[0] / size[1] > 1e6
+        wrong = data.physics(data.points) - data.truth
+        assert (wrong.square().mean(0).sqrt() > 3 * data.noise).all()

@@ -1,0 +1,82 @@
+"""What the intervals hold, and what that costs in accuracy and time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from paper.calibration import LABELS, METHODS, PUMP, Calibration
+from paper.common.experiment import Record, Table
+from paper.common.tables import markdown
+
+_REFERENCE = "map"
+_ROW = ["problem", "N", "noise"]
+
+
+def load(records: Sequence[Record]) -> pd.DataFrame:
+    """A row for each run."""
+    return pd.DataFrame([{k: v for k, v in r.items() if k != "settings"} for r in records])
+
+
+def tables(records: Sequence[Record], experiment: Calibration) -> dict[str, Table]:
+    """All tables, by name."""
+    runs = load(records)
+    methods = [name for name in METHODS if name in set(runs["method"])]
+    pairs = runs[runs["problem"] != PUMP]
+    found = {"summary": Table("All rows", _summary(pairs, methods))}
+    for name, how, title in (
+        ("coverage", "mean", "Mean coverage of the central 95 % interval"),
+        ("half", "mean", "Mean coverage of the central 50 % interval"),
+        ("nrmse", "median", "Median RMSE / sd of the truth"),
+        ("nlpd", "mean", "Mean NLPD, nats, less the logarithm of the truth's sd"),
+        ("seconds", "median", "Median seconds"),
+    ):
+        found[name] = Table(title, _by_method(runs, name, how, methods))
+    return found
+
+
+def _summary(runs: pd.DataFrame, methods: Sequence[str]) -> str:
+    """Over the rows: what this project set itself for its default."""
+    by_row = runs.groupby([*_ROW, "method"], sort=False)
+    mean = by_row[["coverage", "half", "nlpd", "warned"]].mean().unstack()
+    median = by_row[["nrmse", "seconds"]].median().unstack()
+    logs = np.log(runs.pivot_table(index=[*_ROW, "seed"], columns="method", values="nrmse"))
+    rows = []
+    for method in methods:
+        own = mean.xs(method, axis=1, level=1)
+        cells = [
+            f"{own['coverage'].mean():.3f}",
+            f"{own['coverage'].min():.2f}",
+            f"{own['half'].mean():.2f}",
+            f"{own['nlpd'].mean():.2f}",
+        ]
+        if _REFERENCE in methods:
+            ratio = (logs[method] - logs[_REFERENCE]).dropna()
+            gap = own["nlpd"] - mean["nlpd"][_REFERENCE]
+            worst = median["nrmse"][method] / median["nrmse"][_REFERENCE]
+            times = median["seconds"][method] / median["seconds"][_REFERENCE]
+            cells += [
+                f"{np.exp(ratio.mean()):.2f}",
+                f"{worst.max():.2g} ({(worst > 1.3).sum()} above 1.3)",
+                f"{(gap < 0).sum()} of {len(gap)}",
+                f"{gap.max():+.2f}",
+                f"{times.median():.1f}",
+            ]
+        cells.append(f"{own['warned'].mean():.3f}")
+        rows.append([LABELS[method], *cells])
+    head = ["95 % hold", "least of a row", "50 % hold", "NLPD"]
+    if _REFERENCE in methods:
+        head += ["RMSE / that of the most likely", "largest of a row", "NLPD lower in rows"]
+        head += ["largest loss of NLPD", "time / that of the most likely"]
+    return markdown(["", *head, "share of warnings"], rows)
+
+
+def _by_method(runs: pd.DataFrame, column: str, how: str, methods: Sequence[str]) -> str:
+    rows = []
+    for (name, n, noise), part in runs.groupby(_ROW, sort=False):
+        values = part.groupby("method")[column].agg(how)[[*methods]]
+        label = f"{name}, N = {n}" + (", noisy" if noise else "")
+        rows.append([label, *(f"{value:.2g}" for value in values)])
+    return markdown(["", *(LABELS[name] for name in methods)], rows)
