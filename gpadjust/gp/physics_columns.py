@@ -102,7 +102,8 @@ class AppendedPhysics(gpytorch.Module):
 
     For output :math:`j` it returns :math:`(f_{p,j}(x) - c_j) / \text{scale}_j`, in the units of the
     model's targets. The centre c is the offset, or unknown: the offset and a learnt number of
-    spreads. What the prior mean of the whole function is does not depend on an unknown centre.
+    spreads. What the prior mean of the whole function is does not depend on an unknown centre, as
+    long as ``mean`` is that of the term.
 
     Args:
         num_inputs: Number ``d`` of input columns before the appended ones.
@@ -143,7 +144,12 @@ class AppendedPhysics(gpytorch.Module):
     @property
     def origin(self) -> Tensor:
         """The centre c, ``batch_shape x (m) x 1``, in the user's units."""
-        return self.offset + self.spread * self.center if self.learns_center else self.offset
+        return self.offset + self.spread * self._center if self.learns_center else self.offset
+
+    @property
+    def _center(self) -> Tensor:
+        """The number of spreads; predictions leave no trace at it, as at other hyper-parameters."""
+        return self.center if self.training else self.center.detach()
 
     def center_at(self, origin: Tensor) -> Tensor:
         """The number of spreads that an origin is from the offset; 0 for f_p that is constant."""
@@ -153,7 +159,7 @@ class AppendedPhysics(gpytorch.Module):
     @property
     def moved_mean(self) -> Tensor | float:
         """What a centre that has moved takes from the prior mean with a term, to be given back."""
-        return self.spread * self.center * self.mean / self.scale if self.learns_center else 0.0
+        return self.spread * self._center * self.mean / self.scale if self.learns_center else 0.0
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the scaled f_p of each batch as ``... x n``, from ``x``: ``... x n x (d + k)``."""
@@ -176,7 +182,7 @@ class AppendedPhysics(gpytorch.Module):
     def map_batches(self, change: Callable[[Tensor], Tensor]) -> AppendedPhysics:
         """A copy whose buffers are changed along their batch dimensions."""
         new = deepcopy(self)
-        for name, buffer in self.named_buffers():
+        for name, buffer in self.named_buffers(recurse=False):
             setattr(new, name, change(buffer))
         if self.learns_center:
             learnt = self.center.requires_grad

@@ -93,7 +93,7 @@ class TermValue(NamedTuple):
         covariance: ``... x n x n``.
         slope: -2 times its derivative by r^2, if that is not the covariance itself, or None.
         z: The inputs in lengthscales, ``... x n x d``.
-        by_center: Half of its derivative by the centre, ``... x n x n``, but for the symmetry; None
+        by_center: A, where its derivative by the centre is :math:`A + A^T`, ``... x n x n``; None
             if there is no centre to learn.
     """
 
@@ -121,7 +121,7 @@ class StationarySum:
         mean: The prior mean, ``... x n``.
         constant: :math:`K_0`, ``... x n x n``, or None.
         noise: The noise variances, ``... x n``; or the name of the one that is learnt.
-        values: Logarithms of those parameters that may not be learnt, by their names.
+        values: Those parameters that may not be learnt, by their names; logarithms but for centres.
     """
 
     terms: Sequence[StationaryTerm]
@@ -213,7 +213,7 @@ class StationarySum:
             if total is None:
                 total = (by_covariance * value.covariance).sum((-1, -2))
             found[term.scale] = total.reshape(parameters[term.scale].shape)
-        if term.center is not None and value.by_center is not None:
+        if term.center in parameters and value.by_center is not None:
             total = 2 * (by_covariance * value.by_center).sum((-1, -2))
             found[term.center] = total.reshape(parameters[term.center].shape)
         return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Literal, TypedDict, Unpack, overload
 
 from botorch.models import ModelListGP
@@ -12,7 +14,7 @@ from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.full_bayes import SampleResult, sample
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.inference.objective import Objective
-from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES
+from gpadjust.models import ExactGPBase
 
 Method = Literal["map", "hmc"]
 
@@ -81,7 +83,8 @@ def fit(
     smooth the functions are. The model then is a fully Bayesian model as BoTorch has them: its
     posterior is a ``GaussianMixturePosterior``, and acquisition functions average over the samples.
 
-    Small problems are computed with one thread; the user's setting is restored after.
+    A model that holds samples lets go of them first. Small problems are computed with one thread;
+    the user's setting is restored after.
 
     Args:
         model: Any model of this library, any BoTorch model with batched outputs such as
@@ -107,7 +110,7 @@ def fit(
         ValueError: If an option is out of range or not one of the method, no parameter is
             learnable, or a model whose outputs share parameters is to be sampled.
         RuntimeError: If the likelihood cannot be evaluated anywhere (the model is left unchanged),
-            or the model holds samples already.
+            or a model of another library holds samples.
 
     Warns:
         OptimizationWarning: If the optimiser did not converge.
@@ -126,13 +129,35 @@ def fit(
             "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "
             f"ModelListGP of them, got {type(model).__name__}."
         )
-    if is_fully_bayesian(model):
-        raise RuntimeError(HOLDS_SAMPLES)
+    if is_fully_bayesian(model) and not isinstance(model, ExactGPBase):
+        raise RuntimeError(
+            f"The {type(model).__name__} holds samples of its hyper-parameters; build it anew, to "
+            "fit it."
+        )
     search = Search(**{name: given.pop(name) for name in _SEARCH if name in given})
-    with threads_for(model.train_targets.shape[-1], others=True):
+    with threads_for(model.train_targets.shape[-1], others=True), _without_samples(model):
         if method == "map":
             return maximise(Objective(model), search)
         return sample(model, search, **given)
+
+
+@contextmanager
+def _without_samples(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
+    """Let a model go of the samples that it holds; it holds them again if there is an error."""
+    if not isinstance(model, ExactGPBase) or model.num_samples is None:
+        yield
+        return
+    samples = {
+        name: parameter.detach().clone()
+        for name, parameter in model.named_parameters()
+        if parameter.shape[:1] == (model.num_samples,)
+    }
+    model.release_samples()
+    try:
+        yield
+    except BaseException:
+        model.hold_samples(samples)
+        raise
 
 
 def check_options(method: str, options: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gpadjust.inference.hmc import Draws, Potential, hmc
-from gpadjust.inference.map_fit import Search, optima
+from gpadjust.inference.map_fit import NOWHERE, Search, optima
 from gpadjust.inference.objective import Objective
 from gpadjust.inference.priors import register_priors
 from gpadjust.models import ExactGPBase
@@ -40,10 +40,12 @@ class SampleResult:
 
     Attributes:
         r_hat: The split R-hat of the log density along the chains, of each output, ``batch_shape x
-            (m)``; near 1 for chains that are equally likely (Gelman et al. 2013, sec. 11.4).
+            (m)``; near 1 for chains that are equally likely (Gelman et al. 2013, sec. 11.4), and
+            coarse for few iterations.
         effective_sample_size: The smallest one of the hyper-parameters, of the same shape.
         acceptance: Mean acceptance rate of the proposals, of the same shape.
-        draws: All draws of each hyper-parameter, ``iterations x chains x`` its shape, by its name.
+        draws: All draws of each hyper-parameter, ``iterations x chains x`` its shape, by its name;
+            of a centre that is learnt, in standard deviations of f_p from its mean.
     """
 
     r_hat: Tensor
@@ -101,22 +103,27 @@ def sample(
             root,
         )
     result = _diagnose(objective, draws)
-    vectors = draws.positions.flatten(0, 1)
-    index = torch.linspace(len(vectors) - 1, 0, num_samples).round().long().flip(0)
-    model.hold_samples(parameters.to_raw(parameters.unflatten(vectors[index])))
-    if (result.r_hat > _MOST_R_HAT).any():
+    # From all chains, and from all along them.
+    rows = torch.linspace(num_kept - 1, 0, num_samples).round().long().flip(0)
+    vectors = draws.positions[rows, torch.arange(num_samples) % _CHAINS]
+    model.hold_samples(parameters.to_raw(parameters.unflatten(vectors)))
+    if not (result.r_hat <= _MOST_R_HAT).all():
         _warn(result)
     return result
 
 
 def laplace_root(objective: Objective, optimum: Tensor) -> Tensor:
-    """A root ``B x p x p`` of the covariance of Laplace's approximation at an optimum ``B x p``."""
+    """A root of the covariance of Laplace's approximation at an optimum ``B x p``.
+
+    Lower triangular, ``B x p x p``.
+    """
     p = optimum.shape[-1]
     step = _STEP * torch.eye(p).to(optimum).unsqueeze(1)
     _, gradient = objective.value_and_gradient(torch.cat([optimum + step, optimum - step]))
     hessian = (gradient[:p] - gradient[p:]).transpose(0, 1) / (2 * _STEP)
     values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
-    return vectors * values.clamp_min(_WIDEST**-2).rsqrt().unsqueeze(-2)
+    root = vectors * values.clamp_min(_WIDEST**-2).rsqrt().unsqueeze(-2)
+    return torch.linalg.qr(root.mT).R.mT
 
 
 def _starts(
@@ -142,21 +149,30 @@ def _starts(
     """
     problems, p = centres.shape[1:]
     number = _CANDIDATES * num_chains
+    values = values.to(centres)
     share = (values.amin(0) - values).exp().mT  # B x k
-    which = torch.multinomial(share, number, replacement=True, generator=generator).mT
+    which = torch.multinomial(share.cpu(), number, replacement=True, generator=generator).mT
+    which = which.to(centres.device)
     white = torch.randn(number, problems, p, generator=generator, dtype=root.dtype).to(root)
     middle = centres.gather(0, which.unsqueeze(-1).expand(-1, -1, p))
     drawn = middle + (root @ white.unsqueeze(-1)).squeeze(-1)
     drawn[0] = centres.gather(0, values.argmin(0)[None, :, None].expand(1, -1, p))[0]
+    bound = objective.parameters.is_constrained
+    drawn = objective.parameters.clipped(drawn).where(bound, drawn)
     value = objective(drawn).where(objective.parameters.is_allowed(drawn), math.inf)
     away = drawn.unsqueeze(1) - centres
     square = torch.linalg.solve(root, away.unsqueeze(-1)).squeeze(-1).square().sum(-1)
     log_q = (share.log().mT - 0.5 * square).logsumexp(1)
     weight = (-value - log_q).softmax(0).clamp_max(_MOST_WEIGHT)
+    weight = weight.masked_fill(value.isinf(), 0.0)
+    if not (weight.sum(0) > 0).all():
+        raise RuntimeError(NOWHERE)
+    enough = bool(((weight > 0).sum(0) >= num_chains).all())
     chosen = torch.multinomial(
-        weight.mT + 1e-30, num_chains, replacement=False, generator=generator
+        weight.mT.cpu(), num_chains, replacement=not enough, generator=generator
     )
-    return drawn.gather(0, chosen.mT.unsqueeze(-1).expand(-1, -1, p))
+    chosen = chosen.mT.unsqueeze(-1).to(drawn.device)
+    return drawn.gather(0, chosen.expand(-1, -1, p))
 
 
 def potential_of(objective: Objective) -> Potential:
@@ -174,7 +190,9 @@ def potential_of(objective: Objective) -> Potential:
 def _diagnose(objective: Objective, found: Draws) -> SampleResult:
     positions, parameters = found.positions, objective.parameters
     moving = positions[..., positions.std((0, 1)).amin(0) > 0]
-    size = effective_sample_size(moving, chain_dim=1, sample_dim=0).amin(-1)
+    size = found.values.new_ones(positions.shape[2])
+    if moving.shape[-1]:
+        size = effective_sample_size(moving, chain_dim=1, sample_dim=0).amin(-1)
     r_hat = split_gelman_rubin(found.values, chain_dim=1, sample_dim=0)
     shape = parameters.batch_shape
     raw = parameters.to_raw(parameters.unflatten(positions.flatten(0, 1)))
@@ -189,7 +207,7 @@ def _diagnose(objective: Objective, found: Draws) -> SampleResult:
 
 
 def _warn(result: SampleResult) -> None:
-    bad = result.r_hat > _MOST_R_HAT
+    bad = ~(result.r_hat <= _MOST_R_HAT)
     warnings.warn(
         f"The chains of {int(bad.sum())} of {bad.numel()} outputs have not mixed: R-hat of the log "
         f"density is {result.r_hat.max():.2f} (below {_MOST_R_HAT} is good). The mixture may give "

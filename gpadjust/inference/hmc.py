@@ -60,8 +60,8 @@ def hmc(
         generator: Source of randomness.
         progress: Called after each iteration.
         centre: A mean to begin with, ``B x p``, such as the optimum.
-        root: A root of the covariance around it, ``B x p x p``, such as that of Laplace's
-            approximation.
+        root: A root of the covariance around it, lower triangular, ``B x p x p``, such as that of
+            Laplace's approximation.
     """
     chains, problems, p = start.shape
 

@@ -25,7 +25,7 @@ _SEARCHED = 96  # of them, which tell what optima there are
 _ROUGH = 1e-5  # tolerance of that search
 _COMPARED = 6  # of its optima that are compared on all observations
 _REFINED = 2  # of these that the search goes on from
-_NOWHERE = (
+NOWHERE = (
     "The marginal likelihood could not be evaluated at any start: the covariance has no Cholesky "
     "factor. Check for repeated inputs with different targets, or fix a larger noise through "
     "train_Yvar."
@@ -72,7 +72,7 @@ def maximise(objective: Objective, search: Search) -> FitResult:
     values = objective(starts)
     if not values.amin(0).isfinite().all():
         model.eval()
-        raise RuntimeError(_NOWHERE)
+        raise RuntimeError(NOWHERE)
     reached, values, converged = _optimise(objective, starts, search.max_iterations)
     best = values.argmin(0), torch.arange(parameters.num_problems)
     objective.assign(reached[best])
@@ -99,7 +99,7 @@ def optima(objective: Objective, search: Search) -> tuple[Tensor, Tensor]:
         starts = _screened(objective, search)
     values = objective(starts)
     if not values.amin(0).isfinite().all():
-        raise RuntimeError(_NOWHERE)
+        raise RuntimeError(NOWHERE)
     reached, values, _ = _optimise(objective, starts, min(search.max_iterations, 60), _ROUGH)
     return reached, values
 

@@ -296,20 +296,26 @@ class Objective:
         mean2, covariance2 = self._distribution(doubled)
         off = (covariance2 - 2 * covariance).abs().amax((-1, -2))
         close = (off <= 1e-9 * covariance.abs().amax((-1, -2))).all()
-        return bool(close) and torch.equal(mean2, mean)
+        return bool(close) and torch.allclose(mean2, mean, rtol=1e-9, atol=1e-12)
 
 
 def _trend(inputs: Tensor, targets: Tensor) -> Tensor | None:
     """A constant and, of few inputs, a linear trend, orthogonal: ``... x n x q``, or None."""
-    n, d = int((~targets.isnan()).sum(-1).min()), inputs.shape[-1]
+    observed = (~targets.isnan()).unsqueeze(-1)
+    n, d = int(observed.sum(-2).min()), inputs.shape[-1]
     if n < _LEAST:
         return None
-    one = torch.ones_like(inputs[..., :1])
+    one = observed.to(inputs)
     if d > _FEW_INPUTS or n < 2 * (d + 1):
         return one
-    slopes, sizes, _ = torch.linalg.svd(inputs - inputs.mean(-2, keepdim=True), full_matrices=False)
+    count = one.sum(-2, keepdim=True)
+    away = (inputs - (inputs * one).sum(-2, keepdim=True) / count) * one
+    spread = (away.square().sum(-2, keepdim=True) / count).sqrt()
+    rounding = 8 * n * torch.finfo(inputs.dtype).eps * inputs.abs().amax(-2, keepdim=True)
+    away = torch.where(spread > rounding, away / spread, torch.zeros_like(away))
+    slopes, sizes, _ = torch.linalg.svd(away, full_matrices=False)
     # Inputs that do not vary, or only together, have no slopes of their own.
-    rank = int((sizes > 1e-6 * sizes[..., :1]).sum(-1).amin())
+    rank = int((sizes > 1e-6 * math.sqrt(n)).sum(-1).amin())
     return torch.cat([one, slopes[..., :rank] * math.sqrt(n)], dim=-1)
 
 

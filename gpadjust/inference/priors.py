@@ -8,6 +8,7 @@ import torch
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from gpytorch.priors import LogNormalPrior, NormalPrior
 
+from gpadjust.gp import AppendedPhysics
 from gpadjust.models.ar1 import Level
 from gpadjust.models.hyperparameters import (
     KINDS,
@@ -36,7 +37,8 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     The lengthscales grow with the dimension after Hvarfner et al. (2024). All are wide: functions
     that are nearly polynomial (long lengthscales, a large variance), a rho that is nearly constant,
     and data without noise are not ruled out. They were chosen on other data sets
-    than those that are reported. The constant rho of an
+    than those that are reported. A centre that is learnt has N(0, 3^2), in standard deviations of
+    f_p from its mean. The constant rho of an
     :class:`~gpadjust.AR1` has N(1, 1). Give a kernel or likelihood priors of your own
     (``lengthscale_prior=...``, or ``register_prior``) to replace them.
 
@@ -73,7 +75,8 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         read, write = getattr(module, f"_{kind}_param"), getattr(module, f"_{kind}_closure")
         module.register_prior(f"{kind}_prior", prior, read, write)
     for module in model.covar_module.modules():
-        if getattr(module, "learns_center", False) and not module._priors:
+        learns = isinstance(module, AppendedPhysics) and module.learns_center
+        if learns and module.center.requires_grad and not module._priors:
             zero = torch.zeros_like(module.center)
             module.register_prior("center_prior", NormalPrior(zero, zero + _CENTERS), "center")
         if isinstance(module, Level) and module.rho is not None and not module._priors:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
+from gpadjust.gp import AppendedPhysics
 from gpadjust.models import ExactGPBase
 from gpadjust.models.hyperparameters import constraint_of, is_rho, kernels_of, kind_of
 
@@ -31,9 +30,9 @@ def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
                 continue
             value: Tensor = source[name]
             constraint = constraint_of(model, name)
-            if kind_of(name) == "center":
-                basis: Any = model.get_submodule(name.rpartition(".")[0])
-                earlier: Any = previous.get_submodule(name.rpartition(".")[0])
+            basis = model.get_submodule(name.rpartition(".")[0])
+            earlier = previous.get_submodule(name.rpartition(".")[0])
+            if isinstance(basis, AppendedPhysics) and isinstance(earlier, AppendedPhysics):
                 value = basis.center_at(earlier.origin)
             follows = kind_of(name) in ("outputscale", "noise") and constraint is not None
             if follows and not any(name.startswith(f"{path}.") for path in unitless):

@@ -131,7 +131,7 @@ class AdjustedGP(ExactGPBase):
             select = (columns[i].unsqueeze(-2) if m > 1 else columns[i]).expand(*batch_shape, 1, -1)
             own = [of_outputs(centers[i]), of_outputs(scale)]
             if isinstance(center, str) and center == "learn":
-                own += [of_outputs(f[i].std(-2, keepdim=True)), of_outputs(start[i])]
+                own += [of_outputs(_spread(f[i])), of_outputs(start[i])]
             basis = AppendedPhysics(d, select, *own)
             terms.append(term(name, rho_kernels[i], basis, start[i], rho_means[i] == "learn"))
         known = 0.0 if delta.mean == "learn" else delta.mean
@@ -211,8 +211,7 @@ class AdjustedGP(ExactGPBase):
         Of a model that holds samples of its hyper-parameters, or a batch, that of the first.
         """
         shift, scale = self._term_units(name)
-        weights = self._term_weights(name, or_known=True)
-        mean = self._prior_mean(self.train_inputs[0], weights).detach()
+        mean = self._prior_mean(self.train_inputs[0], self._term_weights(name, or_known=True))
         return float((mean[..., :1] * scale + shift).reshape(-1, self.num_outputs)[0, output])
 
     def _inputs_without_basis(self, X: Tensor) -> Tensor:
@@ -331,6 +330,13 @@ def make_kernel(kernel: KernelLike, name: str, num_inputs: int, batch_shape: Siz
                 f"it reads, got {part.ard_num_dims}."
             )
     return kernel
+
+
+def _spread(f_p: Tensor) -> Tensor:
+    """The standard deviation of f_p, ``batch_shape x 1 x m``; 0 if it is one of rounding errors."""
+    spread = f_p.std(-2, keepdim=True)
+    rounding = 8 * torch.finfo(f_p.dtype).eps * f_p.abs().amax(-2, keepdim=True)
+    return spread.where(spread > rounding, torch.zeros_like(spread))
 
 
 def _center(center: float | Tensor | str, f_p: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from torch.nn import Module
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import known_noise, noise_variances, threads_for
 from gpadjust.models.cholesky_strategy import CholeskyStrategy, Weights
-from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES, hold_samples
+from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES, hold_samples, release_samples
 from gpadjust.models.hyperparameters import learnt_noise, set_initial_values
 from gpadjust.models.posteriors import (
     HyperparameterMixture,
@@ -504,6 +504,17 @@ class ExactGPBase(SingleTaskGP):
         """
         self.check_can_hold_samples()
         hold_samples(self, samples)
+
+    def release_samples(self) -> None:
+        """Make the model what it was before it held samples, with the first of them.
+
+        It does nothing if the model holds none.
+
+        Raises:
+            RuntimeError: If it is a model of fantasies.
+        """
+        if self.num_samples is not None:
+            release_samples(self)
 
     def check_can_hold_samples(self) -> None:
         """Raise what :meth:`hold_samples` raises."""

@@ -14,7 +14,10 @@ from torch.nn import Parameter
 
 from gpadjust.gp import AppendedPhysics
 
-HOLDS_SAMPLES = "The model holds samples of its hyper-parameters already; build it anew to fit it."
+HOLDS_SAMPLES = (
+    "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
+    "`model.release_samples()` keeps the first."
+)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
@@ -27,6 +30,22 @@ def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
             named[name].copy_(values)
     model.num_samples = num_samples
     model._is_fully_bayesian = model._is_ensemble = True
+
+
+def release_samples(model: Any) -> None:
+    """Reverse :func:`hold_samples`: keep the first sample; see `ExactGPBase.release_samples`."""
+    if model.train_targets.dim() > len(model._aug_batch_shape) + 1:
+        raise RuntimeError(
+            "A model of fantasies cannot let go of its samples; take the model that they were made "
+            "of."
+        )
+    fixed = getattr(model.likelihood, "noise_covar", None)
+    if isinstance(fixed, FixedGaussianNoise) and fixed.noise.dim() > len(model._aug_batch_shape):
+        # The samples share the noise of the training data, but not that of later observations.
+        fixed.noise = fixed.noise[0]
+    _change(model, lambda tensor: tensor[0])
+    model.num_samples = None
+    model._is_fully_bayesian = model._is_ensemble = False
 
 
 def take_samples(model: Any, index: Tensor) -> Any:

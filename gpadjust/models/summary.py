@@ -8,7 +8,7 @@ import torch
 from botorch.models.transforms.input import Normalize
 from torch import Tensor
 
-from gpadjust.gp import PhysicsInput, Term
+from gpadjust.gp import AppendedPhysics, PhysicsInput, Term
 from gpadjust.gp.gaussian import negative_log_likelihood, noise_variances
 from gpadjust.models.hyperparameters import KINDS, is_rho, kind_of, typical_sizes
 
@@ -52,6 +52,8 @@ def _lines(model: Any) -> list[str]:
         unit = torch.ones_like(scale) if is_rho(term.basis) else scale
         mean = model.term_mean(term.name) if hasattr(model, "term_mean") else 0.0
         lines.append(f"  {term.name}: {'learnt ' * term.learns_mean}mean {mean:.4g}")
+        if isinstance(term.basis, AppendedPhysics) and term.basis.learns_center:
+            lines.append(f"    centre {_text(term.basis.origin)}")
         lines += _of_term(model, term, f"covar_module.terms.{i}.kernel", unit, sizes)
     name = "likelihood.noise_covar.raw_noise"
     noise = noise_variances(model.likelihood, model.train_inputs[0]).mean(-1)

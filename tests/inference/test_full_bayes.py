@@ -15,7 +15,7 @@ from pyro.ops.stats import effective_sample_size
 
 from gpadjust import CKA, BiasGP, fit
 from gpadjust.inference import SampleResult, SamplingWarning, register_priors
-from gpadjust.inference.full_bayes import potential_of
+from gpadjust.inference.full_bayes import laplace_root, potential_of
 from gpadjust.inference.map_fit import Search, maximise
 from gpadjust.inference.objective import Objective
 from gpadjust.validation import leave_one_out
@@ -124,6 +124,46 @@ def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
         covered.append(((low <= truth(Z)) & (truth(Z) <= high)).double().mean())
     assert sum(ratios) / 6 < -0.1
     assert sum(covered) / 6 > 0.9
+
+
+def test_samples_are_of_all_chains(XY):
+    model = CKA(*XY, physics=crude)
+    draws = fit(model, "hmc", num_samples=16, num_screened=32).draws["likelihood.noise_covar.noise"]
+    noise = model.likelihood.noise.flatten()
+    same = torch.isclose(draws.flatten(2), noise, rtol=1e-9).any(0)  # chains x samples
+    assert same.any(0).all()
+    assert int(same.any(1).sum()) == 16
+
+
+@quick
+def test_narrow_constraints_leave_no_chain_behind(XY):
+    base = RBFKernel(ard_num_dims=1, lengthscale_constraint=Interval(0.9, 10.0))
+    model = CKA(
+        *XY,
+        physics=crude,
+        delta_covar_module=ScaleKernel(base),
+        likelihood=GaussianLikelihood(noise_constraint=Interval(1e-3, 1.1e-3)),
+    )
+    fit(model, "hmc", num_screened=32)
+    assert all(parameter.isfinite().all() for parameter in model.parameters())
+    assert model.predict(XY[0]).mean.isfinite().all()
+
+
+def test_laplaces_root_is_triangular_and_of_the_inverse_of_the_hessian(XY):
+    model = CKA(*XY, physics=crude)
+    register_priors(model)
+    objective = Objective(model, marginal=True, of_logs=True, vague_trend=True)
+    maximise(objective, Search())
+    (optimum,) = objective.parameters.current()
+    root = laplace_root(objective, optimum)
+    assert (root.triu(1) == 0).all()
+    precision = torch.linalg.inv(root @ root.mT)[0]
+    step = 0.1 * torch.eye(len(precision), dtype=torch.float64).unsqueeze(1)
+    change = [objective.value_and_gradient(optimum + sign * step)[1] for sign in (1, -1)]
+    hessian = (change[0] - change[1])[:, 0] / 0.2
+    expected = (hessian + hessian.mT) / 2
+    if torch.linalg.eigvalsh(expected).min() > 1 / 16:
+        torch.testing.assert_close(precision, expected, rtol=1e-6, atol=1e-6)
 
 
 class TestBadInput:

@@ -213,12 +213,60 @@ class TestCopies:
             close(other.posterior(Z).mean, expected.mean)
 
 
+class TestLettingGo:
+    def test_the_first_sample_is_kept(self, case, uniform, close):
+        name, model, singles = case
+        Z, m = uniform(4, 2, high=2.0), model.num_outputs
+        more = [uniform(2, 2, seed=3), uniform(2, m, seed=4)]
+        noise = {"noise": torch.full_like(more[1], 1e-3)} if name.endswith("known") else {}
+        if "AR1" not in name:
+            model, *singles = (
+                each.condition_on_observations(*more, **noise) for each in (model, singles[0])
+            )
+        assert model.posterior(Z).mean.shape[0] == 3
+        model.release_samples()
+        assert model.num_samples is None
+        close(model.posterior(Z).mean, singles[0].posterior(Z).mean)
+        close(model.posterior(Z).variance, singles[0].posterior(Z).variance)
+        model.release_samples()
+
+    @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
+    def test_it_can_be_fitted_again(self, data, build):
+        model, fresh = (build("CKA", *data(num_outputs=2)) for _ in range(2))
+        options = {"num_screened": 16, "num_starts": 2}
+        fit(model, "hmc", num_iterations=8, num_samples=4, **options)
+        fit(model, "hmc", num_iterations=8, num_samples=6, **options)
+        assert model.num_samples == 6
+        found = fit(model, "map", **options).log_likelihood
+        assert model.num_samples is None
+        expected = fit(fresh, "map", **options).log_likelihood
+        assert (found > expected - 1.0).all()
+
+    def test_a_model_of_fantasies(self, held, data, uniform):
+        model, _ = held("CKA", *data())
+        fantasies = model.fantasize(uniform(1, 2), SobolQMCNormalSampler(Size([5]), seed=0))
+        with pytest.raises(RuntimeError, match="fantasies"):
+            fantasies.release_samples()
+
+    def test_it_keeps_them_if_a_fit_fails(self, held, data, uniform):
+        model, _ = held("CKA", *data())
+        Z = uniform(4, 2)
+        before = model.posterior(Z).mean
+        with pytest.raises(ValueError, match="no option"):
+            fit(model, "map", num_samples=3)
+        model.likelihood.noise_covar.raw_noise.requires_grad_(False)
+        model.covar_module.requires_grad_(False)
+        with pytest.raises(ValueError, match="no learnable parameter"):
+            fit(model, "map")
+        assert model.num_samples == 3
+        torch.testing.assert_close(model.posterior(Z).mean, before)
+
+
 class TestRefusals:
     def test_training(self, held, data):
         model, _ = held("CKA", *data())
-        for attempt in (model.train, lambda: fit(model), lambda: fit(model, "hmc")):
-            with pytest.raises(RuntimeError, match="holds samples"):
-                attempt()
+        with pytest.raises(RuntimeError, match="holds samples"):
+            model.train()
         with pytest.raises(RuntimeError, match="holds samples"):
             model.hold_samples({})
 

@@ -61,6 +61,19 @@ def test_moments_of_gaussians(gaussians):
         assert relative.abs().max() < 0.12
 
 
+def test_a_centre_and_a_root_that_are_given_keep_the_moments(gaussians):
+    mean, covariance = gaussians
+    root, sd = torch.linalg.cholesky(1.5 * covariance), covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    white = torch.randn(16, 2, 3, 1, generator=generator(), dtype=torch.float64)
+    start = mean + (torch.linalg.cholesky(covariance) @ white).squeeze(-1)
+    potential = gaussian(mean, covariance)
+    draws = hmc(potential, start, 0, 400, generator(), centre=mean + 0.5 * sd, root=root)
+    flat = draws.positions.flatten(0, 1)
+    assert ((flat.mean(0) - mean) / sd).abs().max() < 0.1
+    assert (flat.std(0) / sd - 1).abs().max() < 0.05
+    torch.testing.assert_close(draws.values, potential(flat)[0].reshape(400, 16, 2))
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_weights_of_two_modes(seed):
     start = 3 * torch.randn(16, 1, 2, generator=generator(seed), dtype=torch.float64)

@@ -304,13 +304,26 @@ class TestVagueTrend:
             values.append(objective(objective.parameters.current()).item())
         assert values[0] > values[1] + 100
 
-    @pytest.mark.parametrize("inputs", ["constant", "collinear", "one point more"])
+    @pytest.mark.parametrize(
+        "inputs", ["constant", "collinear", "few points", "all equal", "constant where observed"]
+    )
     def test_inputs_without_slopes_of_their_own(self, inputs):
         X = torch.rand(12, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        X[:, 1] = {"constant": 1.0, "collinear": 2 * X[:, 0]}.get(inputs, X[:, 1])
-        X = X[:3] if inputs == "one point more" else X
-        objective = Objective(ZeroMeanGP(X, X[:, :1].sin()), marginal=True, vague_trend=True)
-        value, gradient = objective.value_and_gradient(objective.parameters.current())
-        assert value.isfinite().all()
-        assert gradient.isfinite().all()
-        assert (gradient != 0).any()
+        X[:, 1] = {"constant": 0.7, "collinear": 2 * X[:, 0]}.get(inputs, X[:, 1])
+        X = X[:3] if inputs == "few points" else X
+        X = torch.full_like(X, 0.1) if inputs == "all equal" else X
+        Y = torch.linspace(0, 1, len(X), dtype=torch.float64).unsqueeze(-1).sin()
+        if inputs == "constant where observed":
+            X[:7, 1] = 0.3
+            Y = torch.cat([Y, Y.masked_fill((torch.arange(12) >= 7).unsqueeze(-1), math.nan)], -1)
+        objective = Objective(ZeroMeanGP(X, Y), marginal=True, vague_trend=True)
+        assert_gradient(objective, neighbours(objective, 1))
+
+    def test_units_of_the_inputs_make_no_difference(self):
+        X = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        Y, values = X[:, :1].sin() + X[:, 1:], []
+        for unit in (1.0, 1e7):
+            units = torch.tensor([unit, 1.0])
+            objective = Objective(ZeroMeanGP(X * units, Y), marginal=True, vague_trend=True)
+            values.append(objective(objective.parameters.current()))
+        torch.testing.assert_close(values[0], values[1], rtol=1e-6, atol=1e-6)

@@ -96,3 +96,43 @@ def test_a_physics_that_is_constant(XY):
     fit(model, num_screened=8)
     assert model.predict(X).mean.isfinite().all()
     warm_start(CKA(X, Y, physics=lambda X: 2.0 + 0 * X[..., :1], center="learn"), model)
+
+
+@pytest.mark.parametrize("method", ["map", "hmc"])
+def test_one_that_is_held_fixed_stays(XY, method):
+    model = move(CKA(*XY, physics=crude, center="learn"), 4.0)
+    model.terms[0].basis.center.requires_grad_(False)
+    fit(model, method, num_screened=16)
+    expected = torch.full_like(model.terms[0].basis.origin, 4.0)
+    torch.testing.assert_close(model.terms[0].basis.origin, expected)
+
+
+def test_predictions_leave_no_trace_at_it(XY, uniform):
+    model = CKA(*XY, physics=crude, center="learn").eval()
+    Z = uniform(4, 2).requires_grad_()
+    model.posterior(Z).mean.sum().backward()
+    assert Z.grad is not None
+    assert model.terms[0].basis.center.grad is None
+    Z = Z.detach()
+    for found in (model.predict(Z).mean, model.posterior(Z).mean, model.delta(Z).mean):
+        assert not found.requires_grad
+
+
+def test_a_parameter_of_the_physics_with_its_name(XY):
+    class Physics(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.center = torch.nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
+
+        def forward(self, X):
+            return crude(X) + self.center
+
+    physics = Physics()
+    models = [CKA(*XY, physics=physics) for _ in range(2)]
+    warm_start(*models)
+    assert models[0].predict(XY[0]).mean.isfinite().all()
+
+
+def test_the_summary_tells_it(XY):
+    model = move(CKA(*XY, physics=crude, center="learn"), 4.25)
+    assert "centre 4.25" in model.summary()
