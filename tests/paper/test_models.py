@@ -9,6 +9,7 @@ import torch
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.envs import random_cart_pole_physics
+from gpadjust.inference import register_priors
 from paper.active import Active
 from paper.active import Settings as ActiveSettings
 from paper.active import run as active_run
@@ -18,6 +19,7 @@ from paper.active.tables import needed, verdicts
 from paper.calibration import METHODS, ROWS, Calibration
 from paper.calibration import Settings as CalibrationSettings
 from paper.calibration import run as calibration_run
+from paper.calibration.leads import LEADS, taken
 from paper.common.runner import main, run_missing, runs_file
 from paper.forrester import Forrester
 from paper.forrester import Settings as ForresterSettings
@@ -361,3 +363,19 @@ class TestCalibration:
         assert size[0] / size[1] > 1e6
         wrong = data.physics(data.points) - data.truth
         assert (wrong.square().mean(0).sqrt() > 3 * data.noise).all()
+
+    def test_priors_are_taken_for_a_while(self):
+        X = torch.rand(6, 1, dtype=torch.float64)
+
+        def medians():
+            model = ZeroMeanGP(X, X.sin())
+            register_priors(model)
+            return {name: prior.loc.exp() for name, _, prior, _, _ in model.named_priors()}
+
+        before = medians()
+        with taken(LEADS["all wide"]):
+            within = medians()
+        after = medians()
+        name = "covar_module.terms.0.kernel.base_kernel.lengthscale_prior"
+        assert torch.equal(before[name], after[name])
+        torch.testing.assert_close(within[name] / before[name], torch.full((1, 1), 10 / 3).double())
