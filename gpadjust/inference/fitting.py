@@ -77,7 +77,8 @@ def fit(
     ``"hmc"``: Full Bayes. With few data (about five points per input, say) the intervals of a point
     estimate are too narrow; those of a mixture over the hyper-parameters' posterior are far closer
     to what they say, and its mean errs less as a rule. The chains start from Laplace's
-    approximation; 16 of them run in one batch, for two to four times as long as ``"map"``.
+    approximation; 16 of them run in one batch, for two to four times as long as ``"map"`` with up
+    to some 50 points, and for ten times as long and more from 200 on.
     Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`, and the size
     of a constant and of a linear trend (of up to three inputs) in the data has no vote on how
     smooth the functions are. The model then is a fully Bayesian model as BoTorch has them: its

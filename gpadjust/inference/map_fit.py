@@ -63,16 +63,7 @@ def maximise(objective: Objective, search: Search) -> FitResult:
     With many observations the search is made on some of them.
     """
     model, parameters = objective.model, objective.parameters
-    starts = parameters.clipped(parameters.current())
-    searches = search.num_screened != 0
-    if searches and parameters.is_batched and objective.num_points > _MANY:
-        starts = _best(objective, torch.cat([starts, _optima_of_some(objective, search)]))
-    elif searches:
-        starts = _screened(objective, search)
-    values = objective(starts)
-    if not values.amin(0).isfinite().all():
-        model.eval()
-        raise RuntimeError(NOWHERE)
+    starts = _starts(objective, search)
     reached, values, converged = _optimise(objective, starts, search.max_iterations)
     best = values.argmin(0), torch.arange(parameters.num_problems)
     objective.assign(reached[best])
@@ -91,17 +82,24 @@ def maximise(objective: Objective, search: Search) -> FitResult:
 
 def optima(objective: Objective, search: Search) -> tuple[Tensor, Tensor]:
     """Rough optima, not assigned to the model: ``k x B x p`` and their values ``k x B``."""
-    parameters = objective.parameters
-    starts = parameters.clipped(parameters.current())
-    if search.num_screened != 0 and objective.num_points > _MANY:
-        starts = _best(objective, torch.cat([starts, _optima_of_some(objective, search)]))
-    elif search.num_screened != 0:
-        starts = _screened(objective, search)
-    values = objective(starts)
-    if not values.amin(0).isfinite().all():
-        raise RuntimeError(NOWHERE)
+    starts = _starts(objective, search)
     reached, values, _ = _optimise(objective, starts, min(search.max_iterations, 60), _ROUGH)
     return reached, values
+
+
+def _starts(objective: Objective, search: Search) -> Tensor:
+    """Where L-BFGS starts, ``k x B x p``; an error if the objective is finite nowhere."""
+    parameters = objective.parameters
+    starts = parameters.clipped(parameters.current())
+    searches = search.num_screened != 0
+    if searches and parameters.is_batched and objective.num_points > _MANY:
+        starts = _best(objective, torch.cat([starts, _optima_of_some(objective, search)]))
+    elif searches:
+        starts = _screened(objective, search)
+    if not objective(starts).amin(0).isfinite().all():
+        objective.model.eval()
+        raise RuntimeError(NOWHERE)
+    return starts
 
 
 def _optima_of_some(objective: Objective, search: Search) -> Tensor:
