@@ -43,7 +43,7 @@ def sine(X):
 def first_call():
     X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
     model = CKA(X, 2 * sine(X) + X, physics=sine)
-    fit(model)
+    fit(model, "map")
     posterior = model.posterior(X)
     return posterior.mean, posterior.variance
 

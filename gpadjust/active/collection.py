@@ -38,9 +38,9 @@ class Collection(Loop):
 
     :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points; where
     a program can measure, :meth:`run` does both. The first points are a scrambled Sobol design;
-    later ones maximise the acquisition function of a model of all data so far, which is fitted from
-    the last one's hyper-parameters. Points that were asked for and not yet told are pending:
-    acquisition functions that take ``X_pending`` count on them.
+    later ones maximise the acquisition function of a model of all data so far. Points that were
+    asked for and not yet told are pending: acquisition functions that take ``X_pending`` count on
+    them.
 
     With a log, each measurement is on the disk before :meth:`tell` does anything else, as a line of
     JSON; so are the points asked for, before :meth:`ask` returns them. A new collection with the
@@ -60,8 +60,8 @@ class Collection(Loop):
             first points, ``k x d``, no two alike, in place of Sobol's. Default: ``2 (d + 1)``.
         data: ``(X, Y)`` measured before. They are not logged: give them each time.
         num_outputs: Number ``m`` of outputs. Default: that of the first measurement.
-        fit: Fits a new model, in place. Default: :func:`gpadjust.fit`. Take
-            ``lambda model: fit(model, "hmc")`` for full Bayes.
+        fit: Fits a new model, in place. Default: :func:`gpadjust.fit`. A point fit,
+            ``lambda model: fit(model, "map")``, begins where the last one was.
         optimizer_options: Arguments of ``optimize_acqf``.
         log: The file of the log.
         seed: Seed of the design and of the acquisition function's maximisation. The global random

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from botorch.exceptions.warnings import OptimizationWarning
 
 from gpadjust.inference import fit as fit_model
 from gpadjust.inference.warm_start import warm_start
@@ -15,26 +13,16 @@ from gpadjust.models import ExactGPBase
 
 
 def refit(model: Any, previous: Any, fit: Callable[[Any], Any] | None) -> None:
-    """Fit a model, in place, from where an earlier one of the same structure was.
+    """Fit a model, in place, from where an earlier point fit of the same structure was.
 
     Args:
         model: The model.
         previous: The model fitted last, or None.
-        fit: Fits it. Default: :func:`gpadjust.fit`, with fewer starts where there is an earlier
-            model.
+        fit: Fits it. Default: :func:`gpadjust.fit`.
     """
-    warm = previous is not None and _alike(model, previous)
-    if warm:
+    if previous is not None and _alike(model, previous):
         warm_start(model, previous)
-    if fit is not None:
-        fit(model)
-    elif not warm:
-        fit_model(model)
-    else:
-        with warnings.catch_warnings():
-            # The next fit goes on from where this one stops.
-            warnings.simplefilter("ignore", OptimizationWarning)
-            fit_model(model, num_screened=64, num_starts=4)
+    (fit or fit_model)(model)
 
 
 def parameter_values(model: Any) -> dict[str, Any]:

@@ -10,13 +10,18 @@ from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
-from gpadjust.dynamics.incremental_fit import check_observed, checked_fit_options, fit_all
+from gpadjust.dynamics.incremental_fit import (
+    DynamicsFitOptions,
+    check_observed,
+    checked_fit_options,
+    fit_all,
+)
 from gpadjust.dynamics.learnt import Learnt, LearntState
 from gpadjust.dynamics.model_recipe import ModelRecipe
 from gpadjust.dynamics.next_state_physics import check_physics
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.inference import FitOptions, FitResult
+from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, ExactGPBase, Prediction
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.states import StateSpec
@@ -47,7 +52,9 @@ class LearnedDynamics(Dynamics):
         model_options: Further arguments of the model, such as ``rho_mean`` of CKA or
             ``num_features`` of RRA. A kernel may be a function of the number of inputs and the
             batch shape that makes it; one that is a module is copied for each fit.
-        fit_options: Options of the search that :func:`gpadjust.fit` makes at the first fit.
+        fit_options: Options of the search that :func:`gpadjust.fit` makes at the first fit, and of
+            all fits the ``method``: by default the hyper-parameters are sampled, and what is
+            predicted has their uncertainty, too; ``"map"`` takes the most likely ones.
 
     Raises:
         TypeError: If an argument is of another type, or the model needs a physics that is missing
@@ -76,7 +83,7 @@ class LearnedDynamics(Dynamics):
         target: Target = "difference",
         encode_angles: bool = True,
         model_options: Mapping[str, Any] | None = None,
-        fit_options: FitOptions | None = None,
+        fit_options: DynamicsFitOptions | None = None,
     ) -> None:
         super().__init__(spec)
         if not isinstance(encode_angles, bool):
@@ -85,7 +92,7 @@ class LearnedDynamics(Dynamics):
         self.physics = None if physics is None else check_physics(physics)
         self.encode_angles = encode_angles
         self.fit_options = checked_fit_options(fit_options)
-        self.fit_result: FitResult | None = None
+        self.fit_result: FitResult | SampleResult | None = None
         self._recipe = ModelRecipe(self.targets, self.physics, model, model_options, encode_angles)
         self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions

@@ -105,7 +105,10 @@ class TrajectoryInformation:
             information_gain(self.model, points, self.unknown, counted=some)
             for points, some in zip(X.split(at_once), made.split(at_once), strict=True)
         ]
-        return torch.cat(parts).reshape(batch[:-1])
+        found = torch.cat(parts)
+        if self.model.num_samples is not None:
+            found = found.mean(-1)
+        return found.reshape(batch[:-1])
 
 
 def check_informative(dynamics: Dynamics | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, TypedDict, Unpack, overload
+from typing import Any, Literal, TypedDict, Unpack, cast, overload
 
 from botorch.models import ModelListGP
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
@@ -12,18 +12,19 @@ from botorch.utils.transforms import is_fully_bayesian
 
 from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.full_bayes import SampleResult, sample
+from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
-from gpadjust.inference.objective import Objective
 from gpadjust.models import ExactGPBase
 
-Method = Literal["map", "hmc"]
+Method = Literal["bayes", "map"]
 
 # Least values of the options of each method.
 _SEARCH = {"num_starts": 1, "num_screened": 0, "max_iterations": 1, "seed": 0}
-_OPTIONS: dict[str, dict[str, int]] = {
+_OPTIONS: dict[Method, dict[str, int]] = {
     "map": _SEARCH,
-    "hmc": {**_SEARCH, "num_samples": 1, "num_iterations": 8, "progress": 0},
+    "bayes": {**_SEARCH, "num_samples": 1, "num_draws": 16},
 }
+_OR_NONE = ("num_starts", "num_screened", "num_samples", "num_draws")
 
 
 class FitOptions(TypedDict, total=False):
@@ -33,96 +34,101 @@ class FitOptions(TypedDict, total=False):
     num_screened: int | None
     max_iterations: int
     seed: int
-    num_samples: int
-    num_iterations: int | None
-    progress: bool
+    num_samples: int | None
+    num_draws: int | None
 
 
 @overload
 def fit(
     model: BatchedMultiOutputGPyTorchModel,
-    method: Literal["map"] = ...,
+    method: None = ...,
     **options: Unpack[FitOptions],
+) -> FitResult | SampleResult: ...
+
+
+@overload
+def fit(
+    model: BatchedMultiOutputGPyTorchModel, method: Literal["map"], **options: Unpack[FitOptions]
 ) -> FitResult: ...
 
 
 @overload
 def fit(
-    model: BatchedMultiOutputGPyTorchModel, method: Literal["hmc"], **options: Unpack[FitOptions]
+    model: BatchedMultiOutputGPyTorchModel, method: Literal["bayes"], **options: Unpack[FitOptions]
 ) -> SampleResult: ...
 
 
 @overload
 def fit(
-    model: ModelListGP, method: Method = ..., **options: Unpack[FitOptions]
+    model: ModelListGP, method: Method | None = ..., **options: Unpack[FitOptions]
 ) -> list[FitResult | SampleResult]: ...
 
 
 def fit(
     model: BatchedMultiOutputGPyTorchModel | ModelListGP,
-    method: Method = "map",
+    method: Method | None = None,
     **options: Unpack[FitOptions],
 ) -> FitResult | SampleResult | list[FitResult | SampleResult]:
-    """Fit a model's hyper-parameters, in place: to their most likely values, or by sampling them.
+    """Fit a model's hyper-parameters, in place: by sampling them, or to their most likely values.
 
-    ``"map"``: Random starts are screened in one batch beside the model's current parameters;
-    L-BFGS then runs from the best of them, for all outputs in lockstep, on a likelihood whose
-    overall scale (and constant means, where they are unknown) is at its optimum in closed form.
-    With more than some 150 points the search is made on 96 of them, and its best optima are
-    refined on all. Starts and bounds follow the data's scales, so that units of inputs, targets
-    and physics make no difference. The result is never less likely than the parameters that the
-    model came with. Priors registered on the model are honoured (maximum a posteriori, otherwise
-    maximum likelihood); parameters with ``requires_grad=False`` stay.
+    ``"bayes"``, the default where it can be done: full Bayes. The model then is a fully Bayesian
+    model as BoTorch has them: it holds samples of its hyper-parameters, its posterior is a
+    ``GaussianMixturePosterior``, and acquisition functions average over the samples. A search, as
+    below, finds the modes; draws around them are weighted by importance sampling. Parameters
+    without a prior get that of :func:`~gpadjust.inference.register_priors`, and the size of a
+    constant and of a linear trend (of up to three inputs) in the data has no vote on how smooth
+    the functions are. What outputs share, such as the parameters of a physics, is at its most
+    likely value.
 
-    ``"hmc"``: Full Bayes. With few data (about five points per input, say) the intervals of a point
-    estimate are too narrow; those of a mixture over the hyper-parameters' posterior are far closer
-    to what they say, and its mean errs less as a rule. The chains start from Laplace's
-    approximation; 16 of them run in one batch, for two to four times as long as ``"map"`` with up
-    to some 50 points, and for ten times as long and more from 200 on.
-    Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`, and the size
-    of a constant and of a linear trend (of up to three inputs) in the data has no vote on how
-    smooth the functions are. The model then is a fully Bayesian model as BoTorch has them: its
-    posterior is a ``GaussianMixturePosterior``, and acquisition functions average over the samples.
+    ``"map"``: the most likely values. Random starts are screened in one batch beside the model's
+    current parameters; L-BFGS then runs from the best of them, for all outputs in lockstep, on a
+    likelihood whose overall scale (and constant means, where they are unknown) is at its optimum in
+    closed form. With more than some 150 points the search is made on 96 of them, and its best
+    optima are refined on all. Starts and bounds follow the data's scales, so that units of inputs,
+    targets and physics make no difference. The result is never less likely than the parameters that
+    the model came with. Priors registered on the model are honoured (maximum a posteriori,
+    otherwise maximum likelihood). With few data its intervals are far too narrow. It is the default
+    for models of other libraries, for batches of data sets, and for
+    :class:`~gpadjust.models.PaperRRA`.
 
-    A model that holds samples lets go of them first. Small problems are computed with one thread;
-    the user's setting is restored after.
+    Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
+    Small problems are computed with one thread; the user's setting is restored after.
 
     Args:
         model: Any model of this library, any BoTorch model with batched outputs such as
             ``SingleTaskGP`` (for ``"map"``), or a ``ModelListGP`` of them.
-        method: ``"map"`` or ``"hmc"``.
+        method: ``"bayes"`` or ``"map"``. Default: ``"bayes"`` if the model can hold samples.
         options: ``num_starts``, the number of starts that L-BFGS is run from, for each output
             (default: 16; 8 if the physics learns, which is evaluated at one vector after the
             other). ``num_screened``, the number of random starts that are screened; 0 fits from
             the current parameters alone, a warm start (default: 256, fewer for more than 100
             points; 32 if the physics learns). ``max_iterations``, the limit of L-BFGS iterations
-            from each start (500). ``seed`` of random starts and sampler (0); the global random
-            state is left alone. Of ``"hmc"`` only: ``num_samples`` that the model is to hold (16),
-            ``num_iterations`` of each chain, of which the first half is thrown away (default: 40,
-            fewer for more than 100 points), and ``progress``, whether to show a bar (False).
+            from each start (500). ``seed`` of random starts and draws (0); the global random
+            state is left alone. Of ``"bayes"`` only: ``num_samples`` that the model is to hold
+            (default: 16, 8 with more than 40 points, 4 with more than 100), and ``num_draws`` that
+            they are chosen from (default: 1,024, down to 128 with more than 70 points).
 
     Returns:
         For ``"map"`` the likelihood reached and whether the optimiser converged, otherwise the
-        draws and whether they mixed; a list of them for a ``ModelListGP``. The model is left in
+        draws and how many of them count; a list of them for a ``ModelListGP``. The model is left in
         eval mode.
 
     Raises:
         TypeError: If the model is of another kind, or an option is no whole number.
         ValueError: If an option is out of range or not one of the method, no parameter is
-            learnable, or a model whose outputs share parameters is to be sampled.
+            learnable, or a model is to be sampled that cannot be.
         RuntimeError: If the likelihood cannot be evaluated anywhere (the model is left unchanged),
             or a model of another library holds samples.
 
     Warns:
         OptimizationWarning: If the optimiser did not converge.
-        SamplingWarning: If the chains did not mix.
+        SamplingWarning: If next to one draw has all the weight.
     """
     given: dict[str, Any] = {**options}
-    check_options(method, given)
     if isinstance(model, ModelListGP):
         results: list[FitResult | SampleResult] = []
         for part in model.models:
-            result = fit(part, method, **options)
+            result: Any = fit(part, method, **options)
             results.extend(result if isinstance(result, list) else [result])
         return results
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
@@ -135,11 +141,30 @@ def fit(
             f"The {type(model).__name__} holds samples of its hyper-parameters; build it anew, to "
             "fit it."
         )
+    method = method or ("bayes" if _can_be_sampled(model) else "map")
+    check_options(method, given)
     search = Search(**{name: given.pop(name) for name in _SEARCH if name in given})
     with threads_for(model.train_targets.shape[-1], others=True), _without_samples(model):
         if method == "map":
-            return maximise(Objective(model), search)
+            return maximise(model, search)
+        if not isinstance(model, ExactGPBase):
+            raise TypeError(
+                f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP is "
+                "the plain Gaussian process."
+            )
         return sample(model, search, **given)
+
+
+def _can_be_sampled(model: BatchedMultiOutputGPyTorchModel) -> bool:
+    """Whether a model can hold samples, and has something to sample."""
+    if not isinstance(model, ExactGPBase):
+        return False
+    try:
+        model.check_can_be_sampled()
+    except ValueError:
+        return False
+    learnt = [name for name, p in model.named_parameters() if p.requires_grad]
+    return len(learnt) > len(shared_parameters(model))
 
 
 @contextmanager
@@ -163,15 +188,15 @@ def _without_samples(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
 
 def check_options(method: str, options: dict[str, Any]) -> None:
     """Raise what :func:`fit` raises of its options."""
-    if method not in _OPTIONS:
-        raise ValueError(f"Unknown method {method!r}; expected 'map' or 'hmc'.")
-    known = _OPTIONS[method]
+    known = _OPTIONS.get(cast(Method, method))
+    if known is None:
+        raise ValueError(f"Unknown method {method!r}; expected 'bayes' or 'map'.")
     for name, value in options.items():
         if name not in known:
-            of_other = name in _OPTIONS["hmc"]
-            hint = "it is one of method 'hmc'" if of_other else f"expected {', '.join(known)}"
+            of_other = name in _OPTIONS["bayes"]
+            hint = "it is one of method 'bayes'" if of_other else f"expected {', '.join(known)}"
             raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
-        if value is None and name in ("num_starts", "num_screened", "num_iterations"):
+        if value is None and name in _OR_NONE:
             continue
         if not isinstance(value, int):
             raise TypeError(f"Expected {name} to be a whole number, got {value!r}.")

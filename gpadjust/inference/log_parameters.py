@@ -25,6 +25,17 @@ Parameters = dict[str, Tensor]
 _LITTLE_NOISE = (1e-11, 1e-6)  # the noise of half of the starts, in typical sizes
 
 
+def shared_parameters(model: BatchedMultiOutputGPyTorchModel) -> list[str]:
+    """The names of the learnable parameters that are no output's own, as those of a physics."""
+    outputs = model._aug_batch_shape
+    return [
+        name
+        for name, p in model.named_parameters()
+        if p.requires_grad
+        and (name.startswith("input_transform.") or p.shape[: len(outputs)] != outputs)
+    ]
+
+
 class LogParameters:
     """Vectors of a model's learnable parameters: logarithms of lengthscales and variances.
 
@@ -66,11 +77,9 @@ class LogParameters:
                 "The model has no learnable parameter: all have `requires_grad=False`."
             )
         self.names = list(self._raw)
-        outputs = model._aug_batch_shape
         self.learns_inputs = any(name.startswith("input_transform.") for name in self.names)
-        own = all(p.shape[: len(outputs)] == outputs for p in self._raw.values())
-        self.is_batched = own and not self.learns_inputs
-        self.batch_shape = outputs if self.is_batched else Size()
+        self.is_batched = not shared_parameters(model)
+        self.batch_shape = model._aug_batch_shape if self.is_batched else Size()
         self.num_problems = self.batch_shape.numel()
         self._shapes = [p.shape[len(self.batch_shape) :] for p in self._raw.values()]
         self._constraints = {name: constraint_of(model, name) for name in self.names}

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
+from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from botorch.optim.batched_lbfgs_b import fmin_l_bfgs_b_batched
 from torch import Tensor
 
+from gpadjust.gp import AppendedPhysics
 from gpadjust.inference.log_parameters import magnitude
 from gpadjust.inference.objective import Objective
 
@@ -57,16 +61,18 @@ class FitResult:
     converged: Tensor
 
 
-def maximise(objective: Objective, search: Search) -> FitResult:
-    """Bring the model of an objective to its optimum, see :func:`~gpadjust.fit`.
+def maximise(model: BatchedMultiOutputGPyTorchModel, search: Search) -> FitResult:
+    """Bring a model to its most likely hyper-parameters, see :func:`~gpadjust.fit`.
 
     With many observations the search is made on some of them.
     """
-    model, parameters = objective.model, objective.parameters
-    starts = _starts(objective, search)
-    reached, values, converged = _optimise(objective, starts, search.max_iterations)
-    best = values.argmin(0), torch.arange(parameters.num_problems)
-    objective.assign(reached[best])
+    with _centers_at_rest(model):
+        objective = Objective(model)
+        parameters = objective.parameters
+        starts = _starts(objective, search)
+        reached, values, converged = _optimise(objective, starts, search.max_iterations)
+        best = values.argmin(0), torch.arange(parameters.num_problems)
+        objective.assign(reached[best])
     model.eval()
     converged = converged[best].reshape(parameters.batch_shape)
     if not converged.all():
@@ -78,6 +84,24 @@ def maximise(objective: Objective, search: Search) -> FitResult:
             stacklevel=4,
         )
     return FitResult(-values[best].reshape(parameters.batch_shape), converged)
+
+
+@contextmanager
+def _centers_at_rest(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
+    """Let centres stay: the most likely ones are found far out, where intervals are too narrow."""
+    centers = [
+        module.center
+        for module in model.covar_module.modules()
+        if isinstance(module, AppendedPhysics) and module.learns_center
+    ]
+    learnt = [center for center in centers if center.requires_grad]
+    for center in learnt:
+        center.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for center in learnt:
+            center.requires_grad_(True)
 
 
 def optima(objective: Objective, search: Search) -> tuple[Tensor, Tensor]:

@@ -255,7 +255,8 @@ class Objective:
             weight = None if basis is None else basis(inputs)
             x, center, spread = (inputs - origin)[..., :d], None, None
             names |= {lengthscale} if scale is None else {lengthscale, scale}
-            if isinstance(basis, AppendedPhysics) and basis.learns_center:
+            learns = isinstance(basis, AppendedPhysics) and basis.learns_center
+            if learns and basis.center.requires_grad:
                 center = f"{path.removesuffix('.kernel')}.basis.center"
                 spread = basis.spread / basis.scale
                 weight = basis(inputs) + spread * basis.center

@@ -44,7 +44,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
 
     Args:
         model: A model of this library. They are made for sampling: :func:`gpadjust.fit` with
-            ``"hmc"``, and GPyTorch's ``pyro_sample_from_prior``. The mode of a wide
+            ``"bayes"``, and GPyTorch's ``pyro_sample_from_prior``. The mode of a wide
             log-normal density lies far below its median, so a maximum a posteriori fit with them
             finds too little noise.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import torch
 from torch import Tensor
 
@@ -15,14 +17,16 @@ def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
 
     They are the same in the user's units: lengthscales, centres, and the variance of a scaling of
     the physics, stay; the other variances follow the units that the outcome transforms put the
-    targets in, which change with the data.
+    targets in, which change with the data. Of a model that holds samples it is their mean.
 
     Args:
         model: The model to start, changed in place.
         previous: The model with the hyper-parameters, of other data.
     """
-    ratio = 2 * (previous._units()[1] / model._units()[1]).log().squeeze(-1)  # ... x (m)
     unitless = [path for path, _, _, basis in kernels_of(model) if is_rho(basis)]
+    if previous.num_samples is not None:
+        previous = _mean_of_samples(previous)
+    ratio = 2 * (previous._units()[1] / model._units()[1]).log().squeeze(-1)  # ... x (m)
     source = dict(previous.named_parameters())
     with torch.no_grad():
         for name, parameter in model.named_parameters():
@@ -39,3 +43,15 @@ def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
                 factor = ratio[(..., *[None] * (value.dim() - ratio.dim()))].exp()
                 value = constraint.inverse_transform(constraint.transform(value) * factor)
             parameter.copy_(value)
+
+
+def _mean_of_samples(model: ExactGPBase) -> ExactGPBase:
+    """A copy with the means of the raw parameters that a model holds samples of."""
+    held = dict(model.named_parameters())
+    model = deepcopy(model)
+    model.release_samples()
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if held[name].dim() > parameter.dim():
+                parameter.copy_(held[name].mean(0))
+    return model

@@ -84,7 +84,7 @@ class AdjustedGP(ExactGPBase):
         delta: Adjustment,
         *,
         more_terms: Callable[[int, Size, Tensor], Sequence[Term]] | None = None,
-        center: float | Tensor | Literal["mean", "learn"] = 0.0,
+        center: float | Tensor | Literal["mean", "learn"] = "learn",
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,

@@ -60,12 +60,10 @@ class CKA(AdjustedGP):
             kriging: for a physics that is wrong by an unknown factor throughout. Far from the data
             the model then falls back to the scaled physics. Default: 1, of several ``"learn"``.
         delta_mean: The prior mean of :math:`\delta`, a number or ``"learn"``.
-        center: With a constant c, the kernel is built on :math:`f_p - c`, in the user's units
-            (``"mean"``: its mean at ``train_X``). The literal model has 0. ``"learn"`` makes c a
+        center: The kernel is built on :math:`f_p - c`. By default, ``"learn"``, the constant c is a
             hyper-parameter, so that a constant in both f_p and targets makes no difference, however
-            large: with full Bayes the best choice as a rule, while a point estimate of it is too
-            sure with few points. Take ``"mean"`` there if f_p varies little about a large constant,
-            which rho and delta would dispute otherwise.
+            large; a point fit (``"map"``) leaves it at the mean of f_p at ``train_X``, where
+            ``"mean"`` keeps it. A number is c in the user's units; the literal model has 0.
         likelihood: A Gaussian likelihood. Default: learnt noise, with a standard deviation of at
             least three millionths of the root mean square of ``train_Y - f_p``.
         outcome_transform: ``Standardize`` or None. Default: division by the root mean square of
@@ -101,7 +99,7 @@ class CKA(AdjustedGP):
         delta_covar_module: KernelLike | None = None,
         rho_mean: Means | None = None,
         delta_mean: float | Literal["learn"] = 0.0,
-        center: float | Tensor | Literal["mean", "learn"] = 0.0,
+        center: float | Tensor | Literal["mean", "learn"] = "learn",
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,

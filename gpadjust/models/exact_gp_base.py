@@ -75,7 +75,7 @@ class ExactGPBase(SingleTaskGP):
     """
 
     prediction_strategy: Any
-    num_samples: int | None = None  # of the hyper-parameters, which `fit(model, "hmc")` draws
+    num_samples: int | None = None  # of the hyper-parameters, which `fit` draws
     covar_module: SumOfTerms
 
     def __init__(
@@ -500,9 +500,11 @@ class ExactGPBase(SingleTaskGP):
 
         Raises:
             RuntimeError: If the model holds samples already.
-            ValueError: If the model is of a batch of data sets.
+            ValueError: If the model cannot be fully Bayesian: it is of a batch of data sets, say.
         """
-        self.check_can_hold_samples()
+        if self.num_samples is not None:
+            raise RuntimeError(HOLDS_SAMPLES)
+        self.check_can_be_sampled()
         hold_samples(self, samples)
 
     def release_samples(self) -> None:
@@ -516,11 +518,11 @@ class ExactGPBase(SingleTaskGP):
         if self.num_samples is not None:
             release_samples(self)
 
-    def check_can_hold_samples(self) -> None:
-        """Raise what :meth:`hold_samples` raises."""
-        if self.num_samples is not None:
-            raise RuntimeError(HOLDS_SAMPLES)
-        if self._input_batch_shape:
+    def check_can_be_sampled(self) -> None:
+        """Raise a ValueError if the model cannot hold samples of its hyper-parameters."""
+        # Of a model that holds samples these are a batch, too.
+        held = 0 if self.num_samples is None else 1
+        if self._input_batch_shape[held:]:
             raise ValueError(
                 "Expected a model of one data set to hold samples, got one with batch_shape "
                 f"{tuple(self._input_batch_shape)}; sample the data sets of a batch one by one."

@@ -67,7 +67,7 @@ class RRA(AdjustedGP):
         num_features: int = 128,
         rho_mean: Means | None = None,
         delta_mean: float | Literal["learn"] = 0.0,
-        center: float | Tensor | Literal["mean", "learn"] = 0.0,
+        center: float | Tensor | Literal["mean", "learn"] = "learn",
         likelihood: Likelihood | None = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
@@ -280,7 +280,7 @@ class PaperRRA(RRA):
         for term in self.covar_module.terms:
             term.kernel.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
 
-    def check_can_hold_samples(self) -> None:
+    def check_can_be_sampled(self) -> None:
         """Refuse: the paper's closed form has no likelihood to sample from."""
         raise ValueError(
             "PaperRRA cannot be fully Bayesian: its covariance is not that of a posterior. Take "

@@ -366,7 +366,7 @@ def _advice(
         sentences.append(
             f"{len(densities[best.structure])} observations are few for {best.num_parameters} "
             "hyper-parameters: the ranking is uncertain, and the intervals of a point fit are too "
-            "narrow; see fit(model, 'hmc')."
+            "narrow; see fit(model)."
         )
 
     def gain(better: str, worse: str) -> tuple[float, float]:

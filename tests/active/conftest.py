@@ -38,7 +38,7 @@ def laboratory(request):
             "acquisition": lambda model: qNegIntegratedPosteriorVariance(model, mc_points=points),
             "budget": 7,
             "initial": 4,
-            "fit": lambda model: fit(model, num_screened=8, num_starts=1),
+            "fit": lambda model: fit(model, "map", num_screened=8, num_starts=1),
             "optimizer_options": {
                 "num_restarts": 1,
                 "raw_samples": 4,

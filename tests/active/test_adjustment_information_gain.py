@@ -162,7 +162,7 @@ class TestAgainstLinearAlgebra:
         D, Y = data()
         Y = Y + 0.02 * torch.randn(Y.shape, dtype=torch.float64)
         model = build(kind, D, Y, rho_mean="learn", delta_mean="learn")
-        fit(model, num_screened=16, num_starts=2)
+        fit(model, "map", num_screened=16, num_starts=2)
         expected = Gaussian(model, D, X)
         assert max(expected.constant.values()) > 1
         assert_close(ask(model, X, about), expected.information(about), 1e-5)
@@ -372,7 +372,7 @@ class TestLife:
     def test_it_follows_the_model(self, model, X):
         acquisition = qAdjustmentInformationGain(model, "rho")
         before = acquisition(X)
-        fit(model, num_screened=8, num_starts=1)
+        fit(model, "map", num_screened=8, num_starts=1)
         assert_close(acquisition(X), qAdjustmentInformationGain(model, "rho")(X))
         assert not torch.allclose(acquisition(X), before)
 

@@ -155,7 +155,7 @@ def _sampled(model, options):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return fit(model, "hmc", **options)
+        return fit(model, "bayes", **options)
 
 
 class TestFailures:

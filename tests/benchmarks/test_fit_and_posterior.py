@@ -49,7 +49,7 @@ def test_fit(benchmark, record_ratio, uniform, n, m):
     Y = (1 + 0.3 * X[:, :1]) * several(X, m) + X[:, 1:].square() + noise
 
     def ours():
-        fit(CKA(X, Y, physics=lambda X: several(X, m)))
+        fit(CKA(X, Y, physics=lambda X: several(X, m)), "map")
 
     def theirs():
         fit_by_botorch(SingleTaskGP(X, Y))

@@ -324,7 +324,7 @@ def test_an_integrated_state_hides_no_failure():
             ValueError,
             "PaperRRA does not take 'rho_mean'",
         ),
-        ({"fit_options": {"method": "hmc"}}, ValueError, "leave 'method' out"),
+        ({"fit_options": {"method": "bayes"}}, ValueError, "leave 'method' out"),
         ({"fit_options": {"num_samples": 8}}, ValueError, "it is one of method 'hmc'"),
         ({"fit_options": {"starts": 8}}, ValueError, "no option 'starts'; expected num_starts"),
         ({"fit_options": [8]}, TypeError, r"dictionary of options of gpadjust.fit, found \[8\]"),

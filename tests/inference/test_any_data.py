@@ -87,7 +87,7 @@ def check(kind, problem):
             BUILD[kind](X, Y, physics=physics)
         return
     model = BUILD[kind](X, Y, physics=physics)
-    fit(model, **FIT)
+    fit(model, "map", **FIT)
     with torch.no_grad():
         posteriors = [model.posterior(Z)]
         if isinstance(model, CKA):
@@ -139,7 +139,7 @@ def test_the_fewest_points_are_interpolated(kind, targets, uniform):
     X = uniform(FEWEST[kind], 1)
     Y = TARGETS[targets](X)
     model = BUILD[kind](X, Y, physics=wave)
-    fit(model, **FIT)
+    fit(model, "map", **FIT)
     mean = model.posterior(X).mean.detach()
     # At worst noise and function are not told from one another.
     assert ((mean - Y).abs() <= (Y - wave(X)).abs().max() + 1e-9).all()
@@ -149,5 +149,5 @@ def test_the_fewest_points_are_interpolated(kind, targets, uniform):
 def test_an_exact_physics_is_left_as_it_is(kind, uniform):
     X, Z = uniform(8, 1), uniform(20, 1, seed=1)
     model = BUILD[kind](X, wave(X), physics=wave)
-    fit(model, **FIT)
+    fit(model, "map", **FIT)
     torch.testing.assert_close(model.posterior(Z).mean, wave(Z), rtol=0, atol=1e-5)

@@ -71,7 +71,7 @@ def log_likelihood(model):
 class TestResult:
     def test_likelihood_and_mode(self, model):
         before = log_likelihood(model)
-        result = fit(model, **QUICK)
+        result = fit(model, "map", **QUICK)
         assert isinstance(result, FitResult)
         assert not model.training
         assert result.converged.all()
@@ -82,11 +82,11 @@ class TestResult:
 
     @pytest.mark.parametrize("num_screened", [0, 8])
     def test_never_worse_than_the_start(self, model, num_screened):
-        fit(model, num_starts=2, num_screened=32)
+        fit(model, "map", num_starts=2, num_screened=32)
         good = log_likelihood(model)
         # From a good start, one random start more or a single iteration must not lose it.
         for seed in range(2):
-            fit(model, num_starts=1, num_screened=num_screened, seed=seed)
+            fit(model, "map", num_starts=1, num_screened=num_screened, seed=seed)
             assert (log_likelihood(model) >= good - 1e-6 * good.abs()).all()
 
     def test_a_start_outside_the_search_is_kept(self, XY):
@@ -97,7 +97,7 @@ class TestResult:
             lengthscales[0].fill_(30.0)
             lengthscales[1].fill_(20.0)
         before = log_likelihood(model)
-        fit(model, num_screened=0)
+        fit(model, "map", num_screened=0)
         assert (log_likelihood(model) >= before).all()
         assert (lengthscales[0] == 30.0).all()
 
@@ -105,12 +105,12 @@ class TestResult:
         X, Y = XY
         models = [CKA(X, Y, physics=crude), BiasGP(X[:6], Y[:6], physics=crude)]
         before = [log_likelihood(model) for model in models]
-        results = fit(ModelListGP(*models), **QUICK)
+        results = fit(ModelListGP(*models), "map", **QUICK)
         assert len(results) == 2
         for model, result, start in zip(models, results, before, strict=True):
             assert (result.log_likelihood > start).all()
             torch.testing.assert_close(result.log_likelihood, log_likelihood(model))
-        again = fit(ModelListGP(*models), num_screened=0, num_starts=1)
+        again = fit(ModelListGP(*models), "map", num_screened=0, num_starts=1)
         for first, second in zip(results, again, strict=True):
             assert (second.log_likelihood >= first.log_likelihood - 1e-6).all()
 
@@ -118,13 +118,13 @@ class TestResult:
         X, Y = XY
         model = SingleTaskGP(X, Y)
         before = log_likelihood(model)
-        assert (fit(model, **QUICK).log_likelihood > before).all()
+        assert (fit(model, "map", **QUICK).log_likelihood > before).all()
 
 
 def test_no_convergence_is_said(model):
     before = log_likelihood(model)
     with pytest.warns(OptimizationWarning, match="did not converge for 2 of 2 outputs within 1"):
-        result = fit(model, num_screened=0, num_starts=1, max_iterations=1)
+        result = fit(model, "map", num_screened=0, num_starts=1, max_iterations=1)
     assert not result.converged.any()
     assert (log_likelihood(model) >= before).all()
 
@@ -141,11 +141,11 @@ class TestOutputs:
         X, Y = XY
         tolerance = 1e-4 if num_screened == 0 else 0.05
         both = BUILD[kind](X, Y)
-        fit(both, num_screened=num_screened)
+        fit(both, "map", num_screened=num_screened)
         options = {"num_features": 16} if kind == "RRA" else {}
         for j in range(2):
             single = type(both)(X, Y[:, [j]], physics=lambda X, j=j: crude(X)[..., [j]], **options)
-            found = fit(single, num_screened=num_screened).log_likelihood
+            found = fit(single, "map", num_screened=num_screened).log_likelihood
             torch.testing.assert_close(found, log_likelihood(both)[j], rtol=1e-4, atol=tolerance)
             if num_screened == 0:
                 Z = X + 0.05
@@ -156,7 +156,7 @@ class TestOutputs:
         X = uniform(3, 8, 2)
         model = CKA(X, 1.5 * crude(X) + X.flip(-1), physics=crude)
         before = log_likelihood(model)
-        result = fit(model, num_screened=8, num_starts=1)
+        result = fit(model, "map", num_screened=8, num_starts=1)
         assert result.log_likelihood.shape == (3, 2)
         assert (result.log_likelihood > before).all()
 
@@ -178,14 +178,14 @@ class TestManyPoints:
 
     @pytest.mark.slow
     def test_it_is_as_good_as_a_search_on_all(self, problem, monkeypatch):
-        found = fit(problem()).log_likelihood
+        found = fit(problem(), "map").log_likelihood
         monkeypatch.setattr(map_fit, "_MANY", 1000)
-        assert (found >= fit(problem()).log_likelihood - 0.1).all()
+        assert (found >= fit(problem(), "map").log_likelihood - 0.1).all()
 
     def test_it_is_never_worse_than_the_start(self, problem):
         model = problem()
-        good = fit(model, **QUICK).log_likelihood
-        again = fit(model, **QUICK, seed=1).log_likelihood
+        good = fit(model, "map", **QUICK).log_likelihood
+        again = fit(model, "map", **QUICK, seed=1).log_likelihood
         assert (again >= good - 1e-6 * good.abs()).all()
 
 
@@ -215,7 +215,7 @@ class TestLearningPhysics:
 
     def test_predictions_use_what_was_learnt(self, model):
         start = log_likelihood(model)
-        fit(model, **QUICK)
+        fit(model, "map", **QUICK)
         assert log_likelihood(model) > start
         assert model.physics.function.rate.item() == pytest.approx(2.0, abs=0.1)
         far = torch.tensor([[400.0]], dtype=torch.float64)
@@ -231,14 +231,14 @@ class TestLearningPhysics:
     def test_the_users_guess_is_not_lost_among_aliases(self, seed):
         X = torch.linspace(0, 3, 15, dtype=torch.float64).unsqueeze(-1)
         model = CKA(X, 1.7 * (3 * X).sin() + 0.05 * X, physics=Pendulum(2.5))
-        fit(model, seed=seed)
+        fit(model, "map", seed=seed)
         assert model.physics.function.rate.item() == pytest.approx(3.0, abs=0.05)
 
     def test_of_several_outputs(self, uniform):
         X = uniform(15, 1, high=3.0)
         Y = torch.cat([(2 * X).sin(), (2 * X).cos() + 0.1], -1)
         model = BiasGP(X, Y, physics=Pendulum(1.8, num_outputs=2))
-        result = fit(model, **QUICK)
+        result = fit(model, "map", **QUICK)
         assert result.log_likelihood.shape == ()
         assert model.physics.function.rate.item() == pytest.approx(2.0, abs=0.05)
 
@@ -251,7 +251,12 @@ class TestUsersChoices:
             prior = LogNormalPrior(centre, 0.02)
             base = MaternKernel(ard_num_dims=2, batch_shape=batch, lengthscale_prior=prior)
             kernel = ScaleKernel(base, batch_shape=batch).double()
-            fit(CKA(X, Y, physics=crude, delta_covar_module=kernel), num_screened=8, num_starts=1)
+            fit(
+                CKA(X, Y, physics=crude, delta_covar_module=kernel),
+                "map",
+                num_screened=8,
+                num_starts=1,
+            )
             assert ((base.lengthscale.log() - centre).abs() < 0.1).all()
 
     def test_fixed_parameters_stay(self, XY):
@@ -259,7 +264,7 @@ class TestUsersChoices:
         fixed = model.terms[1].kernel.base_kernel.raw_lengthscale
         fixed.requires_grad_(False)
         before, free = fixed.clone(), model.likelihood.noise.clone()
-        fit(model, **QUICK)
+        fit(model, "map", **QUICK)
         assert torch.equal(fixed, before)
         assert not fixed.requires_grad
         assert not torch.equal(model.likelihood.noise, free)
@@ -269,7 +274,7 @@ class TestUsersChoices:
         batch = torch.Size([2])
         likelihood = GaussianLikelihood(batch_shape=batch, noise_constraint=GreaterThan(bound))
         model = CKA(*XY, physics=crude, likelihood=likelihood.double())
-        fit(model, **QUICK)
+        fit(model, "map", **QUICK)
         assert (likelihood.noise >= bound).all()
 
     @pytest.mark.parametrize("constraint", [Interval, LogInterval])
@@ -282,7 +287,7 @@ class TestUsersChoices:
         kernel = ScaleKernel(base, batch_shape=batch, **outer).double()
         setattr(base if inner else kernel, kind, (lower + upper) / 2)
         model = CKA(*XY, physics=crude, rho_covar_module=kernel)
-        assert fit(model, **QUICK).log_likelihood.isfinite().all()
+        assert fit(model, "map", **QUICK).log_likelihood.isfinite().all()
         values = getattr(base if inner else kernel, kind)
         # GPyTorch keeps the bounds in float32.
         assert (values >= lower * (1 - 1e-6)).all()
@@ -292,5 +297,5 @@ class TestUsersChoices:
         X, Y = XY
         model = CKA(X, Y, torch.full_like(Y, 0.01), physics=crude)
         before = log_likelihood(model)
-        fit(model, **QUICK)
+        fit(model, "map", **QUICK)
         assert (log_likelihood(model) > before).all()

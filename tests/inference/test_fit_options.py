@@ -22,7 +22,7 @@ def model(uniform):
 BAD = [
     *(
         (method, option, value, error, says)
-        for method in ("map", "hmc")
+        for method in ("map", "bayes")
         for option, value, error, says in (
             ("num_starts", 0, ValueError, "Expected num_starts >= 1, got 0"),
             ("num_starts", 1.5, TypeError, r"Expected num_starts .* whole number, got 1\.5"),
@@ -35,12 +35,12 @@ BAD = [
         )
     ),
     *(
-        ("map", option, 64, ValueError, f"'map' has no option '{option}'; .* method 'hmc'")
-        for option in ("num_samples", "num_iterations", "progress")
+        ("map", option, 64, ValueError, f"'map' has no option '{option}'; .* method 'bayes'")
+        for option in ("num_samples", "num_draws")
     ),
-    ("hmc", "num_samples", 0, ValueError, "Expected num_samples >= 1"),
-    ("hmc", "num_iterations", 7, ValueError, "Expected num_iterations >= 8"),
-    ("gibbs", "seed", 0, ValueError, "expected 'map' or 'hmc'"),
+    ("bayes", "num_samples", 0, ValueError, "Expected num_samples >= 1"),
+    ("bayes", "num_draws", 15, ValueError, "Expected num_draws >= 16"),
+    ("gibbs", "seed", 0, ValueError, "expected 'bayes' or 'map'"),
 ]
 
 
@@ -54,7 +54,7 @@ class TestBadInput:
         with pytest.raises(TypeError, match=r"Expected a model of gpadjust.*got Linear"):
             fit(torch.nn.Linear(2, 1))
         with pytest.raises(ValueError, match="no learnable parameter"):
-            fit(model.requires_grad_(False))
+            fit(model.requires_grad_(False), "bayes")
 
     def test_a_likelihood_that_cannot_be_evaluated(self, model):
         raw = model.terms[0].kernel.raw_outputscale
@@ -64,6 +64,8 @@ class TestBadInput:
         before = [p.clone() for p in model.parameters() if p.requires_grad]
         with pytest.raises(RuntimeError, match="could not be evaluated at any start"):
             fit(model, **QUICK)
+        with pytest.raises(RuntimeError, match="could not be evaluated at any start"):
+            fit(model, "map", **QUICK)
         after = [p for p in model.parameters() if p.requires_grad]
         assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
         assert not model.training
@@ -77,7 +79,7 @@ class TestSeed:
             torch.rand(3)
             state = torch.get_rng_state()
             model.load_state_dict(before)
-            fit(model, seed=3, **QUICK)
+            fit(model, "map", seed=3, **QUICK)
             assert torch.equal(torch.get_rng_state(), state)  # the user's is left alone
             fitted.append([p.clone() for p in model.parameters()])
         assert all(torch.equal(a, b) for a, b in zip(*fitted, strict=True))
@@ -88,7 +90,9 @@ class TestSeed:
         for seed in (1, 2):
             model.load_state_dict(before)
             with pytest.warns(OptimizationWarning):
-                result = fit(model, seed=seed, num_screened=64, num_starts=1, max_iterations=1)
+                result = fit(
+                    model, "map", seed=seed, num_screened=64, num_starts=1, max_iterations=1
+                )
             values.add(tuple(result.log_likelihood.tolist()))
         assert len(values) == 2
 
@@ -111,16 +115,16 @@ class TestThreads:
     @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
     def test_a_small_problem_takes_one(self, model, seen):
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
-        fit(model, **QUICK)
+        fit(model, "map", **QUICK)
         compare(X, Y, crude, structures=["physics mean", "CKA"], **QUICK)
-        fit(model, "hmc", num_samples=8, **QUICK)
+        fit(model, num_draws=64, **QUICK)
         assert set(seen) == {1}
         assert torch.get_num_threads() == 2
 
     @pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
     def test_a_large_fit_takes_the_users(self, seen, uniform):
         X = uniform(300, 1)
-        fit(CKA(X, 2 * crude(X), physics=crude), num_screened=0, max_iterations=1)
+        fit(CKA(X, 2 * crude(X), physics=crude), "map", num_screened=0, max_iterations=1)
         assert set(seen) == {2}
 
     def test_after_an_error(self, model):

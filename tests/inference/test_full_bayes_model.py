@@ -234,8 +234,8 @@ class TestLettingGo:
     def test_it_can_be_fitted_again(self, data, build):
         model, fresh = (build("CKA", *data(num_outputs=2)) for _ in range(2))
         options = {"num_screened": 16, "num_starts": 2}
-        fit(model, "hmc", num_iterations=8, num_samples=4, **options)
-        fit(model, "hmc", num_iterations=8, num_samples=6, **options)
+        fit(model, num_draws=64, num_samples=4, **options)
+        fit(model, num_draws=64, num_samples=6, **options)
         assert model.num_samples == 6
         found = fit(model, "map", **options).log_likelihood
         assert model.num_samples is None
@@ -272,8 +272,8 @@ class TestRefusals:
 
     def test_the_papers_closed_form(self, build, data):
         with pytest.raises(ValueError, match="Take RRA"):
-            fit(build("RRA-paper", *data()), "hmc")
+            fit(build("RRA-paper", *data()), "bayes")
 
     def test_a_batch_of_data_sets(self, build, data):
         with pytest.raises(ValueError, match="one data set"):
-            fit(build("CKA", *data(batch_shape=(2,))), "hmc")
+            fit(build("CKA", *data(batch_shape=(2,))), "bayes")

@@ -65,7 +65,7 @@ def test_one_fit_after_the_other(kind, targets):
     Y = TARGETS[targets]
     model = BUILD[kind](X, Y)
     for options in ({}, {}, {"num_screened": 0}):
-        fit(model, **QUICK | options)
+        fit(model, "map", **QUICK | options)
         assert_above(model, Y)
 
 
@@ -73,7 +73,7 @@ def test_with_missing_targets():
     Y = TARGETS["of outputs of many sizes"].clone()
     Y[1, 0] = Y[4:6, 2] = torch.nan
     model = CKA(X, Y, physics=of(Y))
-    fit(model, **QUICK)
+    fit(model, "map", **QUICK)
     assert_above(model, Y)
 
 
@@ -81,9 +81,9 @@ def test_with_missing_targets():
 def test_from_a_model_of_much_smaller_residuals(num_screened):
     few, Y = crude(X[:5]) + 1e-3 * X[:5], TARGETS["in the class"]
     previous, model = CKA(X[:5], few, physics=crude), CKA(X, Y, physics=of(Y))
-    fit(previous, **QUICK)
+    fit(previous, "map", **QUICK)
     warm_start(model, previous)
-    fit(model, num_screened=num_screened)
+    fit(model, "map", num_screened=num_screened)
     assert_above(model, Y)
 
 
@@ -91,7 +91,7 @@ def test_from_a_users_start_below_it():
     Y = TARGETS["in the class"]
     model = CKA(X, Y, physics=of(Y))
     model.likelihood.noise = 1e-20
-    fit(model, num_screened=0)
+    fit(model, "map", num_screened=0)
     assert_above(model, Y)
 
 
@@ -100,7 +100,7 @@ def test_from_a_users_start_below_it():
 def test_of_samples(targets):
     Y = TARGETS[targets]
     model = CKA(X, Y, physics=of(Y))
-    fit(model, "hmc", num_iterations=16, **QUICK)
+    fit(model, num_draws=256, **QUICK)
     noise = model.likelihood.noise.squeeze(-1).reshape(16, -1)
     noise = noise * model.outcome_transform.stdvs.square().reshape(-1, Y.shape[-1])[0]
     assert (noise >= floors(model, Y) * (1 - 1e-9)).all()

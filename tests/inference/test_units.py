@@ -34,7 +34,7 @@ def error(forrester):
             return scale * forrester.crude((X - shift) / stretch) + offset
 
         model = build(shift + stretch * X, scale * Y + offset, physics=physics)
-        fit(model)
+        fit(model, "map")
         Z = forrester.test_X
         with torch.no_grad():
             mean = (model.posterior(shift + stretch * Z).mean - offset) / scale

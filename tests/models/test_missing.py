@@ -60,7 +60,7 @@ def test_each_output_is_the_model_of_its_own_rows(
 def test_fits_and_samples(gaps, build, costly_kind, uniform):
     X, Y = gaps
     model, Z = build(costly_kind, X, Y), uniform(5, 2, high=2.0, seed=4)
-    result = fit(model, num_screened=8, num_starts=2)
+    result = fit(model, "map", num_screened=8, num_starts=2)
     assert result.log_likelihood.isfinite().all()
     functions, posterior = model.sample_functions(400, seed=0), model.posterior(Z)
     if costly_kind != "RRA-paper":

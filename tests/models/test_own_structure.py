@@ -49,7 +49,7 @@ def problem(uniform):
 def test_it_learns_the_season(problem, uniform):
     X, Y, Z = problem
     model = Seasonal(X, Y, physics=physics)
-    fit(model, num_screened=16, num_starts=2)
+    fit(model, "map", num_screened=16, num_starts=2)
     assert model.term_names == ("rho", "delta", "season")
     assert model.other_names == ("delta", "season")
     found, right = model.term("season", Z).mean.detach(), wave(Z)

@@ -34,7 +34,7 @@ def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs,
     X, Y = data(num_outputs=num_outputs)
     Z, new_X = uniform(4, 2, seed=1), uniform(2, 2, seed=2)
     model = build(kind, X, Y, physics=counting)
-    fit(model, num_screened=8, num_starts=1)
+    fit(model, "map", num_screened=8, num_starts=1)
     with torch.no_grad():
         model.posterior(Z)
         model.posterior(Z.unsqueeze(-2), observation_noise=True)
@@ -66,7 +66,7 @@ def test_each_call_evaluates_it_once(data, build, uniform, counting, kind):
 def test_ar1_evaluates_the_samples_only(data, build, uniform, counting):
     X, Y = data()
     model = build("AR1", X, Y, physics=counting, num_low=10)
-    fit(model, num_screened=8, num_starts=1)
+    fit(model, "map", num_screened=8, num_starts=1)
     model.posterior(uniform(4, 2))
     assert len(counting.rows) == 10
     assert set(counting.rows.values()) == {1}

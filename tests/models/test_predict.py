@@ -91,7 +91,7 @@ def change_by_training(model, build, data):
 
 
 def change_by_fit(model, build, data):
-    fit(model)
+    fit(model, "map")
 
 
 def change_by_state(model, build, data):

@@ -78,7 +78,7 @@ def test_names(uniform, close):
 def test_far_from_the_data_their_weighted_sum_remains(uniform, cls):
     X = problem(uniform, 24)[0]
     model = cls(X, 1.5 * swing(X) - 0.2 * drift(X), physics=[swing, drift])
-    fit(model, num_screened=16, num_starts=2)
+    fit(model, "map", num_screened=16, num_starts=2)
     for j in range(2):
         weights = [model.term_mean(name, j) for name in model.rho_names]
         torch.testing.assert_close(weights, [1.5, -0.2], rtol=1e-3, atol=0)
@@ -213,7 +213,7 @@ def test_the_right_one_of_three_has_the_weight(name):
         X, Z = latin_hypercube(10 * d, d, seed)
         model = CKA(X, truth(X), physics={"right": right, "one": wrong[0], "two": wrong[1]})
         alone = CKA(X, truth(X), physics=right)
-        fit(model), fit(alone)
+        fit(model, "map"), fit(alone, "map")
         sizes = torch.stack([model.term(n, Z).mean.abs().mean() for n in model.rho_names])
         shares.append((sizes[0] / sizes.sum()).item())
         ratios.append(error(model, Z, truth) / error(alone, Z, truth))
@@ -248,7 +248,7 @@ def test_two_physics_each_right_in_half_of_the_box(d):
         errors = []
         for physics in ({"a": first, "b": second}, first, second):
             model = CKA(X, truth(X), physics=physics)
-            fit(model)
+            fit(model, "map")
             errors.append(error(model, Z, truth))
         ratios.append(errors[0] / min(errors[1:]))
     print(d, "RMSE / the better single one's", [f"{r:.2f}" for r in ratios])

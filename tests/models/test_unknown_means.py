@@ -32,7 +32,7 @@ def fitted(X, Y, means=("rho", "delta"), center=0.0, **options):
         **{f"{name}_mean": "learn" for name in means},
         **options,
     )
-    fit(model, **QUICK)
+    fit(model, "map", **QUICK)
     return model
 
 
@@ -68,7 +68,7 @@ def test_a_constant_factor_is_recovered(uniform, factor):
         return 2 + (5 * X).sin()
 
     model = PhysicsMeanGP(X, factor * physics(X), physics=physics, rho_mean="learn")
-    fit(model, **QUICK)
+    fit(model, "map", **QUICK)
     assert model.term_mean("rho") == pytest.approx(factor, rel=1e-6)
     torch.testing.assert_close(model.rho(Z).mean, torch.full_like(Z, factor), rtol=1e-6, atol=0)
     torch.testing.assert_close(
@@ -84,7 +84,7 @@ def test_far_from_the_data_the_constants_remain(uniform, means, center):
     with torch.no_grad():
         for term in model.terms:
             term.kernel.base_kernel.raw_lengthscale.fill_(-3.0).requires_grad_(False)
-    fit(model.train(), num_screened=0, num_starts=1)  # the constants at these lengthscales
+    fit(model.train(), "map", num_screened=0, num_starts=1)  # the constants at these lengthscales
     Z = torch.full((1, 2), 30.0, dtype=torch.float64)
     rho, delta = (model.term_mean(name) for name in ("rho", "delta"))
     mean = model.eval().posterior(Z).mean
@@ -119,7 +119,7 @@ def test_conditioning_and_copies(uniform, same, cls, m):
         return cls(*data, physics=Column(m), **options)
 
     model = build(X, Y)
-    fit(model, **QUICK)
+    fit(model, "map", **QUICK)
     with torch.no_grad():
         model.likelihood.noise_covar.raw_noise.fill_(-7.0)
     new_X, new_Y = uniform(2, 2, seed=4), Y[:2]
@@ -156,7 +156,7 @@ class TestForrester:
             rho_mean="learn",
             delta_mean="learn",
         )
-        fit(model)
+        fit(model, "map")
         Z = forrester.test_X
         mean = model.posterior(Z).mean.detach()
         return (mean - factor * forrester.truth(Z)).square().mean().sqrt().item()

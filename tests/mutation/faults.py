@@ -74,10 +74,10 @@ FAULTS = (
         "The gradient is wrong where the noise is at its least value, and only there.",
     ),
     Fault(
-        "gpadjust/inference/hmc.py",
-        "(white.square() - here.square()).sum(-1) / _INFLATION**2)",
-        "(white.square() - here.square()).sum(-1) / _INFLATION)",
-        "The long jumps of the sampler accept too seldom in the tails: biased samples.",
+        "gpadjust/inference/importance_sampling.py",
+        "draws = _weighted(positions, -values - log_q)",
+        "draws = _weighted(positions, -values)",
+        "The draws are weighted as if all places were equally likely to be drawn: biased samples.",
     ),
     Fault(
         "gpadjust/inference/full_bayes.py",
