@@ -224,9 +224,10 @@ def energy_score(sample: Tensor, y: Tensor) -> Tensor:
     sample, y = sample[:, known].transpose(0, 1), y[known]
     num = sample.shape[1]
     error = (sample - y.unsqueeze(1)).norm(dim=-1).mean(1)
-    # Not by products, which cancel where points are close.
-    pairs = torch.cdist(sample, sample, compute_mode="donot_use_mm_for_euclid_dist")
-    return (error - pairs.sum((1, 2)) / (2 * num * (num - 1))).mean()
+    # Window by window, as all pairs at once are w K^2; not by products, which cancel.
+    mode = "donot_use_mm_for_euclid_dist"
+    pairs = [torch.cdist(each, each, compute_mode=mode).sum().item() for each in sample]
+    return (error - error.new_tensor(pairs) / (2 * num * (num - 1))).mean()
 
 
 def _order_statistic(sample: Tensor, level: float) -> Tensor:

@@ -44,7 +44,7 @@ def foresight(
             horizons=horizons,
             max_windows=_WINDOWS,
             units=typical_change(dynamics.spec, recorded.states, recorded.next_states),
-            state_bounds=task.state_bounds,
+            state_bounds=task.widened(transitions[0]).state_bounds,
         )
     except (NotImplementedError, PhysicsError) as error:  # scores are not worth an episode
         warnings.warn(

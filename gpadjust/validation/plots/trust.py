@@ -24,7 +24,7 @@ from gpadjust.validation.trust import SIDES, Trust
 _COLORS = dict(zip(SIDES, (BLUE, RED, "0.85"), strict=True))
 
 
-def plot_trust(trust: Trust, *, output: int = 0, bins: int = 20, axes: Any = None) -> Any:
+def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = None) -> Any:
     """Draw along each input which share of the predictions rests on physics, data, or neither.
 
     The shares of all points are in the legend.
@@ -62,13 +62,13 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 20, axes: Any = Non
         shares = counts / counts.sum(0).clip(1)
         bottom = np.zeros(bins)
         for share, kind in zip(shares, SIDES, strict=True):
-            bar = {"width": np.diff(edges), "align": "edge", "color": _COLORS[kind]}
+            bar: dict[str, Any] = {"width": np.diff(edges), "align": "edge", "color": _COLORS[kind]}
             ax.bar(edges[:-1], share, bottom=bottom, **bar, label=named[kind])
             bottom += share
         ax.set(xlabel=name, xlim=(edges[0], edges[-1]), ylim=(0, 1))
         tidy(ax)
-    axes[0].set_ylabel("share of predictions that rest on" + _suffix(trust, output))
-    _legend(axes[0])
+    axes[0].set_ylabel("share of predictions")
+    _legend(axes[-1], trust, output)
     return axes
 
 
@@ -99,14 +99,14 @@ def plot_trust_pair(
     side, named = _side_and_names(trust, output)
     d = trust.X.shape[-1]
     i, j = two_inputs(inputs, d, "`plot_trust`")
-    ax = (new_axes(1, 1) if ax is None else given_axes(ax, (1, 1)))[0, 0]
+    ax = (new_axes(1, 1, size=4) if ax is None else given_axes(ax, (1, 1)))[0, 0]
     for k, kind in enumerate(SIDES):
         points = trust.X[side == k]
-        style = {"ls": "", "marker": "o", "ms": 4, "mew": 0}
+        style: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4, "mew": 0}
         ax.plot(points[:, i], points[:, j], color=_COLORS[kind], **style, label=named[kind])
     names = labels(trust, "input", d)
-    ax.set(xlabel=names[i], ylabel=names[j], title="rests on" + _suffix(trust, output))
-    _legend(ax)
+    ax.set(xlabel=names[i], ylabel=names[j])
+    _legend(ax, trust, output)
     tidy(ax)
     return ax
 
@@ -119,11 +119,9 @@ def _side_and_names(trust: Trust, output: int) -> tuple[Tensor, dict[str, str]]:
     return side, {k: f"{k}: {100 * getattr(trust, k)[output].item():.0f} %" for k in SIDES}
 
 
-def _suffix(trust: Trust, output: int) -> str:
+def _legend(ax: Axes, trust: Trust, output: int) -> None:
+    """Add a legend beside the axes, as there is no free place inside."""
     m = trust.override.shape[-1]
-    return f"\nfor {labels(trust, 'output', m)[output]}" if m > 1 else ""
-
-
-def _legend(ax: Axes) -> None:
-    """Beside the axes' upper end, as there is no free place inside."""
-    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=3, fontsize="small")
+    which = f"{labels(trust, 'output', m)[output]} rests on" if m > 1 else "rests on"
+    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+    ax.legend(frameon=False, title=which, alignment="left", **place)
