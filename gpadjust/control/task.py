@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.control.step_or_nan import step_or_nan
 from gpadjust.dynamics import Dynamics
+from gpadjust.dynamics.step_or_nan import step_or_nan
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rewards ``N`` of states, actions and next states, ``N`` rows each."""

@@ -5,6 +5,7 @@ from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.trajectory_information import TrajectoryInformation
+from gpadjust.dynamics.trajectory_scores import TrajectoryScores
 from gpadjust.dynamics.transition_scores import TransitionScores
 from gpadjust.states import StateSpec
 
@@ -15,6 +16,7 @@ __all__ = [
     "PhysicsDynamics",
     "StateSpec",
     "TrajectoryInformation",
+    "TrajectoryScores",
     "TransitionFunctions",
     "TransitionScores",
 ]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gpadjust.dynamics.trajectory_scores import TrajectoryScores, score_trajectories
 from gpadjust.dynamics.transition_scores import TransitionScores, score_transitions
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models import Prediction
@@ -81,6 +82,82 @@ class Dynamics(ABC):
         """
         data = Transitions.checked(self.spec, states, actions, next_states)
         return score_transitions(self.spec, self.predict(data.states, data.actions), data)
+
+    def score_trajectories(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        next_states: Tensor,
+        *,
+        horizons: Sequence[int] = (1, 5, 15),
+        num_functions: int = 39,
+        max_windows: int | None = 25,
+        units: Tensor | None = None,
+        state_bounds: Tensor | None = None,
+        seed: int = 0,
+    ) -> TrajectoryScores:
+        """Judge predictions many steps ahead by episodes that were not learnt from.
+
+        Episodes are rows one after the other; a new one begins wherever a state is not the next
+        state of the row before. Functions that are drawn from the dynamics follow the recorded
+        actions, from recorded states; see :class:`TrajectoryScores`.
+
+        Args:
+            states: ``N x state_dim``.
+            actions: ``N x action_dim``.
+            next_states: ``N x state_dim``; NaN where an entry was not measured.
+            horizons: Numbers of steps. No episode need be as long.
+            num_functions: Number of functions, one for each particle: 39 or more, best one less
+                than a multiple of 40, with which the interval of 95 % lies at two of them.
+            max_windows: How many windows of each horizon to take, evenly spread over all that
+                there are; None for all. The time is linear in windows, steps and functions.
+            units: What changes of the states are measured in for the energy score, ``state_dim``.
+                Default: the root mean square of their changes from ``states`` to ``next_states``.
+            state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
+                would leave them stays where it is. Default: none.
+            seed: Seed of functions and noise; PyTorch's generator is left as it is.
+
+        Raises:
+            RuntimeError: If nothing was learnt yet.
+            TypeError: If states, actions or next states are not float64 tensors.
+            ValueError: If shapes disagree, values are not finite, or an option is out of range.
+            PhysicsError: If the physics fails and does not say where.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
+            >>> spec = StateSpec(["x"], ["v"])
+            >>> dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + 0.1 * X[:, 1:])
+            >>> x = torch.arange(9, dtype=torch.float64).unsqueeze(-1)
+            >>> scores = dynamics.score_trajectories(x[:-1], torch.ones_like(x[1:]), x[1:])
+            >>> scores.rmse[:2, 0], scores.num_windows
+            (tensor([0.9000, 4.5000], dtype=torch.float64), tensor([8, 4, 0]))
+        """
+        data = Transitions.checked(self.spec, states, actions, next_states)
+        return score_trajectories(
+            self.spec,
+            self.sample_functions,
+            self.noise_variance,
+            data,
+            horizons=horizons,
+            num_functions=num_functions,
+            max_windows=max_windows,
+            units=units,
+            state_bounds=state_bounds,
+            seed=seed,
+        )
+
+    def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
+        """How far measured next states scatter about a sampled function, ``N x state_dim``.
+
+        It is what variances of :meth:`predict` have beside those of the functions; zero unless
+        dynamics say something else.
+
+        Args:
+            states: ``N x state_dim``.
+            actions: ``N x action_dim``.
+        """
+        return torch.zeros_like(states)
 
     def rehearse(self, states: Tensor, actions: Tensor) -> None:
         """Find what is wrong with the physics before there are transitions, if it can be told.

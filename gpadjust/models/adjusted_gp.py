@@ -9,6 +9,7 @@ import torch
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.posteriors import Posterior
+from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.kernels import Kernel
 from gpytorch.likelihoods import Likelihood
@@ -213,6 +214,25 @@ class AdjustedGP(ExactGPBase):
         shift, scale = self._term_units(name)
         mean = self._prior_mean(self.train_inputs[0], self._term_weights(name, or_known=True))
         return float((mean[..., :1] * scale + shift).reshape(-1, self.num_outputs)[0, output])
+
+    def fallback(self, X: ArrayLike) -> Tensor:
+        """What the model says where there are no data: its prior mean, such as f_p itself.
+
+        Weights of the physics that are unknown (``rho_mean="learn"``) are those it began with: 1,
+        or least squares of several.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+
+        Returns:
+            ``batch_shape x q x m``, in the units of the targets.
+        """
+        inputs = self.model_inputs(X)
+        shift, scale = self._units()
+        values = self._prior_mean(inputs, self._bases(inputs)) * scale + shift
+        # The same for all samples of hyper-parameters but for rounding.
+        values = self._outputs_last(values)
+        return values if self.num_samples is None else values.mean(MCMC_DIM)
 
     def _inputs_without_basis(self, X: Tensor) -> Tensor:
         transform = getattr(self, "input_transform", None)

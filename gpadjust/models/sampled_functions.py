@@ -132,6 +132,9 @@ class SampledFunctions(Module):
 
 def _product(matrix: Tensor, vectors: Tensor, extra: int) -> Tensor:
     """Matrices ``extra x ... x q x n`` times vectors ``k x ... x n``: ``k x extra x ... x q``."""
+    if not extra and matrix.dim() == vectors.dim():
+        # One matrix for all k, which would be copied for each.
+        return (matrix @ vectors.movedim(0, -1)).movedim(-1, 0)
     vectors = vectors.reshape(vectors.shape[0], *[1] * extra, *vectors.shape[1:])
     return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
 

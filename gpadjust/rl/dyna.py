@@ -24,6 +24,7 @@ from torch import Tensor
 from gpadjust.control import Task
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
+from gpadjust.rl.foresight import foresight
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 from gpadjust.rl.planned_episodes import PlannedEpisode, PlannedEpisodes
@@ -177,22 +178,19 @@ class Dyna(TaskLearner):
 
     def _learn_dynamics(self, new: RecordedEpisodes) -> dict[str, float]:
         """Score the dynamics on new transitions, and teach them these; return what is logged."""
-        dynamics = self.ready_task().dynamics
+        task = self.model_task()
         metrics: dict[str, float] = {}
         start = time.perf_counter()
         with self.timed("fit"):
-            transitions = new.learnable(dynamics)
-            if dynamics.is_fitted:
-                score = dynamics.score(*transitions)
-                metrics = {
-                    "nlpd": float(score.nlpd.mean()),
-                    "coverage": float(score.coverage.mean()),
-                }
-                names = [dynamics.spec.states[i] for i in dynamics.spec.moving]
-                metrics |= {f"rmse/{n}": float(e) for n, e in zip(names, score.rmse, strict=True)}
-            dynamics.update(*transitions)
-        metrics["fit_seconds"] = time.perf_counter() - start
-        # Dynamics without variances have no NLPD.
+            transitions = new.learnable(task.dynamics)
+            if task.dynamics.is_fitted:
+                before = time.perf_counter()
+                horizons = self.options.score_horizons
+                metrics = foresight(task, transitions, self.recorded_episodes(), horizons)
+                metrics["score_seconds"] = time.perf_counter() - before
+            task.dynamics.update(*transitions)
+        metrics["fit_seconds"] = time.perf_counter() - start - metrics.get("score_seconds", 0.0)
+        # Dynamics without variances have no NLPD, short episodes no long trajectories.
         metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         for name, value in metrics.items():
             self.logger.record(f"model/{name}", value)

@@ -8,6 +8,7 @@ from numbers import Integral, Real
 from typing import get_args
 
 from gpadjust.control import CrossEntropyPlanner
+from gpadjust.dynamics.trajectory_scores import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
 _WHOLE = {  # the least of each
@@ -49,6 +50,10 @@ class DynaOptions:
             policy acts in all.
         explore_episodes: How many episodes after the first are planned, if there is an
             ``exploration``.
+        score_horizons: Numbers of steps over which each new episode is predicted before it is
+            learnt, open loop along its actions, to log how well (``model/coverage_15``). Some half
+            a second, and with a physics that is costly its evaluation at 39 particles of 4 windows
+            a step; () does without.
 
     Raises:
         TypeError: If something is of another kind.
@@ -67,6 +72,7 @@ class DynaOptions:
     sampling: Sampling = "step"
     exploration: CrossEntropyPlanner | None = None
     explore_episodes: int = 3
+    score_horizons: tuple[int, ...] = (1, 5, 15)
 
     def __post_init__(self) -> None:
         """Check them."""
@@ -93,6 +99,8 @@ class DynaOptions:
                 raise TypeError(f"{name} must be True or False; found {getattr(self, name)!r}.")
         if self.sampling not in get_args(Sampling):
             raise ValueError(f"Unknown sampling {self.sampling!r}; use 'step' or 'trajectory'.")
+        if self.score_horizons != ():
+            object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
         if not isinstance(self.exploration, (CrossEntropyPlanner, type(None))):
             raise TypeError(
                 f"exploration must be a CrossEntropyPlanner, or None; found {self.exploration!r}."

@@ -3,6 +3,7 @@
 from gpadjust.validation.comparison import STRUCTURES, Candidate, Comparison, Structure, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
+from gpadjust.validation.trust import Trust, trust
 
 __all__ = [
     "STRUCTURES",
@@ -11,6 +12,7 @@ __all__ = [
     "LeaveOneOut",
     "Scores",
     "Structure",
+    "Trust",
     "compare",
     "coverage",
     "crps",
@@ -19,4 +21,5 @@ __all__ = [
     "pit",
     "rmse",
     "score",
+    "trust",
 ]

@@ -906,6 +906,65 @@ def test_the_foresight_of_a_users_own_dynamics_is_logged(point_agent, point_dyna
     assert np.isfinite(logged["model/nlpd"])
 
 
+def logged_of(agent, episodes):
+    """What the log holds of the model after so many episodes of the point, of 5 steps each."""
+    agent.learn(5 * episodes, log_interval=100)
+    return {name for name in agent.logger.name_to_value if name.startswith("model/")}
+
+
+def test_trajectories_are_scored_before_they_are_learnt(point_agent, learnt_dynamics):
+    agent = point_agent(dynamics=learnt_dynamics(), score_horizons=(4, 2, 9))
+    assert agent.options.score_horizons == (2, 4, 9)
+    scores = {f"model/{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (2, 4, 9)}
+    assert not logged_of(agent, 1) & scores
+    # No episode has 9 steps.
+    assert logged_of(agent, 1) & scores == {name for name in scores if "_9" not in name}
+    logged = agent.logger.name_to_value
+    assert 0 <= logged["model/coverage_4"] <= 1
+    assert logged["model/energy_2"] > 0
+    assert logged["model/score_seconds"] > 0
+    assert logged["model/fit_seconds"] > 0
+
+
+def test_without_doubt_energies_alone_are_logged(point_agent):
+    scores = {name for name in logged_of(point_agent(), 1) if "_" in name}
+    assert scores >= {"model/energy_1", "model/energy_5"}
+    assert not any("nlpd" in name or "coverage" in name for name in scores)
+
+
+def test_to_score_trajectories_changes_nothing(point_agent, learnt_dynamics, assert_same):
+    one, other = (
+        point_agent(dynamics=learnt_dynamics(), score_horizons=horizons).learn(15)
+        for horizons in ((1, 5), ())
+    )
+    assert not any("energy" in name for name in other.logger.name_to_value)
+    assert_same(one, other)
+
+
+class Stiff(Own):
+    """Dynamics that have no functions."""
+
+    def sample_functions(self, num_functions, seed=None):
+        raise NotImplementedError("No features of this kernel.")
+
+
+def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(
+    point_agent, point_dynamics
+):
+    agent = point_agent(dynamics=Stiff(point_dynamics.spec))
+    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass DynaOptions"):
+        logged = logged_of(agent, 1)
+    assert "model/coverage" in logged
+    assert "model/energy_1" not in logged
+    logged_of(point_agent(dynamics=Stiff(point_dynamics.spec), score_horizons=()), 1)
+
+
+@pytest.mark.parametrize("horizons", [5, (0,), (1, 1), (1.5,)])
+def test_horizons_that_are_no_numbers_of_steps(horizons):
+    with pytest.raises(ValueError, match="horizon"):
+        DynaOptions(score_horizons=horizons)
+
+
 # Bad input
 
 

@@ -1,4 +1,4 @@
-"""Figures of predictions, of their calibration, and of where the physics is wrong.
+"""Figures of predictions, of their calibration, and of where the physics is wrong or trusted.
 
 Each function draws on the axes that it is given, or on those of a new figure, and returns them;
 show or save the figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``.
@@ -7,6 +7,7 @@ show or save the figure with ``ax.figure``. They need matplotlib, ``pip install 
 from gpadjust.validation.plots.adjustments import plot_adjustment, plot_adjustment_pair
 from gpadjust.validation.plots.calibration import plot_calibration, plot_pit
 from gpadjust.validation.plots.predictions import plot_leave_one_out, plot_prediction
+from gpadjust.validation.plots.trust import plot_trust, plot_trust_pair
 
 __all__ = [
     "plot_adjustment",
@@ -15,4 +16,6 @@ __all__ = [
     "plot_leave_one_out",
     "plot_pit",
     "plot_prediction",
+    "plot_trust",
+    "plot_trust_pair",
 ]

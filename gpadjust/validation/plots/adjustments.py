@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from operator import index
 from typing import Any
 
 import torch
@@ -20,6 +19,7 @@ from gpadjust.validation.plots.drawing import (
     new_axes,
     quantile,
     tidy,
+    two_inputs,
     whole,
 )
 
@@ -138,7 +138,7 @@ def plot_adjustment_pair(
     names = _adjustments(model)
     num_points = whole(num_points, "num_points", 2)
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
-    i, j = _two_inputs(inputs, train_X.shape[-1])
+    i, j = two_inputs(inputs, train_X.shape[-1], "`plot_adjustment`")
     shape = (len(names), 2)
     axes = new_axes(*shape) if axes is None else given_axes(axes, shape)
     lines = [
@@ -187,17 +187,6 @@ def _symbol(name: str) -> str:
     if symbol not in ("rho", "delta"):
         return name
     return rf"$\{symbol}$" + (f" of {physics}" if physics else "")
-
-
-def _two_inputs(inputs: tuple[int, int], d: int) -> tuple[int, int]:
-    try:
-        i, j = (index(k) for k in inputs)
-    except (TypeError, ValueError):
-        i = j = 0  # not two whole numbers: refused below
-    if i == j or not (0 <= i < d and 0 <= j < d):
-        hint = "; draw a model of one input with `plot_adjustment`" if d == 1 else ""
-        raise ValueError(f"Expected two different inputs from 0 to {d - 1}, got {inputs!r}{hint}.")
-    return i, j
 
 
 def _domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Tensor, Tensor, str]:

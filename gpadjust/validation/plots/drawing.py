@@ -56,6 +56,18 @@ def whole(number: Any, name: str, least: int) -> int:
     raise ValueError(f"Expected {name} to be a whole number >= {least}, got {number!r}.")
 
 
+def two_inputs(inputs: Any, d: int, otherwise: str) -> tuple[int, int]:
+    """Two different ones of ``d`` inputs, or a ValueError; ``otherwise`` draws a single one."""
+    try:
+        i, j = (index(k) for k in inputs)
+    except (TypeError, ValueError):
+        i = j = 0  # not two whole numbers: refused below
+    if i == j or not (0 <= i < d and 0 <= j < d):
+        hint = f"; draw a model of one input with {otherwise}" if d == 1 else ""
+        raise ValueError(f"Expected two different inputs from 0 to {d - 1}, got {inputs!r}{hint}.")
+    return i, j
+
+
 def observed(values: Tensor, output: int) -> Tensor:
     """Where the ``n`` values of an output are not NaN, which is somewhere."""
     seen = ~values.isnan()

@@ -1,0 +1,226 @@
+"""What predictions rest on: the physics, the data, or neither."""
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+
+from gpadjust import AR1, CKA, BiasGP, ZeroMeanGP, fit
+from gpadjust.dynamics import LearnedDynamics, StateSpec
+from gpadjust.validation import Trust, trust
+from gpadjust.validation.plots import plot_trust, plot_trust_pair
+
+mpl.use("Agg")
+Z95 = 1.959963984540054
+
+
+def line(low, high, n):
+    return torch.linspace(low, high, n, dtype=torch.float64).unsqueeze(-1)
+
+
+def wave(X):
+    return torch.sin(6 * X)
+
+
+@pytest.fixture
+def half():
+    """A model of a physics that is right up to 0.5 and wrong beyond, from data on [0, 1]."""
+    X = line(0, 1, 20)
+    model = CKA(X, wave(X) + (X - 0.5).clamp_min(0.0).square(), physics=wave)
+    fit(model)
+    return model
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
+
+
+def test_each_side_is_found_where_it_is(half):
+    Z = torch.tensor([[-2.0], [0.1], [0.3], [0.8], [0.95]], dtype=torch.float64)
+    found = trust(half, Z)
+    assert found.side[:, 0].tolist() == [2, 0, 0, 1, 1]
+    assert (found.physics.item(), found.data.item(), found.neither.item()) == (0.4, 0.4, 0.2)
+
+
+def test_the_definition_by_hand(half):
+    Z = line(-1, 2, 50)
+    found = trust(half, Z, level=0.9)
+    mean, variance = half.predict(Z)
+    X = line(0, 1, 20)
+    w = 1.6448536269514722 * variance.sqrt()
+    discrepancy = (X - 0.5).clamp_min(0.0).square().square().mean().sqrt()
+    y = wave(X) + (X - 0.5).clamp_min(0.0).square()
+    w = w.clamp_min(1e-3 * y.std(correction=0).item())
+    torch.testing.assert_close(found.override, (mean - wave(Z)).abs() / w)
+    torch.testing.assert_close(found.doubt, w / discrepancy)
+
+
+def test_a_perfect_physics_is_trusted_everywhere():
+    X = line(0, 1, 9)
+    model = CKA(X, wave(X), physics=wave)
+    fit(model)
+    assert trust(model, line(-1, 2, 50)).physics.item() == 1
+
+
+def test_a_physics_that_is_wrong_throughout_is_overridden():
+    X = line(0, 1, 12)
+    model = CKA(X, 2 * wave(X) + 3, physics=wave)
+    fit(model)
+    found = trust(model)
+    assert found.X.shape == (512, 1)
+    assert (found.X >= 0).all()
+    assert (found.X <= 1).all()
+    assert found.data.item() == 1
+
+
+def test_without_data_there_is_neither():
+    """A model that has learnt of a large discrepancy elsewhere."""
+    X = line(0, 0.2, 12)
+    model = CKA(X, wave(X) + (40 * X).sin(), physics=wave)
+    fit(model)
+    assert trust(model, line(3, 4, 20)).neither.item() == 1
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e3])
+def test_units_make_no_difference(half, shift):
+    X = line(0, 1, 20)
+    Y = wave(X) + (X - 0.5).clamp_min(0.0).square()
+    other = BiasGP(50 * X, 1e6 * (Y + shift), physics=lambda X: 1e6 * (wave(X / 50) + shift))
+    plain = BiasGP(X, Y, physics=wave)
+    for model in (other, plain):
+        fit(model)
+    Z = line(-0.5, 1.5, 50)
+    one, two = trust(plain, Z), trust(other, 50 * Z)
+    torch.testing.assert_close(one.doubt, two.doubt, rtol=1e-2, atol=1e-3)
+    assert (one.side != two.side).sum() <= 1
+
+
+def test_outputs_are_judged_one_by_one(data, build):
+    X, Y = data(num_outputs=2)
+    Y[:3, 0] = torch.nan
+    model = build("CKA", X, Y)
+    found = trust(model, num_points=16)
+    assert found.side.shape == found.override.shape == found.doubt.shape == (16, 2)
+    torch.testing.assert_close(found.physics + found.data + found.neither, torch.ones(2).double())
+    second = trust(model.subset_output([1]), found.X)
+    torch.testing.assert_close(second.override, found.override[:, 1:])
+    torch.testing.assert_close(second.doubt, found.doubt[:, 1:])
+
+
+@pytest.mark.parametrize("kind", ["CKA", "PhysicsMeanGP", "ScaleGP", "RRA", "BiasGP"])
+def test_all_models_with_a_physics_fall_back_to_it(kind, data, build, crude_physics):
+    X, Y = data(num_outputs=2)
+    model = build(kind, X, Y)
+    Z = 3 * torch.rand(7, 2, dtype=torch.float64)
+    torch.testing.assert_close(model.fallback(Z), crude_physics(Z))
+    assert trust(model, Z).side.shape == (7, 2)
+
+
+def test_of_several_physics_the_weighted_sum_counts():
+    X = line(0, 1, 12)
+    physics = {"wave": wave, "line": lambda X: X}
+    model = CKA(X, 2 * wave(X) - 3 * X, physics=physics)
+    Z = line(0, 2, 9)
+    torch.testing.assert_close(model.fallback(Z), 2 * wave(Z) - 3 * Z)
+    fit(model)
+    assert trust(model).physics.item() == 1
+    known = CKA(X, 2 * wave(X) - 3 * X, physics=physics, rho_mean=(1.0, 0.5), center="mean")
+    torch.testing.assert_close(known.fallback(Z), wave(Z) + 0.5 * Z)
+
+
+@pytest.mark.parametrize("num_outputs", [1, 2])
+def test_a_model_that_holds_samples_is_judged_as_their_mixture(data, held, num_outputs):
+    X, Y = data(num_outputs=num_outputs)
+    model, singles = held("CKA", X, Y, center="learn")
+    Z = torch.rand(5, 2, dtype=torch.float64)
+    found = trust(model, Z)
+    mean = torch.stack([single.predict(Z).mean for single in singles]).mean(0)
+    sd = model.predict(Z).variance.sqrt()
+    expected = (mean - singles[0].fallback(Z)).abs() / (Z95 * sd)
+    torch.testing.assert_close(found.override, expected)
+    torch.testing.assert_close(model.fallback(Z), singles[0].fallback(Z))
+
+
+def test_the_model_of_learned_dynamics(uniform):
+    spec = StateSpec(["x", "angle"], ["v"], angles=["angle"])
+    dynamics = LearnedDynamics(spec, lambda X: X[:, :2] + 0.1 * X[:, 2:])
+    states, actions = uniform(12, 2), uniform(12, 1, seed=1)
+    rates = torch.tensor([[0.2, 0.1]], dtype=torch.float64)
+    dynamics.update(states, actions, states + rates * actions)
+    found = trust(dynamics.model, dynamics.targets.inputs(states, actions))
+    assert found.side[:, 1].tolist() == [0] * 12
+    assert found.data[0] > 0.8
+
+
+def test_bad_input(half, data):
+    X, Y = data()
+    for call, error, says in (
+        (lambda: trust(ZeroMeanGP(X, Y)), TypeError, "could trust, such as CKA, got ZeroMeanGP"),
+        (lambda: trust(AR1(X, Y, low_X=X, low_Y=Y)), TypeError, "got AR1"),
+        (lambda: trust("CKA"), TypeError, "of LearnedDynamics pass its `model`"),
+        (lambda: trust(half, X), ValueError, "columns"),
+        (lambda: trust(half, X[:0, :1]), ValueError, "one point or more"),
+        (lambda: trust(half, X[None, :, :1]), ValueError, "Expected X of shape n x d"),
+        (lambda: trust(half, level=95), ValueError, "level between 0 and 1"),
+        (lambda: trust(half, num_points=0), ValueError, "num_points to be a whole number >= 1"),
+        (lambda: trust(half, num_points=2.5), ValueError, "num_points to be a whole number"),
+    ):
+        with pytest.raises(error, match=says):
+            call()
+    batch = CKA(X.expand(2, -1, -1), Y.expand(2, -1, -1), physics=lambda X: X[..., :1])
+    with pytest.raises(ValueError, match=r"of one data set, got one with batch_shape \(2,\)"):
+        trust(batch)
+
+
+@pytest.fixture
+def known():
+    """Nine points of two inputs and two outputs, whose sides are known."""
+    side = torch.tensor([0, 1, 2] * 3)
+    X = torch.stack([torch.arange(9.0), side.double()], -1).double()
+    override = torch.stack([(side == 1) * 2.0, torch.zeros(9)], -1).double()
+    doubt = torch.stack([(side == 2) * 2.0, torch.zeros(9)], -1).double()
+    return Trust(X, override, doubt, ("speed [m/s]", "x2"), ("lift", "drag"))
+
+
+def test_shares_along_each_input(known):
+    axes = plot_trust(known, bins=3)
+    assert axes.shape == (2,)
+    assert [ax.get_xlabel() for ax in axes] == ["speed [m/s]", "$x_{2}$"]
+    for container, kind in zip(axes[0].containers, ("physics", "data", "neither"), strict=True):
+        assert container.get_label() == f"{kind}: 33 %"
+        np.testing.assert_allclose([bar.get_height() for bar in container], [1 / 3] * 3)
+    heights = [[bar.get_height() for bar in container] for container in axes[1].containers]
+    np.testing.assert_allclose(heights, np.eye(3))
+    assert axes[1].get_legend().get_title().get_text() == "lift rests on"
+    second = plot_trust(known, output=1)[0]
+    assert second.containers[0].get_label() == "physics: 100 %"
+
+
+def test_points_over_two_inputs(known):
+    ax = plot_trust_pair(known, (1, 0))
+    for k, drawn in enumerate(ax.lines):
+        np.testing.assert_allclose(drawn.get_xydata(), known.X[k::3].flip(-1))
+    assert ax.get_ylabel() == "speed [m/s]"
+
+
+def test_an_input_that_never_changed(known):
+    known.X[:, 1] = 2.0
+    axes = plot_trust(known)
+    assert sum(bar.get_height() for c in axes[1].containers for bar in c) == pytest.approx(1)
+
+
+def test_figures_refuse_what_they_cannot_draw(half, known):
+    for call, error, says in (
+        (lambda: plot_trust(half), TypeError, r"Expected a Trust, got CKA; pass `trust\(model\)`"),
+        (lambda: plot_trust(known, output=2), ValueError, "There is no output 2"),
+        (lambda: plot_trust(known, bins=0), ValueError, "bins to be a whole number >= 1"),
+        (lambda: plot_trust(known, axes=[1]), ValueError, "Expected 2 axes"),
+        (lambda: plot_trust_pair(known, (0, 2)), ValueError, "two different inputs from 0 to 1"),
+        (lambda: plot_trust_pair(trust(half)), ValueError, "of one input with `plot_trust`"),
+    ):
+        with pytest.raises(error, match=says):
+            call()
+    assert not plt.get_fignums()
