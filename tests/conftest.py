@@ -165,6 +165,8 @@ def build():
         m = Y.shape[-1]
         if kind != "ZeroMeanGP":
             options.setdefault("physics", lambda X: crude(X)[..., :m])
+        if kind in ("CKA", "RRA"):
+            options.setdefault("center", 0.0)  # the literal model, which the formulas are of
         if kind == "AR1":
             options.setdefault("num_low", 12)
             options.setdefault("bounds", torch.tensor([[0.0] * X.shape[-1], [2.0] * X.shape[-1]]))

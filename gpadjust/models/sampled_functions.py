@@ -126,7 +126,7 @@ class SampledFunctions(Module):
             if self.updates and not term.is_known:
                 part = part + _product(next(cross), self.updates[i], extra)
             basis = term.weights(inputs)
-            total = total + (part if basis is None else part * basis)
+            total = total + (part if basis is None else part * basis) + term.moved_mean
         return total
 
 

@@ -23,6 +23,8 @@ def test_a_model_from_a_dataset(
         options |= {"bounds": torch.tensor([[0.0, 0.0], [2.0, 2.0]]), "num_low": 12}
     if kind.startswith("RRA"):
         options["num_features"] = 24
+    if kind in ("CKA", "RRA"):
+        options["center"] = 0.0
     direct = build(kind, X, Y, Yvar).eval()
     model = type(direct)(**type(direct).construct_inputs(dataset, **options)).eval()
     Z = uniform(4, 2)

@@ -53,7 +53,7 @@ def test_variances_that_are_small(dense, close, scale, options):
     def physics(X):
         return scale * (1 + X)
 
-    model = CKA(X, Y, physics=physics, **options).eval()
+    model = CKA(X, Y, physics=physics, center=0.0, **options).eval()
     with torch.no_grad():
         for term, outputscale in zip(model.terms, (1e-4, 1e-3), strict=True):
             term.kernel.outputscale = outputscale
@@ -63,7 +63,7 @@ def test_variances_that_are_small(dense, close, scale, options):
 
 def test_noise_of_observations_and_the_marginal_likelihood(uniform, shuffle, dense, close):
     X, Y, Z, physics = problem(uniform, 2, 10.0, 0)
-    model = shuffle(CKA(X, Y, physics=physics))
+    model = shuffle(CKA(X, Y, physics=physics, center=0.0))
     formula = dense(model, X, Y, physics)
     mean, covariance = formula.posterior(Z)
     posterior = model.posterior(Z, observation_noise=True)
@@ -79,7 +79,7 @@ def test_noise_of_observations_and_the_marginal_likelihood(uniform, shuffle, den
 def test_known_noise(uniform, shuffle, dense, close):
     X, Y, Z, physics = problem(uniform, 2, 3.0, 1)
     Yvar = uniform(*Y.shape, low=0.01, high=0.3, seed=9)
-    model = shuffle(CKA(X, Y, Yvar, physics=physics))
+    model = shuffle(CKA(X, Y, Yvar, physics=physics, center=0.0))
     agree(model, dense(model, X, Y, physics, noise=Yvar), Z, close)
 
 

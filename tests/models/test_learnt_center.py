@@ -144,3 +144,14 @@ def test_a_parameter_of_the_physics_with_its_name(XY):
 def test_the_summary_tells_it(XY):
     model = move(CKA(*XY, physics=crude, center="learn"), 4.25)
     assert "centre 4.25" in model.summary()
+
+
+@pytest.mark.parametrize("cls", [CKA, RRA])
+def test_functions_have_the_posteriors_mean_near_and_far(XY, cls):
+    X, Y = XY
+    model = move(cls(X, Y, physics=crude), -7.0)
+    Z = torch.cat([X[:2] + 0.1, 50 + X[:2]])
+    posterior = model.posterior(Z)
+    values = model.sample_functions(2000, seed=0)(Z)
+    error = (values.mean(0) - posterior.mean) / posterior.variance.sqrt()
+    assert error.abs().max() < 0.12
