@@ -1,8 +1,10 @@
 """Judging predictions, and choosing by them. `gpadjust.validation.plots` needs matplotlib."""
 
-from gpadjust.validation.comparison import STRUCTURES, Candidate, Comparison, Structure, compare
+from gpadjust.validation.comparison import Comparison, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
+from gpadjust.validation.ranking import Candidate, pseudo_bma_weights
 from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
+from gpadjust.validation.structures import STRUCTURES, Structure
 
 __all__ = [
     "STRUCTURES",
@@ -17,6 +19,7 @@ __all__ = [
     "leave_one_out",
     "nlpd",
     "pit",
+    "pseudo_bma_weights",
     "rmse",
     "score",
 ]
