@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, NamedTuple, Self
 
 import torch
 from botorch.acquisition.objective import PosteriorTransform
@@ -33,12 +33,12 @@ class Part(NamedTuple):
     Attributes:
         name: The structure's name.
         model: A model of that output alone.
-        count: How many of the components are its.
+        number: How many of the components are its.
     """
 
     name: str
     model: ExactGPBase
-    count: int
+    number: int
 
 
 class StackedGP(Model):
@@ -132,8 +132,11 @@ class StackedGP(Model):
         """The weights of each output, and what each of the models has learnt."""
         lines = [repr(self)]
         for name, parts in zip(self.output_names, self.parts, strict=True):
-            lines += [f"{part.count / self.num_samples:.0%} of {name}: {part.name}, "
-                      f"{part.model.summary()}" for part in parts]
+            lines += [
+                f"{part.number / self.num_samples:.0%} of {name}: {part.name}, "
+                f"{part.model.summary()}"
+                for part in parts
+            ]
         return "\n".join(lines)
 
     def posterior(
@@ -199,7 +202,7 @@ class StackedGP(Model):
         for j, group in enumerate(self.parts):
             each = [
                 [
-                    _for_each(moment, part.count, MCMC_DIM)
+                    _for_each(moment, part.number, MCMC_DIM)
                     for moment in part.model._components(X, _of_output(observation_noise, j))
                 ]
                 for part in group
@@ -220,7 +223,7 @@ class StackedGP(Model):
             drawn = []
             for group in self.parts:
                 owner = torch.arange(len(group)).repeat_interleave(
-                    torch.tensor([part.count for part in group])
+                    torch.tensor([part.number for part in group])
                 )
                 owner = owner[torch.randperm(self.num_samples)]
                 owner = owner[torch.arange(num_functions) % self.num_samples]
@@ -274,7 +277,7 @@ class StackedGP(Model):
 
     def _with(self, groups: list[list[ExactGPBase]], idcs: list[int]) -> Self:
         """The same mixtures, of some outputs, of other models."""
-        other = cast(Self, type(self).__new__(type(self)))
+        other = type(self).__new__(type(self))
         Model.__init__(other)
         other.num_samples, other.input_names = self.num_samples, self.input_names
         other.output_names = tuple(self.output_names[i] for i in idcs)
@@ -315,7 +318,7 @@ def _joint(part: Part, posterior: Any) -> tuple[Tensor, Tensor]:
     covariance: Tensor = to_dense(posterior.distribution.lazy_covariance_matrix)
     if part.model.num_samples is None:
         mean, covariance = mean.unsqueeze(-2), covariance.unsqueeze(-3)
-    return _for_each(mean, part.count, -2), _for_each(covariance, part.count, -3)
+    return _for_each(mean, part.number, -2), _for_each(covariance, part.number, -3)
 
 
 def _of_output(observation_noise: bool | Tensor, output: int) -> bool | Tensor:

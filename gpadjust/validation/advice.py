@@ -101,7 +101,7 @@ def _preferred(model: ExactGPBase, X: Tensor, output: int) -> list[str]:
         if set(names) <= set(model.term_names):
             sizes = torch.stack([_mean_of(model, n, X)[:, output].abs() for n in names])  # k x n
         else:
-            constants = [abs(model.term_mean(n, output)) for n in names]  # type: ignore[operator]
+            constants = [abs(model.term_mean(n, output)) for n in names]
             sizes = torch.tensor(constants).unsqueeze(-1).expand(-1, len(X)).to(X)
     labels = [name.removeprefix("rho_") for name in names]
     overall = sizes.mean(-1)

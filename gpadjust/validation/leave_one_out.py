@@ -182,15 +182,14 @@ def mixture_of(
 def _mixture_of(parts: list[Part]) -> LeaveOneOut:
     """Of the mixture of several models of one output."""
     each = [leave_one_out(part.model) for part in parts]
-    moments = (
+    mean, variance, density = (
         torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
         for name in ("mean", "variance", "log_density")
     )
-    counts = torch.tensor([part.count for part in parts]).to(each[0].mean)
-    weight = (counts / counts.sum()).reshape(-1, 1, 1)
-    return replace(
-        each[0], **dict(zip(("mean", "variance", "log_density"), mixture_of(*moments, weight)))
-    )
+    numbers = torch.tensor([part.number for part in parts]).to(mean)
+    weight = (numbers / numbers.sum()).reshape(-1, 1, 1)
+    mean, variance, density = mixture_of(mean, variance, density, weight)
+    return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 
 def training_data(model: Any) -> tuple[Tensor, Tensor]:

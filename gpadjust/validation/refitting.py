@@ -53,7 +53,8 @@ def refitted(
     sample(model, **options)
     with torch.no_grad():
         every = model._components(X, True if noise is None else noise)
-        mean, variance = (each.unflatten(-1, (m, n)).diagonal(dim1=-3, dim2=-1).mT for each in every)
+        each = [moments.unflatten(-1, (m, n)) for moments in every]
+        mean, variance = (moments.diagonal(dim1=-3, dim2=-1).mT for moments in each)
     density = log_densities(mean, variance, Y)
     weight = torch.full_like(mean, 1 / mean.shape[MCMC_DIM])
     return LeaveOneOut(X, Y, *mixture_of(mean, variance, density, weight), data.output_names)
