@@ -2,7 +2,7 @@
 
 from gpadjust.validation.comparison import Comparison, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
-from gpadjust.validation.ranking import Candidate, pseudo_bma_weights
+from gpadjust.validation.ranking import Candidate, stacking_weights
 from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
 from gpadjust.validation.structures import STRUCTURES, Structure
 
@@ -19,7 +19,7 @@ __all__ = [
     "leave_one_out",
     "nlpd",
     "pit",
-    "pseudo_bma_weights",
     "rmse",
     "score",
+    "stacking_weights",
 ]

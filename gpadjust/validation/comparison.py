@@ -108,8 +108,8 @@ def compare(
     density* (elpd) of left-out observations, of which each is out of the hyper-parameters, too: up
     to 24 observations, by fitting again without each of them, and with more by the weights of
     :func:`leave_one_out`. A difference of less than two standard errors shows nothing. Where no
-    structure has nearly all weight, the recommended model is their mixture with the weights of
-    *pseudo-BMA+* (Yao et al. 2018), a :class:`~gpadjust.StackedGP`.
+    structure has nearly all weight, the recommended model is their mixture, a
+    :class:`~gpadjust.StackedGP` with the weights of :func:`stacking_weights`.
 
     Of several physics each structure is fitted to each of them alone, ``"CKA of coarse"`` and so
     on, and to all at once, ``"CKA of all"``; the advice says which physics the data prefer, and

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gpadjust.validation.leave_one_out import LeaveOneOut
 
-_BOOTSTRAPS = 1000
+_BOOTSTRAPS = 200
+_STEPS = 300
 _WORST = -1e6  # nats; a density of zero would make others' differences infinite
 
 
@@ -23,7 +24,7 @@ class Candidate(NamedTuple):
         elpd: Expected log predictive density, the sum over the observations, in nats.
         elpd_diff: That less the best structure's; 0 for the best.
         se_diff: The standard error of this difference.
-        weight: Its weight in the stacked model, by pseudo-BMA+.
+        weight: Its weight in the stacked model.
         rmse: Root mean square error, relative to the standard deviation of the observations.
         coverage: Share of the observations within their 95 % intervals.
     """
@@ -45,7 +46,7 @@ def ranking(left_out: dict[str, LeaveOneOut], output: int) -> list[Candidate]:
         output: The number of the output.
     """
     density = densities(left_out, output)
-    weights = pseudo_bma_weights(density).tolist()
+    weights = stacking_weights(density).tolist()
     order = density.sum(0).argsort(descending=True, stable=True).tolist()
     names, rows = [*left_out], []
     for k in order:
@@ -80,21 +81,26 @@ def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
     return each.sum().item(), math.sqrt(len(each)) * each.std(correction=0).item()
 
 
-def pseudo_bma_weights(density: Tensor, seed: int = 0) -> Tensor:
-    r"""Weights of structures by pseudo-BMA+ (Yao et al. 2018, sec. 3.4), ``K``.
+def stacking_weights(density: Tensor, seed: int = 0) -> Tensor:
+    r"""Weights of structures whose mixture predicts left-out observations best, ``K``.
 
-    .. math:: w_k = E_\alpha \frac{\exp(n \sum_i \alpha_i \ell_{ik})}
-        {\sum_j \exp(n \sum_i \alpha_i \ell_{ij})}, \quad \alpha \sim Dirichlet(1, \dots, 1)
+    .. math:: w = E_\alpha \arg\max_w \sum_i \alpha_i \log \sum_k w_k \exp(\ell_{ik}),
+        \quad \alpha \sim Dirichlet(1, \dots, 1)
 
-    The Bayesian bootstrap over the observations keeps few of them from being too sure.
+    (Yao et al. 2018, eq. 4). The Bayesian bootstrap over the observations (Rubin 1981) keeps few of
+    them from being too sure.
 
     Args:
         density: Log predictive densities of left-out observations, ``n x K``.
         seed: Of the bootstrap.
     """
-    n = len(density)
+    n, K = density.shape
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.rand(_BOOTSTRAPS, n, generator=generator, dtype=torch.float64)
     share = -torch.log1p(-drawn)  # exponential
     share = (share / share.sum(-1, keepdim=True)).to(density)
-    return (n * share @ density).softmax(-1).mean(0)
+    likelihood = (density - density.amax(-1, keepdim=True)).exp()
+    weights = density.new_full((_BOOTSTRAPS, K), 1 / K)
+    for _ in range(_STEPS):  # expectation maximisation, which keeps to the simplex
+        weights = weights * ((share / (weights @ likelihood.mT)) @ likelihood)
+    return weights.mean(0)
