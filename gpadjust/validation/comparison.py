@@ -32,7 +32,7 @@ _FEW = 24  # observations, up to which each structure is fitted again without ea
 _REFIT = {"num_iterations": 16, "num_samples": 128, "num_starts": 4, "num_screened": 64}
 _DRAWS = (32, 256)  # of the hyper-parameters, the least and the most
 _MEMORY = 20_000  # observations times draws
-_HELD = 16  # samples of a model, half the components of the stacked one
+_HELD = 32  # samples of a model, and components of the stacked one
 _CLEAR = 0.95  # weight of a structure that needs no others
 
 
@@ -187,11 +187,10 @@ def compare(
         except Exception as error:
             error.add_note(f"This is of the structure {structure.name!r}.")
             raise
-        models[structure.name] = _thinned(model, 2 * _HELD)
+        models[structure.name] = _thinned(model, _HELD)
     by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))
-    stacked = StackedGP(models, _weights(models, by_output), 2 * _HELD)
-    models = {name: _thinned(model, _HELD) for name, model in models.items()}
+    stacked = StackedGP(models, _weights(models, by_output), _HELD)
     sentences = advice([structure for structure, _ in found], models, left_out, table, data.X)
     return Comparison(models, stacked, table, sentences)
 

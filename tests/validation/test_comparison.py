@@ -111,7 +111,7 @@ def test_each_output_is_judged_by_itself(X, scaled, noise):
     stacked = comparison.recommended
     assert isinstance(stacked, StackedGP)
     for name, model in comparison.models.items():
-        assert model.num_samples == 16
+        assert model.num_samples == 32
         expected = [row(comparison, name, output).weight for output in ("y1", "y2")]
         assert stacked.weights[name] == pytest.approx(expected, abs=1 / 32)
     assert stacked.predict(X).mean[:, 0].sub(Y[:, 0]).abs().max() < 1
@@ -127,8 +127,7 @@ def test_units_make_no_difference(X, scaled):
     assert large.rmse == pytest.approx(small.rmse, rel=1e-3)
 
 
-def test_with_many_points_samples_are_weighted(monkeypatch):
-    monkeypatch.setattr(comparison_of, "_DRAWS", (16, 16))
+def test_with_many_points_samples_are_weighted():
     X = torch.linspace(0, 1, 25, dtype=torch.float64).unsqueeze(-1)
     Y = X.exp() + 0.1 * (50 * X).sin()
     comparison = compare(X, Y, crude, structures=["physics mean"], **QUICK)
