@@ -8,6 +8,7 @@ from gpadjust.models.exact_gp_base import ExactGPBase, Prediction
 from gpadjust.models.rra import RRA, PaperRRA
 from gpadjust.models.sampled_functions import SampledFunctions
 from gpadjust.models.saving import load, save
+from gpadjust.models.stacked import StackedGP
 
 __all__ = [
     "AR1",
@@ -22,6 +23,7 @@ __all__ = [
     "Prediction",
     "SampledFunctions",
     "ScaleGP",
+    "StackedGP",
     "ZeroMeanGP",
     "load",
     "save",

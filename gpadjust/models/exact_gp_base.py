@@ -30,8 +30,8 @@ from gpadjust.models.hyperparameters import learnt_noise, set_initial_values
 from gpadjust.models.posteriors import (
     HyperparameterMixture,
     ScaleFreePosterior,
+    mixture_interval,
     mixture_moments,
-    mixture_quantile,
 )
 from gpadjust.models.sampled_functions import SampledFunctions, draw_functions
 from gpadjust.models.summary import summary, title
@@ -291,10 +291,7 @@ class ExactGPBase(SingleTaskGP):
         Raises:
             ValueError: If ``level`` is not between 0 and 1.
         """
-        if not isinstance(level, float) or not 0 < level < 1:
-            raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
-        parts = self._components(X, observation_noise)
-        return mixture_quantile(*parts, (1 - level) / 2), mixture_quantile(*parts, (1 + level) / 2)
+        return mixture_interval(lambda: self._components(X, observation_noise), level)
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024

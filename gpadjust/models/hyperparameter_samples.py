@@ -48,8 +48,11 @@ def release_samples(model: Any) -> None:
     model._is_fully_bayesian = model._is_ensemble = False
 
 
-def take_samples(model: Any, index: Tensor) -> Any:
-    """A copy whose batch is some of the samples, maybe repeated; a plain batch to BoTorch."""
+def take_samples(model: Any, index: Tensor, as_mixture: bool = False) -> Any:
+    """A copy whose batch is some of the samples, maybe repeated.
+
+    To BoTorch it is a plain batch, or a fully Bayesian model of these samples, ``as_mixture``.
+    """
     model = deepcopy(model)
     fixed = getattr(model.likelihood, "noise_covar", None)
     if isinstance(fixed, FixedGaussianNoise):
@@ -57,8 +60,8 @@ def take_samples(model: Any, index: Tensor) -> Any:
         shape = (*model._aug_batch_shape, fixed.noise.shape[-1])
         fixed.noise = fixed.noise.expand(shape)[index]
     _change(model, lambda tensor: tensor[index])
-    model.num_samples = None
-    model._is_fully_bayesian = model._is_ensemble = False
+    model.num_samples = len(index) if as_mixture else None
+    model._is_fully_bayesian = model._is_ensemble = as_mixture
     return model
 
 

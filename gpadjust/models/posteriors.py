@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from botorch.posteriors import GPyTorchPosterior, Posterior
@@ -121,6 +122,16 @@ def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
         below = torch.special.ndtr((middle.unsqueeze(MCMC_DIM) - mean) / sd).mean(MCMC_DIM) < level
         low, high = torch.where(below, middle, low), torch.where(below, high, middle)
     return (low + high) / 2
+
+
+def mixture_interval(
+    components: Callable[[], tuple[Tensor, Tensor]], level: float
+) -> tuple[Tensor, Tensor]:
+    """Lower and upper ends of the central intervals of mixtures, ``... x q x m`` each."""
+    if not isinstance(level, float) or not 0 < level < 1:
+        raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
+    parts = components()
+    return mixture_quantile(*parts, (1 - level) / 2), mixture_quantile(*parts, (1 + level) / 2)
 
 
 def _variance(distribution: MultivariateNormal) -> Tensor:

@@ -1,8 +1,10 @@
 """Judging predictions, and choosing by them. `gpadjust.validation.plots` needs matplotlib."""
 
-from gpadjust.validation.comparison import STRUCTURES, Candidate, Comparison, Structure, compare
+from gpadjust.validation.comparison import Comparison, compare
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
+from gpadjust.validation.ranking import Candidate, stacking_weights
 from gpadjust.validation.scores import Scores, coverage, crps, nlpd, pit, rmse, score
+from gpadjust.validation.structures import STRUCTURES, Structure
 from gpadjust.validation.trust import Trust, trust
 
 __all__ = [
@@ -21,5 +23,6 @@ __all__ = [
     "pit",
     "rmse",
     "score",
+    "stacking_weights",
     "trust",
 ]

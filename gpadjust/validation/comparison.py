@@ -1,143 +1,85 @@
-"""Choosing the structure of an adjustment by evidence and leave-one-out."""
+"""Choosing the structure of an adjustment by leave-one-out."""
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from botorch.models.transforms.input import InputTransform
-from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 from tqdm import tqdm
 
 from gpadjust.gp.gaussian import threads_for
-from gpadjust.inference.fitting import fit
-from gpadjust.inference.map_fit import FitResult
-from gpadjust.models import CKA, RRA, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.inference.fitting import check_options, fit
+from gpadjust.inference.full_bayes import SamplingWarning
+from gpadjust.inference.log_parameters import shared_parameters
+from gpadjust.models import ExactGPBase, StackedGP
 from gpadjust.models.adjusted_gp import PhysicsLike
-from gpadjust.models.training_data import ArrayLike, training_data
-from gpadjust.physics import JoinedPhysics, Physics, as_physics
-from gpadjust.validation.leave_one_out import leave_one_out
+from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
+from gpadjust.physics import as_physics
+from gpadjust.validation.advice import advice
+from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
+from gpadjust.validation.ranking import Candidate, ranking
+from gpadjust.validation.refitting import LEAST, refitted
+from gpadjust.validation.structures import STRUCTURES, Structure, candidates, known_structures
 
-Criterion = Literal["leave-one-out", "evidence"]
-
-
-class Structure(NamedTuple):
-    """A way to adjust a physics, one of those that :func:`compare` fits.
-
-    Attributes:
-        name: Its name.
-        build: Makes the model of ``train_X, train_Y, train_Yvar`` with the keyword arguments
-            ``physics`` and ``input_transform``.
-        unknowns: How many constant means are unknown, for one physics.
-        uses_physics: Whether it reads the physics at all.
-        adjusts: Whether it does more than to take the physics as a mean.
-        joins: Whether it takes several physics at once.
-    """
-
-    name: str
-    build: Callable[..., ExactGPBase]
-    unknowns: int = 0
-    uses_physics: bool = True
-    adjusts: bool = True
-    joins: bool = True
-
-
-def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> ExactGPBase:
-    return ZeroMeanGP(*data, **options)
-
-
-STRUCTURES = (
-    Structure("zero mean", _zero_mean, uses_physics=False, adjusts=False, joins=False),
-    Structure("physics mean", PhysicsMeanGP, adjusts=False),
-    Structure(
-        "constant rho", partial(PhysicsMeanGP, rho_mean="learn", delta_mean="learn"), unknowns=2
-    ),
-    Structure("CKA", CKA),
-    Structure("CKA centred", partial(CKA, center="mean")),
-    Structure(
-        "CKA centred, learnt rho mean", partial(CKA, center="mean", rho_mean="learn"), unknowns=1
-    ),
-    Structure("RRA", RRA),
-)
-"""The structures that :func:`compare` knows; add your own to them."""
-_ENOUGH = 3  # observations for each hyper-parameter; with fewer, point fits are found too sure
-_SURE = 2.0  # standard errors that a difference takes to be real
-
-
-class Candidate(NamedTuple):
-    """How well a structure does; sums over outputs and points, in the user's units.
-
-    Attributes:
-        structure: Its name.
-        evidence: Log marginal likelihood at its best hyper-parameters, with unknown constants at
-            their least squares estimates (which flatters them a little); higher is better.
-        log_predictive: Sum of the leave-one-out log predictive densities; higher is better.
-        rmse: Leave-one-out root mean square error, relative to the standard deviation of the
-            targets (mean over outputs).
-        coverage: Share of the observations within their 95 % leave-one-out intervals.
-        num_parameters: Number of hyper-parameters.
-        converged: Whether the optimiser converged.
-    """
-
-    structure: str
-    evidence: float
-    log_predictive: float
-    rmse: float
-    coverage: float
-    num_parameters: int
-    converged: bool
+_FEW = 24  # observations, up to which each structure is fitted again without each of them
+_REFIT = {"num_draws": 512, "num_samples": 64, "num_starts": 4, "num_screened": 64}
+_DRAWS = (32, 256)  # of the hyper-parameters, the least and the most
+_MEMORY = 20_000  # observations times draws
+_HELD = 32  # samples of a model, and components of the stacked one
+_CLEAR = 0.95  # weight of a structure that needs no others
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Fitted models of several structures, and which of them the data prefer.
 
-    Print it for the table and the advice.
+    Print it for the tables and the advice.
 
     Attributes:
         models: The fitted models by the names of their structures.
-        table: The candidates, best first.
-        criterion: What they are ranked by.
+        stacked: All of them, stacked with the weights of the tables.
+        table: The candidates of each output, best first, by the names of the outputs.
         advice: What the comparison says about the physics, in sentences.
     """
 
     models: dict[str, ExactGPBase]
-    table: list[Candidate]
-    criterion: Criterion
+    stacked: StackedGP
+    table: dict[str, list[Candidate]]
     advice: list[str]
 
     @property
     def chosen(self) -> str:
-        """The name of the best structure.
-
-        RRA is CKA seen through random features, so it is not chosen where CKA is at hand.
-        """
-        return _best([row.structure for row in self.table])
+        """The structure that is clearly best for all outputs, otherwise ``"stacked"``."""
+        heaviest = [max(rows, key=lambda row: row.weight) for rows in self.table.values()]
+        names = {row.structure for row in heaviest}
+        clear = len(names) == 1 and all(row.weight >= _CLEAR for row in heaviest)
+        return names.pop() if clear else "stacked"
 
     @property
-    def best(self) -> ExactGPBase:
-        """The fitted model of the best structure."""
-        return self.models[self.chosen]
+    def recommended(self) -> ExactGPBase | StackedGP:
+        """The fitted model of the structure that is clearly best, otherwise the stacked one."""
+        return self.models.get(self.chosen, self.stacked)
 
     def __str__(self) -> str:
-        width = max(len(row.structure) for row in self.table)
-        head = ("structure", "evidence", "LOO density", "LOO RMSE/sd", "coverage", "parameters")
-        lines = [f"{head[0]:{width}}" + "".join(f"  {name:>11}" for name in head[1:])]
-        lines += [
-            f"{row.structure:{width}}  {row.evidence:>11.4g}  {row.log_predictive:>11.4g}"
-            f"  {row.rmse:>11.3g}  {row.coverage:>11.2f}  {row.num_parameters:>11}"
-            + ("" if row.converged else "  not converged")
-            for row in self.table
-        ]
-        return "\n".join([*lines, "", *self.advice])
+        width = max(len(row.structure) for rows in self.table.values() for row in rows)
+        head = ("elpd", "elpd diff", "its error", "weight", "RMSE/sd", "coverage")
+        lines: list[str] = []
+        for output, rows in self.table.items():
+            lines.append(f"{output:{width}}" + "".join(f"  {name:>9}" for name in head))
+            lines += [
+                f"{row.structure:{width}}  {row.elpd:>9.4g}  {row.elpd_diff:>9.3g}"
+                f"  {row.se_diff:>9.2g}  {row.weight:>9.2f}  {row.rmse:>9.3g}  {row.coverage:>9.2f}"
+                for row in rows
+            ]
+            lines.append("")
+        return "\n".join([*lines, *self.advice])
 
 
 def compare(
@@ -148,7 +90,6 @@ def compare(
     *,
     input_transform: InputTransform | None = None,
     structures: Sequence[str | Structure] = STRUCTURES,
-    criterion: Criterion = "leave-one-out",
     num_starts: int | None = None,
     num_screened: int | None = None,
     seed: int = 0,
@@ -156,48 +97,47 @@ def compare(
 ) -> Comparison:
     r"""Fit models of several structures and rank them: how should this physics be adjusted?
 
-    ==================================  ===========================================================
-    ``"zero mean"``                     no physics, :class:`~gpadjust.ZeroMeanGP`
-    ``"physics mean"``                  :math:`f_p + \delta(x)`, :class:`~gpadjust.PhysicsMeanGP`
-    ``"constant rho"``                  :math:`\rho f_p + \mu + \delta(x)` with unknown constants
-    ``"CKA"``                           :math:`\rho(x) f_p + \delta(x)`, :class:`~gpadjust.CKA`
-    ``"CKA centred"``                   with the kernel on f_p less its mean
-    ``"CKA centred, learnt rho mean"``  and an unknown constant mean of :math:`\rho`
-    ``"RRA"``                           on random features, :class:`~gpadjust.RRA`
-    ==================================  ===========================================================
+    ==================  ===========================================================================
+    ``"zero mean"``     no physics, :class:`~gpadjust.ZeroMeanGP`
+    ``"physics mean"``  :math:`f_p + \delta(x)`, :class:`~gpadjust.PhysicsMeanGP`
+    ``"constant rho"``  :math:`\rho f_p + \mu + \delta(x)` with unknown constants
+    ``"CKA"``           :math:`\rho(x) (f_p - c) + \delta(x)` with learnt c, :class:`~gpadjust.CKA`
+    ==================  ===========================================================================
+
+    All are fitted by full Bayes. Each output is judged by itself, by the *expected log predictive
+    density* (elpd) of left-out observations, of which each is out of the hyper-parameters, too: up
+    to 24 observations, by fitting again without each of them, and with more by the weights of
+    :func:`leave_one_out`. A difference of less than two standard errors shows nothing. Where no
+    structure has nearly all weight, the recommended model is their mixture, a
+    :class:`~gpadjust.StackedGP` with the weights of :func:`stacking_weights`.
 
     Of several physics each structure is fitted to each of them alone, ``"CKA of coarse"`` and so
     on, and to all at once, ``"CKA of all"``; the advice says which physics the data prefer, and
     where (by the mean size of each rho in the halves of each input's range).
 
-    Two numbers tell how good a structure is: its *evidence*, the marginal likelihood at the best
-    hyper-parameters, and the *leave-one-out* log predictive density, which judges predictions and
-    minds neither the number of hyper-parameters nor how vague their priors are. Where they
-    disagree by little, take the simpler structure. RRA is ranked with the others, but CKA, which it
-    approximates, is chosen in its place.
+    The parameters of a physics that learns are not fitted again, so that left-out observations have
+    had their say in them. The advice says so.
 
     Args:
         train_X: Inputs, ``n x d``, as in :class:`~gpadjust.CKA`.
-        train_Y: Targets, ``n x m``; one structure is chosen for all outputs.
+        train_Y: Targets, ``n x m``.
         physics: The physics f_p, or several, as in :class:`~gpadjust.CKA`. Each model has a copy of
             its own, where it has parameters.
         train_Yvar: Known observation variances, as in :class:`~gpadjust.CKA`.
         input_transform: As in :class:`~gpadjust.CKA`; each model has a copy of its own.
         structures: Which to fit: names, or a :class:`Structure` of your own.
-        criterion: ``"leave-one-out"`` or ``"evidence"``, what to rank them by.
         num_starts: As in :func:`~gpadjust.fit`.
         num_screened: As in :func:`~gpadjust.fit`.
         seed: Seed of the fits.
         progress: Whether to show a progress bar.
 
     Returns:
-        The fitted models, the ranking, and advice in words: whether the physics helps, and whether
-        adjusting it is better than taking it as the mean.
+        The fitted models, the rankings, the recommended model, and advice in words: whether the
+        physics is shown to help, and whether scaling it is better than taking it as the mean.
 
     Raises:
         TypeError: As :class:`~gpadjust.CKA` and :func:`~gpadjust.fit`.
-        ValueError: As these two; if a structure or criterion is unknown, or there is a batch of
-            data sets.
+        ValueError: As these two; if a structure is unknown, or there is a batch of data sets.
         PhysicsError: As :class:`~gpadjust.CKA`.
 
     Example:
@@ -205,33 +145,27 @@ def compare(
         >>> from gpadjust import compare
         >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
         >>> comparison = compare(
-        ...     X, 2 * torch.sin(6 * X) + X, lambda X: torch.sin(6 * X),
+        ...     X, 2 * torch.sin(6 * X) + X.exp(), lambda X: torch.sin(6 * X),
         ...     structures=["zero mean", "physics mean", "CKA"],
         ... )
         >>> comparison.chosen
         'CKA'
-        >>> mean, variance = comparison.best.predict(X)
+        >>> mean, variance = comparison.recommended.predict(X)
     """
-    chosen = _known(structures)
-    if criterion not in ("leave-one-out", "evidence"):
-        raise ValueError(
-            f"Unknown criterion {criterion!r}; expected 'leave-one-out' or 'evidence'."
-        )
+    asked = known_structures(structures)
+    search = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
+    check_options("map", search)
+    given = {name: value for name, value in search.items() if value is not None}
     data = training_data(train_X, train_Y, train_Yvar)
     if data.X.dim() > 2:
         raise ValueError(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
             "the data sets of a batch one by one."
         )
-    candidates = _candidates(chosen, as_physics(physics))
+    found = candidates(asked, as_physics(physics), len(data.X))
     models: dict[str, ExactGPBase] = {}
-    rows: list[Candidate] = []
-    densities: dict[str, Tensor] = {}
-    for structure, part in tqdm(candidates, disable=not progress, unit="structure"):
-        parts = len(part.parts) if isinstance(part, JoinedPhysics) else 1
-        unknowns = structure.unknowns + (parts - 1 if parts > 1 else 0)
-        if unknowns and len(data.X) < 2 + unknowns and len(candidates) > 1:
-            continue  # too few points for its unknown constants
+    left_out: dict[str, LeaveOneOut] = {}
+    for structure, part in tqdm(found, disable=not progress, unit="structure"):
         try:
             model = structure.build(
                 train_X,
@@ -240,170 +174,50 @@ def compare(
                 physics=deepcopy(part),
                 input_transform=deepcopy(input_transform),
             )
+            with warnings.catch_warnings(), threads_for(len(data.X), others=True):
+                warnings.simplefilter("ignore", OptimizationWarning)
+                warnings.simplefilter("ignore", SamplingWarning)
+                fit(model, "bayes", num_samples=_number(len(data.X)), **search)
+                again = not shared_parameters(model) and _can_be_left_out(data)
+                left_out[structure.name] = (
+                    refitted(structure, data, part, input_transform, **{**_REFIT, **given})
+                    if again
+                    else leave_one_out(model)
+                )
         except Exception as error:
             error.add_note(f"This is of the structure {structure.name!r}.")
             raise
-        with warnings.catch_warnings(), threads_for(len(data.X), others=True):
-            warnings.simplefilter("ignore", OptimizationWarning)
-            result = fit(model, num_starts=num_starts, num_screened=num_screened, seed=seed)
-            row, densities[structure.name] = _judge(structure, model, result)
-        models[structure.name] = model
-        rows.append(row)
-    key = "evidence" if criterion == "evidence" else "log_predictive"
-    rows.sort(key=lambda row: _or_worst(getattr(row, key)), reverse=True)
-    by_name = {structure.name: structure for structure, _ in candidates}
-    advice = _advice(rows, densities, by_name)
-    best = models[_best([row.structure for row in rows])]
-    if isinstance(as_physics(physics), JoinedPhysics):
-        advice.extend(_preferred(best, data.X))
-    return Comparison(models, rows, criterion, advice)
+        models[structure.name] = _thinned(model, _HELD)
+    by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
+    table = dict(zip(data.output_names, by_output, strict=True))
+    stacked = StackedGP(models, _weights(models, by_output), _HELD)
+    sentences = advice([structure for structure, _ in found], models, left_out, table, data.X)
+    return Comparison(models, stacked, table, sentences)
 
 
-def _known(structures: Sequence[str | Structure]) -> list[Structure]:
-    """The structures that are asked for, each once."""
-    names = {structure.name: structure for structure in STRUCTURES}
-    given = [structures] if isinstance(structures, str | Structure) else [*structures]
-    unknown = [s for s in given if not isinstance(s, Structure) and s not in names]
-    if unknown or not given:
-        raise ValueError(
-            f"Unknown structures {unknown}; expected some of {', '.join(map(repr, names))}, or a "
-            "Structure of your own."
-        )
-    found = [s if isinstance(s, Structure) else names[s] for s in given]
-    named = {structure.name: structure for structure in found}
-    if any(named[structure.name] != structure for structure in found):
-        raise ValueError("Expected structures of different names; give yours a name of its own.")
-    return list(named.values())
+def _number(num_points: int) -> int:
+    """How many samples of the hyper-parameters leave-one-out is told by."""
+    least, most = _DRAWS
+    return max(least, min(most, _MEMORY // num_points))
 
 
-def _candidates(structures: list[Structure], physics: Physics) -> list[tuple[Structure, Physics]]:
-    """What is to be fitted: structures of one physics, or of each of several and of all."""
-    if not isinstance(physics, JoinedPhysics):
-        return [(structure, physics) for structure in structures]
-    candidates: list[tuple[Structure, Physics]] = []
-    for structure in structures:
-        if not structure.uses_physics:
-            candidates.append((structure, physics))
-            continue
-        parts = cast(Iterable[Physics], physics.parts)
-        of: list[tuple[str, Physics]] = [*zip(physics.names, parts, strict=True)]
-        of += [("all", physics)] if structure.joins else []
-        for name, part in of:
-            named = structure._replace(name=f"{structure.name} of {name}")
-            candidates.append((named, part))
-    return candidates
+def _can_be_left_out(data: TrainingData) -> bool:
+    """Whether each structure can be fitted again without each observation."""
+    observed = (~data.Y.isnan()).sum(-2)
+    return len(data.X) <= _FEW and int(observed.min()) >= LEAST
 
 
-def _preferred(model: ExactGPBase, X: Tensor) -> list[str]:
-    """Which physics a model of several relies on, and where."""
-    names = getattr(model, "rho_names", ())
-    if len(names) < 2:
-        return []
-    with torch.no_grad():
-        if set(names) <= set(model.term_names):
-            sizes = torch.stack([model.term(n, X).mean.abs().mean(-1) for n in names])  # k x n
-        else:
-            sizes = torch.tensor([abs(model.term_mean(n)) for n in names]).unsqueeze(-1)
-            sizes = sizes.expand(-1, len(X)).to(X)
-    labels = [name.removeprefix("rho_") for name in names]
-    overall = sizes.mean(-1)
-    shares = ", ".join(f"{n} {w:.2g}" for n, w in zip(labels, overall.tolist(), strict=True))
-    sentences = [f"Mean size of rho at the data: {shares}."]
-    for i in range(X.shape[-1]):
-        low = X[:, i] <= X[:, i].median()
-        if low.all():
-            continue
-        first, second = sizes[:, low].mean(-1), sizes[:, ~low].mean(-1)
-        a, b = int(first.argmax()), int(second.argmax())
-        if a != b:
-            sentences.append(
-                f"Below the median of {model.input_names[i]} the data prefer {labels[a]}, above it "
-                f"{labels[b]}."
-            )
-    return sentences
+def _thinned(model: ExactGPBase, number: int) -> ExactGPBase:
+    """A model that holds some of its samples."""
+    if model.num_samples is None or model.num_samples <= number:
+        return model
+    index = torch.linspace(0, model.num_samples - 1, number).round().long()
+    thinned: ExactGPBase = take_samples(model, index, as_mixture=True)
+    return thinned
 
 
-def _best(order: list[str]) -> str:
-    """The first of an order, but CKA itself rather than its approximation."""
-    return next(
-        (n for n in order if "RRA" not in n or n.replace("RRA", "CKA") not in order), order[0]
-    )
-
-
-def _judge(structure: Structure, model: ExactGPBase, result: FitResult) -> tuple[Candidate, Tensor]:
-    """The row of a fitted model, and the leave-one-out log densities of all observations."""
-    loo = leave_one_out(model)
-    observed = ~loo.Y.isnan()
-    normal = torch.distributions.Normal(loo.mean, loo.variance.sqrt(), validate_args=False)
-    densities = normal.log_prob(loo.Y)[observed]
-    # Likelihoods are in the units of the model's targets, which differ between structures.
-    scale: Any = getattr(model, "outcome_transform", None)
-    units = 0.0 if scale is None else (observed * scale.stdvs.log()).sum().item()
-    spread = nanstd(loo.Y, dim=-2)
-    relative = loo.rmse / spread.where(spread > 0, torch.ones_like(spread))
-    learnt = sum(p.numel() for p in model.parameters() if p.requires_grad)
-    learnt += sum(term.learns_mean for term in model.terms) * model.num_outputs
-    row = Candidate(
-        structure.name,
-        result.log_likelihood.sum().item() - units,
-        densities.sum().item(),
-        relative.mean().item(),
-        loo.coverage().mean().item(),
-        learnt,
-        bool(result.converged.all()),
-    )
-    return row, densities
-
-
-def _advice(
-    rows: list[Candidate], densities: dict[str, Tensor], structures: dict[str, Structure]
-) -> list[str]:
-    """What the ranking says about the physics."""
-    order = [row.structure for row in rows]
-    best = next(row for row in rows if row.structure == _best(order))
-    sentences = [f"Best: {best.structure}."]
-    if len(densities[best.structure]) < _ENOUGH * best.num_parameters:
-        sentences.append(
-            f"{len(densities[best.structure])} observations are few for {best.num_parameters} "
-            "hyper-parameters: the ranking is uncertain, and the intervals of a point fit are too "
-            "narrow; see fit(model)."
-        )
-
-    def gain(better: str, worse: str) -> tuple[float, float]:
-        """Difference of the log predictive densities, and its standard error."""
-        difference = densities[better] - densities[worse]
-        n = difference.numel()
-        return difference.sum().item(), math.sqrt(n) * difference.std(correction=0).item()
-
-    def first(names: Callable[[str], bool]) -> str | None:
-        return next((name for name in order if names(name)), None)
-
-    # RRA without physics would be another model than the zero mean.
-    with_physics = first(
-        lambda name: structures[name].uses_physics and not name.startswith(("RRA", "constant"))
-    )
-    without = first(lambda name: not structures[name].uses_physics)
-    if with_physics and without:
-        value, error = gain(with_physics, without)
-        if value <= _SURE * error:
-            sentences.append(
-                "As far as these data tell, the physics does not help: left-out observations are "
-                f"predicted no better with it ({with_physics}) than without ({value:+.1f} +- "
-                f"{error:.1f} nats). Check its units and inputs, or leave it out."
-            )
-            return sentences
-    adjusted = first(lambda name: structures[name].adjusts)
-    plain = first(lambda name: name.startswith("physics mean"))
-    if adjusted and plain:
-        value, error = gain(adjusted, plain)
-        if value <= _SURE * error:
-            sentences.append(
-                f"As far as these data tell, scaling the physics ({adjusted}) is no better than "
-                f"the physics mean ({value:+.1f} +- {error:.1f} nats): prefer the simpler "
-                "PhysicsMeanGP."
-            )
-    return sentences
-
-
-def _or_worst(value: float) -> float:
-    return value if math.isfinite(value) else -math.inf
+def _weights(models: dict[str, ExactGPBase], by_output: list[list[Candidate]]) -> Tensor:
+    """The weights of the tables, ``K x m``, in the order of the models."""
+    named = [{row.structure: row.weight for row in rows} for rows in by_output]
+    weights = [[own[name] for own in named] for name in models]
+    return torch.tensor(weights, dtype=torch.float64)

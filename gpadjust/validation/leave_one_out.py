@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -17,8 +17,9 @@ from linear_operator import to_dense
 from torch import Tensor
 
 from gpadjust.gp.gaussian import noise_variances
-from gpadjust.models import ExactGPBase
+from gpadjust.models import ExactGPBase, StackedGP
 from gpadjust.models.cholesky_strategy import Factors
+from gpadjust.models.stacked import Part
 from gpadjust.validation import scores
 
 
@@ -31,6 +32,9 @@ class LeaveOneOut:
         Y: Observations, ``batch_shape x n x m``; NaN where there is none.
         mean: Their predictions, of the same shape.
         variance: The variances of the predictions, observation noise included.
+        log_density: The log predictive densities of the observations, in nats, of the same shape;
+            of a mixture its own, whose shape the other scores take as Gaussian. NaN where there is
+            no observation.
         output_names: The names of the outputs; empty if the model has none.
     """
 
@@ -38,6 +42,7 @@ class LeaveOneOut:
     Y: Tensor
     mean: Tensor
     variance: Tensor
+    log_density: Tensor
     output_names: tuple[str, ...] = ()
 
     @property
@@ -53,7 +58,7 @@ class LeaveOneOut:
     @property
     def nlpd(self) -> Tensor:
         """Mean negative log predictive density, ``batch_shape x m``."""
-        return scores.nlpd(self.mean, self.variance, self.Y)
+        return -self.log_density.nanmean(-2)
 
     @property
     def crps(self) -> Tensor:
@@ -70,7 +75,9 @@ class LeaveOneOut:
         return scores.coverage(self.mean, self.variance, self.Y, level)
 
 
-def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> LeaveOneOut:
+def leave_one_out(
+    model: BatchedMultiOutputGPyTorchModel | ModelListGP | StackedGP,
+) -> LeaveOneOut:
     r"""Predict each observation from all the others, without fitting again.
 
     The hyper-parameters (and the scale of the outcomes) stay as they are, so that each left-out
@@ -88,7 +95,8 @@ def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> Leave
     Of a model that holds samples of its hyper-parameters, these *are* without the left-out
     observation: a sample has the weight :math:`1 / p(y_i | y_{-i}, \theta)`, at most
     :math:`\sqrt S` times the average (Gelfand et al. 1992; Ionides 2008), and mean and variance
-    are those of the weighted mixture, whose shape the scores take as Gaussian.
+    are those of the weighted mixture. Of a :class:`~gpadjust.StackedGP` it is the mixture of its
+    parts' predictions; its weights stay.
 
     Args:
         model: Any model of this library, a ``SingleTaskGP``, or a ``ModelListGP`` of such with the
@@ -111,6 +119,8 @@ def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> Leave
     """
     if isinstance(model, ModelListGP):
         return _join([leave_one_out(part) for part in model.models])
+    if isinstance(model, StackedGP):
+        return _join([_mixture_of(parts) for parts in model.parts])
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(
             "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such, got "
@@ -137,20 +147,49 @@ def leave_one_out(model: BatchedMultiOutputGPyTorchModel | ModelListGP) -> Leave
             variance = variance * transform.stdvs.square()
         if is_fully_bayesian(model):
             X, Y = X.select(MCMC_DIM, 0), Y.select(MCMC_DIM, 0)
-            mean, variance = _mixture(Y, mean, variance)
+        else:
+            mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
+        density = log_densities(mean, variance, Y)
+        mean, variance, density = mixture_of(mean, variance, density, _without_each(density))
     X, Y = X[..., rows, :].expand(*mean.shape[:-1], X.shape[-1]), Y.expand(mean.shape)
-    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, getattr(model, "output_names", ()))
+    names = getattr(model, "output_names", ())
+    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, density, names)
 
 
-def _mixture(Y: Tensor, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance ``... x n x m`` of mixtures of predictions ``... x S x n x m``."""
-    error = (Y.unsqueeze(MCMC_DIM) - mean).square().nan_to_num(nan=0.0)
-    weight = (0.5 * (error / variance + variance.log())).softmax(MCMC_DIM)
+def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:
+    """Of observations ``... x n x m`` by Gaussians ``... x S x n x m``; NaN where there is none."""
+    normal = torch.distributions.Normal(mean, variance.sqrt(), validate_args=False)
+    return normal.log_prob(Y.unsqueeze(MCMC_DIM))
+
+
+def _without_each(density: Tensor) -> Tensor:
+    """Weights of samples that have seen all, for each observation to have had no say in them."""
+    weight = (-density).nan_to_num(nan=0.0).softmax(MCMC_DIM)
     weight = weight.clamp_max(weight.shape[MCMC_DIM] ** -0.5)
-    weight = weight / weight.sum(MCMC_DIM, keepdim=True)
+    return weight / weight.sum(MCMC_DIM, keepdim=True)
+
+
+def mixture_of(
+    mean: Tensor, variance: Tensor, density: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, variance and log density of mixtures with weights, 1 in all, along ``MCMC_DIM``."""
     centre = (weight * mean).sum(MCMC_DIM, keepdim=True)
     spread = (mean - centre).square()
-    return centre.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM)
+    total = (weight.log() + density).logsumexp(MCMC_DIM)
+    return centre.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
+
+
+def _mixture_of(parts: list[Part]) -> LeaveOneOut:
+    """Of the mixture of several models of one output."""
+    each = [leave_one_out(part.model) for part in parts]
+    mean, variance, density = (
+        torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
+        for name in ("mean", "variance", "log_density")
+    )
+    numbers = torch.tensor([part.number for part in parts]).to(mean)
+    weight = (numbers / numbers.sum()).reshape(-1, 1, 1)
+    mean, variance, density = mixture_of(mean, variance, density, weight)
+    return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 
 def training_data(model: Any) -> tuple[Tensor, Tensor]:
@@ -158,8 +197,9 @@ def training_data(model: Any) -> tuple[Tensor, Tensor]:
 
     Of an :class:`~gpadjust.AR1` those of the high level; of a batch the first.
     """
-    if isinstance(model, ModelListGP):
-        parts = [training_data(part) for part in model.models]
+    if isinstance(model, ModelListGP | StackedGP):
+        models = model.models if isinstance(model, ModelListGP) else [g[0] for g in model.groups]
+        parts = [training_data(part) for part in models]
         return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
@@ -217,9 +257,9 @@ def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
                 "The models of the list have different training inputs, so their observations do "
                 "not belong to the same points; call `leave_one_out` on each of `model.models`."
             )
-    Y, mean, variance = (
+    Y, mean, variance, density = (
         torch.cat([getattr(part, name) for part in parts], dim=-1)
-        for name in ("Y", "mean", "variance")
+        for name in ("Y", "mean", "variance", "log_density")
     )
     names = tuple(name for part in parts for name in part.output_names)
-    return LeaveOneOut(X, Y, mean, variance, names)
+    return LeaveOneOut(X, Y, mean, variance, density, names)

@@ -8,13 +8,14 @@ from typing import Any, ClassVar, Literal, get_args
 
 from paper.common.experiment import Experiment, Task
 
-Method = Literal["map", "hmc", "hmc-centre", "long"]
+Method = Literal["map", "hmc", "hmc-centre", "long", "compare"]
 METHODS: tuple[Method, ...] = get_args(Method)
 LABELS = {
     "map": "most likely",
     "hmc": "full Bayes",
     "hmc-centre": "full Bayes, centre learnt",
     "long": "the same, ten times longer",
+    "compare": "recommended by compare",
 }
 _PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
 # Name in mf2, observations per input, noise in standard deviations of the truth.
@@ -45,7 +46,7 @@ class Calibration(Experiment):
     runs: int = 10
     """data sets of each kind; twice as many of the pump"""
     out: Path = Path("results/calibration")
-    methods: tuple[Method, ...] = ("map", "hmc", "hmc-centre")
+    methods: tuple[Method, ...] = ("map", "hmc", "hmc-centre", "compare")
     """of inference"""
     settings: Settings = field(default_factory=Settings)
 

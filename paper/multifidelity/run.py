@@ -127,7 +127,7 @@ def trained(
         warnings.filterwarnings("ignore", category=SamplingWarning)
         if method == "chosen":
             comparison = compare(X, Y, pair.physics())
-            return comparison.best, comparison.chosen
+            return comparison.recommended, comparison.chosen
         if method == "SMT MFK":
             low_X = low_inputs(pair, X, num_low * pair.d, seed)
             return SMTModel(low_X, pair.physics()(low_X), X, Y), ""

@@ -1,0 +1,128 @@
+"""What a comparison of structures says about the physics, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from botorch.posteriors.fully_bayesian import MCMC_DIM
+from torch import Tensor
+
+from gpadjust.inference.log_parameters import shared_parameters
+from gpadjust.models import ExactGPBase
+from gpadjust.validation.leave_one_out import LeaveOneOut
+from gpadjust.validation.ranking import Candidate, densities, difference
+from gpadjust.validation.structures import Structure
+
+_SURE = 2.0  # standard errors that a difference takes to be real
+
+
+def advice(
+    structures: Sequence[Structure],
+    models: dict[str, ExactGPBase],
+    left_out: dict[str, LeaveOneOut],
+    table: dict[str, list[Candidate]],
+    X: Tensor,
+) -> list[str]:
+    """Sentences for each output, and what holds for all.
+
+    Args:
+        structures: What was fitted.
+        models: The models by the names of their structures.
+        left_out: Their leave-one-out predictions.
+        table: The rankings, by the names of the outputs.
+        X: Training inputs, ``n x d``.
+    """
+    by_name = {structure.name: structure for structure in structures}
+    sentences = []
+    for j, (output, rows) in enumerate(table.items()):
+        where = f"{output}: " if len(table) > 1 else ""
+        density = dict(zip(left_out, densities(left_out, j).unbind(-1), strict=True))
+        found = [_best(rows), *_gains(by_name, [row.structure for row in rows], density)]
+        found += _preferred(models[rows[0].structure], X, j)
+        sentences += [where + sentence for sentence in found]
+    flattered = [name for name, model in models.items() if shared_parameters(model)]
+    if flattered:
+        sentences.append(
+            f"{', '.join(flattered)}: left-out observations have had their say in the parameters of "
+            "the physics, so that these elpd are too high. Freeze them with requires_grad_(False) "
+            "for a fair comparison."
+        )
+    return sentences
+
+
+def _best(rows: list[Candidate]) -> str:
+    """Which structure is best, and how sure that is."""
+    best, *others = rows
+    near = [row for row in others if -row.elpd_diff <= _SURE * row.se_diff]
+    sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"
+    if not near:
+        return f"{sentence}."
+    return (
+        f"{sentence}; not shown to be worse, within {_SURE:.0f} standard errors: "
+        f"{', '.join(row.structure for row in near)}."
+    )
+
+
+def _gains(
+    structures: dict[str, Structure], order: list[str], density: dict[str, Tensor]
+) -> list[str]:
+    """Whether the physics helps, and whether scaling it does."""
+
+    def first(matches: Callable[[Structure], bool]) -> str | None:
+        return next((name for name in order if matches(structures[name])), None)
+
+    # An unknown constant may help by itself.
+    with_physics = first(lambda s: s.uses_physics and not s.unknowns)
+    with_physics = with_physics or first(lambda s: s.uses_physics)
+    plain = first(lambda s: s.uses_physics and not s.adjusts)
+    pairs = (
+        ("The physics", with_physics, first(lambda s: not s.uses_physics), "without it"),
+        ("Scaling the physics", first(lambda s: s.adjusts), plain, "with the physics as a mean"),
+    )
+    sentences = []
+    for subject, better, worse, otherwise in pairs:
+        if better is None or worse is None:
+            continue
+        value, error = difference(density[better], density[worse])
+        shown = value > _SURE * error
+        sentences.append(
+            f"{subject} {'helps' if shown else 'is not shown to help'}: elpd {value:+.1f} +- "
+            f"{error:.1f} nats ({better}) over that {otherwise} ({worse})."
+        )
+    return sentences
+
+
+def _preferred(model: ExactGPBase, X: Tensor, output: int) -> list[str]:
+    """Which physics a model of several relies on, and where."""
+    names = getattr(model, "rho_names", ())
+    if len(names) < 2:
+        return []
+    with torch.no_grad():
+        if set(names) <= set(model.term_names):
+            sizes = torch.stack([_mean_of(model, n, X)[:, output].abs() for n in names])  # k x n
+        else:
+            constants = [abs(model.term_mean(n, output)) for n in names]
+            sizes = torch.tensor(constants).unsqueeze(-1).expand(-1, len(X)).to(X)
+    labels = [name.removeprefix("rho_") for name in names]
+    overall = sizes.mean(-1)
+    shares = ", ".join(f"{n} {w:.2g}" for n, w in zip(labels, overall.tolist(), strict=True))
+    sentences = [f"Mean size of rho at the data: {shares}."]
+    for i in range(X.shape[-1]):
+        low = X[:, i] <= X[:, i].median()
+        if low.all():
+            continue
+        first, second = sizes[:, low].mean(-1), sizes[:, ~low].mean(-1)
+        a, b = int(first.argmax()), int(second.argmax())
+        if a != b:
+            sentences.append(
+                f"Below the median of {model.input_names[i]} the data prefer {labels[a]}, above it "
+                f"{labels[b]}."
+            )
+    return sentences
+
+
+def _mean_of(model: ExactGPBase, term: str, X: Tensor) -> Tensor:
+    """The posterior mean of a term, ``n x m``."""
+    mean: Tensor = model.term(term, X).mean
+    return mean if model.num_samples is None else mean.mean(MCMC_DIM)

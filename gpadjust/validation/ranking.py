@@ -1,0 +1,106 @@
+"""Which structure predicts an output best, how sure that is, and weights to stack them by."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from botorch.models.transforms.outcome import nanstd
+from torch import Tensor
+
+from gpadjust.validation.leave_one_out import LeaveOneOut
+
+_BOOTSTRAPS = 200
+_STEPS = 300
+_WORST = -1e6  # nats; a density of zero would make others' differences infinite
+
+
+class Candidate(NamedTuple):
+    """How well a structure predicts an output's left-out observations, in the user's units.
+
+    Attributes:
+        structure: Its name.
+        elpd: Expected log predictive density, the sum over the observations, in nats.
+        elpd_diff: That less the best structure's; 0 for the best.
+        se_diff: The standard error of this difference.
+        weight: Its weight in the stacked model.
+        rmse: Root mean square error, relative to the standard deviation of the observations.
+        coverage: Share of the observations within their 95 % intervals.
+    """
+
+    structure: str
+    elpd: float
+    elpd_diff: float
+    se_diff: float
+    weight: float
+    rmse: float
+    coverage: float
+
+
+def ranking(left_out: dict[str, LeaveOneOut], output: int) -> list[Candidate]:
+    """The structures for one output, best first.
+
+    Args:
+        left_out: The leave-one-out predictions of each structure.
+        output: The number of the output.
+    """
+    density = densities(left_out, output)
+    weights = stacking_weights(density).tolist()
+    order = density.sum(0).argsort(descending=True, stable=True).tolist()
+    names, rows = [*left_out], []
+    for k in order:
+        loo = left_out[names[k]]
+        elpd_diff, se_diff = difference(density[:, k], density[:, order[0]])
+        spread = float(nanstd(loo.Y[:, output : output + 1], dim=0))
+        rows.append(
+            Candidate(
+                names[k],
+                density[:, k].sum().item(),
+                elpd_diff,
+                se_diff,
+                weights[k],
+                loo.rmse[output].item() / (spread if spread > 0 else 1.0),
+                loo.coverage()[output].item(),
+            )
+        )
+    return rows
+
+
+def densities(left_out: dict[str, LeaveOneOut], output: int) -> Tensor:
+    """The log predictive densities of an output's observations by each structure, ``n x K``."""
+    found = torch.stack([loo.log_density[:, output] for loo in left_out.values()], -1)
+    (first, *_) = left_out.values()
+    seen = ~first.Y[:, output].isnan()
+    return found[seen].nan_to_num(nan=_WORST, neginf=_WORST).clamp_min(_WORST)
+
+
+def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
+    """The difference of two elpd, and its standard error (Vehtari et al. 2017, eq. 24)."""
+    each = first - second
+    return each.sum().item(), math.sqrt(len(each)) * each.std(correction=0).item()
+
+
+def stacking_weights(density: Tensor, seed: int = 0) -> Tensor:
+    r"""Weights of structures whose mixture predicts left-out observations best, ``K``.
+
+    .. math:: w = E_\alpha \arg\max_w \sum_i \alpha_i \log \sum_k w_k \exp(\ell_{ik}),
+        \quad \alpha \sim Dirichlet(1, \dots, 1)
+
+    (Yao et al. 2018, eq. 4). The Bayesian bootstrap over the observations (Rubin 1981) keeps few of
+    them from being too sure.
+
+    Args:
+        density: Log predictive densities of left-out observations, ``n x K``.
+        seed: Of the bootstrap.
+    """
+    n, K = density.shape
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(_BOOTSTRAPS, n, generator=generator, dtype=torch.float64)
+    share = -torch.log1p(-drawn)  # exponential
+    share = (share / share.sum(-1, keepdim=True)).to(density)
+    likelihood = (density - density.amax(-1, keepdim=True)).exp()
+    weights = density.new_full((_BOOTSTRAPS, K), 1 / K)
+    for _ in range(_STEPS):  # expectation maximisation, which keeps to the simplex
+        weights = weights * ((share / (weights @ likelihood.mT)) @ likelihood)
+    return weights.mean(0)

@@ -1,0 +1,88 @@
+"""The structures that :func:`gpadjust.compare` fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+from gpadjust.models import CKA, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.physics import JoinedPhysics, Physics
+
+
+class Structure(NamedTuple):
+    """A way to adjust a physics, one of those that :func:`~gpadjust.compare` fits.
+
+    Attributes:
+        name: Its name.
+        build: Makes the model of ``train_X, train_Y, train_Yvar`` with the keyword arguments
+            ``physics`` and ``input_transform``; of any number of outputs, each by itself.
+        unknowns: How many constant means are unknown, for one physics.
+        uses_physics: Whether it reads the physics at all.
+        adjusts: Whether it does more than to take the physics as a mean.
+        joins: Whether it takes several physics at once.
+    """
+
+    name: str
+    build: Callable[..., ExactGPBase]
+    unknowns: int = 0
+    uses_physics: bool = True
+    adjusts: bool = True
+    joins: bool = True
+
+
+def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> ExactGPBase:
+    return ZeroMeanGP(*data, **options)
+
+
+STRUCTURES = (
+    Structure("zero mean", _zero_mean, uses_physics=False, adjusts=False, joins=False),
+    Structure("physics mean", PhysicsMeanGP, adjusts=False),
+    Structure(
+        "constant rho", partial(PhysicsMeanGP, rho_mean="learn", delta_mean="learn"), unknowns=2
+    ),
+    Structure("CKA", CKA),
+)
+"""The structures that :func:`gpadjust.compare` knows; add your own to them."""
+
+
+def known_structures(structures: Sequence[str | Structure]) -> list[Structure]:
+    """The structures that are asked for, each once."""
+    names = {structure.name: structure for structure in STRUCTURES}
+    given = [structures] if isinstance(structures, str | Structure) else [*structures]
+    unknown = [s for s in given if not isinstance(s, Structure) and s not in names]
+    if unknown or not given:
+        raise ValueError(
+            f"Unknown structures {unknown}; expected some of {', '.join(map(repr, names))}, or a "
+            "Structure of your own."
+        )
+    found = [s if isinstance(s, Structure) else names[s] for s in given]
+    named = {structure.name: structure for structure in found}
+    if any(named[structure.name] != structure for structure in found):
+        raise ValueError("Expected structures of different names; give yours a name of its own.")
+    return list(named.values())
+
+
+def candidates(
+    structures: list[Structure], physics: Physics, num_points: int
+) -> list[tuple[Structure, Physics]]:
+    """What is to be fitted: structures of one physics, or of each of several and of all.
+
+    Those with too many unknown constants for the points are left out, if there are others.
+    """
+    found: list[tuple[Structure, Physics]] = []
+    for structure in structures:
+        if not isinstance(physics, JoinedPhysics) or not structure.uses_physics:
+            found.append((structure, physics))
+            continue
+        parts = cast(Iterable[Physics], physics.parts)
+        of: list[tuple[str, Physics]] = [*zip(physics.names, parts, strict=True)]
+        for name, part in of:
+            found.append((structure._replace(name=f"{structure.name} of {name}"), part))
+        if structure.joins:
+            several = structure.unknowns + len(of) - 1
+            joined = structure._replace(name=f"{structure.name} of all", unknowns=several)
+            found.append((joined, physics))
+    few = [pair for pair in found if pair[0].unknowns and num_points < 2 + pair[0].unknowns]
+    return [pair for pair in found if pair not in few] or found

@@ -1,0 +1,200 @@
+"""Stacked models: the mixture of their parts, output by output, as BoTorch's models are used."""
+
+import pytest
+import torch
+from botorch.acquisition import qLogExpectedImprovement, qLogNoisyExpectedImprovement
+from botorch.acquisition.objective import ScalarizedPosteriorTransform
+from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
+
+from gpadjust import CKA, PhysicsMeanGP, StackedGP
+from gpadjust.models.stacked import allocation
+from gpadjust.validation import leave_one_out
+from gpadjust.validation.leave_one_out import training_data
+
+
+def f_p(X):
+    return torch.stack([(6 * X[..., 0]).sin(), 100 * X[..., 1]], -1)
+
+
+def held(model, num_samples, seed):
+    """The model with samples around its hyper-parameters."""
+    generator = torch.Generator().manual_seed(seed)
+    samples = {
+        name: p.detach()
+        + 0.3 * torch.randn(num_samples, *p.shape, generator=generator, dtype=torch.float64)
+        for name, p in model.named_parameters()
+    }
+    model.hold_samples(samples)
+    return model
+
+
+@pytest.fixture
+def data(uniform):
+    X = uniform(7, 2)
+    return X, 2 * f_p(X) + X.square()
+
+
+@pytest.fixture
+def models(data):
+    return {
+        "CKA": held(CKA(*data, physics=f_p), 8, 0),
+        "mean": held(PhysicsMeanGP(*data, physics=f_p), 8, 1),
+    }
+
+
+@pytest.fixture
+def weights():
+    return torch.tensor([[0.25, 1.0], [0.75, 0.0]], dtype=torch.float64)
+
+
+@pytest.fixture
+def Z(uniform):
+    return uniform(5, 2, seed=3)
+
+
+def quarter(model, Z, output, number):
+    """Moments of some of a model's components."""
+    index = torch.linspace(0, 7, number).round().long()
+    posterior = model.posterior(Z)
+    return posterior.mean[index, :, output], posterior.variance[index, :, output]
+
+
+def test_moments_are_those_of_the_weighted_mixture(models, weights, Z):
+    stacked = StackedGP(models, weights, num_components=8)
+    assert stacked.weights == {"CKA": [0.25, 1.0], "mean": [0.75, 0.0]}
+    first = [quarter(models["CKA"], Z, 0, 2), quarter(models["mean"], Z, 0, 6)]
+    second = [quarter(models["CKA"], Z, 1, 8)]
+    mean, variance = stacked.predict(Z)
+    posterior = stacked.posterior(Z)
+    assert isinstance(posterior, GaussianMixturePosterior)
+    assert posterior.mean.shape == (8, 5, 2)
+    for j, parts in enumerate((first, second)):
+        means, variances = (torch.cat(moments) for moments in zip(*parts, strict=True))
+        expected = means.mean(0)
+        torch.testing.assert_close(mean[:, j], expected)
+        second_moment = (variances + means.square()).mean(0)
+        torch.testing.assert_close(variance[:, j], second_moment - expected.square())
+    torch.testing.assert_close(posterior.mixture_mean, mean)
+    torch.testing.assert_close(posterior.mixture_variance, variance)
+    low, high = stacked.interval(Z, 0.5)
+    assert ((low < mean) & (mean < high)).all()
+
+
+def test_of_one_model_it_is_that_model(models, Z):
+    stacked = StackedGP({"CKA": models["CKA"]}, torch.ones(1, 2).double(), num_components=8)
+    torch.testing.assert_close(stacked.predict(Z, True), models["CKA"].predict(Z, True))
+    for ours, theirs in zip(stacked.interval(Z), models["CKA"].interval(Z), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    ours, theirs = stacked.posterior(Z), models["CKA"].posterior(Z)
+    torch.testing.assert_close(ours.covariance_matrix, theirs.covariance_matrix)
+    ours, theirs = leave_one_out(stacked), leave_one_out(models["CKA"])
+    torch.testing.assert_close(ours.log_density, theirs.log_density)
+    torch.testing.assert_close(ours.variance, theirs.variance)
+
+
+def test_point_estimates_are_stacked_as_well(data, models, weights, Z):
+    point = PhysicsMeanGP(*data, physics=f_p)
+    stacked = StackedGP({**models, "mean": point}, weights, num_components=4)
+    expected = quarter(models["CKA"], Z, 0, 1)[0].sum(0) + 3 * point.posterior(Z).mean[:, 0]
+    torch.testing.assert_close(stacked.predict(Z).mean[:, 0], expected / 4)
+    torch.testing.assert_close(stacked.posterior(Z).mixture_mean, stacked.predict(Z).mean)
+
+
+def test_left_out_densities_are_mixed(models, weights):
+    stacked = StackedGP(models, weights, num_components=8)
+    loo, (X, Y) = leave_one_out(stacked), training_data(stacked)
+    parts = [leave_one_out(part.model).log_density.exp() for part in stacked.parts[0]]
+    expected = (parts[0] / 4 + 3 * parts[1] / 4).log()
+    torch.testing.assert_close(loo.log_density[:, :1], expected)
+    torch.testing.assert_close(loo.Y, Y)
+    torch.testing.assert_close(loo.X, X)
+
+
+def test_functions_are_spread_over_the_components(models, weights, Z):
+    stacked = StackedGP(models, weights, num_components=8)
+    functions = stacked.sample_functions(400, seed=0, num_features=256)
+    values, own = functions(Z), functions.each(Z.expand(400, -1, -1))
+    assert values.shape == (400, 5, 2)
+    torch.testing.assert_close(own, values)
+    mean, variance = stacked.predict(Z)
+    assert ((values.mean(0) - mean).abs() < 0.3 * variance.sqrt()).all()
+    assert functions(Z.expand(3, -1, -1)).shape == (400, 3, 5, 2)
+    few = stacked.sample_functions(1, seed=0)
+    assert torch.equal(few(Z), stacked.sample_functions(1, seed=0)(Z))
+
+
+def test_outputs_are_subset(models, weights, Z):
+    stacked = StackedGP(models, weights, num_components=4)
+    subset = stacked.subset_output([-1])
+    assert (subset.num_outputs, subset.output_names) == (1, ("y2",))
+    assert subset.weights == {"CKA": [1.0], "mean": [0.0]}
+    torch.testing.assert_close(subset.predict(Z).mean, stacked.predict(Z).mean[:, 1:])
+    mean = stacked.posterior(Z, output_indices=[1, 0]).mean
+    torch.testing.assert_close(mean, stacked.posterior(Z).mean.flip(-1))
+
+
+def test_conditioning_conditions_each_part(data, models, weights, Z):
+    stacked = StackedGP(models, weights, num_components=4)
+    Y = 2 * f_p(Z[:2])
+    Y[1, 1] = torch.nan
+    conditioned = stacked.condition_on_observations(Z[:2], Y)
+    for j, k in ((0, 2), (1, 1)):
+        for part, before in zip(conditioned.parts[j], stacked.parts[j], strict=True):
+            expected = before.model.condition_on_observations(Z[:k], Y[:k, j : j + 1])
+            torch.testing.assert_close(part.model.predict(Z), expected.predict(Z))
+    assert conditioned.weights == stacked.weights
+    assert leave_one_out(conditioned.subset_output([0])).Y.shape == (9, 1)
+
+
+def test_acquisition_functions_average_over_the_components(data, models, weights, Z):
+    both = StackedGP(models, weights, num_components=4)
+    stacked, X = both.subset_output([0]), Z.unsqueeze(1).requires_grad_()
+    value = qLogExpectedImprovement(stacked, best_f=1.0)(X)
+    assert value.shape == (5,)
+    (gradient,) = torch.autograd.grad(value.sum(), X)
+    assert gradient.isfinite().all()
+    assert qLogNoisyExpectedImprovement(stacked, data[0])(Z.unsqueeze(1)).shape == (5,)
+    sum_of_both = ScalarizedPosteriorTransform(torch.tensor([1.0, 0.01]).double())
+    posterior = both.posterior(Z, posterior_transform=sum_of_both)
+    expected = both.posterior(Z).mean @ torch.tensor([1.0, 0.01]).double()
+    torch.testing.assert_close(posterior.mean.squeeze(-1), expected)
+
+
+def test_it_tells_what_it_is_of(models, weights):
+    stacked = StackedGP(models, weights)
+    assert repr(stacked) == "StackedGP of CKA, mean: 32 components"
+    assert "75% of y1: mean, PhysicsMeanGP of 'f_p'" in stacked.summary()
+
+
+def test_whole_numbers_by_the_largest_remainders():
+    for weights, expected in (
+        ([0.5, 0.3, 0.2], [4, 2, 2]),
+        ([1.0, 0.0, 0.0], [8, 0, 0]),
+        ([0.96, 0.02, 0.02], [8, 0, 0]),
+    ):
+        assert allocation(torch.tensor(weights).double(), 8) == expected
+
+
+def test_bad_input(data, models, weights, Z):
+    X, Y = data
+    for given, share, says in (
+        ({}, weights, "got none"),
+        (models, weights[:1], "weights of shape"),
+        (models, -weights, "not negative"),
+        (models, weights / 2, "1 in all"),
+        ({**models, "mean": PhysicsMeanGP(X[1:], Y[1:], physics=f_p)}, weights, "the same data"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            StackedGP(given, share)
+    with pytest.raises(TypeError, match="got a Linear as 'mean'"):
+        StackedGP({**models, "mean": torch.nn.Linear(1, 1)}, weights)
+    with pytest.raises(ValueError, match="num_components"):
+        StackedGP(models, weights, num_components=0)
+    stacked = StackedGP(models, weights, num_components=4)
+    for call in (
+        lambda: stacked.subset_output([2]),
+        lambda: stacked.interval(Z, 2.0),
+        lambda: stacked.condition_on_observations(Z, Y),
+    ):
+        with pytest.raises(ValueError, match="Expected"):
+            call()
