@@ -269,6 +269,7 @@ class LearnedDynamics(Dynamics):
             target=self.targets.target,
             encode_angles=self.encode_angles,
             model_options=self.model_options,
+            method=self.fit_options.get("method"),
         )
 
     def state_dict(self) -> dict[str, Any]:

@@ -145,14 +145,17 @@ def fit(
     check_options(method, given)
     search = Search(**{name: given.pop(name) for name in _SEARCH if name in given})
     with threads_for(model.train_targets.shape[-1], others=True), _without_samples(model):
-        if method == "map":
-            return maximise(model, search)
-        if not isinstance(model, ExactGPBase):
-            raise TypeError(
-                f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP is "
-                "the plain Gaussian process."
-            )
-        return sample(model, search, **given)
+        try:
+            if method == "map":
+                return maximise(model, search)
+            if not isinstance(model, ExactGPBase):
+                raise TypeError(
+                    f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP "
+                    "is the plain Gaussian process."
+                )
+            return sample(model, search, **given)
+        finally:
+            model.eval()
 
 
 def _can_be_sampled(model: BatchedMultiOutputGPyTorchModel) -> bool:

@@ -61,7 +61,6 @@ def sample(
     """
     model.check_can_be_sampled()
     target = deepcopy(model)
-    model.eval()
     settled = _settle_shared(target, search)
     register_priors(target)
     objective = Objective(target, marginal=True, of_logs=True, vague_trend=True)
@@ -144,8 +143,8 @@ def _named(objective: Objective, vectors: Tensor) -> dict[str, Tensor]:
 def _warn(result: SampleResult) -> None:
     low = result.power < _LEAST_POWER
     warnings.warn(
-        f"The draws of {int(low.sum())} of {low.numel()} outputs are of the approximation that they "
-        "begin with rather than of the posterior (weights to the power of "
+        f"The draws of {int(low.sum())} of {low.numel()} outputs are of the approximation that "
+        "they begin with rather than of the posterior (weights to the power of "
         f"{result.power.min():.2g}). Raise num_draws, or give narrower priors, that of the noise "
         "above all.",
         SamplingWarning,

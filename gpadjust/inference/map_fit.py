@@ -121,7 +121,6 @@ def _starts(objective: Objective, search: Search) -> Tensor:
     elif searches:
         starts = _screened(objective, search)
     if not objective(starts).amin(0).isfinite().all():
-        objective.model.eval()
         raise RuntimeError(NOWHERE)
     return starts
 

@@ -557,7 +557,10 @@ class ExactGPBase(SingleTaskGP):
         }
         own = self.state_dict()
         other = {n for n in own.keys() & state_dict.keys() if own[n].shape != state_dict[n].shape}
-        if (other and not samples) or (strict and own.keys() != state_dict.keys()):
+        if samples:  # of which there are as many of each
+            sizes = {len(values) for values in samples.values()}
+            other = {n for n in other if not _has_samples(state_dict[n], own[n], sizes)}
+        if other or (strict and own.keys() != state_dict.keys()):
             wrong = sorted(own.keys() ^ state_dict.keys()) or sorted(other)
             raise RuntimeError(
                 f"The state is of another model than this {type(self).__name__}, which is left as "
@@ -660,6 +663,11 @@ class ExactGPBase(SingleTaskGP):
         # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
         with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
             return super().condition_on_observations(X, Y, **kwargs)
+
+
+def _has_samples(values: Tensor, one: Tensor, sizes: set[int]) -> bool:
+    """Whether values are as many of one as there are samples."""
+    return len(sizes) == 1 and values.shape == (*sizes, *one.shape)
 
 
 def _is_plain(value: Any) -> bool:

@@ -108,7 +108,7 @@ class HyperparameterMixture(GaussianMixturePosterior):
 def mixture_moments(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance ``... x q x m`` of mixtures of components ``... x S x q x m``."""
     # Not as a difference of second moments, which cancels.
-    spread = mean.var(MCMC_DIM, correction=0)
+    spread = (mean - mean.mean(MCMC_DIM, keepdim=True)).square().mean(MCMC_DIM)
     return mean.mean(MCMC_DIM), variance.mean(MCMC_DIM) + spread
 
 

@@ -44,9 +44,9 @@ def advice(
     flattered = [name for name, model in models.items() if shared_parameters(model)]
     if flattered:
         sentences.append(
-            f"{', '.join(flattered)}: left-out observations have had their say in the parameters of "
-            "the physics, so that these elpd are too high. Freeze them with requires_grad_(False) "
-            "for a fair comparison."
+            f"{', '.join(flattered)}: left-out observations have had their say in the parameters "
+            "of the physics, so that these elpd are too high. Freeze them with "
+            "requires_grad_(False) for a fair comparison."
         )
     return sentences
 

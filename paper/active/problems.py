@@ -63,8 +63,9 @@ class Problem:
         transform = AngleInput(self.angles) if self.angles else None
         if kind == "GP":
             return ZeroMeanGP(X, Y, input_transform=transform)
-        made = CKA if kind == "CKA" else PhysicsMeanGP
-        return made(X, Y, physics=self.physics, input_transform=transform)
+        if kind == "CKA":  # the literal one
+            return CKA(X, Y, physics=self.physics, center=0.0, input_transform=transform)
+        return PhysicsMeanGP(X, Y, physics=self.physics, input_transform=transform)
 
 
 def problem(name: str, seed: int) -> Problem:

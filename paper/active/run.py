@@ -185,6 +185,7 @@ def fitted(settings: Settings, model: Any) -> None:
     """Fit a model from the hyper-parameters that it has and others."""
     fit(
         model,
+        "map",
         num_screened=settings.num_screened,
         num_starts=settings.num_starts,
         max_iterations=settings.max_iterations,

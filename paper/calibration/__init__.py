@@ -8,14 +8,14 @@ from typing import Any, ClassVar, Literal, get_args
 
 from paper.common.experiment import Experiment, Task
 
-Method = Literal["map", "hmc", "hmc-centre", "long", "compare"]
+Method = Literal["map", "default", "literal", "compare", "long"]
 METHODS: tuple[Method, ...] = get_args(Method)
 LABELS = {
     "map": "most likely",
-    "hmc": "full Bayes",
-    "hmc-centre": "full Bayes, centre learnt",
-    "long": "the same, ten times longer",
+    "default": "default",
+    "literal": "default, centre 0",
     "compare": "recommended by compare",
+    "long": "16 times as many draws",
 }
 _PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
 # Name in mf2, observations per input, noise in standard deviations of the truth.
@@ -46,7 +46,7 @@ class Calibration(Experiment):
     runs: int = 10
     """data sets of each kind; twice as many of the pump"""
     out: Path = Path("results/calibration")
-    methods: tuple[Method, ...] = ("map", "hmc", "hmc-centre", "compare")
+    methods: tuple[Method, ...] = ("map", "default", "literal", "compare")
     """of inference"""
     settings: Settings = field(default_factory=Settings)
 

@@ -129,19 +129,19 @@ def pump(n: int, seed: int) -> Data:
 
 
 def fitted(data: Data, method: Method) -> tuple[ExactGPBase | StackedGP, bool]:
-    """A model fitted by a method, and whether it said that its chains did not mix."""
+    """A model fitted by a method, and whether it said that its draws are not of the posterior."""
     if method == "compare":
         return compare(data.X, data.Y, data.physics).recommended, False
-    center: Any = 0.0 if method in ("map", "hmc") else "learn"
+    center: Any = 0.0 if method in ("map", "literal") else "learn"
     model = CKA(data.X, data.Y, physics=data.physics, center=center)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if method == "map":
             fit(model, "map")
         elif method == "long":
-            fit(model, "hmc", num_iterations=400, num_samples=128)
+            fit(model, num_draws=16_384, num_samples=128)
         else:
-            fit(model, "hmc")
+            fit(model)
     for each in caught:
         if not issubclass(each.category, OptimizationWarning | SamplingWarning):
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)

@@ -55,10 +55,19 @@ def dynamics(
     if scenario.model == "truth":
         return PhysicsDynamics(spec, truth)
     model = getattr(gpadjust.models, scenario.model)
-    options = {"num_features": settings.num_features} if "RRA" in scenario.model else None
+    # The literal model, at its most likely hyper-parameters.
+    options: dict[str, Any] = {"center": 0.0} if scenario.model in ("CKA", "RRA") else {}
+    options |= {"num_features": settings.num_features} if "RRA" in scenario.model else {}
     adjusted = None if model is gpadjust.models.ZeroMeanGP else physics
     target: Any = settings.target
-    return LearnedDynamics(spec, adjusted, model=model, target=target, model_options=options)
+    return LearnedDynamics(
+        spec,
+        adjusted,
+        model=model,
+        target=target,
+        model_options=options,
+        fit_options={"method": "map"},
+    )
 
 
 def make_agent(experiment: Control, name: str, seed: int) -> DynaSAC:
@@ -141,6 +150,7 @@ def _options(experiment: Control, name: str, system: System) -> DynaOptions:
         num_particles=settings.num_particles,
         exploration=system.exploration,
         explore_episodes=system.explore_episodes,
+        score_horizons=(),
     )
 
 

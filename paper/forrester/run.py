@@ -103,7 +103,7 @@ def trained(
         warnings.filterwarnings("ignore", message=".*nearly zero.*")
         if protocol == "gpadjust":
             model = _build(name, protocol, reading, X, Y)
-            fit(model)
+            fit(model, "map")
         else:
             model = _build(name, protocol, reading, X, Y, **_plain(name, Y, settings.noise))
             if name == "RRA":
@@ -131,6 +131,8 @@ def _build(
         "RRA": PaperRRA if protocol == "paper" else RRA,
         LEARNT: CKA,
     }
+    if kinds[name] in (CKA, RRA):
+        options["center"] = 0.0  # the literal model
     return kinds[name](X, Y, physics=physics, **options)
 
 

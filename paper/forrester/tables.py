@@ -83,7 +83,7 @@ def errors(runs: pd.DataFrame) -> str:
         [name, *(f"{mean[p, name]:.3g} / {median[p, name]:.3g}" for p in PROTOCOLS)]
         for name in runs[runs["protocol"] == "paper"]["model"].unique()
     ]
-    return markdown(["mean / median RMSE", "paper's protocol", "`fit`"], rows)
+    return markdown(["mean / median RMSE", "paper's protocol", '`fit(model, "map")`'], rows)
 
 
 def judge(runs: pd.DataFrame, grid: pd.DataFrame | None = None) -> list[Judged]:

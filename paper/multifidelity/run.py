@@ -132,7 +132,7 @@ def trained(
             low_X = low_inputs(pair, X, num_low * pair.d, seed)
             return SMTModel(low_X, pair.physics()(low_X), X, Y), ""
         model = _built(method, pair, X, Y, num_low, seed)
-        fit(model, "hmc") if method == "CKA Bayes" else fit(model)
+        fit(model, "bayes" if method == "CKA Bayes" else "map")
         return model, ""
 
 
@@ -143,5 +143,8 @@ def _built(method: Method, pair: Pair, X: Tensor, Y: Tensor, num_low: int, seed:
     if method == "AR1":
         low_X = low_inputs(pair, X, num_low * pair.d, seed)
         return AR1(X, Y, physics=pair.physics(), low_X=low_X)
-    kinds: dict[str, Any] = {"Phy": PhysicsMeanGP, "CKA": CKA, "CKA Bayes": CKA, "RRA": RRA}
-    return kinds[method](X, Y, physics=pair.physics())
+    if method == "Phy":
+        return PhysicsMeanGP(X, Y, physics=pair.physics())
+    if method == "CKA Bayes":
+        return CKA(X, Y, physics=pair.physics())
+    return (CKA if method == "CKA" else RRA)(X, Y, physics=pair.physics(), center=0.0)

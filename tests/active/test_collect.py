@@ -14,7 +14,6 @@ from botorch.acquisition import LogExpectedImprovement, qKnowledgeGradient
 from botorch.models import SingleTaskGP
 from botorch.models.transforms import Normalize
 
-from gpadjust import fit
 from gpadjust.active import (
     Collection,
     CollectionError,
@@ -129,12 +128,7 @@ class TestMeasuring:
 
     def test_the_default_fit(self, laboratory):
         result = collect(**laboratory(budget=6, fit=None))
-        assert result.model.num_samples is None
-
-    def test_full_bayes(self, laboratory):
-        sample = {"num_samples": 4, "num_iterations": 8, "num_starts": 1, "num_screened": 8}
-        result = collect(**laboratory(budget=5, fit=lambda m: _sampled(m, sample)))
-        assert result.model.num_samples == 4
+        assert result.model.num_samples == 16
 
     def test_a_model_of_botorch(self, laboratory, bounds):
 
@@ -148,14 +142,6 @@ class TestMeasuring:
         acquisition = lambda model: qKnowledgeGradient(model, num_fantasies=2)  # noqa: E731
         result = collect(**laboratory(acquisition=acquisition, budget=5))
         assert result.X.shape == (5, 2)
-
-
-def _sampled(model, options):
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return fit(model, "bayes", **options)
 
 
 class TestFailures:

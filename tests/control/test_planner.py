@@ -14,7 +14,7 @@ from gpadjust.physics import PhysicsError
 pytestmark = pytest.mark.filterwarnings("ignore:L-BFGS did not converge")
 BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
 SPEC = StateSpec(["x"], ["v"])
-QUICK = {"num_starts": 1, "num_screened": 0, "max_iterations": 15}
+QUICK = {"method": "map", "num_starts": 1, "num_screened": 0, "max_iterations": 15}
 
 
 @pytest.fixture

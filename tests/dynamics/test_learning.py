@@ -96,7 +96,7 @@ def test_refits_are_quiet_and_leave_the_generator_alone(cart_pole_system, make):
 
 def test_a_warm_start_is_the_same_in_the_users_units(cart_pole_system, make):
     system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude)
+    dynamics = make("CKA", system.spec, system.crude, fit_options={"method": "map"})
     states, actions, next_states = system.trial(0)
     next_states = next_states + 0.01 * torch.randn_like(next_states)
     dynamics.update(states, actions, next_states)
@@ -141,7 +141,7 @@ def test_kernels_of_the_users(cart_pole_system, make):
 @pytest.mark.parametrize("first", [0, 100])
 def test_refits_come_near_what_a_search_reaches(cart_pole_system, make, first):
     system = cart_pole_system
-    dynamics = make("CKA", system.spec, system.crude, fit_options={})
+    dynamics = make("CKA", system.spec, system.crude, fit_options={"method": "map"})
     for seed in range(first, first + 8):
         dynamics.update(*system.trial(seed))
     reached = dynamics.fit_result.log_likelihood.sum()

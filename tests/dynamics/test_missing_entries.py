@@ -7,7 +7,6 @@ import torch
 
 from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.incremental_fit import search_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
 
@@ -98,15 +97,6 @@ def test_a_state_that_is_seldom_measured(cart_pole_system, make):
     assert dynamics.score(*system.trial(9)).rmse.isfinite().all()
     with pytest.raises(ValueError, match="from, got 1 with a measured 'omega'"):
         make("GP", system.spec, None).update(states[:150], actions[:150], next_states[:150])
-
-
-def test_rows_of_a_search_hold_two_observations_of_each_output():
-    observed = torch.zeros(400, 3, dtype=torch.bool)
-    observed[:, 0] = observed[[7, 300], 1] = observed[[7, 8, 9], 2] = True
-    rows = search_rows(observed)
-    assert len(set(rows.tolist())) == 128
-    assert (observed[rows].sum(0) >= 2).all()
-    assert search_rows(observed[:128]) is None
 
 
 def test_a_row_of_nothing_is_refused(cart_pole_system, make, holed):

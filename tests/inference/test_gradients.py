@@ -69,7 +69,7 @@ MODELS = {
     "centre": of(CKA, center="learn"),
     "both means": of(CKA, center="mean", rho_mean="learn", delta_mean="learn"),
     "two physics": lambda X, Y, m: CKA(
-        X, Y, physics=[physics(m), lambda X: X[..., :1] + physics(m)(X).sin()]
+        X, Y, physics=[physics(m), lambda X: X[..., :1] + physics(m)(X).sin()], center="mean"
     ),
     "rho mean alone": of(PhysicsMeanGP, rho_mean="learn"),
 }
@@ -94,6 +94,7 @@ def test_every_kernel(smoothness, ard, seed, m, learn):
         rho_covar_module=kernel(smoothness, ard, batch),
         delta_covar_module=kernel(None, not ard, batch),
         rho_mean="learn" if learn else 1.0,
+        center="mean" if learn else "learn",
     )
     assert_equal_to_autograd(model, seed)
 

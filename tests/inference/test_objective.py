@@ -153,7 +153,7 @@ def test_its_gradient_is_that_of_finite_differences(model, marginal):
 def test_rows_are_those_of_a_model_of_them(XY):
     X, Y = XY
     rows = torch.tensor([0, 2, 3, 6, 8])
-    options = {"physics": crude, "outcome_transform": None}
+    options = {"physics": crude, "outcome_transform": None, "center": 0.0}
     part = Objective(CKA(X, Y, **options), marginal=True, rows=rows)
     alone = Objective(CKA(X[rows], Y[rows], **options), marginal=True)
     vectors = neighbours(alone)

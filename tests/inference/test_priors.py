@@ -56,7 +56,9 @@ def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics)
     X, Y = data()
     own = GammaPrior(3.0, 6.0)
     kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=own))
-    model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel)
+    model = CKA(
+        X, Y, center=0.0, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel
+    )
     model.terms[1].kernel.raw_outputscale.requires_grad_(False)
     register_priors(model)
     assert kernel.base_kernel.lengthscale_prior is own
@@ -86,7 +88,9 @@ def test_objective_is_gpytorchs_log_posterior(build, data, shuffle, kind, num_ou
 def test_potential_has_the_jacobian_of_the_logarithm(data, crude_physics, prior):
     X, Y = data()
     kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=prior))
-    model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel)
+    model = CKA(
+        X, Y, center=0.0, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel
+    )
     register_priors(model)
     objective = Objective(model, marginal=True)
     of_logs = Objective(model, marginal=True, of_logs=True)

@@ -342,12 +342,12 @@ class TestCalibration:
             dict(zip(experiment.key, (*kind, method, 0), strict=True))
             | experiment.run(*kind, method, 0, unfinished=tmp_path)
             for kind in kinds
-            for method in ("map", "hmc-centre")
+            for method in ("map", "default")
         ]
         assert all(0 <= r["half"] <= r["coverage"] <= 1 for r in records)
         found = experiment.tables(records)
         assert "pump, N = 12, noisy" in found["coverage"].text
-        assert "full Bayes, centre learnt" in found["summary"].text
+        assert "| default |" in found["summary"].text
 
     def test_there_are_sixteen_kinds_and_the_noise_is_what_it_says(self):
         assert len(ROWS) == 16
