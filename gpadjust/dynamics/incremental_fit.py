@@ -68,11 +68,12 @@ def fit_all(
     n = len(data.states)
     check_observed(recipe.targets.spec, data)
     model = recipe.build(data, quiet=previous is not None)
+    given: Any = options
     if previous is None:
-        return Fitted(model, fit(model, **options), n)
+        return Fitted(model, fit(model, **given), n)
     warm_start(model, previous.model)
     searches = n >= 2 * previous.searched_at
-    held: Any = {k: v for k, v in options.items() if k in ("method", "num_samples", "num_draws")}
+    held: Any = {k: v for k, v in given.items() if k in ("method", "num_samples", "num_draws")}
     with warnings.catch_warnings():
         # The next update goes on from where this one stops.
         warnings.simplefilter("ignore", OptimizationWarning)

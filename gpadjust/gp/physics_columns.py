@@ -142,6 +142,11 @@ class AppendedPhysics(gpytorch.Module):
             self.register_parameter("center", Parameter(torch.zeros_like(spread)))
 
     @property
+    def has_free_center(self) -> bool:
+        """Whether a fit may move the centre."""
+        return self.learns_center and self.center.requires_grad
+
+    @property
     def origin(self) -> Tensor:
         """The centre c, ``batch_shape x (m) x 1``, in the user's units."""
         return self.offset + self.spread * self._center if self.learns_center else self.offset

@@ -89,12 +89,11 @@ def maximise(model: BatchedMultiOutputGPyTorchModel, search: Search) -> FitResul
 @contextmanager
 def _centers_at_rest(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
     """Let centres stay: the most likely ones are found far out, where intervals are too narrow."""
-    centers = [
+    learnt = [
         module.center
         for module in model.covar_module.modules()
-        if isinstance(module, AppendedPhysics) and module.learns_center
+        if isinstance(module, AppendedPhysics) and module.has_free_center
     ]
-    learnt = [center for center in centers if center.requires_grad]
     for center in learnt:
         center.requires_grad_(False)
     try:

@@ -255,8 +255,7 @@ class Objective:
             weight = None if basis is None else basis(inputs)
             x, center, spread = (inputs - origin)[..., :d], None, None
             names |= {lengthscale} if scale is None else {lengthscale, scale}
-            learns = isinstance(basis, AppendedPhysics) and basis.learns_center
-            if learns and basis.center.requires_grad:
+            if isinstance(basis, AppendedPhysics) and basis.has_free_center:
                 center = f"{path.removesuffix('.kernel')}.basis.center"
                 spread = basis.spread / basis.scale
                 weight = basis(inputs) + spread * basis.center

@@ -75,8 +75,8 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         read, write = getattr(module, f"_{kind}_param"), getattr(module, f"_{kind}_closure")
         module.register_prior(f"{kind}_prior", prior, read, write)
     for module in model.covar_module.modules():
-        learns = isinstance(module, AppendedPhysics) and module.learns_center
-        if learns and module.center.requires_grad and not module._priors:
+        free = isinstance(module, AppendedPhysics) and module.has_free_center
+        if free and not module._priors:
             zero = torch.zeros_like(module.center)
             module.register_prior("center_prior", NormalPrior(zero, zero + _CENTERS), "center")
         if isinstance(module, Level) and module.rho is not None and not module._priors:

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
@@ -153,7 +154,7 @@ def compare(
         >>> mean, variance = comparison.recommended.predict(X)
     """
     asked = known_structures(structures)
-    search = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
+    search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
     given = {name: value for name, value in search.items() if value is not None}
     data = training_data(train_X, train_Y, train_Yvar)
