@@ -18,16 +18,18 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
     names = {}
     exec(first, names)
     truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
-    assert (names["posterior"].mean - truth).abs().max() < 1e-2
-    assert (names["rho"].mean - 2).abs().max() < 0.5
-    before = names["posterior"].mean
+    assert (names["mean"] - truth).abs().max() < 1e-2
+    assert (names["rho"].mixture_mean - 2).abs().max() < 0.5
+    before = names["mean"]
     exec(held, names)
     assert "noise: sd" in capsys.readouterr().out
     assert (names["lower"] <= before).all()
-    torch.testing.assert_close(names["model"].posterior(names["test_X"]).mean, before)
+    torch.testing.assert_close(names["model"].predict(names["test_X"]).mean, before)
     exec(second, names)
     assert "physics mean" in capsys.readouterr().out
-    assert (names["mixture"].mixture_mean - truth).abs().max() < 1e-2
+    assert (
+        names["comparison"].recommended.predict(names["test_X"]).mean - truth
+    ).abs().max() < 1e-2
     assert names["loo"].rmse < 1e-2
 
 
@@ -37,7 +39,7 @@ def test_measuring(tmp_path, monkeypatch):
     names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
     exec(code, names)
     X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
-    error = names["result"].model.posterior(X).mean - 2 * names["f_p"](X) - X
+    error = names["result"].model.predict(X).mean - 2 * names["f_p"](X) - X
     assert error.abs().max() < 1e-2
     assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8
 

@@ -75,8 +75,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/inference/importance_sampling.py",
-        "draws = _weighted(positions, -values - log_q)",
-        "draws = _weighted(positions, -values)",
+        "-values - (log_q + log_shares[:, None, None]).logsumexp(0))",
+        "-values)",
         "The draws are weighted as if all places were equally likely to be drawn: biased samples.",
     ),
     Fault(
