@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, get_args
 
 from paper.common.experiment import Experiment, Task
 
-Method = Literal["GP", "Phy", "AR1", "SMT MFK", "CKA", "CKA Bayes", "chosen", "RRA"]
+Method = Literal["GP", "Phy", "AR1", "SMT MFK", "CKA", "CKA Bayes", "RRA"]
 METHODS: tuple[Method, ...] = get_args(Method)
 PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
 FIRST_LOOK = 8  # runs
@@ -28,7 +28,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class Multifidelity(Experiment):
-    """Eight methods learn textbook functions of high fidelity; f_p is that of low fidelity."""
+    """Seven methods learn textbook functions of high fidelity; f_p is that of low fidelity."""
 
     runs: int = 10
     """data sets; the number is the seed"""

@@ -17,7 +17,7 @@ from gpytorch.distributions import MultivariateNormal
 from linear_operator.operators import DiagLinearOperator
 from torch import Tensor
 
-from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ZeroMeanGP, compare, fit
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ZeroMeanGP, fit
 from gpadjust.inference import SamplingWarning
 from gpadjust.validation import coverage, crps, nlpd, rmse
 from paper.common.experiment import Record
@@ -78,7 +78,7 @@ def run(
     test_X = problem.sobol(settings.num_test, seed=0)
     test_Y = problem.truth(test_X)
     start = time.perf_counter()
-    model, chosen = trained(method, problem, X, Y, settings.num_low, seed)
+    model = trained(method, problem, X, Y, settings.num_low, seed)
     seconds = time.perf_counter() - start
     mean, variance, mixture_dim = _predictions(model, test_X)
     prediction = (mean, variance, test_Y)
@@ -90,7 +90,6 @@ def run(
         "crps": crps(*prediction, mixture_dim=mixture_dim).item() / sd,
         "coverage": coverage(*prediction, mixture_dim=mixture_dim).item(),
         "seconds": seconds,
-        "chosen": chosen,
     }
 
 
@@ -105,9 +104,7 @@ def _predictions(model: Any, X: Tensor) -> tuple[Tensor, Tensor, int | None]:
     return mean, variance, MCMC_DIM if is_mixture else None
 
 
-def trained(
-    method: Method, pair: Pair, X: Tensor, Y: Tensor, num_low: int, seed: int
-) -> tuple[Any, str]:
+def trained(method: Method, pair: Pair, X: Tensor, Y: Tensor, num_low: int, seed: int) -> Any:
     """Build and train a model by one of the methods.
 
     Args:
@@ -119,21 +116,18 @@ def trained(
         seed: Of these samples.
 
     Returns:
-        The model, and the name of the structure that "chosen" chose (empty for the others).
+        The model.
     """
     with warnings.catch_warnings():
         # A fit that has not converged is shown by its scores.
         warnings.filterwarnings("ignore", category=OptimizationWarning)
         warnings.filterwarnings("ignore", category=SamplingWarning)
-        if method == "chosen":
-            comparison = compare(X, Y, pair.physics())
-            return comparison.recommended, comparison.chosen
         if method == "SMT MFK":
             low_X = low_inputs(pair, X, num_low * pair.d, seed)
-            return SMTModel(low_X, pair.physics()(low_X), X, Y), ""
+            return SMTModel(low_X, pair.physics()(low_X), X, Y)
         model = _built(method, pair, X, Y, num_low, seed)
         fit(model, "bayes" if method == "CKA Bayes" else "map")
-        return model, ""
+        return model
 
 
 def _built(method: Method, pair: Pair, X: Tensor, Y: Tensor, num_low: int, seed: int) -> Any:

@@ -51,9 +51,6 @@ def tables(records: Sequence[Record], experiment: Multifidelity) -> dict[str, Ta
     found["paired"] = Table(title, _paired(runs))
     judged = {f"N = {size} d": [judge_intervals(part)] for size, part in runs.groupby("per_input")}
     found["claims"] = Table("Claim on the intervals", claims_table("claim", judged))
-    chosen = runs[runs["chosen"] != ""].groupby(["pair", "N"], sort=False)["chosen"]
-    rows = [[f"{pair}, N = {N}", _counted(names)] for (pair, N), names in chosen]
-    found["chosen"] = Table("What was chosen, and in how many runs", markdown(["", ""], rows))
     return found
 
 
@@ -127,8 +124,3 @@ def _paired(runs: pd.DataFrame) -> str:
 
 def _cells(values: pd.Series[float], bold: bool) -> list[str]:
     return best_in_bold(values) if bold else [f"{value:.2g}" for value in values]
-
-
-def _counted(chosen: pd.Series[str]) -> str:
-    """How often each structure was chosen, the most frequent first."""
-    return ", ".join(f"{name} {count}" for name, count in chosen.value_counts().items())

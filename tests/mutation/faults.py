@@ -116,10 +116,10 @@ FAULTS = (
         "An angle that wraps between prediction and truth counts as an error of a full turn.",
     ),
     Fault(
-        "gpadjust/dynamics/incremental_fit.py",
-        "observed.cumsum(0) <= 2",
-        "observed.cumsum(0) <= 1",
-        "A search among many transitions may see a single one of a state that is seldom measured.",
+        "gpadjust/inference/full_bayes.py",
+        "model.get_parameter(name).copy_(value)",
+        "model.get_parameter(name).copy_(model.get_parameter(name))",
+        "The parameters of a physics that learns stay where they were.",
     ),
     Fault(
         "gpadjust/envs/remember_action.py",
