@@ -429,7 +429,7 @@ class TestStructures:
         with pytest.raises(ValueError, match="no problem 'pendulums'"):
             Structures(problems=("pendulums",)).check()
 
-    @pytest.mark.parametrize("name", ["cart-pole", "pendulum", "double-pendulum"])
+    @pytest.mark.parametrize("name", ["arm", "cart-pole", "pendulum", "double-pendulum"])
     def test_transitions(self, name):
         """Few are part of many; all go on from where the one before ended, or are of records."""
         few, many = (systems.system(name, n, 60, 3) for n in (10, 50))
