@@ -13,6 +13,7 @@ EXPERIMENTS = {
     "forrester": ("Forrester", "eight models of Forrester's function (figure 1)"),
     "multifidelity": ("Multifidelity", "eight methods on functions of low and high fidelity"),
     "calibration": ("Calibration", "do intervals hold? CKA by each method of inference"),
+    "structures": ("Structures", "does the richer model pay? CKA beside what it contains"),
     "active": ("Active", "error over measurements, by who chooses them"),
     "cartpole": ("CartPole", "learners that swing up a cart-pole"),
     "arm": ("Arm", "learners that reach with a muscle arm"),

@@ -1,0 +1,167 @@
+"""Transitions to learn from and to be scored at: of simulated systems, and of records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpadjust.dynamics.transitions import Transitions
+from gpadjust.envs import (
+    ARM_SPEC,
+    CART_POLE_SPEC,
+    CartPoleSwingUpEnv,
+    MuscleArmEnv,
+    random_cart_pole_physics,
+    torque_arm_physics,
+)
+from gpadjust.physics import ODEPhysics, Physics
+from gpadjust.states import StateSpec
+from paper.structures import ARM, SIMULATED
+
+RECORDS = Path(__file__).parents[1] / "records"
+CONTROL_STEP = 4  # rows of a record, of 10 ms each
+_GRAVITY = 9.81
+_TEST_SEED = 20_000  # no run has it
+_EPISODE = {"arm": 15, "cart-pole": 25}  # steps, as the environments' ids have them
+_TRAIN = {"pendulum": ("energy_shaping",), "double-pendulum": ("00", "02", "03")}
+_TEST = {"pendulum": ("sac",), "double-pendulum": ("01", "12", "13")}
+_SPECS = {
+    "pendulum": StateSpec(["q", "dq"], ["u"], angles=["q"]),
+    "double-pendulum": StateSpec(["q1", "q2", "dq1", "dq2"], ["u1", "u2"], angles=["q1", "q2"]),
+}
+_MOVES = 0.3  # rad/s; the simple pendulum is at rest for much of its record
+
+
+class System(NamedTuple):
+    """What dynamics learn from, and what they are scored at.
+
+    Attributes:
+        spec: What states and actions are.
+        physics: f_p, from states and actions to next states.
+        train: Transitions to learn from.
+        test: Others.
+    """
+
+    spec: StateSpec
+    physics: Physics
+    train: Transitions
+    test: Transitions
+
+
+def system(name: str, n: int, num_test: int, seed: int) -> System:
+    """The transitions of a run: ``n`` to learn from, of the seed, and those that all are scored at.
+
+    A smaller ``n`` takes the first ones of a larger one. Of a simulated system they are those of
+    whole episodes with uniform actions, drawn anew for each step; of a real machine they are
+    spread at random over the records, without overlap.
+
+    Raises:
+        ValueError: If the records have fewer.
+    """
+    if name in SIMULATED:
+        physics = torque_arm_physics() if name == ARM else random_cart_pole_physics(seed)
+        spec = ARM_SPEC if name == ARM else CART_POLE_SPEC
+        return System(spec, physics, episodes(name, n, seed), episodes(name, num_test, _TEST_SEED))
+    known = recorded(name, _TRAIN[name])
+    if n > len(known.states):
+        raise ValueError(f"The records of the {name} have {len(known.states)} transitions, not {n}")
+    order = torch.randperm(len(known.states), generator=torch.Generator().manual_seed(seed))
+    test = recorded(name, _TEST[name])
+    if name == "pendulum":
+        moves = test.states[:, 1].abs() > _MOVES
+        test = Transitions(*(part[moves] for part in test))
+    physics = pendulum_physics() if name == "pendulum" else double_pendulum_physics()
+    return System(_SPECS[name], physics, Transitions(*(part[order[:n]] for part in known)), test)
+
+
+@cache
+def episodes(name: str, n: int, seed: int) -> Transitions:
+    """The first ``n`` transitions of episodes with uniform actions, drawn anew for each step."""
+    env: Any = MuscleArmEnv() if name == ARM else CartPoleSwingUpEnv()
+    space = env.action_space
+    generator = np.random.default_rng(seed)
+    found: list[tuple[NDArray[np.float64], ...]] = []
+    env.reset(seed=seed)
+    while len(found) < n:
+        env.reset()
+        for _ in range(_EPISODE[name]):
+            before, action = env.state, generator.uniform(space.low, space.high)
+            failed = env.step(action)[3]
+            if failed:
+                break
+            found.append((before, action, env.state))
+    return Transitions(*(torch.from_numpy(np.stack(part[:n])) for part in zip(*found, strict=True)))
+
+
+@cache
+def recorded(name: str, numbers: tuple[str, ...]) -> Transitions:
+    """The transitions of 40 ms of records, one after the other, without overlap.
+
+    The actions are means over the 40 ms.
+    """
+    spec, parts = _SPECS[name], []
+    for number in numbers:
+        table = pd.read_csv(RECORDS / f"{name.replace('-', '_')}_{number}.csv")
+        segment = table["segment"] if "segment" in table else pd.Series(0, index=table.index)
+        for _, rows in table.groupby(segment):
+            parts.append(_transitions(rows, spec))
+    return Transitions(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def _transitions(rows: pd.DataFrame, spec: StateSpec) -> Transitions:
+    """Those of a stretch of a record without gaps."""
+    states = torch.tensor(rows[list(spec.states)].to_numpy(dtype=float))[::CONTROL_STEP]
+    actions = torch.tensor(rows[list(spec.actions)].to_numpy(dtype=float))
+    held = actions.unfold(0, CONTROL_STEP, CONTROL_STEP).mean(-1)[: len(states) - 1]
+    return Transitions(states[:-1], held, states[1:])
+
+
+def pendulum_physics() -> ODEPhysics:
+    """A point mass on a rod, of the authors' mass and length, without friction."""
+    mass, length = 0.6755, 0.5
+
+    def rates(state: Tensor, action: Tensor) -> Tensor:
+        q, dq = state.unbind(-1)
+        torque = action[:, 0] - mass * _GRAVITY * length * q.sin()
+        return torch.stack([dq, torque / (mass * length**2)], dim=-1)
+
+    return _step(rates, 2, "pendulum")
+
+
+def double_pendulum_physics() -> ODEPhysics:
+    """Two rigid links with the parameters of the authors' first model, without friction.
+
+    The equation of motion of Spong, Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006,
+    section 7.3, with inertias about the joints.
+    """
+    mass_1, mass_2, length, centre_1, centre_2 = 0.608, 0.630, 0.3, 0.275, 0.166
+    inertia_1, inertia_2 = 0.0547, 0.0252
+    coupling = mass_2 * length * centre_2
+
+    def rates(state: Tensor, action: Tensor) -> Tensor:
+        q1, q2, dq1, dq2 = state.unbind(-1)
+        across = inertia_2 + coupling * q2.cos()
+        whole = inertia_1 + mass_2 * length**2 + coupling * q2.cos() + across
+        swing = coupling * q2.sin()
+        both = mass_2 * centre_2 * _GRAVITY * (q1 + q2).sin()
+        first = (mass_1 * centre_1 + mass_2 * length) * _GRAVITY * q1.sin()
+        torque_1 = action[:, 0] + swing * (2 * dq1 + dq2) * dq2 - first - both
+        torque_2 = action[:, 1] - swing * dq1.square() - both
+        size = whole * inertia_2 - across.square()
+        ddq1 = (inertia_2 * torque_1 - across * torque_2) / size
+        ddq2 = (whole * torque_2 - across * torque_1) / size
+        return torch.stack([dq1, dq2, ddq1, ddq2], dim=-1)
+
+    return _step(rates, 4, "double_pendulum")
+
+
+def _step(rates: Callable[[Tensor, Tensor], Tensor], state_dim: int, name: str) -> ODEPhysics:
+    return ODEPhysics(rates, step=0.01 * CONTROL_STEP, state_dim=state_dim, substeps=4, name=name)
