@@ -18,6 +18,7 @@ EXPERIMENTS = {
     "cartpole": ("CartPole", "learners that swing up a cart-pole"),
     "arm": ("Arm", "learners that reach with a muscle arm"),
     "exploration": ("Exploration", "cart-poles whose trials are random, SAC's or informative"),
+    "foresight": ("Foresight", "do dynamics foresee the next trial, and know how well?"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

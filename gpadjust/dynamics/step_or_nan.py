@@ -43,6 +43,7 @@ def step_or_nan(
                 return torch.full_like(states, torch.nan)
             # They are evaluated with the others, at a place where the physics does not fail.
             working = int((~failed).nonzero()[0])
-            states[failed], actions[failed] = states[working], actions[working]
+            place = states[working].clone(), actions[working].clone()  # not of what is written
+            states[failed], actions[failed] = place
         else:
             return following.masked_fill(failed.unsqueeze(-1), torch.nan)

@@ -1,0 +1,78 @@
+"""Tables of how well trials were foreseen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from paper.common.experiment import Record, Table
+from paper.common.tables import markdown
+from paper.foresight import METHODS, NOISES, SYSTEMS, Foresight
+
+
+def tables(records: Sequence[Record], experiment: Foresight) -> dict[str, Table]:
+    """All tables, by name."""
+    settings = experiment.settings
+    last, far = settings.trials, max(settings.horizons)
+    rows, by_trial, conditioned = [], [], []
+    for system, noise, method in _kinds():
+        runs = [r[f"{noise}-{method}"] for r in records if r["system"] == system]
+        if not runs:
+            continue
+        label = [SYSTEMS[system], NOISES[noise], METHODS[method], f"{len(runs)}"]
+
+        def over(name: str, first: int, runs: Sequence[Record] = runs) -> str:
+            return _spread([_mean(run[name][first - 2 :]) for run in runs])
+
+        near = [_spread([_mean(run["coverage"][i]) for run in runs]) for i in range(last - 1)]
+        rows.append(
+            [
+                *label,
+                near[0],
+                over("coverage", 3),
+                over(f"coverage_{far}", 2),
+                over("nlpd", 3),
+                over(f"nlpd_{far}", 2),
+            ]
+        )
+        seconds = np.median([run["fit_seconds"][-1] for run in runs])
+        by_trial.append([*label, *near, f"{seconds:.1f}"])
+        told = [_mean(run["conditioned"]["coverage"]) for run in runs]
+        gaps = [t - _mean(run["coverage"][-1]) for t, run in zip(told, runs, strict=True)]
+        conditioned.append([*label, _spread(told), near[-1], _spread(gaps, "+.2f")])
+    start = ["system", "noise", "fit", "agents"]
+    text = {
+        "coverage": [
+            *start,
+            "next states: trial 2",
+            f"trials 3-{last}",
+            f"{far} steps: trials 2-{last}",
+            f"NLPD, next states, 3-{last}",
+            f"NLPD, {far} steps, 2-{last}",
+        ],
+        "trials": [*start, *(f"trial {i}" for i in range(2, last + 1)), "last fit, s"],
+        "conditioned": [*start, "conditioned", "fitted again", "difference"],
+    }
+    titles = {
+        "coverage": "Shares in the intervals of 95 %, and NLPD in nats",
+        "trials": "Shares of the next states in the intervals of 95 %, by trial",
+        "conditioned": f"Shares of the next states of trial {last}, conditioned or fitted again",
+    }
+    found = {"coverage": rows, "trials": by_trial, "conditioned": conditioned}
+    return {name: Table(titles[name], markdown(text[name], found[name])) for name in found}
+
+
+def _kinds() -> Iterable[tuple[str, str, str]]:
+    return ((s, n, m) for s in SYSTEMS for n in NOISES for m in METHODS)
+
+
+def _mean(values: object) -> float:
+    """Over states, trials or both, of what is known."""
+    return float(np.nanmean(np.array(values, dtype=float)))
+
+
+def _spread(values: Sequence[float], form: str = ".2f") -> str:
+    """The mean and its standard error."""
+    error = np.std(values, ddof=1) / len(values) ** 0.5 if len(values) > 1 else np.nan
+    return f"{np.mean(values):{form}}" + ("" if np.isnan(error) else f" ± {error:.2f}")
