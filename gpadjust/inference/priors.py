@@ -56,7 +56,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         >>> model = CKA(X, X.sin(), physics=lambda X: X)
         >>> register_priors(model)
         >>> {name.rsplit(".", 1)[-1] for name, *_ in model.named_priors()} == {
-        ...     "lengthscale_prior", "outputscale_prior", "noise_prior"
+        ...     "lengthscale_prior", "outputscale_prior", "noise_prior", "center_prior"
         ... }
         True
     """

@@ -83,7 +83,7 @@ class CKA(AdjustedGP):
         >>> model = CKA(train_X, train_Y, physics=lambda X: torch.sin(6 * X))
         >>> result = fit(model)
         >>> test_X = torch.tensor([[0.33]], dtype=torch.float64)
-        >>> round(model.posterior(test_X).mean.item(), 2)
+        >>> round(model.predict(test_X).mean.item(), 2)
         2.16
         >>> rho, delta = model.rho(test_X), model.delta(test_X)
     """
