@@ -18,6 +18,7 @@ from gpadjust.inference.warm_start import warm_start
 from gpadjust.models import ExactGPBase
 from gpadjust.states import StateSpec
 
+KEPT = ("method", "num_samples", "num_draws", "seed")  # options of later fits, too
 _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
 _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=15)
 
@@ -73,7 +74,7 @@ def fit_all(
         return Fitted(model, fit(model, **given), n)
     warm_start(model, previous.model)
     searches = n >= 2 * previous.searched_at
-    held: Any = {k: v for k, v in given.items() if k in ("method", "num_samples", "num_draws")}
+    held: Any = {k: v for k, v in given.items() if k in KEPT}
     with warnings.catch_warnings():
         # The next update goes on from where this one stops.
         warnings.simplefilter("ignore", OptimizationWarning)

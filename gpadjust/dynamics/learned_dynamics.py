@@ -53,8 +53,9 @@ class LearnedDynamics(Dynamics):
             ``num_features`` of RRA. A kernel may be a function of the number of inputs and the
             batch shape that makes it; one that is a module is copied for each fit.
         fit_options: Options of the search that :func:`gpadjust.fit` makes at the first fit, and of
-            all fits the ``method``: by default the hyper-parameters are sampled, and what is
-            predicted has their uncertainty, too; ``"map"`` takes the most likely ones.
+            all fits ``method``, ``num_samples``, ``num_draws`` and ``seed``. By default the
+            hyper-parameters are sampled, and what is predicted has their uncertainty, too;
+            ``"map"`` takes the most likely ones.
 
     Raises:
         TypeError: If an argument is of another type, or the model needs a physics that is missing

@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal, TypedDict, Unpack, cast, overload
 
+import torch
 from botorch.models import ModelListGP
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from botorch.utils.transforms import is_fully_bayesian
 
+from gpadjust.gp import AppendedPhysics
 from gpadjust.gp.gaussian import threads_for
-from gpadjust.inference.full_bayes import SampleResult, sample
+from gpadjust.inference.full_bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.models import ExactGPBase
@@ -126,11 +128,7 @@ def fit(
     """
     given: dict[str, Any] = {**options}
     if isinstance(model, ModelListGP):
-        results: list[FitResult | SampleResult] = []
-        for part in model.models:
-            result: Any = fit(part, method, **options)
-            results.extend(result if isinstance(result, list) else [result])
-        return results
+        return _fit_list(model, method, given)
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(
             "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "
@@ -158,6 +156,25 @@ def fit(
             model.eval()
 
 
+def _fit_list(
+    models: ModelListGP, method: Method | None, options: dict[str, Any]
+) -> list[FitResult | SampleResult]:
+    """Fit the parts of a list; those that are sampled hold the same number of samples."""
+    sampled = [method == "bayes" or (method is None and _can_be_sampled(m)) for m in models.models]
+    for each in sampled:
+        check_options("bayes" if each else "map", options)
+    if any(sampled) and options.get("num_samples") is None:
+        most = max(part.train_targets.shape[-1] for part in models.models)
+        options = {**options, "num_samples": default_num_samples(most)}
+    results: list[FitResult | SampleResult] = []
+    for i, (part, sampling) in enumerate(zip(models.models, sampled, strict=True)):
+        own = {k: v for k, v in options.items() if sampling or k != "num_samples"}
+        own["seed"] = options.get("seed", 0) + i  # or their samples would be alike
+        result: Any = fit(part, "bayes" if sampling else "map", **own)
+        results.append(result)
+    return results
+
+
 def _can_be_sampled(model: BatchedMultiOutputGPyTorchModel) -> bool:
     """Whether a model can hold samples, and has something to sample."""
     if not isinstance(model, ExactGPBase):
@@ -182,9 +199,14 @@ def _without_samples(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
         if parameter.shape[:1] == (model.num_samples,)
     }
     model.release_samples()
+    with torch.no_grad():
+        for module in model.covar_module.modules():
+            if isinstance(module, AppendedPhysics) and module.has_free_center:
+                module.center.zero_()  # where a new model has it
     try:
         yield
     except BaseException:
+        model.release_samples()
         model.hold_samples(samples)
         raise
 

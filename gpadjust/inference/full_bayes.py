@@ -68,11 +68,13 @@ def sample(
     if num_draws is None:
         num_draws = max(_DRAWS[0], min(_DRAWS[1], _COST // n**2))
     if num_samples is None:
-        num_samples = next(number for most, number in _SAMPLES.items() if n <= most)
+        num_samples = default_num_samples(n)
     generator = torch.Generator().manual_seed(search.seed)
     draws = _draw(objective, search, num_draws, generator)
     vectors = draws.resampled(max(_RETURNED, num_samples), generator)
     rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
+    if settled:
+        model.train()  # its inputs are then transformed again, with what they are at now
     with torch.no_grad():
         for name, value in settled.items():
             model.get_parameter(name).copy_(value)
@@ -81,6 +83,11 @@ def sample(
     if (result.power < _LEAST_POWER).any():
         _warn(result)
     return result
+
+
+def default_num_samples(num_points: int) -> int:
+    """How many samples a model of so many observations holds, if that is not said."""
+    return next(number for most, number in _SAMPLES.items() if num_points <= most)
 
 
 def _settle_shared(model: ExactGPBase, search: Search) -> dict[str, Tensor]:
@@ -101,9 +108,9 @@ def _draw(
 ) -> Draws:
     """Draws of the hyper-parameters; an error if the likelihood is nowhere finite."""
     centres, values = optima(objective, search)
-    order = values.argsort(dim=0)
+    values, order = values.to(centres).sort(dim=0)
     centres = centres.gather(0, order.unsqueeze(-1).expand_as(centres))
-    share = (-values.gather(0, order).to(centres)).softmax(0)
+    share = (-values).softmax(0)
     proposal = Mixture(centres, share, laplace_root(objective, centres[0]))
     parameters = objective.parameters
 

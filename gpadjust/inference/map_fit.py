@@ -81,14 +81,14 @@ def maximise(model: BatchedMultiOutputGPyTorchModel, search: Search) -> FitResul
             f"outputs within {search.max_iterations} iterations; the parameters are the best "
             "found. Raise max_iterations or num_starts.",
             OptimizationWarning,
-            stacklevel=4,
+            stacklevel=3,
         )
     return FitResult(-values[best].reshape(parameters.batch_shape), converged)
 
 
 @contextmanager
 def _centers_at_rest(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
-    """Let centres stay: the most likely ones are found far out, where intervals are too narrow."""
+    """Let centres rest: the most likely ones are found far out, where intervals are too narrow."""
     learnt = [
         module.center
         for module in model.covar_module.modules()
@@ -183,6 +183,7 @@ def _screened(objective: Objective, search: Search) -> Tensor:
 
 def _rows(vectors: Tensor, numbers: Tensor) -> Tensor:
     """Those of the vectors ``k x B x p`` of the numbers ``k' x B``, for each problem."""
+    numbers = numbers.to(vectors.device)
     return vectors.gather(0, numbers.unsqueeze(-1).expand(-1, -1, vectors.shape[-1]))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -300,7 +301,7 @@ def _part(model: ExactGPBase, output: int, count: int) -> ExactGPBase:
     """A model of one output, with as many of its samples, evenly spread, as it has components."""
     part = model.subset_output([output]) if model.num_outputs > 1 else model
     if part.num_samples is None:
-        return part
+        return deepcopy(part)
     index = torch.linspace(0, part.num_samples - 1, count).round().long()
     return take_samples(part, index, as_mixture=True)
 

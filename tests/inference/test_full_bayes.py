@@ -320,3 +320,47 @@ def test_constraints_hold(XY, lengths, noises, options):
         assert ((values >= limits.lower_bound) & (values <= limits.upper_bound)).all()
     assert all(parameter.isfinite().all() for parameter in model.parameters())
     assert model.predict(XY[0]).mean.isfinite().all()
+
+
+class TestBeforeAndAfter:
+    """A fit does not depend on what the model did before."""
+
+    @pytest.mark.parametrize("before", ["predicted", "fitted"])
+    def test_a_physics_that_learns(self, before):
+        X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        Y = 2 * (6 * X).sin() + X
+
+        class Wave(torch.nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.rate = torch.nn.Parameter(torch.tensor(5.0, dtype=torch.float64))
+
+            def forward(self, X):
+                return (self.rate * X).sin()
+
+        model = CKA(X, Y, physics=Wave())
+        model.predict(X)
+        if before == "fitted":
+            fit(model, **SHORT)
+            with torch.no_grad():
+                model.physics.function.rate.fill_(5.0)
+        fit(model, **SHORT)
+        assert (model.predict(X).mean - Y).abs().max() < 0.05
+
+    def test_the_most_likely_values_after_samples(self, XY):
+        first, second = (CKA(*XY, physics=crude) for _ in range(2))
+        fit(first)
+        found = fit(first, "map").log_likelihood
+        torch.testing.assert_close(found, fit(second, "map").log_likelihood, rtol=1e-4, atol=1e-4)
+        assert first.terms[0].basis.center.item() == 0.0
+
+
+@quick
+def test_a_list_of_models_of_few_and_many_points(uniform):
+    X = uniform(45, 1)
+    Y = crude(X) + X.exp() + 0.1 * torch.randn(45, 1, dtype=torch.float64)
+    few, many = CKA(X[:8], Y[:8], physics=crude), BiasGP(X, Y, physics=crude)
+    models = ModelListGP(few, many)
+    fit(models, num_draws=64, num_starts=1, num_screened=8)
+    assert few.num_samples == many.num_samples == 8
+    assert models.posterior(X[:5]).mean.shape == (8, 5, 2)

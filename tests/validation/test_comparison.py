@@ -21,7 +21,7 @@ def crude(X):
 
 @pytest.fixture(autouse=True)
 def _quick(request, monkeypatch):
-    """Short chains, where their length is not what is looked at."""
+    """Few draws, where their number is not what is looked at."""
     if request.node.get_closest_marker("slow") is None:
         short = {"num_draws": 128, "num_samples": 32, **QUICK}
         monkeypatch.setattr(comparison_of, "_REFIT", short)
