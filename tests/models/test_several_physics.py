@@ -247,7 +247,7 @@ def test_two_physics_each_right_in_half_of_the_box(d):
         X, Z = latin_hypercube(10 * d, d, seed)
         errors = []
         for physics in ({"a": first, "b": second}, first, second):
-            model = CKA(X, truth(X), physics=physics)
+            model = CKA(X, truth(X), physics=physics, center=0.0)
             fit(model, "map")
             errors.append(error(model, Z, truth))
         ratios.append(errors[0] / min(errors[1:]))
