@@ -12,8 +12,8 @@ from torch import Tensor
 from gpadjust.dynamics.learnt import Learnt
 from gpadjust.dynamics.model_recipe import ModelRecipe
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.inference import FitOptions, FitResult, Method, SampleResult, fit
-from gpadjust.inference.fitting import check_options
+from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
+from gpadjust.inference.fitting import Method, check_options
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models import ExactGPBase
 from gpadjust.states import StateSpec

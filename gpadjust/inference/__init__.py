@@ -1,6 +1,6 @@
 """Fitting the models, by maximum likelihood or full Bayes."""
 
-from gpadjust.inference.fitting import FitOptions, Method, fit
+from gpadjust.inference.fitting import FitOptions, fit
 from gpadjust.inference.full_bayes import SampleResult, SamplingWarning
 from gpadjust.inference.map_fit import FitResult
 from gpadjust.inference.priors import register_priors
@@ -8,7 +8,6 @@ from gpadjust.inference.priors import register_priors
 __all__ = [
     "FitOptions",
     "FitResult",
-    "Method",
     "SampleResult",
     "SamplingWarning",
     "fit",
