@@ -218,8 +218,8 @@ class AdjustedGP(ExactGPBase):
     def fallback(self, X: ArrayLike) -> Tensor:
         """What the model says where there are no data: its prior mean, such as f_p itself.
 
-        Weights of the physics that are unknown (``rho_mean="learn"``) are those it began with: 1,
-        or least squares of several.
+        Weights of the physics that are unknown (``rho_mean="learn"``) are those it began with, 1,
+        or least squares of several; after a point fit they are its estimates.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.

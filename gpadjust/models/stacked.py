@@ -25,7 +25,7 @@ from gpadjust.models.posteriors import (
     mixture_moments,
 )
 from gpadjust.models.sampled_functions import check_number, seeded
-from gpadjust.models.training_data import ArrayLike, to_tensor
+from gpadjust.models.training_data import ArrayLike, check_finite, check_observed, to_tensor
 
 
 class Part(NamedTuple):
@@ -262,6 +262,8 @@ class StackedGP(Model):
                 f"Expected X of shape k x d and Y of shape k x {self.num_outputs}, got "
                 f"{tuple(X.shape)} and {tuple(Y.shape)}; fantasies are made of its parts."
             )
+        check_finite(X, "X")
+        check_observed(Y, "Y")
         groups: list[list[ExactGPBase]] = []
         for j, group in enumerate(self.parts):
             seen, column = ~Y[:, j].isnan(), slice(j, j + 1)

@@ -198,3 +198,13 @@ def test_bad_input(data, models, weights, Z):
     ):
         with pytest.raises(ValueError, match="Expected"):
             call()
+
+
+def test_observations_of_nothing_are_refused(build, uniform):
+    X = uniform(6, 2)
+    Y = X.sin().sum(-1, keepdim=True)
+    stacked = StackedGP({"CKA": build("CKA", X, Y)}, torch.ones(1, 1, dtype=torch.float64))
+    with pytest.raises(ValueError, match="Y"):
+        stacked.condition_on_observations(X[:1], torch.full_like(Y[:1], torch.nan))
+    with pytest.raises(ValueError, match="X"):
+        stacked.condition_on_observations(torch.full_like(X[:1], torch.inf), Y[:1])
