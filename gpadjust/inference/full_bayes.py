@@ -25,7 +25,7 @@ _DRAWS = (128, 1024)  # the least and the most by default
 _COST = 5_120_000  # draws times observations squared
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
 _RETURNED = 256  # draws, at least
-_LEAST_POWER = 0.05  # of the weights
+LEAST_POWER = 0.05  # of the weights, for draws that show the posterior
 
 
 class SamplingWarning(UserWarning):
@@ -80,7 +80,7 @@ def sample(
             model.get_parameter(name).copy_(value)
     model.hold_samples(parameters.to_raw(parameters.unflatten(vectors[rows])))
     result = SampleResult(draws.power.reshape(parameters.batch_shape), _named(objective, vectors))
-    if (result.power < _LEAST_POWER).any():
+    if (result.power < LEAST_POWER).any():
         _warn(result)
     return result
 
@@ -148,7 +148,7 @@ def _named(objective: Objective, vectors: Tensor) -> dict[str, Tensor]:
 
 
 def _warn(result: SampleResult) -> None:
-    low = result.power < _LEAST_POWER
+    low = result.power < LEAST_POWER
     warnings.warn(
         f"The draws of {int(low.sum())} of {low.numel()} outputs are of the approximation that "
         "they begin with rather than of the posterior (weights to the power of "

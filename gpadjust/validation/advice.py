@@ -8,6 +8,7 @@ import torch
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from torch import Tensor
 
+from gpadjust.inference.full_bayes import LEAST_POWER
 from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.models import ExactGPBase
 from gpadjust.validation.leave_one_out import LeaveOneOut
@@ -15,12 +16,14 @@ from gpadjust.validation.ranking import Candidate, densities, difference
 from gpadjust.validation.structures import Structure
 
 _SURE = 2.0  # standard errors that a difference takes to be real
+_COUNTS = 0.05  # weight with which a structure is a part of what is recommended
 
 
 def advice(
     structures: Sequence[Structure],
     models: dict[str, ExactGPBase],
     left_out: dict[str, LeaveOneOut],
+    power: dict[str, Tensor],
     table: dict[str, list[Candidate]],
     X: Tensor,
 ) -> list[str]:
@@ -30,6 +33,7 @@ def advice(
         structures: What was fitted.
         models: The models by the names of their structures.
         left_out: Their leave-one-out predictions.
+        power: That of the importance weights of their samples, ``m`` each.
         table: The rankings, by the names of the outputs.
         X: Training inputs, ``n x d``.
     """
@@ -40,6 +44,7 @@ def advice(
         density = dict(zip(left_out, densities(left_out, j).unbind(-1), strict=True))
         found = [_best(rows), *_gains(by_name, [row.structure for row in rows], density)]
         found += _preferred(models[rows[0].structure], X, j)
+        found += _unsampled(rows, power, j)
         sentences += [where + sentence for sentence in found]
     flattered = [name for name, model in models.items() if shared_parameters(model)]
     if flattered:
@@ -91,6 +96,18 @@ def _gains(
             f"{error:.1f} nats ({better}) over that {otherwise} ({worse})."
         )
     return sentences
+
+
+def _unsampled(rows: list[Candidate], power: dict[str, Tensor], output: int) -> list[str]:
+    """Which of the structures that count are known by draws that are not of their posterior."""
+    names = [row.structure for row in rows if row.weight > _COUNTS]
+    low = [name for name in names if power[name][output] < LEAST_POWER]
+    if not low:
+        return []
+    return [
+        f"The samples of {', '.join(low)} are of an approximation rather than of the posterior: "
+        "doubt the intervals, and fit again with more num_draws or narrower priors."
+    ]
 
 
 def _preferred(model: ExactGPBase, X: Tensor, output: int) -> list[str]:

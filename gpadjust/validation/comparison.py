@@ -27,7 +27,13 @@ from gpadjust.validation.advice import advice
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.ranking import Candidate, ranking
 from gpadjust.validation.refitting import LEAST, refitted
-from gpadjust.validation.structures import STRUCTURES, Structure, candidates, known_structures
+from gpadjust.validation.structures import (
+    STACKED,
+    STRUCTURES,
+    Structure,
+    candidates,
+    known_structures,
+)
 
 _FEW = 24  # observations, up to which each structure is fitted again without each of them
 _REFIT = {"num_draws": 512, "num_samples": 64, "num_starts": 4, "num_screened": 64}
@@ -61,7 +67,7 @@ class Comparison:
         heaviest = [max(rows, key=lambda row: row.weight) for rows in self.table.values()]
         names = {row.structure for row in heaviest}
         clear = len(names) == 1 and all(row.weight >= _CLEAR for row in heaviest)
-        return names.pop() if clear else "stacked"
+        return names.pop() if clear else STACKED
 
     @property
     def recommended(self) -> ExactGPBase | StackedGP:
@@ -114,7 +120,9 @@ def compare(
 
     Of several physics each structure is fitted to each of them alone, ``"CKA of coarse"`` and so
     on, and to all at once, ``"CKA of all"``; the advice says which physics the data prefer, and
-    where (by the mean size of each rho in the halves of each input's range).
+    where (by the mean size of each rho at the data below and above the median of each input). A
+    structure with too many unknown constants for the points is left out of models and tables,
+    unless there is no other.
 
     The parameters of a physics that learns are not fitted again, so that left-out observations have
     had their say in them. The advice says so.
@@ -138,7 +146,8 @@ def compare(
 
     Raises:
         TypeError: As :class:`~gpadjust.CKA` and :func:`~gpadjust.fit`.
-        ValueError: As these two; if a structure is unknown, or there is a batch of data sets.
+        ValueError: As these two; if a structure is unknown or has a name that is taken, or there
+            is a batch of data sets.
         PhysicsError: As :class:`~gpadjust.CKA`.
 
     Example:
@@ -166,6 +175,7 @@ def compare(
     found = candidates(asked, as_physics(physics), len(data.X))
     models: dict[str, ExactGPBase] = {}
     left_out: dict[str, LeaveOneOut] = {}
+    power: dict[str, Tensor] = {}
     for structure, part in tqdm(found, disable=not progress, unit="structure"):
         try:
             model = structure.build(
@@ -177,8 +187,8 @@ def compare(
             )
             with warnings.catch_warnings(), threads_for(len(data.X), others=True):
                 warnings.simplefilter("ignore", OptimizationWarning)
-                warnings.simplefilter("ignore", SamplingWarning)
-                fit(model, "bayes", num_samples=_number(len(data.X)), **search)
+                warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
+                result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
                 again = not shared_parameters(model) and _can_be_left_out(data)
                 left_out[structure.name] = (
                     refitted(structure, data, part, input_transform, **{**_REFIT, **given})
@@ -188,11 +198,13 @@ def compare(
         except Exception as error:
             error.add_note(f"This is of the structure {structure.name!r}.")
             raise
+        power[structure.name] = result.power.flatten()
         models[structure.name] = _thinned(model, _HELD)
     by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))
     stacked = StackedGP(models, _weights(models, by_output), _HELD)
-    sentences = advice([structure for structure, _ in found], models, left_out, table, data.X)
+    fitted = [structure for structure, _ in found]
+    sentences = advice(fitted, models, left_out, power, table, data.X)
     return Comparison(models, stacked, table, sentences)
 
 

@@ -10,6 +10,8 @@ from gpadjust.models import CKA, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.physics import JoinedPhysics, Physics
 
+STACKED = "stacked"  # what a comparison calls the mixture of all structures
+
 
 class Structure(NamedTuple):
     """A way to adjust a physics, one of those that :func:`~gpadjust.compare` fits.
@@ -59,8 +61,11 @@ def known_structures(structures: Sequence[str | Structure]) -> list[Structure]:
         )
     found = [s if isinstance(s, Structure) else names[s] for s in given]
     named = {structure.name: structure for structure in found}
-    if any(named[structure.name] != structure for structure in found):
-        raise ValueError("Expected structures of different names; give yours a name of its own.")
+    if any(named[structure.name] != structure for structure in found) or STACKED in named:
+        raise ValueError(
+            f"Expected structures of different names, none of them {STACKED!r} (their mixture), "
+            f"got {[structure.name for structure in found]}; give yours a name of its own."
+        )
     return list(named.values())
 
 

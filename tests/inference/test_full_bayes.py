@@ -101,7 +101,7 @@ def test_figures(build, data):
 def test_a_warning_when_the_draws_are_not_of_the_posterior(XY, monkeypatch):
     power = fit(CKA(*XY, physics=crude), **SHORT | {"num_draws": 16}).power
     assert 0.05 < power < 1
-    monkeypatch.setattr(full_bayes, "_LEAST_POWER", power.item() + 1e-9)
+    monkeypatch.setattr(full_bayes, "LEAST_POWER", power.item() + 1e-9)
     with pytest.warns(SamplingWarning, match=rf"power of {power.item():.2g}\). Raise num_draws"):
         fit(CKA(*XY, physics=crude), **SHORT | {"num_draws": 16})
 

@@ -12,6 +12,7 @@ from gpadjust.validation import STRUCTURES, Structure, leave_one_out, stacking_w
 from gpadjust.validation.ranking import ranking
 
 comparison_of = sys.modules["gpadjust.validation.comparison"]
+advice_of = sys.modules["gpadjust.validation.advice"]
 QUICK = {"num_starts": 1, "num_screened": 16}
 
 
@@ -96,7 +97,8 @@ def test_the_best_structure_is_recommended_where_it_is_clear(scaled):
     assert len({len(line) for line in lines[:3]}) == 1
 
 
-def test_each_output_is_judged_by_itself(X, scaled, noise):
+def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
+    monkeypatch.setattr(advice_of, "LEAST_POWER", 2.0)  # as if all sampling had been poor
     Y = torch.cat([scaled[1], 100 * (3 * X).cos() + noise], -1)
     Y[3, 1] = torch.nan
 
@@ -107,6 +109,8 @@ def test_each_output_is_judged_by_itself(X, scaled, noise):
     assert comparison.table["y1"][0].structure == "CKA"
     assert says(comparison, "y1: The physics helps")
     assert says(comparison, "y2: The physics is not shown to help")
+    assert says(comparison, "y1: The samples of CKA are of an approximation")
+    assert says(comparison, "y2: The samples of zero mean")
     assert comparison.chosen == "stacked"
     stacked = comparison.recommended
     assert isinstance(stacked, StackedGP)
@@ -244,6 +248,7 @@ def test_bad_input(scaled):
     for data, options, says in (
         ((X, Y), {"structures": []}, "structures"),
         ((X, Y), {"structures": ["CKA", "kriging"]}, "structures"),
+        ((X, Y), {"structures": [Structure("stacked", CKA)]}, "none of them 'stacked'"),
         ((X.expand(2, -1, -1), Y.expand(2, -1, -1)), {}, "one data set"),
         ((X, Y[:5]), {}, "train_Y"),
         *(((X, Y), {n: -1}, f"Expected {n}") for n in ("num_starts", "num_screened", "seed")),
