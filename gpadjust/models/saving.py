@@ -10,6 +10,7 @@ import torch
 
 from gpadjust.gp import PhysicsInput
 from gpadjust.models.exact_gp_base import ExactGPBase
+from gpadjust.models.stacked import StackedGP
 from gpadjust.physics import JoinedPhysics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
@@ -27,7 +28,8 @@ def save(model: ExactGPBase, path: str | Path) -> None:
         path: The file, which ``torch.load`` reads with ``weights_only=True``.
 
     Raises:
-        TypeError: If it is no model of this library.
+        TypeError: If it is no model of this library, or a :class:`~gpadjust.StackedGP`, whose
+            models and ``weights`` are to be saved instead.
         ValueError: If its class is not in its module, or it is a subset of a model's outputs.
 
     Example:
@@ -41,6 +43,12 @@ def save(model: ExactGPBase, path: str | Path) -> None:
         >>> torch.equal(again.posterior(X).mean, model.posterior(X).mean)
         True
     """
+    if isinstance(model, StackedGP):
+        raise TypeError(
+            "Expected a model of one structure, got a StackedGP: save the models that it was made "
+            "of (of a comparison its `models`) one by one, beside its `weights`, and stack them "
+            "again when they are loaded."
+        )
     if not isinstance(model, ExactGPBase):
         raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
     name = f"{type(model).__module__}:{type(model).__qualname__}"

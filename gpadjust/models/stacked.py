@@ -14,6 +14,7 @@ from botorch.posteriors.fully_bayesian import MCMC_DIM
 from linear_operator import to_dense
 from torch import Size, Tensor
 from torch.nn import Module, ModuleList
+from torch.quasirandom import SobolEngine
 
 from gpadjust.models.exact_gp_base import ExactGPBase, Prediction
 from gpadjust.models.hyperparameter_samples import take_samples
@@ -49,7 +50,8 @@ class StackedGP(Model):
 
     (Yao et al. 2018). Each output has weights of its own. The mixture is of equally likely
     Gaussians: samples of each model's hyper-parameters, in proportion to its weight. To BoTorch it
-    is a fully Bayesian model, so that acquisition functions average over the components.
+    is a fully Bayesian model, so that acquisition functions average over the components. As outputs
+    are independent, components of each structure of one meet those of all structures of another.
     :func:`~gpadjust.compare` finds the weights; the hyper-parameters stay as they are.
 
     Args:
@@ -92,6 +94,8 @@ class StackedGP(Model):
         self.weights: dict[str, list[float]] = {name: [] for name in models}
         self.groups: Any = ModuleList()
         self._labels: list[list[tuple[str, int]]] = []
+        self._orders: list[Tensor] = []
+        orders = _orders(first.num_outputs, num_components)
         for j, share in enumerate(weights.unbind(-1)):
             counts = allocation(share, num_components)
             for name, count in zip(models, counts, strict=True):
@@ -99,6 +103,7 @@ class StackedGP(Model):
             used = [(name, n) for name, n in zip(models, counts, strict=True) if n]
             self.groups.append(ModuleList([_part(models[name], j, n) for name, n in used]))
             self._labels.append(used)
+            self._orders.append(orders[j] if len(used) > 1 else torch.arange(num_components))
         self.eval()
 
     @property
@@ -158,7 +163,9 @@ class StackedGP(Model):
                 for part in group
             ]
             means, covariances = zip(*each, strict=True)
-            moments.append((torch.cat(means, -2), torch.cat(covariances, -3)))
+            mean, covariance = torch.cat(means, -2), torch.cat(covariances, -3)
+            order = self._orders[j]
+            moments.append((mean[..., order, :], covariance[..., order, :, :]))
         several = self.num_outputs > 1
         mean = torch.stack([m for m, _ in moments], -2) if several else moments[0][0]
         covariance = torch.stack([c for _, c in moments], -3) if several else moments[0][1]
@@ -287,6 +294,7 @@ class StackedGP(Model):
         other.weights = {name: [w[i] for i in idcs] for name, w in self.weights.items()}
         other.groups = ModuleList([ModuleList(group) for group in groups])
         other._labels = [self._labels[i] for i in idcs]
+        other._orders = [self._orders[i] for i in idcs]
         return other.eval()
 
 
@@ -297,6 +305,11 @@ def allocation(weights: Tensor, total: int) -> list[int]:
     rest = (exact - counts).argsort(descending=True, stable=True)[: total - int(counts.sum())]
     counts[rest] += 1
     return counts.tolist()
+
+
+def _orders(num_outputs: int, number: int) -> Tensor:
+    """An order of components for each output, ``m x S``, in which pairs fill a square evenly."""
+    return SobolEngine(num_outputs).draw(number).argsort(0).argsort(0).mT
 
 
 def _part(model: ExactGPBase, output: int, count: int) -> ExactGPBase:

@@ -5,7 +5,7 @@ import torch
 from botorch.models.transforms import Normalize
 from torch.nn.functional import relu, silu
 
-from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ZeroMeanGP, load, save
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, StackedGP, ZeroMeanGP, load, save
 
 
 @pytest.fixture
@@ -105,6 +105,18 @@ def test_a_state_of_another_model_changes_nothing(uniform):
         with pytest.raises(RuntimeError, match=r"left as it was; they differ in .*terms\.0"):
             model.load_state_dict(wrong)
     torch.testing.assert_close(model.predict(Z), before)
+
+
+def test_a_stacked_model_comes_back_by_its_parts(uniform, path):
+    X, Y, Z = problem(uniform)
+    models = {name: BUILDS[name](X, Y) for name in ("learnt centre", "zero mean")}
+    stacked = StackedGP(models, torch.tensor([[0.5, 0.25], [0.5, 0.75]]).double())
+    with pytest.raises(TypeError, match="save the models that it was made of"):
+        save(stacked, path)
+    for name, model in models.items():
+        save(model, path)
+        models[name] = load(path)
+    same(StackedGP(models, torch.tensor([*stacked.weights.values()]).double()), stacked, Z)
 
 
 def test_files_that_are_no_models(path):

@@ -6,7 +6,7 @@ from botorch.acquisition import qLogExpectedImprovement, qLogNoisyExpectedImprov
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 
-from gpadjust import CKA, PhysicsMeanGP, StackedGP
+from gpadjust import CKA, PhysicsMeanGP, StackedGP, ZeroMeanGP
 from gpadjust.models.stacked import allocation
 from gpadjust.validation import leave_one_out
 from gpadjust.validation.leave_one_out import training_data
@@ -98,6 +98,25 @@ def test_point_estimates_are_stacked_as_well(data, models, weights, Z):
     expected = quarter(models["CKA"], Z, 0, 1)[0].sum(0) + 3 * point.posterior(Z).mean[:, 0]
     torch.testing.assert_close(stacked.predict(Z).mean[:, 0], expected / 4)
     torch.testing.assert_close(stacked.posterior(Z).mixture_mean, stacked.predict(Z).mean)
+
+
+def test_outputs_are_independent(uniform):
+    """Structures that say 0 and 100, of which each output has its own mixture."""
+
+    def physics(X):
+        return torch.full_like(X[..., :1], 100.0).expand(*X.shape[:-1], 3)
+
+    X = uniform(7, 2)
+    models = {
+        "f_p": PhysicsMeanGP(X, physics(X), physics=physics),
+        "zero": ZeroMeanGP(X, X.new_ones(7, 3)),
+    }
+    stacked = StackedGP(models, torch.tensor([[0.5, 0.5, 0.25], [0.5, 0.5, 0.75]]).double())
+    posterior = stacked.posterior(X[:1] + 9)
+    torch.manual_seed(0)
+    deviation = posterior.rsample(torch.Size([64])) - posterior.mixture_mean
+    correlation = deviation.flatten(0, 2).mT.corrcoef()
+    torch.testing.assert_close(correlation, torch.eye(3).double(), rtol=0, atol=0.1)
 
 
 def test_left_out_densities_are_mixed(models, weights):
