@@ -16,6 +16,7 @@ from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
 from gpadjust.inference.fitting import Method, check_options
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models import ExactGPBase
+from gpadjust.models.rra import NOT_SAMPLED, PaperRRA
 from gpadjust.states import StateSpec
 
 KEPT = ("method", "num_samples", "num_draws", "seed")  # options of later fits, too
@@ -29,7 +30,9 @@ class DynamicsFitOptions(FitOptions, total=False):
     method: Method | None
 
 
-def checked_fit_options(options: DynamicsFitOptions | None) -> DynamicsFitOptions:
+def checked_fit_options(
+    options: DynamicsFitOptions | None, model: type[ExactGPBase]
+) -> DynamicsFitOptions:
     """The options of the first fit, once they are found to be right."""
     if options is not None and not isinstance(options, Mapping):
         raise TypeError(
@@ -37,6 +40,10 @@ def checked_fit_options(options: DynamicsFitOptions | None) -> DynamicsFitOption
         )
     own: Any = {**(options or {})}
     method = own.pop("method", None)
+    if issubclass(model, PaperRRA):
+        if method == "bayes":
+            raise ValueError(NOT_SAMPLED)
+        method = method or "map"
     check_options("bayes" if method is None else method, own)
     return {**(options or {})}
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
 from gpadjust.dynamics.incremental_fit import (
+    KEPT,
     DynamicsFitOptions,
     check_observed,
     checked_fit_options,
@@ -92,9 +93,9 @@ class LearnedDynamics(Dynamics):
         self.targets = TransitionTargets(spec, target)
         self.physics = None if physics is None else check_physics(physics)
         self.encode_angles = encode_angles
-        self.fit_options = checked_fit_options(fit_options)
         self.fit_result: FitResult | SampleResult | None = None
         self._recipe = ModelRecipe(self.targets, self.physics, model, model_options, encode_angles)
+        self.fit_options = checked_fit_options(fit_options, model)
         self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions
 
@@ -263,6 +264,7 @@ class LearnedDynamics(Dynamics):
         """What these dynamics are, each setting as a text; of objects, the class."""
         parts = [*self._recipe.parts]
         several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
+        kept = {k: v for k, v in self.fit_options.items() if k in KEPT and v is not None}
         return fingerprint(
             self,
             model=self.model_class,
@@ -270,7 +272,7 @@ class LearnedDynamics(Dynamics):
             target=self.targets.target,
             encode_angles=self.encode_angles,
             model_options=self.model_options,
-            method=self.fit_options.get("method"),
+            **{"method": None, **kept},
         )
 
     def state_dict(self) -> dict[str, Any]:

@@ -24,6 +24,11 @@ from gpadjust.models.hyperparameters import default_constraint
 from gpadjust.models.sampled_functions import SampledFunctions, TermFeatures, weighted
 from gpadjust.models.training_data import ArrayLike
 
+NOT_SAMPLED = (
+    "PaperRRA cannot be fully Bayesian: its covariance is not that of a posterior. Take RRA, or "
+    "fit it by method 'map'."
+)
+
 
 class RRA(AdjustedGP):
     r"""Ridge regression adjustment (Wannawas and Faisal 2023, section 2.2), a Bayesian linear model
@@ -282,10 +287,7 @@ class PaperRRA(RRA):
 
     def check_can_be_sampled(self) -> None:
         """Refuse: the paper's closed form has no likelihood to sample from."""
-        raise ValueError(
-            "PaperRRA cannot be fully Bayesian: its covariance is not that of a posterior. Take "
-            "RRA."
-        )
+        raise ValueError(NOT_SAMPLED)
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """As the base class, with the variance of the paper's covariance."""

@@ -205,6 +205,18 @@ def test_a_model_of_the_user(cart_pole_system):
         dynamics(model_options={"wave": 2})
 
 
+def test_it_is_described_by_what_all_fits_are_told(cart_pole_system):
+    def described(**options):
+        return LearnedDynamics(
+            cart_pole_system.spec, cart_pole_system.crude, fit_options=options
+        ).describe()
+
+    plain = described()
+    assert plain == described(num_starts=2, num_samples=None)
+    assert described(num_samples=8, seed=3) == {**plain, "num_samples": "8", "seed": "3"}
+    assert described(method="map") == {**plain, "method": "'map'"}
+
+
 def test_each_transition_costs_one_row_of_the_physics(uniform):
     rows = []
 
