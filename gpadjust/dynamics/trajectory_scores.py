@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.open_loop import Move, chosen_starts, follow, steps_ahead
+from gpadjust.dynamics.step_or_nan import step_or_nan
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.sampled_functions import check_number
 from gpadjust.states import StateSpec
@@ -30,7 +31,8 @@ class TrajectoryScores(NamedTuple):
 
     Windows overlap, and all see the same functions: the scores of so many windows scatter more than
     those of as many independent predictions. A particle that is lost, because it would leave the
-    bounds or the finite numbers or meet a failure of the physics, stays where it was before.
+    bounds or the finite numbers or meet a failure of the physics, stays where it was before. A
+    window is left out if the physics fails at the last state recorded in it, for the noise's sake.
 
     Args:
         horizons: The numbers of steps, ``H``.
@@ -133,8 +135,9 @@ def score_trajectories(
             (particles, lost), last = found[horizon], data.some(starts + horizon - 1)
             noise = torch.zeros_like(last.states)
             if len(starts):
-                noise = noise_variance(last.states, last.actions).sqrt()
-            ends = Ends(particles, noise, last.next_states, lost)
+                noise = step_or_nan(noise_variance, last.states, last.actions).sqrt()
+            known = ~noise.isnan().all(-1)
+            ends = Ends(particles[:, known], noise[known], last.next_states[known], lost[:, known])
             scores.append(score_ends(spec, ends, units, generator))
     columns = {name: torch.stack([each[name] for each in scores]) for name in scores[0]}
     names = tuple(spec.states[i] for i in spec.moving)

@@ -12,6 +12,7 @@ from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateS
 from gpadjust.dynamics.plots import plot_trajectory_scores
 from gpadjust.dynamics.trajectory_scores import energy_score
 from gpadjust.models import Prediction
+from gpadjust.physics import PhysicsError
 from gpadjust.validation import crps
 
 mpl.use("Agg")
@@ -268,6 +269,23 @@ def test_lost_particles_stay_where_they_were(uniform, how):
     scores = dynamics.score_trajectories(x, v, x, horizons=(1, 2, 3, 5), state_bounds=bounds)
     assert scores.lost.tolist() == [0, 0, 1, 1]
     assert scores.rmse.flatten().tolist() == [1, 2, 2, 2]
+
+
+def test_windows_where_the_noise_is_unknown_are_left_out(uniform):
+    class Fails(Drift):
+        def noise_variance(self, states, actions):
+            rows = (states[:, 0] == bad).nonzero().flatten().tolist()
+            if rows:
+                raise PhysicsError("It fails.", rows=rows)
+            return super().noise_variance(states, actions)
+
+    data, options = episodes(uniform, 9, noise=0.1), {"horizons": (1,), "max_windows": None}
+    bad, rest = data[0][-1, 0], [t[:-1] for t in data]
+    options["units"] = torch.ones(1)
+    expected = Drift(0.1, noise=0.1).score_trajectories(*rest, **options)
+    found = Fails(0.1, noise=0.1).score_trajectories(*data, **options)
+    assert found.num_windows.tolist() == [8]
+    torch.testing.assert_close(found[2:], expected[2:])
 
 
 def test_scores_are_the_same_again_and_draw_from_no_generator(uniform):
