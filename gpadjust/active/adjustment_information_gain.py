@@ -73,8 +73,8 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
 
     Raises:
         TypeError: If the model has no such adjustment, or is no adjustment of a physics.
-        ValueError: If ``about`` is unknown, or ``"delta"`` of a model with ``center``, whose delta
-            is not independent of rho a priori.
+        ValueError: If ``about`` is unknown, or ``"delta"`` of a model with a centre, as by default,
+            whose delta is not independent of rho a priori; with ``center=0.0`` it is.
 
     Example:
         >>> import torch
@@ -160,6 +160,7 @@ def _check(model: Any, about: str) -> None:
         raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
     if about == "delta" and len(model._term_weights("delta")) > 1:
         raise ValueError(
-            "With `center`, delta is not independent of rho a priori, and its information has no "
-            "closed form: ask about 'rho' or 'both', or build the model with center=0."
+            f"The {name} takes a centre from f_p (by default it is learnt), so that delta is not "
+            "independent of rho a priori and its information has no closed form: ask about 'rho' "
+            "or 'both', or build and fit the model with center=0.0."
         )

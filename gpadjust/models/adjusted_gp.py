@@ -173,6 +173,10 @@ class AdjustedGP(ExactGPBase):
     def rho(self, X: ArrayLike, physics: str | int | None = None) -> Posterior:
         r"""The posterior of the scaling :math:`\rho` at ``X``; f_p is not evaluated there.
 
+        After the default fit rho and delta apart are far less certain than their sum: observations
+        are of the sum alone, and how much of it is rho's depends on centre and sizes, which few
+        data tell.
+
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
             physics: Which of several physics, by its name or number.
@@ -186,7 +190,10 @@ class AdjustedGP(ExactGPBase):
         return self.term(self.rho_name(physics), X)
 
     def delta(self, X: ArrayLike) -> Posterior:
-        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`."""
+        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`.
+
+        Like rho it is far less certain than their sum.
+        """
         return self.term("delta", X)
 
     def rho_name(self, physics: str | int | None = None) -> str:

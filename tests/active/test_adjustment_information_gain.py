@@ -406,8 +406,10 @@ class TestErrors:
             qAdjustmentInformationGain(build("RRA-paper", *data()))
 
     def test_delta_of_a_centred_model(self, data, build):
-        with pytest.raises(ValueError, match="ask about 'rho' or 'both'"):
-            qAdjustmentInformationGain(build("CKA", *data(), center="mean"), "delta")
+        for center in ("mean", "learn"):
+            with pytest.raises(ValueError, match=r"ask about 'rho' or 'both', .* center=0\.0"):
+                qAdjustmentInformationGain(build("CKA", *data(), center=center), "delta")
+        qAdjustmentInformationGain(build("CKA", *data(), center=0.0), "delta")
 
     def test_unknown_adjustment(self, data, build):
         with pytest.raises(ValueError, match=r"about='epsilon'; expected 'rho'"):
