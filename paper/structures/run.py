@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 
@@ -19,14 +18,12 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.dynamics.transition_scores import score_transitions
 from gpadjust.inference import SampleResult, SamplingWarning
 from gpadjust.models import ExactGPBase
-from gpadjust.validation import score
 from paper.calibration import PUMP
-from paper.calibration.run import Data, of_pair, pump
+from paper.calibration.run import Data, of_pair, pump, scored
 from paper.common.experiment import Record
 from paper.structures import CLASSES, GROUPS, Model, Structures
 from paper.structures.systems import System, system
 
-_CHUNK = 50  # points predicted jointly, for the sake of memory
 _Fitted = TypeVar("_Fitted")
 
 
@@ -53,29 +50,12 @@ def run(
 
 
 def _of_function(data: Data, name: Model, seed: int) -> Record:
-    """Errors of the mean against the truth; the density and coverage of new observations."""
+    """Scores of each output, as those of calibration."""
     (model, power), found = _timed(lambda: _fitted(data, name))
-    generator = torch.Generator().manual_seed(seed + 1_000)
-    new = data.noise * torch.randn(data.truth.shape, generator=generator, dtype=torch.float64)
-    sd = data.truth.std(0)
-    with torch.no_grad():
-        seen = [
-            score(model.posterior(X, observation_noise=True), Y)
-            for X, Y in zip(
-                data.points.split(_CHUNK), (data.truth + new).split(_CHUNK), strict=True
-            )
-        ]
-        mean = torch.cat([model.predict(X).mean for X in data.points.split(_CHUNK)])
-    sizes = torch.tensor([len(each.pit) for each in seen], dtype=torch.float64)
-    nlpd = (torch.stack([each.nlpd for each in seen]) * sizes.unsqueeze(-1)).sum(0) / sizes.sum()
-    away = (torch.cat([each.pit for each in seen]) - 0.5).abs()
+    scores = scored(model, data, seed)
     return {
         "N": len(data.X),
-        **_scores(
-            (mean - data.truth).square().mean(0).sqrt() / sd,
-            nlpd - sd.log(),
-            (away <= 0.475).double().mean(0),
-        ),
+        **_scores(scores["nrmse"], scores["nlpd"], scores["coverage"]),
         "power": power,
         **found,
     }
