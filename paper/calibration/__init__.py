@@ -29,6 +29,11 @@ ROWS: tuple[tuple[str, int, float], ...] = (
 PUMP = "pump"  # two noisy outputs of very different units
 
 
+def label(problem: str, n: int, noise: float) -> str:
+    """What a row is called."""
+    return f"{problem}, N = {n}" + (", noisy" if noise else "")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """What decides the numbers."""

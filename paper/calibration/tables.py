@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from paper.calibration import LABELS, METHODS, PUMP, Calibration
+from paper.calibration import LABELS, METHODS, PUMP, Calibration, label
+from paper.calibration.claims import ROW, other_methods, targets
 from paper.common.experiment import Record, Table
-from paper.common.tables import markdown
+from paper.common.tables import claims_table, markdown
 
 _REFERENCE = "map"
-_ROW = ["problem", "N", "noise"]
 
 
 def load(records: Sequence[Record]) -> pd.DataFrame:
@@ -25,7 +25,9 @@ def tables(records: Sequence[Record], experiment: Calibration) -> dict[str, Tabl
     runs = load(records)
     methods = [name for name in METHODS if name in set(runs["method"])]
     pairs = runs[runs["problem"] != PUMP]
-    found = {"summary": Table("All rows", _summary(pairs, methods))}
+    judged = targets(runs, other_methods(experiment))
+    found = {"targets": Table("Targets", claims_table("target", {"": judged}))}
+    found["summary"] = Table("All rows", _summary(pairs, methods))
     for name, how, title in (
         ("coverage", "mean", "Mean coverage of the central 95 % interval"),
         ("half", "mean", "Mean coverage of the central 50 % interval"),
@@ -39,16 +41,16 @@ def tables(records: Sequence[Record], experiment: Calibration) -> dict[str, Tabl
 
 def _summary(runs: pd.DataFrame, methods: Sequence[str]) -> str:
     """Over the rows: what this project set itself for its default."""
-    by_row = runs.groupby([*_ROW, "method"], sort=False)
+    by_row = runs.groupby([*ROW, "method"], sort=False)
     mean = by_row[["coverage", "half", "nlpd", "warned"]].mean().unstack()
     median = by_row[["nrmse", "seconds"]].median().unstack()
-    logs = np.log(runs.pivot_table(index=[*_ROW, "seed"], columns="method", values="nrmse"))
+    logs = np.log(runs.pivot_table(index=[*ROW, "seed"], columns="method", values="nrmse"))
     rows = []
     for method in methods:
         own = mean.xs(method, axis=1, level=1)
         seeds = set(runs[runs["method"] == method]["seed"])  # of which others may have more
         beside = runs[(runs["method"] == _REFERENCE) & runs["seed"].isin(seeds)].groupby(
-            _ROW, sort=False
+            ROW, sort=False
         )
         cells = [
             f"{own['coverage'].mean():.3f}",
@@ -79,8 +81,7 @@ def _summary(runs: pd.DataFrame, methods: Sequence[str]) -> str:
 
 def _by_method(runs: pd.DataFrame, column: str, how: str, methods: Sequence[str]) -> str:
     rows = []
-    for (name, n, noise), part in runs.groupby(_ROW, sort=False):
+    for (name, n, noise), part in runs.groupby(ROW, sort=False):
         values = part.groupby("method")[column].agg(how)[[*methods]]
-        label = f"{name}, N = {n}" + (", noisy" if noise else "")
-        rows.append([label, *(f"{value:.2g}" for value in values)])
+        rows.append([label(name, n, noise), *(f"{value:.2g}" for value in values)])
     return markdown(["", *(LABELS[name] for name in methods)], rows)

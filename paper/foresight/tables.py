@@ -6,9 +6,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from paper.common.claims import FEWEST, Judged, Verdict, counted, met
 from paper.common.experiment import Record, Table
-from paper.common.tables import markdown
+from paper.common.tables import claims_table, markdown
 from paper.foresight import METHODS, NOISES, SYSTEMS, Foresight
+
+# Shares that the default's intervals of 95 % are to hold.
+SECOND, LATER, FAR = (0.85, 0.99), (0.90, 0.98), (0.85, 0.99)
+CONDITIONED = 0.1  # the most that conditioning may change them
 
 
 def tables(records: Sequence[Record], experiment: Foresight) -> dict[str, Table]:
@@ -60,7 +65,56 @@ def tables(records: Sequence[Record], experiment: Foresight) -> dict[str, Table]
         "conditioned": f"Shares of the next states of trial {last}, conditioned or fitted again",
     }
     found = {"coverage": rows, "trials": by_trial, "conditioned": conditioned}
-    return {name: Table(titles[name], markdown(text[name], found[name])) for name in found}
+    judged = Table(
+        "Targets of the default fit", claims_table("target", verdicts(records, experiment))
+    )
+    return {
+        "targets": judged,
+        **{name: Table(titles[name], markdown(text[name], found[name])) for name in found},
+    }
+
+
+def verdicts(records: Sequence[Record], experiment: Foresight) -> dict[str, list[Judged]]:
+    """Those on the default fit, by system and noise; single trials are means over the agents."""
+    last, far = experiment.settings.trials, max(experiment.settings.horizons)
+    aims = (
+        ("K1", "coverage", 2, 2, SECOND, "intervals of 95 % hold of the next states of trial 2"),
+        ("K2", "coverage", 3, last, LATER, f"of those of trials 3-{last}, in the mean"),
+        ("K3", f"coverage_{far}", 2, last, FAR, f"{far} steps ahead, of trials 2-{last}, mean"),
+    )
+    found = {}
+    for system, noise in dict.fromkeys((s, n) for s, n, _ in _kinds()):
+        runs = [r[f"{noise}-default"] for r in records if r["system"] == system]
+        if not runs:
+            continue
+        judged = []
+        for id, name, first, end, (low, high), text in aims:
+            trials = {i: _mean([run[name][i - 2] for run in runs]) for i in range(first, end + 1)}
+            mean = _mean([*trials.values()])
+            said = f"{mean:.3f}"
+            for which, beyond in (
+                ("below", {i: value for i, value in trials.items() if value < low}),
+                ("above", {i: value for i, value in trials.items() if value > high}),
+            ):
+                if beyond and len(trials) > 1:
+                    said += f"; {which}: " + ", ".join(
+                        f"trial {i} {value:.3f}" for i, value in beyond.items()
+                    )
+            judged.append((id, f"{text}: {low:.2f} to {high:.2f}", met(low <= mean <= high), said))
+        gaps = [_mean(r["conditioned"]["coverage"]) - _mean(r["coverage"][-1]) for r in runs]
+        text = f"conditioned on three times the data, mean: within {CONDITIONED} of fitting again"
+        said = f"{_mean(gaps):+.3f}; agents " + ", ".join(f"{gap:+.2f}" for gap in gaps)
+        judged.append(("K4", text, met(abs(_mean(gaps)) <= CONDITIONED), said))
+        heading = SYSTEMS[system] + (f", {NOISES[noise]} noise" if noise != "none" else "")
+        found[heading] = [_of(len(runs), *each) for each in judged]
+    return found
+
+
+def _of(runs: int, id: str, text: str, verdict: Verdict, measured: str) -> Judged:
+    """A verdict, unless the runs are too few for one."""
+    if runs < FEWEST:
+        return Judged(id, text, "not run", "too few runs")
+    return Judged(id, text, verdict, f"{counted(runs)}: {measured}")
 
 
 def _kinds() -> Iterable[tuple[str, str, str]]:

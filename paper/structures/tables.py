@@ -7,12 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from paper.calibration import label
+from paper.common.claims import Judged, met
 from paper.common.experiment import Record, Table
-from paper.common.tables import markdown
+from paper.common.tables import claims_table, markdown
 from paper.structures import CELLS, GROUPS, LABELS, MODELS, Structures
 
 MOST_RMSE = 1.1  # in those of the better of physics mean and GP
 MOST_NLPD = 0.15  # nats above the better of them
+CELLS_HELD = 0.9  # the share in which CKA is to hold both
 MOST_RRA = 1.15  # of RRA's RMSE in CKA's, in the mean
 _CONTAINED = ["phy", "gp"]
 _CELL = ["problem", "size", "noise"]
@@ -49,8 +52,7 @@ def cells(records: Sequence[Record]) -> pd.DataFrame:
     found["seeds"], found["best"] = sizes["seeds"], best
     found["group"] = [GROUPS[name] for name, *_ in found.index]
     found["label"] = [
-        f"{name}, N = {n}" + (", noisy" if noise else "")
-        for (name, _, noise), n in zip(found.index, sizes["N"], strict=True)
+        label(name, n, noise) for (name, _, noise), n in zip(found.index, sizes["N"], strict=True)
     ]
     return found
 
@@ -59,6 +61,7 @@ def tables(records: Sequence[Record], experiment: Structures) -> dict[str, Table
     """All tables, by name."""
     found = cells(records)
     return {
+        "targets": Table("Targets", claims_table("target", {"": verdicts(found)})),
         "summary": Table("CKA beside the better of physics mean and GP", summary(found)),
         "nrmse": Table(
             "Median RMSE / that of the better of physics mean and GP",
@@ -73,6 +76,55 @@ def tables(records: Sequence[Record], experiment: Structures) -> dict[str, Table
     }
 
 
+def verdicts(found: pd.DataFrame) -> list[Judged]:
+    """Whether CKA loses to what it contains, and RRA to CKA."""
+    rmse, nlpd = found["nrmse", "cka"], found["nlpd", "cka"]
+    held = (rmse <= MOST_RMSE) & (nlpd <= MOST_NLPD)
+    beyond = "; ".join(
+        f"{name}: RMSE {error:.2f}, NLPD {density:+.2f}"
+        for name, error, density in zip(
+            found["label"][~held], rmse[~held], nlpd[~held], strict=True
+        )
+    )
+    groups = {
+        name: found[found["group"] == name] if name else found
+        for name in ["", *dict.fromkeys(found["group"])]
+    }
+    ahead = {name: (_ratio(part), part["nlpd", "cka"].mean()) for name, part in groups.items()}
+    rra = {name: _ratio(part, "rra", "cka") for name, part in groups.items()}
+    return [
+        Judged(
+            "S1",
+            f"CKA's RMSE at most {MOST_RMSE} times, and its NLPD at most {MOST_NLPD} nats above, "
+            f"that of the better of physics mean and GP in at least {CELLS_HELD:.0%} of the cells",
+            met(held.mean() >= CELLS_HELD),
+            f"in {held.sum()} of {len(held)} ({held.mean():.0%})"
+            + (f"; not in {beyond}" if beyond else ""),
+        ),
+        Judged(
+            "S2",
+            "CKA is ahead of the better of them in the mean",
+            met(ahead[""][0] < 1 and ahead[""][1] < 0),
+            "; ".join(
+                f"{name}: " * bool(name) + f"RMSE {error:.2f} times, NLPD {density:+.2f}"
+                for name, (error, density) in ahead.items()
+            ),
+        ),
+        Judged(
+            "S3",
+            f"RRA's RMSE at most {MOST_RRA} times CKA's in the mean",
+            met(rra[""] <= MOST_RRA),
+            "; ".join(f"{name}: " * bool(name) + f"{ratio:.2f}" for name, ratio in rra.items()),
+        ),
+    ]
+
+
+def _ratio(part: pd.DataFrame, model: str = "cka", other: str | None = None) -> float:
+    """The geometric mean of RMSEs, in units of the better one of physics mean and GP, or other."""
+    of = part["nrmse", model] / (1 if other is None else part["nrmse", other])
+    return float(np.exp(np.log(of).mean()))
+
+
 def summary(found: pd.DataFrame) -> str:
     """In how many cells CKA holds both limits, and the means, by group."""
     rows = []
@@ -81,7 +133,7 @@ def summary(found: pd.DataFrame) -> str:
         close = part["nrmse", "cka"] <= MOST_RMSE
         sure = part["nlpd", "cka"] <= MOST_NLPD
         geometric = np.exp(np.log(part["nrmse"]).mean())
-        rra = np.exp(np.log(part["nrmse", "rra"] / part["nrmse", "cka"]).mean())
+        rra = _ratio(part, "rra", "cka")
         rows.append(
             [
                 name,
@@ -103,11 +155,11 @@ def summary(found: pd.DataFrame) -> str:
 def _by_model(found: pd.DataFrame, column: str, how: str, most: float | None = None) -> str:
     """A row for each cell; what of CKA is beyond the limit is bold."""
     rows = []
-    for i, label in enumerate(found["label"]):
+    for i, cell in enumerate(found["label"]):
         values = [(model, found[column, model].iloc[i]) for model in MODELS]
         rows.append(
             [
-                label,
+                cell,
                 *(
                     f"**{value:{how}}**"
                     if model == "cka" and most is not None and value > most

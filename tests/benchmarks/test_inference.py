@@ -94,3 +94,35 @@ def test_full_bayes(benchmark, record_ratio, uniform, n):
         lambda: build_and("map"),
         rounds=3,
     )
+
+
+@pytest.mark.parametrize("points", [0, 100, 10_000], ids=["fit", "predict-100", "predict-10000"])
+@pytest.mark.parametrize("row", [("currin", 5), ("hartmann6", 5), ("branin", 100)])
+def test_default_beside_map(benchmark, record_ratio, row, points):
+    """On data sets of paper/calibration: fitting, or predicting at so many points."""
+    pytest.importorskip("mf2")
+    from paper.calibration.run import fitted, of_pair
+
+    sets = [of_pair(*row, 0.0, 10, seed) for seed in range(3 if row[0] == "branin" else 5)]
+
+    def models(method):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return [fitted(data, method)[0] for data in sets]
+
+    benchmark.group = f"default beside map, {row[0]}, n = {len(sets[0].X)}"
+    if not points:
+        record_ratio("fits", lambda: models("default"), lambda: models("map"), rounds=3)
+        return
+    Z = torch.cat([data.points for data in sets])
+    low, high = Z.amin(0), Z.amax(0)
+    Z = low + (high - low) * torch.rand(points, Z.shape[-1], dtype=torch.float64)
+    default, most_likely = models("default"), models("map")
+
+    def predict(found):
+        with torch.no_grad():
+            for model in found:
+                model.predict(Z)
+
+    name = f"predict at {points:,} points"
+    record_ratio(name, lambda: predict(default), lambda: predict(most_likely), rounds=7)

@@ -33,11 +33,12 @@ def test_a_run_and_its_tables(tmp_path, monkeypatch):
             assert all(0 <= each <= 1 for row in scores[share] for each in row)
         assert len(scores["fit_seconds"]) == 2
         assert len(scores["conditioned"]["coverage"]) == 4
-    record = {"system": "cartpole", "seed": 0, **found}
+    defaults = {f"{noise}-default": found[f"{noise}-map"] for noise in NOISES}
+    record = {"system": "cartpole", "seed": 0, **found, **defaults}
     tables = experiment.tables([record, {**record, "seed": 1}])
-    for table in tables.values():
+    for name, table in tables.items():
         lines = table.text.splitlines()
-        assert len(lines) == 2 + len(NOISES)
+        assert len(lines) == 2 + (4 if name == "targets" else len(NOISES))
         assert len({line.count("|") for line in lines}) == 1
 
 

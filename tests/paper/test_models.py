@@ -19,6 +19,7 @@ from paper.active.tables import needed, verdicts
 from paper.calibration import METHODS, ROWS, Calibration
 from paper.calibration import Settings as CalibrationSettings
 from paper.calibration import run as calibration_run
+from paper.calibration.claims import targets
 from paper.calibration.leads import LEADS, taken
 from paper.common.runner import main, run_missing, runs_file
 from paper.forrester import Forrester
@@ -351,6 +352,33 @@ class TestCalibration:
         found = experiment.tables(records)
         assert "pump, N = 12, noisy" in found["coverage"].text
         assert "| default |" in found["summary"].text
+        assert found["targets"].text.count("**not run**") == 2
+
+    @pytest.mark.parametrize("worst", [0.9, 0.8])
+    def test_targets(self, tmp_path, worst):
+        """The rows of a trial in which all but two methods of one row are alike."""
+        scores = {"nlpd": 0.0, "half": 0.5, "seconds": 1.0, "warned": False}
+        kinds = [(*row, method) for row in (*ROWS, ("pump", 6, 1.0)) for method in METHODS]
+        records = [
+            {"problem": name, "per_input": size, "noise": noise, "method": method, "seed": 0,
+             "N": size, "nrmse": 2.0 if (name, method) == ("booth", "compare") else 1.0,
+             "coverage": worst if name == "currin" else 0.95, **scores}
+            for name, size, noise, method in kinds
+        ]  # fmt: skip
+        runs = pd.DataFrame(records)
+        rows = runs[(runs["method"] == "map") & (runs["problem"] != "pump")]
+        singles = pd.concat([rows.assign(method="cka"), rows.assign(method="SMT MFK")])
+        found = {each.id: each for each in targets(runs, singles)}
+        assert (found["D2"].verdict, found["D2"].measured) == (
+            ("met", "none")
+            if worst > 0.85
+            else ("missed", "currin, N = 5: 0.800; currin, N = 10: 0.800")
+        )
+        assert (found["D4"].verdict, found["D6"].verdict) == ("met", "missed")
+        assert found["R4"].verdict == "met"
+        assert found["R4"].measured.startswith("in 14 of 16;")
+        runs = Calibration(out=tmp_path / "calibration").tables(records)["targets"].text
+        assert "no results of structures" in runs
 
     def test_there_are_sixteen_kinds_and_the_noise_is_what_it_says(self):
         assert len(ROWS) == 16
@@ -400,6 +428,7 @@ class TestStructures:
         found = experiment.tables(records)
         assert "pendulum, N = 5" in found["nrmse"].text
         assert "| all |" in found["summary"].text
+        assert "| S1 |" in found["targets"].text
 
     def test_limits(self):
         """Both limits are against the better of the two, of each score by itself."""
