@@ -147,6 +147,21 @@ def check_observed(Y: Tensor, name: str) -> None:
     _check_rows(nothing, name, "to hold an observation in each row, found nothing but NaN")
 
 
+def check_noise(noise: object, Y: Tensor) -> None:
+    """Raise an error unless ``noise`` holds variances of the new observations ``Y``."""
+    expected = f"Expected noise as a float64 tensor of variances of Y's shape {tuple(Y.shape)}, got"
+    if not isinstance(noise, Tensor) or noise.dtype != torch.float64:
+        found = f"a tensor in {noise.dtype}" if isinstance(noise, Tensor) else repr(noise)
+        raise TypeError(f"{expected} {found}; of one variance, `torch.full_like(Y, variance)`.")
+    if noise.shape[-2:] != Y.shape[-2:]:
+        raise ValueError(
+            f"{expected} shape {tuple(noise.shape)}; of one variance, `torch.full_like(Y, "
+            "variance)`."
+        )
+    if (~(noise.isfinite() & (noise >= 0)) & ~Y.isnan()).any():
+        raise ValueError("Expected noise (variances) to be finite and not negative.")
+
+
 def _check_rows(bad: Tensor, name: str, expected: str) -> None:
     if bad.any():
         rows = sorted({int(index[-1]) for index in bad.nonzero()})

@@ -192,14 +192,14 @@ def _mixture_of(parts: list[Part]) -> LeaveOneOut:
     return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 
-def training_data(model: Any) -> tuple[Tensor, Tensor]:
+def observations(model: Any) -> tuple[Tensor, Tensor]:
     """The observations that a model was given, ``n x d`` and ``n x m`` in the user's units.
 
     Of an :class:`~gpadjust.AR1` those of the high level; of a batch the first.
     """
     if isinstance(model, ModelListGP | StackedGP):
         models = model.models if isinstance(model, ModelListGP) else [g[0] for g in model.groups]
-        parts = [training_data(part) for part in models]
+        parts = [observations(part) for part in models]
         return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)

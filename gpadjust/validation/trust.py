@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gpadjust.models import AdjustedGP
 from gpadjust.models.training_data import ArrayLike, to_tensor
-from gpadjust.validation.leave_one_out import training_data
+from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.scores import check_level
 
 SIDES = ("physics", "data", "neither")
@@ -125,7 +125,7 @@ def trust(
             f"{tuple(model.batch_shape)}; judge the data sets one by one."
         )
     with torch.no_grad():
-        train_X, train_Y = training_data(model)
+        train_X, train_Y = observations(model)
         X = _points(train_X, num_points) if X is None else to_tensor(X, "X")
         if X.dim() != 2 or not len(X):
             raise ValueError(f"Expected X of shape n x d, one point or more, got {tuple(X.shape)}.")

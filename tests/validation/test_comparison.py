@@ -60,7 +60,7 @@ def without_each(build, X, Y):
         rest = torch.arange(len(X)) != i
         model = build(X[rest], Y[rest])
         fit(model, "bayes", num_samples=128, num_starts=2, num_screened=32)
-        mean, variance = model._components(X[i : i + 1], True)
+        mean, variance = model.components(X[i : i + 1], True)
         normal = torch.distributions.Normal(mean, variance.sqrt())
         found.append(normal.log_prob(Y[i]).logsumexp(0) - math.log(128))
     return torch.cat(found).detach()
