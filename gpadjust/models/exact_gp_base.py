@@ -666,7 +666,7 @@ class ExactGPBase(SingleTaskGP):
             transform = getattr(self, "outcome_transform", None)
             if transform is not None and fantasize_flag.off():
                 noise = noise / transform.stdvs.square()
-            kwargs["noise"] = noise
+            kwargs["noise"] = noise.nan_to_num(nan=1.0, posinf=1.0)  # where nothing was observed
         if self.num_samples is not None:
             # All samples see the same observations, unless these have a dimension for them, as
             # fantasies have.

@@ -173,7 +173,7 @@ def _check_rows(bad: Tensor, name: str, expected: str) -> None:
 
 
 def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Tensor:
-    """Known variances of the shape of ``Y``; 1 where there is no observation."""
+    """Known variances of the shape of ``Y``; their mean where there is no observation."""
     if isinstance(values, int | float | list | tuple):
         values = torch.tensor(values, dtype=torch.float64)
     given = to_tensor(values, name)
@@ -182,7 +182,8 @@ def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Ten
             f"Expected {name} (known variances) as one number, {Y.shape[-1]} numbers (one for each "
             f"output), or of the targets' shape {tuple(Y.shape)}, got {tuple(given.shape)}."
         )
-    variances = given.expand(Y.shape).where(~Y.isnan(), torch.ones_like(Y))
+    variances = given.expand(Y.shape).where(~Y.isnan(), torch.full_like(Y, torch.nan))
+    variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
     check_finite(variances, name)
     if (variances < 0).any():
         raise ValueError(
