@@ -568,15 +568,20 @@ class ExactGPBase(SingleTaskGP):
             other = {n for n in other if not _has_samples(state_dict[n], own[n], sizes)}
         if other or (strict and own.keys() != state_dict.keys()):
             wrong = sorted(own.keys() ^ state_dict.keys()) or sorted(other)
+            held = self.num_samples is not None
+            hint = (
+                " It holds samples: for a state with another number of them, or none, call "
+                "`model.release_samples()` first."
+            )
             raise RuntimeError(
                 f"The state is of another model than this {type(self).__name__}, which is left as "
-                f"it was; they differ in {', '.join(wrong[:5])}."
+                f"it was; they differ in {', '.join(wrong[:5])}.{hint * held}"
             )
         if samples:
             self.train()
             # Before samples are held, for which inputs are transformed once and for all.
             prefix = "input_transform."
-            own = {n.removeprefix(prefix): v for n, v in state_dict.items() if prefix in n}
+            own = {n.removeprefix(prefix): v for n, v in state_dict.items() if n.startswith(prefix)}
             if own:
                 self.input_transform.load_state_dict(own, strict)
             self.hold_samples(samples)

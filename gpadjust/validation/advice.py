@@ -90,8 +90,8 @@ def _gains(
 
     def gain(better: str, worse: str, otherwise: str) -> tuple[int, str]:
         value, error = difference(density[better], density[worse])
-        text = f"elpd {round(value, 1) + 0.0:+.1f} +- {error:.1f} nats ({better}) over that {otherwise} ({worse})"
-        return sign_of(value, error), text
+        nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
+        return sign_of(value, error), f"elpd {nats} ({better}) over that {otherwise} ({worse})"
 
     best, without = first(lambda s: s.uses_physics), first(lambda s: not s.uses_physics)
     sentences = []

@@ -231,6 +231,11 @@ def test_it_tells_what_it_is_of(models, weights):
     assert "75% of y1: mean, PhysicsMeanGP of 'f_p'" in stacked.summary()
 
 
+def test_it_is_not_trained(models, weights):
+    with pytest.raises(RuntimeError, match="made of fitted models, and not trained"):
+        StackedGP(models, weights).train()
+
+
 def test_whole_numbers_by_the_largest_remainders():
     for weights, expected in (
         ([0.5, 0.3, 0.2], [4, 2, 2]),
