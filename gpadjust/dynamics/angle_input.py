@@ -57,6 +57,13 @@ class AngleInput(InputTransform):
             parts += [column.sin(), column.cos()] if i in self.columns else [column]
         return torch.stack(parts, dim=-1)
 
+    def column_names(self, names: Sequence[str]) -> list[str]:
+        """The names of the columns of :meth:`transform`, of those of X."""
+        found: list[str] = []
+        for i, name in enumerate(names):
+            found += [f"sin({name})", f"cos({name})"] if i in self.columns else [name]
+        return found
+
     def equals(self, other: InputTransform) -> bool:
         """Whether ``other`` replaces the same columns."""
         return isinstance(other, AngleInput) and self.columns == other.columns

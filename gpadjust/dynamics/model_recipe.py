@@ -72,7 +72,10 @@ class ModelRecipe:
             if quiet:
                 warnings.simplefilter("ignore")
             make: Callable[..., ExactGPBase] = self.model_class
-            return make(*self._rows(data), **options)
+            model = make(*self._rows(data), **options)
+        model.input_names = self.targets.input_names
+        model.output_names = self.targets.output_names
+        return model
 
     def condition(self, model: ExactGPBase, data: Transitions) -> ExactGPBase:
         """The model with further transitions, its hyper-parameters as they are."""

@@ -63,7 +63,7 @@ def plot_trajectory_scores(scores: TrajectoryScores, *, axes: Any = None) -> Any
     axes[0].legend(frameon=False, loc="lower right", fontsize="small")
     axes[1].plot(steps, scores.energy[has], "o-", color=BLUE, ms=4.5, lw=1.5)
     axes[1].set(ylabel="energy score, in typical steps")
-    axes[1].set_ylim(bottom=0)
+    axes[1].set_ylim(0, 1.1 * float(scores.energy[has].max()) or None)
     for ax in axes:
         ax.set(xlabel="steps ahead", xticks=steps)
         tidy(ax)

@@ -41,6 +41,21 @@ class TransitionTargets:
         self.predicted = [moving.index(i) for i in spec.predicted]
         self.angles = [moving.index(i) for i in spec.angle_columns if i in moving]
 
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """The names of the columns of :meth:`inputs`."""
+        spec = self.spec
+        moving, previous = (
+            [spec.states[i] for i in c] for c in (spec.moving, spec.previous_columns)
+        )
+        return (*moving, *spec.actions, *previous)
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """The names of the targets."""
+        names = [self.spec.states[i] for i in self.spec.predicted]
+        return tuple(f"change of {n}" if self.target == "difference" else n for n in names)
+
     def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
         """The raw inputs of a model, ``... x d``: states that move, actions, previous actions.
 

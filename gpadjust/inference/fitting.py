@@ -223,7 +223,7 @@ def check_options(method: str, options: dict[str, Any]) -> None:
             raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
         if value is None and name in _OR_NONE:
             continue
-        if not isinstance(value, int):
+        if not isinstance(value, int) or isinstance(value, bool):
             raise TypeError(f"Expected {name} to be a whole number, got {value!r}.")
         if value < known[name]:
             raise ValueError(f"Expected {name} >= {known[name]}, got {value}.")

@@ -40,6 +40,7 @@ from gpadjust.models.training_data import (
     TrainingData,
     check_columns,
     check_finite,
+    check_noise,
     check_observed,
     to_tensor,
 )
@@ -184,7 +185,10 @@ class ExactGPBase(SingleTaskGP):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Posterior:
-        """The joint posterior at raw ``X`` (``... x q x d``); see BoTorch."""
+        """The joint posterior at raw ``X`` (``... x q x d``); see BoTorch.
+
+        Variances that are given as ``observation_noise`` are in the square of the user's units.
+        """
         if output_indices is not None and list(output_indices) != list(range(self.num_outputs)):
             subset = self.subset_output(list(output_indices))
             return subset.posterior(X, None, observation_noise, posterior_transform)
@@ -226,7 +230,7 @@ class ExactGPBase(SingleTaskGP):
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
             observation_noise: Whether to predict observations instead of the function; or their
-                noise variances, ``batch_shape x q x m``, as in ``posterior``.
+                noise variances, ``batch_shape x q x m``, in the square of the user's units.
 
         Returns:
             The mean and the variance, ``batch_shape x q x m`` each, in the user's units.
@@ -245,12 +249,12 @@ class ExactGPBase(SingleTaskGP):
             >>> mean.shape
             torch.Size([1000, 1])
         """
-        mean, variance = self._components(X, observation_noise)
+        mean, variance = self.components(X, observation_noise)
         if self.num_samples is None:
             return Prediction(mean.squeeze(MCMC_DIM), variance.squeeze(MCMC_DIM))
         return Prediction(*mixture_moments(mean, variance))
 
-    def _components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
+    def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances for each sample of the hyper-parameters, ``... x S x q x m``."""
         inputs = self.model_inputs(X)
         with threads_for(self.train_targets.shape[-1]):
@@ -291,7 +295,7 @@ class ExactGPBase(SingleTaskGP):
         Raises:
             ValueError: If ``level`` is not between 0 and 1.
         """
-        return mixture_interval(lambda: self._components(X, observation_noise), level)
+        return mixture_interval(lambda: self.components(X, observation_noise), level)
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024
@@ -456,7 +460,9 @@ class ExactGPBase(SingleTaskGP):
                     "Expected observation_noise as True, False, or variances of shape ... x "
                     f"{expected[0]} x {expected[1]}, got shape {tuple(observation_noise.shape)}."
                 )
-            return self._outputs_first(given)
+            given = self._outputs_first(given)
+            # In the user's units; those that BoTorch makes fantasies with are in the model's.
+            return given if fantasize_flag.on() else given / self._units()[1].square()
         if observation_noise is not True:
             raise TypeError(
                 "Expected observation_noise as True, False, or a tensor of variances, got "
@@ -562,15 +568,20 @@ class ExactGPBase(SingleTaskGP):
             other = {n for n in other if not _has_samples(state_dict[n], own[n], sizes)}
         if other or (strict and own.keys() != state_dict.keys()):
             wrong = sorted(own.keys() ^ state_dict.keys()) or sorted(other)
+            held = self.num_samples is not None
+            hint = (
+                " It holds samples: for a state with another number of them, or none, call "
+                "`model.release_samples()` first."
+            )
             raise RuntimeError(
                 f"The state is of another model than this {type(self).__name__}, which is left as "
-                f"it was; they differ in {', '.join(wrong[:5])}."
+                f"it was; they differ in {', '.join(wrong[:5])}.{hint * held}"
             )
         if samples:
             self.train()
             # Before samples are held, for which inputs are transformed once and for all.
             prefix = "input_transform."
-            own = {n.removeprefix(prefix): v for n, v in state_dict.items() if prefix in n}
+            own = {n.removeprefix(prefix): v for n, v in state_dict.items() if n.startswith(prefix)}
             if own:
                 self.input_transform.load_state_dict(own, strict)
             self.hold_samples(samples)
@@ -621,11 +632,13 @@ class ExactGPBase(SingleTaskGP):
             X: Raw inputs, ``batch_shape x k x d``.
             Y: Observations, ``(f) x batch_shape x k x m``, in the user's units; NaN where an
                 output was not observed.
-            kwargs: ``noise``, the variances of the new observations, if they are known.
+            kwargs: ``noise``, the variances of the new observations, if they are known: of the
+                shape of ``Y``, in the square of the user's units.
 
         Raises:
-            ValueError: If ``X`` is not finite, ``Y`` is missing in a whole row, or their numbers
-                of rows or of outputs disagree.
+            TypeError: If ``X``, ``Y`` or ``noise`` is not float64.
+            ValueError: If ``X`` is not finite, ``Y`` is missing in a whole row, their numbers of
+                rows or of outputs disagree, or ``noise`` is missing, negative or of another shape.
         """
         check_columns(X, self.input_names)
         X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
@@ -642,14 +655,23 @@ class ExactGPBase(SingleTaskGP):
                 f"{tuple(Y.shape)}."
             )
         check_observed(Y, "Y")
-        if isinstance(self.likelihood, FixedNoiseGaussianLikelihood) and "noise" not in kwargs:
+        return self.with_observations(X, Y, **kwargs)
+
+    def with_observations(
+        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
+    ) -> Self:
+        """As :meth:`condition_on_observations`, of checked tensors, where whole rows may be NaN."""
+        if isinstance(self.likelihood, FixedNoiseGaussianLikelihood) and noise is None:
             raise ValueError(
                 "The model was built with known noise (train_Yvar), so that of new observations is "
                 "needed, too: pass `noise`, variances of the shape of Y."
             )
-        noise = kwargs.get("noise")
-        if noise is not None and (~(noise.isfinite() & (noise >= 0)) & ~Y.isnan()).any():
-            raise ValueError("Expected noise (variances) to be finite and not negative.")
+        if noise is not None:
+            check_noise(noise, Y)
+            transform = getattr(self, "outcome_transform", None)
+            if transform is not None and fantasize_flag.off():
+                noise = noise / transform.stdvs.square()
+            kwargs["noise"] = noise.nan_to_num(nan=1.0, posinf=1.0)  # where nothing was observed
         if self.num_samples is not None:
             # All samples see the same observations, unless these have a dimension for them, as
             # fantasies have.

@@ -55,7 +55,9 @@ def take_samples(model: Any, index: Tensor, as_mixture: bool = False) -> Any:
     """
     model = deepcopy(model)
     fixed = getattr(model.likelihood, "noise_covar", None)
-    if isinstance(fixed, FixedGaussianNoise):
+    if isinstance(fixed, FixedGaussianNoise) and (
+        not as_mixture or fixed.noise.dim() > len(model._aug_batch_shape)
+    ):
         # The samples share the noise of the training data, but not that of later observations.
         shape = (*model._aug_batch_shape, fixed.noise.shape[-1])
         fixed.noise = fixed.noise.expand(shape)[index]

@@ -12,6 +12,7 @@ from gpadjust.gp import AppendedPhysics, PhysicsInput, Term
 from gpadjust.gp.gaussian import negative_log_likelihood, noise_variances
 from gpadjust.models.hyperparameters import KINDS, is_rho, kind_of, typical_sizes
 
+_ROUNDING = 1e-12  # of a term's unit
 _NEAR = 1.01  # times a bound is at the bound
 
 
@@ -51,6 +52,7 @@ def _lines(model: Any) -> list[str]:
     for i, term in enumerate(model.terms):
         unit = torch.ones_like(scale) if is_rho(term.basis) else scale
         mean = model.term_mean(term.name) if hasattr(model, "term_mean") else 0.0
+        mean = mean if abs(mean) > _ROUNDING * float(unit.flatten()[0]) else 0.0
         lines.append(f"  {term.name}: {'learnt ' * term.learns_mean}mean {mean:.4g}")
         if isinstance(term.basis, AppendedPhysics) and term.basis.learns_center:
             lines.append(f"    centre {_text(term.basis.origin)}")
@@ -84,7 +86,7 @@ def _of_term(
 
 def _columns(model: Any, number: int) -> list[tuple[str, float]]:
     """The names of a kernel's inputs, and what a length of one is in the user's units."""
-    base = getattr(model, "input_transform", None)
+    base: Any = getattr(model, "input_transform", None)
     base = getattr(base, "base", base)
     if number == len(model.input_names):
         if isinstance(base, Normalize):
@@ -92,6 +94,10 @@ def _columns(model: Any, number: int) -> list[tuple[str, float]]:
             return list(zip(model.input_names, lengths, strict=True))
         if base is None:
             return [(name, 1.0) for name in model.input_names]
+    if hasattr(base, "column_names"):
+        names = base.column_names(model.input_names)
+        if len(names) == number:
+            return [(name, 1.0) for name in names]
     return [(f"transformed input {i + 1}", 1.0) for i in range(number)]
 
 

@@ -147,6 +147,21 @@ def check_observed(Y: Tensor, name: str) -> None:
     _check_rows(nothing, name, "to hold an observation in each row, found nothing but NaN")
 
 
+def check_noise(noise: object, Y: Tensor) -> None:
+    """Raise an error unless ``noise`` holds variances of the new observations ``Y``."""
+    expected = f"Expected noise as a float64 tensor of variances of Y's shape {tuple(Y.shape)}, got"
+    if not isinstance(noise, Tensor) or noise.dtype != torch.float64:
+        found = f"a tensor in {noise.dtype}" if isinstance(noise, Tensor) else repr(noise)
+        raise TypeError(f"{expected} {found}; of one variance, `torch.full_like(Y, variance)`.")
+    if noise.shape[-2:] != Y.shape[-2:]:
+        raise ValueError(
+            f"{expected} shape {tuple(noise.shape)}; of one variance, `torch.full_like(Y, "
+            "variance)`."
+        )
+    if (~(noise.isfinite() & (noise >= 0)) & ~Y.isnan()).any():
+        raise ValueError("Expected noise (variances) to be finite and not negative.")
+
+
 def _check_rows(bad: Tensor, name: str, expected: str) -> None:
     if bad.any():
         rows = sorted({int(index[-1]) for index in bad.nonzero()})
@@ -158,7 +173,7 @@ def _check_rows(bad: Tensor, name: str, expected: str) -> None:
 
 
 def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Tensor:
-    """Known variances of the shape of ``Y``; 1 where there is no observation."""
+    """Known variances of the shape of ``Y``; their mean where there is no observation."""
     if isinstance(values, int | float | list | tuple):
         values = torch.tensor(values, dtype=torch.float64)
     given = to_tensor(values, name)
@@ -167,7 +182,8 @@ def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Ten
             f"Expected {name} (known variances) as one number, {Y.shape[-1]} numbers (one for each "
             f"output), or of the targets' shape {tuple(Y.shape)}, got {tuple(given.shape)}."
         )
-    variances = given.expand(Y.shape).where(~Y.isnan(), torch.ones_like(Y))
+    variances = given.expand(Y.shape).where(~Y.isnan(), torch.full_like(Y, torch.nan))
+    variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
     check_finite(variances, name)
     if (variances < 0).any():
         raise ValueError(

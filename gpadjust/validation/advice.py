@@ -12,10 +12,10 @@ from gpadjust.inference.full_bayes import LEAST_POWER
 from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.models import ExactGPBase
 from gpadjust.validation.leave_one_out import LeaveOneOut
-from gpadjust.validation.ranking import Candidate, densities, difference
+from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, difference, sign_of
+from gpadjust.validation.refitting import LEAST
 from gpadjust.validation.structures import Structure
 
-_SURE = 2.0  # standard errors that a difference takes to be real
 _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
 
 
@@ -38,14 +38,25 @@ def advice(
         X: Training inputs, ``n x d``.
     """
     by_name = {structure.name: structure for structure in structures}
-    sentences = []
+    sentences, fewest = [], len(X)
     for j, (output, rows) in enumerate(table.items()):
         where = f"{output}: " if len(table) > 1 else ""
         density = dict(zip(left_out, densities(left_out, j).unbind(-1), strict=True))
+        fewest = min(fewest, len(density[rows[0].structure]))
         found = [_best(rows), *_gains(by_name, [row.structure for row in rows], density)]
         found += _preferred(models[rows[0].structure], X, j)
         found += _unsampled(rows, power, j)
         sentences += [where + sentence for sentence in found]
+    if fewest < ENOUGH and len(models) > 1:
+        sentences.append(
+            f"{fewest} observations (of {ENOUGH} at least) cannot show a structure to be clearly "
+            "best: what is recommended is the mixture."
+        )
+    if fewest < LEAST:
+        sentences.append(
+            f"{fewest} observations are too few to fit again without each: they have had their say "
+            "in their own predictions, so that these elpd are too high."
+        )
     flattered = [name for name, model in models.items() if shared_parameters(model)]
     if flattered:
         sentences.append(
@@ -59,12 +70,12 @@ def advice(
 def _best(rows: list[Candidate]) -> str:
     """Which structure is best, and how sure that is."""
     best, *others = rows
-    near = [row for row in others if -row.elpd_diff <= _SURE * row.se_diff]
+    near = [row for row in others if not sign_of(row.elpd_diff, row.se_diff)]
     sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"
     if not near:
         return f"{sentence}."
     return (
-        f"{sentence}; not shown to be worse, within {_SURE:.0f} standard errors: "
+        f"{sentence}; not shown to be worse, within {SURE:.0f} standard errors: "
         f"{', '.join(row.structure for row in near)}."
     )
 
@@ -77,24 +88,30 @@ def _gains(
     def first(matches: Callable[[Structure], bool]) -> str | None:
         return next((name for name in order if matches(structures[name])), None)
 
-    # An unknown constant may help by itself.
-    with_physics = first(lambda s: s.uses_physics and not s.unknowns)
-    with_physics = with_physics or first(lambda s: s.uses_physics)
-    plain = first(lambda s: s.uses_physics and not s.adjusts)
-    pairs = (
-        ("The physics", with_physics, first(lambda s: not s.uses_physics), "without it"),
-        ("Scaling the physics", first(lambda s: s.adjusts), plain, "with the physics as a mean"),
-    )
-    sentences = []
-    for subject, better, worse, otherwise in pairs:
-        if better is None or worse is None:
-            continue
+    def gain(better: str, worse: str, otherwise: str) -> tuple[int, str]:
         value, error = difference(density[better], density[worse])
-        shown = value > _SURE * error
-        sentences.append(
-            f"{subject} {'helps' if shown else 'is not shown to help'}: elpd {value:+.1f} +- "
-            f"{error:.1f} nats ({better}) over that {otherwise} ({worse})."
-        )
+        nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
+        return sign_of(value, error), f"elpd {nats} ({better}) over that {otherwise} ({worse})"
+
+    best, without = first(lambda s: s.uses_physics), first(lambda s: not s.uses_physics)
+    sentences = []
+    if best is not None and without is not None:
+        # An unknown constant may help by itself.
+        fair = first(lambda s: s.uses_physics and not s.unknowns) or best
+        sign, text = gain(fair, without, "without it")
+        if sign > 0:
+            sentences.append(f"The physics helps: {text}.")
+        else:
+            sign, text = gain(best, without, "without it")
+            says = "makes predictions worse" if sign < 0 else "is not shown to help"
+            alone = "; its unknown constants may do so by themselves" if sign > 0 else ""
+            return [f"The physics {says}: {text}{alone}."]
+    adjusting = first(lambda s: s.adjusts)
+    plain = first(lambda s: s.uses_physics and not s.adjusts)
+    if adjusting is not None and plain is not None:
+        sign, text = gain(adjusting, plain, "with the physics as a mean")
+        says = "helps" if sign > 0 else "is not shown to help"
+        sentences.append(f"Scaling the physics {says}: {text}.")
     return sentences
 
 

@@ -22,6 +22,8 @@ from gpadjust.models.cholesky_strategy import Factors
 from gpadjust.models.stacked import Part
 from gpadjust.validation import scores
 
+_ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
+
 
 @dataclass(frozen=True)
 class LeaveOneOut:
@@ -33,8 +35,9 @@ class LeaveOneOut:
         mean: Their predictions, of the same shape.
         variance: The variances of the predictions, observation noise included.
         log_density: The log predictive densities of the observations, in nats, of the same shape;
-            of a mixture its own, whose shape the other scores take as Gaussian. NaN where there is
-            no observation.
+            of a mixture its own, whose shape the other scores take as Gaussian; of standard
+            deviations of at least 1e-8 of that of the observations, as less is rounding. NaN where
+            there is no observation.
         output_names: The names of the outputs; empty if the model has none.
     """
 
@@ -158,7 +161,9 @@ def leave_one_out(
 
 def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:
     """Of observations ``... x n x m`` by Gaussians ``... x S x n x m``; NaN where there is none."""
-    normal = torch.distributions.Normal(mean, variance.sqrt(), validate_args=False)
+    spread = (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2, keepdim=True).sqrt()
+    sd = torch.maximum(variance.sqrt(), _ROUNDING * spread.unsqueeze(MCMC_DIM))
+    normal = torch.distributions.Normal(mean, sd, validate_args=False)
     return normal.log_prob(Y.unsqueeze(MCMC_DIM))
 
 
@@ -192,14 +197,14 @@ def _mixture_of(parts: list[Part]) -> LeaveOneOut:
     return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 
-def training_data(model: Any) -> tuple[Tensor, Tensor]:
+def observations(model: Any) -> tuple[Tensor, Tensor]:
     """The observations that a model was given, ``n x d`` and ``n x m`` in the user's units.
 
     Of an :class:`~gpadjust.AR1` those of the high level; of a batch the first.
     """
     if isinstance(model, ModelListGP | StackedGP):
         models = model.models if isinstance(model, ModelListGP) else [g[0] for g in model.groups]
-        parts = [training_data(part) for part in models]
+        parts = [observations(part) for part in models]
         return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)

@@ -13,6 +13,10 @@ from gpadjust.validation.leave_one_out import LeaveOneOut
 
 _BOOTSTRAPS = 200
 _STEPS = 300
+SURE = 2.0  # standard errors that a difference takes to be real
+ENOUGH = 8  # observations, for a structure to be clearly best
+_CLEAR = 0.95  # weight of a structure that needs no others
+_LEAST = 1e-6  # nats; less is rounding
 _WORST = -1e6  # nats; a density of zero would make others' differences infinite
 
 
@@ -79,6 +83,19 @@ def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
     """The difference of two elpd, and its standard error (Vehtari et al. 2017, eq. 24)."""
     each = first - second
     return each.sum().item(), math.sqrt(len(each)) * each.std(correction=0).item()
+
+
+def sign_of(value: float, error: float) -> int:
+    """Which sign a difference is shown to have, or 0."""
+    shown = abs(value) > max(SURE * error, _LEAST)
+    return 0 if not shown else 1 if value > 0 else -1
+
+
+def is_clear(rows: list[Candidate], number: int) -> bool:
+    """Whether the first of the rows needs no others, by this number of observations."""
+    best, *others = rows
+    worse = all(sign_of(row.elpd_diff, row.se_diff) < 0 for row in others)
+    return not others or (number >= ENOUGH and best.weight >= _CLEAR and worse)
 
 
 def stacking_weights(density: Tensor, seed: int = 0) -> Tensor:

@@ -51,7 +51,7 @@ def refitted(
     )
     fit(model, "bayes", **options)
     with torch.no_grad():
-        every = model._components(X, True if noise is None else noise)
+        every = model.components(X, True if noise is None else noise)
         each = [moments.unflatten(-1, (m, n)) for moments in every]
         mean, variance = (moments.diagonal(dim1=-3, dim2=-1).mT for moments in each)
     density = log_densities(mean, variance, Y)

@@ -10,9 +10,9 @@ import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-from gpadjust.models import AdjustedGP
+from gpadjust.models import AdjustedGP, StackedGP
 from gpadjust.models.training_data import ArrayLike, to_tensor
-from gpadjust.validation.leave_one_out import training_data
+from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.scores import check_level
 
 SIDES = ("physics", "data", "neither")
@@ -97,7 +97,8 @@ def trust(
         num_points: How many points there are if there is no ``X``.
 
     Raises:
-        TypeError: If the model has no physics to be trusted, or ``level`` is no number.
+        TypeError: If the model has no physics to be trusted, or is a :class:`~gpadjust.StackedGP`,
+            or ``level`` is no number.
         ValueError: If ``X`` has the wrong shape, the model is of a batch of data sets, or ``level``
             or ``num_points`` is out of range.
         PhysicsError: If the physics fails.
@@ -114,6 +115,12 @@ def trust(
         (True, True)
     """
     check_level(level)
+    if isinstance(model, StackedGP):
+        raise TypeError(
+            "Expected a model of one structure, got a StackedGP, whose parts differ in what they "
+            "rest on; take one of the models that it was made of, such as "
+            "comparison.models['CKA']."
+        )
     if not isinstance(model, AdjustedGP) or not model.rho_names:
         raise TypeError(
             f"Expected a model with a physics that it could trust, such as CKA, got "
@@ -125,7 +132,7 @@ def trust(
             f"{tuple(model.batch_shape)}; judge the data sets one by one."
         )
     with torch.no_grad():
-        train_X, train_Y = training_data(model)
+        train_X, train_Y = observations(model)
         X = _points(train_X, num_points) if X is None else to_tensor(X, "X")
         if X.dim() != 2 or not len(X):
             raise ValueError(f"Expected X of shape n x d, one point or more, got {tuple(X.shape)}.")

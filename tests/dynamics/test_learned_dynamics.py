@@ -11,6 +11,7 @@ from gpadjust.gp import Term
 from gpadjust.models import AdjustedGP, Adjustment
 from gpadjust.models.hyperparameters import scaled_rbf
 from gpadjust.physics import ODEPhysics
+from gpadjust.validation import trust
 
 pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
 
@@ -353,3 +354,23 @@ def test_a_warning_of_the_model_is_given_once(recwarn):
     recwarn.clear()
     dynamics.update(x + 0.01, x, x + 0.01 + 0.12 * x)
     assert not recwarn.list
+
+
+def test_the_model_has_the_names_of_the_spec(uniform):
+    spec = StateSpec(
+        ["theta", "omega", "last"], ["torque"], angles=["theta"], previous={"last": "torque"}
+    )
+    states, actions = uniform(6, 3), uniform(6, 1, seed=1)
+    following = torch.cat([states[:, :2] + 0.1 * states[:, :2].sin(), actions], -1)
+    options = {"method": "map", "num_starts": 1, "num_screened": 8}
+    dynamics = LearnedDynamics(spec, lambda X: 0.9 * X[:, :2], fit_options=options)
+    dynamics.fit(states, actions, following)
+    model = dynamics.model
+    assert model.input_names == ("theta", "omega", "torque", "last")
+    assert model.output_names == ("change of theta", "change of omega")
+    text = model.summary()
+    for name in ("sin(theta)", "cos(theta)", "omega", "torque", "last"):
+        assert f"lengthscale of {name}:" in text
+    assert trust(model).input_names == model.input_names
+    absolute = LearnedDynamics(spec, lambda X: X[:, :2], target="absolute")
+    assert absolute.targets.output_names == ("theta", "omega")

@@ -348,6 +348,7 @@ def test_the_figure_shows_coverage_and_energy(uniform):
     lines = {line.get_label(): line for line in axes[0].lines}
     assert lines.keys() >= {"x", "y"}
     np.testing.assert_allclose(lines["y"].get_xdata(), [1, 4])
+    assert axes[1].get_ylim()[1] > 1.05 * scores.energy[:2].max()
     np.testing.assert_allclose(lines["y"].get_ydata(), scores.coverage[:2, 1])
     np.testing.assert_allclose(axes[1].lines[0].get_ydata(), scores.energy[:2])
     silent = Drift(0.0, spec=spec).score_trajectories(states, actions[:, :1], following)

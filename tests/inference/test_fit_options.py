@@ -26,6 +26,7 @@ BAD = [
         for option, value, error, says in (
             ("num_starts", 0, ValueError, "Expected num_starts >= 1, got 0"),
             ("num_starts", 1.5, TypeError, r"Expected num_starts .* whole number, got 1\.5"),
+            ("num_starts", True, TypeError, "Expected num_starts .* whole number, got True"),
             ("num_screened", -1, ValueError, "Expected num_screened >= 0, got -1"),
             ("max_iterations", 0, ValueError, "Expected max_iterations >= 1, got 0"),
             ("max_iterations", None, TypeError, "Expected max_iterations .* got None"),

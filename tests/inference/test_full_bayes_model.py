@@ -212,6 +212,17 @@ class TestCopies:
             assert other.num_samples == 3
             close(other.posterior(Z).mean, expected.mean)
 
+    def test_a_state_with_another_number_of_samples(self, held, data, build):
+        model, _ = held("CKA", *data())
+        fresh = build("CKA", *data())
+        expected = model.train_targets
+        with pytest.raises(RuntimeError, match=r"another number.*release_samples\(\)` first"):
+            model.load_state_dict(fresh.state_dict())
+        assert model.num_samples == 3
+        assert torch.equal(model.train_targets, expected)
+        model.release_samples()
+        model.load_state_dict(fresh.state_dict())
+
 
 class TestLettingGo:
     def test_the_first_sample_is_kept(self, case, uniform, close):

@@ -57,6 +57,29 @@ def test_conditioning_is_rebuilding(
     assert torch.equal(model.posterior(Z).mean, before)
 
 
+def test_known_noise_is_in_the_units_of_the_targets(data, build, kind, close):
+    X, Y = data()
+    model = build(kind, X, 100 * Y, 25.0).eval()
+    noise = torch.full_like(Y[:2], 25.0)
+    conditioned = model.condition_on_observations(X[:2] + 0.1, 100 * Y[:2], noise=noise)
+    variances = conditioned.data()["train_Yvar"]
+    close(variances, torch.full_like(variances, 25.0))
+
+
+def test_the_noise_of_what_was_not_observed_makes_no_difference(data, build, uniform, close):
+    X, Y = data(num_outputs=2)
+    model, noise = build("CKA", X, Y, 0.1), torch.full((2, 2), 0.1, dtype=torch.float64)
+    new_Y = Y[:2].clone()
+    new_Y[0, 1] = torch.nan
+    predicted = []
+    for value in (0.1, 7.0, torch.nan):
+        noise[0, 1] = value
+        conditioned = model.condition_on_observations(X[:2] + 0.1, new_Y, noise=noise)
+        predicted.append(torch.cat(conditioned.predict(X, True)))
+    for each in predicted[1:]:
+        close(each, predicted[0])
+
+
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 def test_fantasies(data, build, kind, num_outputs, uniform, close, known_noise):
     X, Y = data(num_outputs=num_outputs)

@@ -3,13 +3,15 @@
 import pytest
 import torch
 from botorch.acquisition import qLogExpectedImprovement, qLogNoisyExpectedImprovement
+from botorch.acquisition.active_learning import qNegIntegratedPosteriorVariance
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
+from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust import CKA, PhysicsMeanGP, StackedGP, ZeroMeanGP
 from gpadjust.models.stacked import allocation
 from gpadjust.validation import leave_one_out
-from gpadjust.validation.leave_one_out import training_data
+from gpadjust.validation.leave_one_out import observations
 
 
 def f_p(X):
@@ -109,8 +111,9 @@ def test_outputs_are_independent(uniform):
     X = uniform(7, 2)
     models = {
         "f_p": PhysicsMeanGP(X, physics(X), physics=physics),
-        "zero": ZeroMeanGP(X, X.new_ones(7, 3)),
+        "zero": ZeroMeanGP(X, physics(X)),
     }
+    models["zero"].terms[0].kernel.outputscale = 1e-4
     stacked = StackedGP(models, torch.tensor([[0.5, 0.5, 0.25], [0.5, 0.5, 0.75]]).double())
     posterior = stacked.posterior(X[:1] + 9)
     torch.manual_seed(0)
@@ -121,7 +124,7 @@ def test_outputs_are_independent(uniform):
 
 def test_left_out_densities_are_mixed(models, weights):
     stacked = StackedGP(models, weights, num_components=8)
-    loo, (X, Y) = leave_one_out(stacked), training_data(stacked)
+    loo, (X, Y) = leave_one_out(stacked), observations(stacked)
     parts = [leave_one_out(part.model).log_density.exp() for part in stacked.parts[0]]
     expected = (parts[0] / 4 + 3 * parts[1] / 4).log()
     torch.testing.assert_close(loo.log_density[:, :1], expected)
@@ -162,7 +165,50 @@ def test_conditioning_conditions_each_part(data, models, weights, Z):
             expected = before.model.condition_on_observations(Z[:k], Y[:k, j : j + 1])
             torch.testing.assert_close(part.model.predict(Z), expected.predict(Z))
     assert conditioned.weights == stacked.weights
-    assert leave_one_out(conditioned.subset_output([0])).Y.shape == (9, 1)
+    loo, (X, all_Y) = leave_one_out(conditioned), observations(conditioned)
+    torch.testing.assert_close(loo.Y, torch.cat([data[1], Y]), equal_nan=True)
+    torch.testing.assert_close(all_Y, loo.Y, equal_nan=True)
+    assert torch.equal(loo.log_density.isnan(), loo.Y.isnan())
+    assert X.shape == (9, 2)
+
+
+@pytest.mark.parametrize("holds_samples", [True, False])
+def test_conditioning_with_known_noise(data, Z, holds_samples):
+    """A stacked model of one model is that model, through two rounds and a fantasy."""
+    X, Y = data
+    model = CKA(X, Y, 0.1, physics=f_p)
+    model = held(model, 4, 0) if holds_samples else model
+    stacked = StackedGP({"CKA": model}, [[1.0, 1.0]], num_components=4)
+    noise, new_Y = torch.full((1, 2), 0.3, dtype=torch.float64), 2 * f_p(Z)
+    for k in range(2):
+        row = slice(k, k + 1)
+        model = model.condition_on_observations(Z[row], new_Y[row], noise=noise)
+        stacked = stacked.condition_on_observations(Z[row], new_Y[row], noise=noise)
+    for ours, theirs in zip(stacked.predict(X, True), model.predict(X, True), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    assert stacked.subset_output([1]).groups[0][0].data()["train_Yvar"].max() == pytest.approx(0.3)
+    torch.testing.assert_close(leave_one_out(stacked).mean, leave_one_out(model).mean)
+    with pytest.raises(ValueError, match="pass `noise`"):
+        stacked.condition_on_observations(Z, new_Y)
+
+
+@pytest.mark.parametrize("holds_samples", [True, False])
+def test_fantasies_of_each_component(data, models, weights, Z, holds_samples):
+    X, Y = data
+    other = PhysicsMeanGP(X, Y, 0.1, physics=f_p)
+    models["mean"] = held(other, 3, 0) if holds_samples else other
+    stacked = StackedGP(models, weights, num_components=4)
+    sampler = SobolQMCNormalSampler(torch.Size([3]), seed=0)
+    fantasies = stacked.fantasize(Z.unsqueeze(1), sampler)
+    sure = fantasies.posterior(Z.unsqueeze(1)).variance
+    assert sure.shape == (3, 5, 4, 1, 2)
+    assert (sure < stacked.posterior(Z.unsqueeze(1)).variance).all()
+    drawn = sampler(stacked.posterior(Z.unsqueeze(1), observation_noise=True))
+    moved = fantasies.posterior(Z.unsqueeze(1)).mean - stacked.posterior(Z.unsqueeze(1)).mean
+    drawn = drawn - stacked.posterior(Z.unsqueeze(1)).mean
+    assert (moved.sign() == drawn.sign()).all()  # each goes after its own observation
+    value = qNegIntegratedPosteriorVariance(stacked.subset_output([0]), X)(Z.unsqueeze(1))
+    assert value.shape == (5,)
 
 
 def test_acquisition_functions_average_over_the_components(data, models, weights, Z):
@@ -185,6 +231,11 @@ def test_it_tells_what_it_is_of(models, weights):
     assert "75% of y1: mean, PhysicsMeanGP of 'f_p'" in stacked.summary()
 
 
+def test_it_is_not_trained(models, weights):
+    with pytest.raises(RuntimeError, match="made of fitted models, and not trained"):
+        StackedGP(models, weights).train()
+
+
 def test_whole_numbers_by_the_largest_remainders():
     for weights, expected in (
         ([0.5, 0.3, 0.2], [4, 2, 2]),
@@ -202,11 +253,15 @@ def test_bad_input(data, models, weights, Z):
         (models, -weights, "not negative"),
         (models, weights / 2, "1 in all"),
         ({**models, "mean": PhysicsMeanGP(X[1:], Y[1:], physics=f_p)}, weights, "the same data"),
+        ({**models, "mean": PhysicsMeanGP(X + 1, Y, physics=f_p)}, weights, "the same data"),
+        ({**models, "mean": PhysicsMeanGP(X, 2 * Y, physics=f_p)}, weights, "the same data"),
     ):
         with pytest.raises(ValueError, match=says):
             StackedGP(given, share)
     with pytest.raises(TypeError, match="got a Linear as 'mean'"):
         StackedGP({**models, "mean": torch.nn.Linear(1, 1)}, weights)
+    with pytest.raises(TypeError, match="Expected weights as a tensor or lists"):
+        StackedGP(models, [[1.0], [0.5, 0.5]])
     with pytest.raises(ValueError, match="num_components"):
         StackedGP(models, weights, num_components=0)
     stacked = StackedGP(models, weights, num_components=4)
@@ -217,6 +272,17 @@ def test_bad_input(data, models, weights, Z):
     ):
         with pytest.raises(ValueError, match="Expected"):
             call()
+    new, noise = (Z[:2], Y[:2]), torch.ones(2, 2, dtype=torch.float64)
+    for error, options, says in (
+        (TypeError, {"nois": noise}, "unexpected keyword argument 'nois'"),
+        (TypeError, {"noise": 0.1}, "got 0.1; of one variance"),
+        (TypeError, {"noise": noise.float()}, "got a tensor in torch.float32"),
+        (ValueError, {"noise": noise[0]}, r"got shape \(2,\)"),
+        (ValueError, {"noise": -noise}, "not negative"),
+    ):
+        for model in (stacked, models["CKA"]):
+            with pytest.raises(error, match=says):
+                model.condition_on_observations(*new, **options)
 
 
 def test_observations_of_nothing_are_refused(build, uniform):

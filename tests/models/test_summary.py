@@ -42,6 +42,13 @@ def test_numbers_are_in_the_users_units(uniform):
     assert numbers(text, "log likelihood") == pytest.approx([expected], rel=1e-3)
 
 
+def test_a_mean_that_is_rounding_is_zero(uniform, monkeypatch):
+    X = uniform(8, 1)
+    model = ZeroMeanGP(X, X)
+    monkeypatch.setattr(ZeroMeanGP, "term_mean", lambda *args: 7e-19)
+    assert "f: mean 0\n" in model.summary()
+
+
 def test_bounds_and_learnt_means_are_told(uniform):
     X = uniform(8, 1)
     model = CKA(X, crude(X) + X.square(), physics=crude, rho_mean="learn")

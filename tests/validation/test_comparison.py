@@ -9,7 +9,7 @@ from botorch.models.transforms import Normalize
 
 from gpadjust import CKA, StackedGP, ZeroMeanGP, compare, fit
 from gpadjust.validation import STRUCTURES, Structure, leave_one_out, stacking_weights
-from gpadjust.validation.ranking import ranking
+from gpadjust.validation.ranking import Candidate, is_clear, ranking
 
 comparison_of = sys.modules["gpadjust.validation.comparison"]
 advice_of = sys.modules["gpadjust.validation.advice"]
@@ -60,7 +60,7 @@ def without_each(build, X, Y):
         rest = torch.arange(len(X)) != i
         model = build(X[rest], Y[rest])
         fit(model, "bayes", num_samples=128, num_starts=2, num_screened=32)
-        mean, variance = model._components(X[i : i + 1], True)
+        mean, variance = model.components(X[i : i + 1], True)
         normal = torch.distributions.Normal(mean, variance.sqrt())
         found.append(normal.log_prob(Y[i]).logsumexp(0) - math.log(128))
     return torch.cat(found).detach()
@@ -108,7 +108,9 @@ def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
     comparison = compare(X, Y, physics, structures=["zero mean", "CKA"], **QUICK)
     assert comparison.table["y1"][0].structure == "CKA"
     assert says(comparison, "y1: The physics helps")
-    assert says(comparison, "y2: The physics is not shown to help")
+    assert says(comparison, "y2: The physics ")
+    assert not says(comparison, "y2: The physics helps")
+    assert not says(comparison, "y2: Scaling the physics")
     assert says(comparison, "y1: The samples of CKA are of an approximation")
     assert says(comparison, "y2: The samples of zero mean")
     assert comparison.chosen == "stacked"
@@ -122,13 +124,47 @@ def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
     assert str(comparison).count("its error") == 2
 
 
-def test_units_make_no_difference(X, scaled):
+@pytest.mark.parametrize("variance", [None, 0.01], ids=["learnt noise", "known noise"])
+def test_units_make_no_difference(X, scaled, variance):
     Y = scaled[1]
-    small = compare(X, Y, crude, structures=["physics mean"], **QUICK)
-    large = compare(X, 1000 * Y, lambda X: 1000 * crude(X), structures=["physics mean"], **QUICK)
+    options = {"structures": ["physics mean"], **QUICK}
+    small = compare(X, Y, crude, variance, **options)
+    variance = None if variance is None else 1e6 * variance
+    large = compare(X, 1000 * Y, lambda X: 1000 * crude(X), variance, **options)
     small, large = row(small, "physics mean"), row(large, "physics mean")
     assert large.elpd == pytest.approx(small.elpd - len(X) * math.log(1000), abs=1e-3)
     assert large.rmse == pytest.approx(small.rmse, rel=1e-3)
+
+
+def test_rounding_errors_show_nothing(X):
+    names = ["physics mean", "CKA"]
+    comparison = compare(X, crude(X), crude, structures=names, **QUICK)
+    assert comparison.chosen == "stacked"
+    assert [row.weight for row in comparison.table["y"]] == pytest.approx([0.5, 0.5], abs=1e-3)
+    assert says(comparison, "Scaling the physics is not shown to help: elpd +0.0")
+
+
+def test_few_observations_show_no_structure_to_be_best(scaled):
+    X, Y = scaled
+    names = ["physics mean", "CKA"]
+    comparison = compare(X[::3], Y[::3], crude, structures=names, **QUICK)
+    assert comparison.chosen == "stacked"
+    assert says(comparison, "3 observations (of 8 at least)")
+    assert not says(comparison, "too few to fit again")
+    two = compare(X[:2], Y[:2], crude, structures=names, **QUICK)
+    assert says(two, "2 observations are too few to fit again without each")
+
+
+class TestClear:
+    best = Candidate("CKA", 9.0, 0.0, 0.0, 0.97, 0.1, 0.9)
+    worse = Candidate("zero mean", 1.0, -8.0, 3.0, 0.03, 1.0, 0.9)
+
+    def test_by_weight_errors_and_numbers(self):
+        assert is_clear([self.best, self.worse], 8)
+        assert not is_clear([self.best, self.worse], 7)
+        assert not is_clear([self.best, self.worse._replace(se_diff=4.1)], 8)
+        assert not is_clear([self.best._replace(weight=0.9), self.worse], 8)
+        assert is_clear([self.best], 2)
 
 
 def test_with_many_points_samples_are_weighted():
@@ -146,6 +182,25 @@ class TestAdvice:
         assert says(comparison, "The physics is not shown to help")
         assert says(comparison, "not shown to be worse")
         assert comparison.chosen == "stacked"
+
+    def test_a_physics_that_is_worse_than_none(self):
+        names = {structure.name: structure for structure in STRUCTURES}
+        density = {"zero mean": 4.0, "constant rho": 2.0, "CKA": 1.0, "physics mean": -9.0}
+        values = {n: torch.tensor([v, v + 0.1]).double() for n, v in density.items()}
+        (sentence,) = advice_of._gains(names, [*density], values)
+        assert sentence.startswith("The physics makes predictions worse: elpd -4.0 +- 0.0 nats (c")
+        values["constant rho"] = values["zero mean"] + torch.tensor([1.0, -1.0])
+        (sentence,) = advice_of._gains(names, [*density], values)
+        assert sentence.startswith("The physics is not shown to help: elpd +0.0")
+        values["constant rho"] = values["zero mean"] + 1
+        (sentence,) = advice_of._gains(names, [*density], values)
+        assert sentence.endswith("its unknown constants may do so by themselves.")
+        values["CKA"] = values["zero mean"] + 1
+        both = advice_of._gains(names, [*density], values)
+        assert [sentence.partition(":")[0] for sentence in both] == [
+            "The physics helps",
+            "Scaling the physics helps",
+        ]
 
     def test_a_smooth_bias(self, X, noise):
         Y, names = crude(X) + X.exp() + noise, ["physics mean", "CKA"]

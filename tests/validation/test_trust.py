@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust import AR1, CKA, BiasGP, ZeroMeanGP, fit
+from gpadjust import AR1, CKA, BiasGP, StackedGP, ZeroMeanGP, fit
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.validation import Trust, trust
 from gpadjust.validation.plots import plot_trust, plot_trust_pair
@@ -160,6 +160,11 @@ def test_bad_input(half, data):
     for call, error, says in (
         (lambda: trust(ZeroMeanGP(X, Y)), TypeError, "could trust, such as CKA, got ZeroMeanGP"),
         (lambda: trust(AR1(X, Y, low_X=X, low_Y=Y)), TypeError, "got AR1"),
+        (
+            lambda: trust(StackedGP({"CKA": half}, [[1.0] * half.num_outputs])),
+            TypeError,
+            r"got a StackedGP.*comparison\.models\['CKA'\]",
+        ),
         (lambda: trust("CKA"), TypeError, "of LearnedDynamics pass its `model`"),
         (lambda: trust(half, X), ValueError, "columns"),
         (lambda: trust(half, X[:0, :1]), ValueError, "one point or more"),

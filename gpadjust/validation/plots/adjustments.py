@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.validation.leave_one_out import training_data
+from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     GREY,
     RED,
@@ -191,7 +191,7 @@ def _symbol(name: str) -> str:
 
 def _domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Tensor, Tensor, str]:
     """Inputs at which the output was observed, the range, the base point, and whose they are."""
-    X, Y = training_data(model)
+    X, Y = observations(model)
     d, num_outputs = X.shape[-1], Y.shape[-1]
     seen = ~column(Y, output).isnan()
     if bounds is None:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust.physics import JoinedPhysics
-from gpadjust.validation.leave_one_out import LeaveOneOut, training_data
+from gpadjust.validation.leave_one_out import LeaveOneOut, observations
 from gpadjust.validation.plots.drawing import (
     BAND,
     BLUE,
@@ -100,7 +100,7 @@ def plot_prediction(
     if Y is not None:
         order = order[seen[order]]
         ax.plot(X[order, 0].detach(), truth[order], color="black", lw=1, ls=":", label="truth")
-    train_X, train_Y = training_data(model)
+    train_X, train_Y = observations(model)
     y = column(train_Y, output)
     ax.plot(train_X[~y.isnan(), 0], y[~y.isnan()], color=RED, **DOTS, label="data")
     ax.set(xlabel=labels(model, "input", 1)[0], ylabel=label)
