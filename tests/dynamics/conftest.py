@@ -51,6 +51,7 @@ def cart_pole_system():
     return CartPole()
 
 
+FEW_SAMPLES = {"num_starts": 1, "num_screened": 8, "num_samples": 3, "num_draws": 16}
 _MODELS = {
     "GP": ZeroMeanGP,
     "PhysicsMean": PhysicsMeanGP,
@@ -80,10 +81,11 @@ def costly_kind(request):
 
 @pytest.fixture
 def make():
-    """Makes dynamics by the name of their model, with a quick search."""
+    """Makes dynamics by the name of their model, with a quick search and few samples."""
 
     def make(kind, spec, physics, **options):
-        options.setdefault("fit_options", {"num_starts": 4, "num_screened": 32})
+        sampled = FEW_SAMPLES if kind != "RRA-paper" else {"num_starts": 1, "num_screened": 8}
+        options.setdefault("fit_options", sampled)
         if kind.startswith("RRA"):
             options.setdefault("model_options", {"num_features": 32})
         physics = None if kind == "GP" else physics

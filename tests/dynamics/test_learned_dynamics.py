@@ -27,7 +27,9 @@ def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
 
 def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
     system = cart_pole_system
-    dynamics = make(kind, system.spec, system.crude)
+    fit_options = {"num_starts": 2, "num_screened": 16, "num_draws": 64} if kind == "RRA" else None
+    options = {"fit_options": fit_options} if fit_options else {}
+    dynamics = make(kind, system.spec, system.crude, **options)
     assert not dynamics.is_fitted
     for seed in range(2):
         dynamics.update(*system.trial(seed))
@@ -185,7 +187,7 @@ def test_a_model_of_the_user(cart_pole_system):
     system = cart_pole_system
 
     def dynamics(**options):
-        fit_options = {"num_starts": 1, "num_screened": 8}
+        fit_options = {"method": "map", "num_starts": 1, "num_screened": 8}
         options.setdefault("model_options", {"waves": 2, "center": 0.0})
         return LearnedDynamics(
             system.spec, system.crude, model=WavyCKA, fit_options=fit_options, **options
@@ -244,7 +246,7 @@ def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     dynamics = make(kind, system.spec, system.crude)
     states, actions, next_states = system.trial(0, 12)
     dynamics.update(states, actions, next_states + 0.02 * torch.randn_like(next_states))
-    k = 600
+    k = 300
     state, action = (t[:3] for t in system.trial(1)[:2])
     mean, variance = dynamics.predict(state, action, observation_noise=False)
     functions = dynamics.sample_functions(k, seed=0)
@@ -256,7 +258,7 @@ def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     torch.testing.assert_close(one, drawn[:, :1])
     error = (drawn.mean(0) - mean) / variance.sqrt()
     assert error.abs().max() < 5 / math.sqrt(k)
-    torch.testing.assert_close(drawn.var(0) / variance, torch.ones_like(mean), rtol=0, atol=0.3)
+    torch.testing.assert_close(drawn.var(0) / variance, torch.ones_like(mean), rtol=0, atol=0.4)
 
 
 def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, kind):

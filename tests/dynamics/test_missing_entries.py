@@ -137,12 +137,12 @@ def test_declared_states_are_checked_where_they_were_measured():
         dynamics.update(states, actions, following)
 
 
-def test_a_physics_of_differences_is_still_found_out(cart_pole_system, holed):
+def test_a_physics_of_differences_is_still_found_out(cart_pole_system, make, holed):
     system = cart_pole_system
 
     def change(X):
         return system.crude(X) - X[:, :4]
 
-    for dynamics in (LearnedDynamics(system.spec, change), PhysicsDynamics(system.spec, change)):
+    for dynamics in (make("CKA", system.spec, change), PhysicsDynamics(system.spec, change)):
         with pytest.warns(UserWarning, match="seems to return the change"):
             dynamics.update(*holed)

@@ -91,7 +91,7 @@ def test_functions_and_information(cart_pole_system, make, still):
     assert TrajectoryInformation(dynamics)(states, actions) > 0
 
 
-def test_each_part_is_checked(cart_pole_system, still):
+def test_each_part_is_checked(cart_pole_system, make, still):
     system = cart_pole_system
     change = ODEPhysics(lambda s, a: s, 0.1, 4, difference=True)
     with pytest.raises(ValueError, match="difference=False"):
@@ -99,8 +99,8 @@ def test_each_part_is_checked(cart_pole_system, still):
     with pytest.raises(ValueError, match="Expected one physics to follow"):
         PhysicsDynamics(system.spec, [system.crude, still])
     assert PhysicsDynamics(system.spec, JoinedPhysics([still])).is_fitted
-    dynamics = LearnedDynamics(
-        system.spec, {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
+    dynamics = make(
+        "CKA", system.spec, {"rod": system.crude, "late": lambda X: system.crude(X) - X[:, :4]}
     )
     with pytest.warns(UserWarning, match="'late' seems to return the change"):
         dynamics.update(*system.trial(0))

@@ -13,6 +13,7 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC
 
 POINT_SPEC = StateSpec(["x"], ["v"])
+FEW_SAMPLES = {"num_starts": 1, "num_screened": 0, "num_samples": 3, "num_draws": 16}
 
 
 class Point(gymnasium.Env):
@@ -53,9 +54,15 @@ def point_dynamics():
 
 
 @pytest.fixture
-def learnt_dynamics(point_dynamics):
+def crude_dynamics(point_dynamics):
+    """Makes dynamics that learn the point from a physics, with a quick search and few samples."""
+    return lambda physics: LearnedDynamics(point_dynamics.spec, physics, fit_options=FEW_SAMPLES)
+
+
+@pytest.fixture
+def learnt_dynamics(crude_dynamics):
     """Makes dynamics that learn the point from a physics that errs."""
-    return lambda: LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
+    return lambda: crude_dynamics(lambda X: X[:, :1] + 0.4 * X[:, 1:])
 
 
 @pytest.fixture
@@ -76,7 +83,10 @@ def point_task(point_dynamics, point_reward):
 
 @pytest.fixture
 def point_agent(point_env, point_task):
-    """Makes an agent for the point; parts of the task, options and arguments can be given."""
+    """Makes an agent for the point; parts of the task, options and arguments can be given.
+
+    It scores no trajectories, unless ``score_horizons`` are given.
+    """
 
     def make(env=None, algorithm=DynaSAC, **given):
         def taken(kind, **defaults):
@@ -84,7 +94,7 @@ def point_agent(point_env, point_task):
             return {**defaults, **{name: given.pop(name) for name in names}}
 
         task = given.pop("task", None) or point_task(**taken(Task))
-        options = DynaOptions(**taken(DynaOptions, model_episodes=2))
+        options = DynaOptions(**taken(DynaOptions, model_episodes=2, score_horizons=()))
         defaults = {
             "policy": "MlpPolicy",
             "batch_size": 8,

@@ -261,13 +261,13 @@ def test_cart_pole(cart_pole):
     dynamics = LearnedDynamics(
         CART_POLE_SPEC,
         random_cart_pole_physics(0),
-        fit_options={"num_screened": 8, "num_starts": 1},
+        fit_options={"num_screened": 8, "num_starts": 1, "num_samples": 3, "num_draws": 16},
     )
     agent = DynaSAC(
         "MlpPolicy",
         cart_pole(),
         Task(dynamics, cart_pole_reward),
-        DynaOptions(model_episodes=1, sampling="trajectory"),
+        DynaOptions(model_episodes=1, sampling="trajectory", score_horizons=()),
         batch_size=8,
         policy_kwargs={"net_arch": [8]},
         seed=0,
@@ -569,13 +569,14 @@ def test_parameters_without_dynamics_are_refused_unless_told(saved, point_agent,
     assert not other.task.dynamics.is_fitted
 
 
-def test_a_task_that_is_given_after_loading_knows_what_was_learnt(saved, point_env, point_task):
+def test_a_task_that_is_given_after_loading_knows_what_was_learnt(
+    saved, point_env, point_task, crude_dynamics
+):
     agent, path = saved
     loaded = DynaSAC.load(path, env=point_env())
     known = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
     loaded.set_parameters(known, exact_match=False)
-    spec = agent.task.dynamics.spec
-    loaded.task = point_task(dynamics=LearnedDynamics(spec, agent.task.dynamics.physics))
+    loaded.task = point_task(dynamics=crude_dynamics(agent.task.dynamics.physics))
     loaded.learn(5, reset_num_timesteps=False)
     assert loaded.task.dynamics.num_transitions == 15
 
@@ -590,9 +591,9 @@ def test_parameters_are_taken_as_a_whole(saved, point_agent, learnt_dynamics, te
     assert other.task.dynamics.num_transitions == 5
 
 
-def test_another_physics_is_not_loaded(saved, point_task, point_dynamics):
+def test_another_physics_is_not_loaded(saved, point_task, crude_dynamics):
     _, path = saved
-    other = LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.1 * X[:, 1:])
+    other = crude_dynamics(lambda X: X[:, :1] + 0.1 * X[:, 1:])
     with pytest.raises(RuntimeError, match="physics"):
         DynaSAC.load(path, task=point_task(dynamics=other))
 
@@ -619,7 +620,7 @@ def test_a_wrong_reward_is_mended_and_nothing_is_lost(point_agent, point_task, l
 
 @pytest.mark.parametrize("fails", ["fit", "rollout"])
 def test_a_physics_that_fails_for_a_while_loses_no_transition(
-    point_agent, point_dynamics, fails, monkeypatch
+    point_agent, crude_dynamics, fails, monkeypatch
 ):
     """Where the dynamics learn, or after that, where particles move."""
     broken = []
@@ -629,7 +630,7 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(
             raise PhysicsError("the simulator's licence has expired")
         return X[:, :1] + 0.4 * X[:, 1:]
 
-    dynamics = LearnedDynamics(point_dynamics.spec, physics)
+    dynamics = crude_dynamics(physics)
     agent = point_agent(dynamics=dynamics)
     agent.learn(5)
     if fails == "rollout":
@@ -655,14 +656,14 @@ def test_other_dynamics_learn_all_that_there_is(point_agent, point_task, learnt_
     assert other.num_transitions == 15
 
 
-def test_transitions_at_which_the_physics_fails_are_left_out(point_agent, point_dynamics):
+def test_transitions_at_which_the_physics_fails_are_left_out(point_agent, crude_dynamics):
     def physics(X):
         bad = (X[:, 0] < 0.4).nonzero().flatten().tolist()
         if bad:
             raise PhysicsError("not below .4", bad)
         return X[:, :1] + 0.4 * X[:, 1:]
 
-    dynamics = LearnedDynamics(point_dynamics.spec, physics)
+    dynamics = crude_dynamics(physics)
     agent = point_agent(dynamics=dynamics)
     with pytest.warns(UserWarning, match=r"fails at \d of \d new transitions"):
         agent.learn(20)
@@ -927,7 +928,7 @@ def test_trajectories_are_scored_before_they_are_learnt(point_agent, learnt_dyna
 
 
 def test_without_doubt_energies_alone_are_logged(point_agent):
-    scores = {name for name in logged_of(point_agent(), 1) if "_" in name}
+    scores = {name for name in logged_of(point_agent(score_horizons=(1, 5)), 1) if "_" in name}
     assert scores >= {"model/energy_1", "model/energy_5"}
     assert not any("nlpd" in name or "coverage" in name for name in scores)
 
@@ -951,7 +952,7 @@ class Stiff(Own):
 def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(
     point_agent, point_dynamics
 ):
-    agent = point_agent(dynamics=Stiff(point_dynamics.spec))
+    agent = point_agent(dynamics=Stiff(point_dynamics.spec), score_horizons=(1, 5))
     with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass DynaOptions"):
         logged = logged_of(agent, 1)
     assert "model/coverage" in logged

@@ -19,15 +19,6 @@ FEW = CrossEntropyPlanner(
 TOTAL = 20  # four episodes of the point
 
 
-@pytest.fixture
-def learnt_dynamics(point_dynamics):
-    """Makes dynamics that learn the point from a physics that errs, with a quick search."""
-    quick = {"num_starts": 1, "num_screened": 0}
-    return lambda: LearnedDynamics(
-        point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=quick
-    )
-
-
 class PowerCut(Exception):  # noqa: N818
     pass
 
