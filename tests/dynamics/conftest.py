@@ -68,7 +68,7 @@ def kind(request):
     return request.param
 
 
-_QUICK = ["GP", "CKA"]
+_QUICK = ["CKA", "RRA"]
 
 
 @pytest.fixture(

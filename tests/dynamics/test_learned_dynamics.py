@@ -12,7 +12,9 @@ from gpadjust.models import AdjustedGP, Adjustment
 from gpadjust.models.hyperparameters import scaled_rbf
 from gpadjust.physics import ODEPhysics
 
-pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+)
 
 
 def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
@@ -240,7 +242,7 @@ def test_samples_scatter_as_predicted(cart_pole_system, make):
     assert (noise_free < variance).all()
 
 
-@pytest.mark.parametrize("kind", ["GP", "CKA", "RRA"])
+@pytest.mark.parametrize("kind", [pytest.param("GP", marks=pytest.mark.slow), "CKA", "RRA"])
 def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     system = cart_pole_system
     dynamics = make(kind, system.spec, system.crude)
@@ -261,9 +263,9 @@ def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     torch.testing.assert_close(drawn.var(0) / variance, torch.ones_like(mean), rtol=0, atol=0.4)
 
 
-def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, kind):
+def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, costly_kind):
     system = cart_pole_system
-    dynamics = make(kind, system.spec, system.crude)
+    dynamics = make(costly_kind, system.spec, system.crude)
     dynamics.update(*system.trial(0, 12))
     functions = dynamics.model.sample_functions(3, seed=0)
     states, actions = (t[:6].reshape(3, 2, -1) for t in system.trial(1)[:2])

@@ -11,7 +11,9 @@ from gpytorch.kernels import MaternKernel, ScaleKernel
 from gpadjust import fit
 from gpadjust.inference.warm_start import warm_start
 
-pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+)
 
 
 def stored(dynamics):

@@ -8,7 +8,9 @@ import torch
 from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 
-pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+)
 
 
 @pytest.fixture

@@ -8,7 +8,9 @@ import torch
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, TrajectoryInformation
 from gpadjust.physics import JoinedPhysics, ODEPhysics, PhysicsError
 
-pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+)
 SEVERAL = ["PhysicsMean", "Scale", "CKA", "RRA", "RRA-paper"]
 
 
@@ -18,7 +20,10 @@ def still():
     return lambda X: X[:, :4] + 0.1 * torch.cat([X[:, 2:4], torch.zeros_like(X[:, 2:4])], -1)
 
 
-@pytest.mark.parametrize("kind", SEVERAL)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(k, marks=() if k in ("CKA", "RRA") else pytest.mark.slow) for k in SEVERAL],
+)
 def test_every_structure_takes_several(cart_pole_system, make, still, kind):
     system = cart_pole_system
     dynamics = make(kind, system.spec, {"rod": system.crude, "still": still})

@@ -125,7 +125,10 @@ def test_equal_seeds_give_equal_trajectories():
     assert not np.array_equal(first.reset(seed=3)[0], first.reset()[0])
 
 
-@pytest.mark.parametrize("render_mode", [None, "rgb_array", "human"])
+# A window takes its time.
+@pytest.mark.parametrize(
+    "render_mode", [None, "rgb_array", pytest.param("human", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("duplicate", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
 def test_copy_goes_on_as_the_original(render_mode, duplicate):
     env = gym.make(ID, render_mode=render_mode)

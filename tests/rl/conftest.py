@@ -85,7 +85,7 @@ def point_task(point_dynamics, point_reward):
 def point_agent(point_env, point_task):
     """Makes an agent for the point; parts of the task, options and arguments can be given.
 
-    It scores no trajectories, unless ``score_horizons`` are given.
+    It scores no trajectories, and makes an update for five steps in the model, unless it is told.
     """
 
     def make(env=None, algorithm=DynaSAC, **given):
@@ -94,7 +94,8 @@ def point_agent(point_env, point_task):
             return {**defaults, **{name: given.pop(name) for name in names}}
 
         task = given.pop("task", None) or point_task(**taken(Task))
-        options = DynaOptions(**taken(DynaOptions, model_episodes=2, score_horizons=()))
+        few = {"model_episodes": 2, "updates_per_model_step": 0.2, "score_horizons": ()}
+        options = DynaOptions(**taken(DynaOptions, **few))
         defaults = {
             "policy": "MlpPolicy",
             "batch_size": 8,

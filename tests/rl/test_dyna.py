@@ -69,7 +69,7 @@ def model_rows(agent):
     ],
 )
 def test_updates_are_as_many_as_promised(point_agent, options, updates):
-    agent = point_agent(**options).learn(15)
+    agent = point_agent(**{"updates_per_model_step": 1} | options).learn(15)
     assert agent._n_updates == updates
 
 
@@ -120,7 +120,9 @@ def test_episodes_that_terminate_in_the_model_end_there(point_agent, point_env):
 
 @pytest.mark.parametrize("keep", [False, True])
 def test_after_last_model_episode_batches_hold_model_rows_only_if_kept(point_agent, keep):
-    agent = point_agent(last_model_episode=2, keep_model_data=keep, real_fraction=0.0)
+    agent = point_agent(
+        last_model_episode=2, keep_model_data=keep, real_fraction=0.0, updates_per_model_step=1
+    )
     mixed = []
     sample = agent.replay_buffer.sample
 
@@ -226,7 +228,10 @@ def test_a_first_episode_of_a_single_step_waits_for_the_second(
 ):
     dynamics = learnt_dynamics()
     agent = point_agent(
-        point_env(end=-9), terminated=lambda states: states[:, 0] > -9, dynamics=dynamics
+        point_env(end=-9),
+        terminated=lambda states: states[:, 0] > -9,
+        dynamics=dynamics,
+        updates_per_model_step=1,
     )
     assert agent.learn(1).num_episodes == 0
     agent.learn(2, reset_num_timesteps=False)
@@ -251,6 +256,7 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
         gamma=0.5,
         tau=0.05,
         policy_kwargs={"net_arch": [16]},
+        updates_per_model_step=1,
     )
     before = cost(agent)
     agent.learn(30)
@@ -375,7 +381,12 @@ def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynam
         point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
     )
     starts = torch.tensor([[0.6], [1.4], [0.8]])
-    agent = point_agent(dynamics=runaway, model_episodes=3, initial_states=lambda n: starts[:n])
+    agent = point_agent(
+        dynamics=runaway,
+        model_episodes=3,
+        initial_states=lambda n: starts[:n],
+        updates_per_model_step=1,
+    )
     agent.learn(5)
     assert agent.logger.name_to_value["model/left_bounds"] == 1
     assert model_rows(agent) == 1 + 2 * 5
@@ -865,7 +876,7 @@ def test_target_networks_are_updated_as_seldom_as_told(point_agent, monkeypatch)
     monkeypatch.setattr(
         SAC, "train", lambda agent, n, batch: chunks.append(n) or train(agent, n, batch)
     )
-    agent = point_agent(target_update_interval=10).learn(10)
+    agent = point_agent(target_update_interval=10, updates_per_model_step=1).learn(10)
     assert chunks == [5, 10, 5, 10]
     assert agent.owed_updates == 0
 
