@@ -150,7 +150,7 @@ class TestFailures:
         [
             (throw(OSError("no gas")), "OSError: no gas"),
             (lambda Y: Y * float("nan"), r"measured \[nan\]"),
-            (lambda Y: Y + float("inf"), r"measured \[inf\]"),
+            pytest.param(lambda Y: Y + float("inf"), r"measured \[inf\]", marks=pytest.mark.slow),
         ],
     )
     def test_they_are_skipped_and_counted(self, laboratory, tmp_path, what, message):

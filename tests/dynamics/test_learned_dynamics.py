@@ -16,6 +16,11 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
 )
 
+KINDS = ["CKA", "RRA"]
+KINDS += [
+    pytest.param(k, marks=pytest.mark.slow) for k in ("GP", "PhysicsMean", "Scale", "RRA-paper")
+]
+
 
 def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
     system = cart_pole_system
@@ -27,6 +32,7 @@ def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
         torch.testing.assert_close(mean, next_states, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", KINDS)
 def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
     system = cart_pole_system
     fit_options = {"num_starts": 2, "num_screened": 16, "num_draws": 64} if kind == "RRA" else None

@@ -95,8 +95,8 @@ def _few_targets(monkeypatch):
     [
         (CartPole(settings=TINY), "mf", 10),
         (CartPole(settings=TINY), "cka", 24),
-        (Exploration(settings=TINY_PLANS), "gp-info", 24),
-        (Arm(settings=TINY_ARM), "cka-memory", 7),
+        pytest.param(Exploration(settings=TINY_PLANS), "gp-info", 24, marks=pytest.mark.slow),
+        pytest.param(Arm(settings=TINY_ARM), "cka-memory", 7, marks=pytest.mark.slow),
     ],
 )
 def test_an_interrupted_run_gives_the_numbers_of_another(tmp_path, experiment, name, step):

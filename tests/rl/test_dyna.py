@@ -422,12 +422,21 @@ def test_progress_bar(point_agent, capsys):
 # Saving and loading
 
 
+@pytest.fixture(scope="module")
+def once():
+    """What is made once for several tests, none of which changes it."""
+    return {}
+
+
 @pytest.fixture
-def saved(point_agent, learnt_dynamics, tmp_path):
+def saved(once, point_agent, learnt_dynamics, tmp_path_factory):
     """An agent after two episodes, and its file."""
-    agent = point_agent(dynamics=learnt_dynamics()).learn(10)
-    agent.save(tmp_path / "agent")
-    return agent, tmp_path / "agent.zip"
+    if not once:
+        agent = point_agent(dynamics=learnt_dynamics()).learn(10)
+        path = tmp_path_factory.mktemp("saved") / "agent.zip"
+        agent.save(path)
+        once["saved"] = agent, path
+    return once["saved"]
 
 
 def test_a_loaded_agent_predicts_the_same(saved):

@@ -108,13 +108,9 @@ def test_an_episode_can_be_planned_anew(point_agent, learnt_dynamics, monkeypatc
 
 
 def test_without_exploration_nothing_changes(point_agent, learnt_dynamics, assert_same):
-    plain = point_agent(dynamics=learnt_dynamics()).learn(TOTAL)
-    none = point_agent(dynamics=learnt_dynamics(), exploration=None, explore_episodes=7).learn(
-        TOTAL
-    )
-    never = point_agent(dynamics=learnt_dynamics(), exploration=FEW, explore_episodes=0).learn(
-        TOTAL
-    )
+    plain = point_agent(dynamics=learnt_dynamics()).learn(10)
+    none = point_agent(dynamics=learnt_dynamics(), exploration=None, explore_episodes=7).learn(10)
+    never = point_agent(dynamics=learnt_dynamics(), exploration=FEW, explore_episodes=0).learn(10)
     assert_same(plain, none)
     assert_same(plain, never)
 
@@ -123,18 +119,25 @@ def test_two_runs_are_the_same_and_not_those_of_the_policy(
     point_agent, learnt_dynamics, assert_same
 ):
     one, other = (
-        point_agent(dynamics=learnt_dynamics(), exploration=FEW).learn(TOTAL) for _ in range(2)
+        point_agent(dynamics=learnt_dynamics(), exploration=FEW).learn(15) for _ in range(2)
     )
     assert_same(one, other)
-    plain = point_agent(dynamics=learnt_dynamics()).learn(TOTAL)
+    plain = point_agent(dynamics=learnt_dynamics()).learn(10)
     rows = slice(0, 5), slice(5, 10)
     for row, same in zip(rows, (True, False), strict=True):
         actions = (agent.replay_buffer.actions[row] for agent in (one, plain))
         assert np.array_equal(*actions) == same
 
 
-@pytest.mark.parametrize("step", [8, 13])
-@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize(
+    ("step", "normalised"),
+    [
+        (8, False),
+        (13, True),
+        pytest.param(8, True, marks=pytest.mark.slow),
+        pytest.param(13, False, marks=pytest.mark.slow),
+    ],
+)
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
     point_agent, point_env, learnt_dynamics, point_task, assert_same, tmp_path, step, normalised
 ):
