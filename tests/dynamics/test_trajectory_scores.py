@@ -110,7 +110,9 @@ def test_each_particle_keeps_its_function_and_noise_comes_once(uniform, noise):
         assert scores.energy[i].item() == pytest.approx(gaussian.item(), rel=0.1)
 
 
-@pytest.mark.parametrize("num_functions", [39, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "num_functions", [39, *(pytest.param(n, marks=pytest.mark.slow) for n in (50, 79))]
+)
 def test_the_coverage_of_a_calibrated_model_is_nominal(uniform, num_functions):
     """The rate of each of many seeds is one more draw of the rates of its functions."""
     rates = 0.1 * torch.randn(200, dtype=torch.float64)
