@@ -13,7 +13,8 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC
 
 POINT_SPEC = StateSpec(["x"], ["v"])
-FEW_SAMPLES = {"num_starts": 1, "num_screened": 0, "num_samples": 3, "num_draws": 16}
+QUICK = {"num_starts": 1, "num_screened": 0}
+FEW_SAMPLES = {**QUICK, "num_samples": 3, "num_draws": 16}
 
 
 class Point(gymnasium.Env):
@@ -55,14 +56,23 @@ def point_dynamics():
 
 @pytest.fixture
 def crude_dynamics(point_dynamics):
-    """Makes dynamics that learn the point from a physics, with a quick search and few samples."""
-    return lambda physics: LearnedDynamics(point_dynamics.spec, physics, fit_options=FEW_SAMPLES)
+    """Makes dynamics that learn the point from a physics, by a quick search."""
+    quick = {"method": "map", **QUICK}
+    return lambda physics: LearnedDynamics(point_dynamics.spec, physics, fit_options=quick)
 
 
 @pytest.fixture
 def learnt_dynamics(crude_dynamics):
     """Makes dynamics that learn the point from a physics that errs."""
     return lambda: crude_dynamics(lambda X: X[:, :1] + 0.4 * X[:, 1:])
+
+
+@pytest.fixture
+def sampled_dynamics(point_dynamics):
+    """As `learnt_dynamics`, by full Bayes, with few samples."""
+    return lambda: LearnedDynamics(
+        point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=FEW_SAMPLES
+    )
 
 
 @pytest.fixture

@@ -62,11 +62,11 @@ def wrapped(point_env):
 
 
 @pytest.fixture
-def kind_of_dynamics(point_dynamics, learnt_dynamics):
+def kind_of_dynamics(point_dynamics, sampled_dynamics):
     """Makes dynamics of a kind."""
 
     def make(kind):
-        return point_dynamics if kind == "physics" else learnt_dynamics()
+        return point_dynamics if kind == "physics" else sampled_dynamics()
 
     return make
 

@@ -136,8 +136,8 @@ def test_after_last_model_episode_batches_hold_model_rows_only_if_kept(point_age
     assert model_rows(agent) == 2 * 2 * 5
 
 
-def test_a_long_run_in_pieces_goes_on(point_agent, learnt_dynamics):
-    dynamics = learnt_dynamics()
+def test_a_long_run_in_pieces_goes_on(point_agent, sampled_dynamics):
+    dynamics = sampled_dynamics()
     agent = point_agent(dynamics=dynamics)
     for total in (10, 20):  # the second call counts time steps from zero again
         agent.learn(10)
@@ -349,8 +349,8 @@ def test_normalised_observations_are_what_the_policy_sees_in_the_model(
     np.testing.assert_allclose(in_model[0], env.normalize_obs(start), rtol=1e-6)
 
 
-def test_two_runs_are_the_same(point_agent, learnt_dynamics, assert_same):
-    agents = [point_agent(dynamics=learnt_dynamics(), seed=3).learn(10) for _ in range(2)]
+def test_two_runs_are_the_same(point_agent, sampled_dynamics, assert_same):
+    agents = [point_agent(dynamics=sampled_dynamics(), seed=3).learn(10) for _ in range(2)]
     assert_same(*agents)
 
 
@@ -463,9 +463,12 @@ def test_with_dynamics_but_no_environment_it_says_so(saved, learnt_dynamics, poi
         loaded.learn(5)
 
 
-def test_with_dynamics_a_loaded_agent_goes_on(saved, point_env, learnt_dynamics, point_task):
-    agent, path = saved
-    dynamics = learnt_dynamics()
+def test_with_dynamics_a_loaded_agent_goes_on(
+    point_agent, point_env, sampled_dynamics, point_task, tmp_path
+):
+    agent, path = point_agent(dynamics=sampled_dynamics()).learn(10), tmp_path / "agent.zip"
+    agent.save(path)
+    dynamics = sampled_dynamics()
     loaded = DynaSAC.load(path, env=point_env(), task=point_task(dynamics=dynamics))
     x = torch.linspace(0, 1, 5).double()[:, None]
     for one, other in zip(dynamics.predict(x, x), agent.task.dynamics.predict(x, x), strict=True):
@@ -933,8 +936,8 @@ def logged_of(agent, episodes):
     return {name for name in agent.logger.name_to_value if name.startswith("model/")}
 
 
-def test_trajectories_are_scored_before_they_are_learnt(point_agent, learnt_dynamics):
-    agent = point_agent(dynamics=learnt_dynamics(), score_horizons=(4, 2, 9))
+def test_trajectories_are_scored_before_they_are_learnt(point_agent, sampled_dynamics):
+    agent = point_agent(dynamics=sampled_dynamics(), score_horizons=(4, 2, 9))
     assert agent.options.score_horizons == (2, 4, 9)
     scores = {f"model/{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (2, 4, 9)}
     assert not logged_of(agent, 1) & scores
@@ -953,9 +956,9 @@ def test_without_doubt_energies_alone_are_logged(point_agent):
     assert not any("nlpd" in name or "coverage" in name for name in scores)
 
 
-def test_to_score_trajectories_changes_nothing(point_agent, learnt_dynamics, assert_same):
+def test_to_score_trajectories_changes_nothing(point_agent, sampled_dynamics, assert_same):
     one, other = (
-        point_agent(dynamics=learnt_dynamics(), score_horizons=horizons).learn(15)
+        point_agent(dynamics=sampled_dynamics(), score_horizons=horizons).learn(15)
         for horizons in ((1, 5), ())
     )
     assert not any("energy" in name for name in other.logger.name_to_value)

@@ -158,7 +158,7 @@ def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
 
 
 def test_a_run_that_was_interrupted_within_plans(
-    point_agent, point_env, learnt_dynamics, point_task, assert_same, tmp_path
+    point_agent, point_env, sampled_dynamics, point_task, assert_same, tmp_path
 ):
     """Of two environments whose episodes end at once, checkpoints lie in the middle of them."""
 
@@ -168,7 +168,7 @@ def test_a_run_that_was_interrupted_within_plans(
             Information(), num_random=4, num_policy=2, rounds=0, replan_every=2
         )
         return point_agent(
-            env, dynamics=learnt_dynamics(), exploration=options, train_freq=(3, "step")
+            env, dynamics=sampled_dynamics(), exploration=options, train_freq=(3, "step")
         )
 
     path, watched = tmp_path / "run.ckpt", Watches()
@@ -177,7 +177,7 @@ def test_a_run_that_was_interrupted_within_plans(
     with pytest.raises(PowerCut):
         make().learn(36, [EpisodeCheckpoint(path), Watches(cut=28)])
     env = DummyVecEnv([point_env, point_env])
-    second = resume(path, env, point_task(dynamics=learnt_dynamics()))
+    second = resume(path, env, point_task(dynamics=sampled_dynamics()))
     assert second.num_timesteps == 24
     assert any(episode is not None for episode in second.planned.under_way.values())
     second.learn(12, reset_num_timesteps=False)
