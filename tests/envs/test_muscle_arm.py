@@ -418,9 +418,13 @@ def test_nothing_is_printed_and_no_log_is_written(tmp_path):
 
 
 def test_without_opensim_only_the_arm_is_missing(tmp_path):
+    """And an id with the package needs no import of it."""
     code = (
         "import sys; sys.modules['opensim'] = None\n"
-        "import gpadjust, gpadjust.envs, gymnasium\n"
+        "import gpadjust\n"
+        "assert not {'gymnasium', 'gpadjust.envs'} & set(sys.modules)\n"
+        "import gymnasium\n"
+        "print(gymnasium.make('gpadjust.envs:gpadjust/CartPoleSwingUp-v0').unwrapped)\n"
         "gpadjust.envs.torque_arm_physics()\n"
         "makers = [lambda: gymnasium.make('gpadjust/MuscleArm-v0'), "
         "gpadjust.envs.opensim_arm_physics]\n"
@@ -431,7 +435,9 @@ def test_without_opensim_only_the_arm_is_missing(tmp_path):
     run = python(code, tmp_path)
     assert run.returncode == 0, run.stderr
     message = 'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
-    assert run.stdout.splitlines() == [message, message]
+    cart_pole, *messages = run.stdout.splitlines()
+    assert "CartPoleSwingUpEnv" in cart_pole
+    assert messages == [message, message]
 
 
 @pytest.mark.parametrize(
