@@ -15,22 +15,26 @@ def python(code):
     return run.stdout
 
 
-@pytest.mark.parametrize(
-    ("first", "absent"),
-    [
-        ("import gpadjust", "torch"),
-        ("import gpadjust.envs", "botorch gpytorch linear_operator stable_baselines3 opensim"),
-        ("import gpadjust.states", "botorch gpytorch linear_operator gymnasium"),
-        ("from gpadjust import ODEPhysics", "botorch gpytorch"),
-    ],
-)
-def test_what_is_not_needed_is_not_imported(first, absent):
-    code = f"import sys; {first}; print(*set({absent.split()}) & {{*sys.modules}})"
-    assert python(code).split() == []
+def test_what_is_not_needed_is_not_imported():
+    """One after the other, so that none may bring what a later one is to do without."""
+    steps = {
+        "import gpadjust": "torch",
+        "import gpadjust.states": "botorch gpytorch linear_operator gymnasium",
+        "from gpadjust import ODEPhysics": "botorch gpytorch gymnasium",
+        "import gpadjust.envs": "botorch gpytorch linear_operator stable_baselines3 opensim",
+    }
+    code = "import sys\n" + "".join(
+        f"{first}\nprint({first!r}, *set({absent.split()}) & {{*sys.modules}})\n"
+        for first, absent in steps.items()
+    )
+    assert python(code).splitlines() == [*steps]
 
 
-def test_every_name_is_there():
+def test_every_name_is_there_and_brings_nothing_optional():
+    optional = ["gymnasium", "stable_baselines3", "pygame", "opensim", "matplotlib", "pandas"]
     code = (
+        "import sys, gpadjust.active\n"
+        f"assert not {set(optional)} & {{*sys.modules}}, 'needless imports'\n"
         "from gpadjust import *; import gpadjust\n"
         "for name in gpadjust.__all__:\n"
         "    assert globals()[name] is getattr(gpadjust, name), name\n"

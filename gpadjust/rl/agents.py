@@ -23,8 +23,8 @@ class DynaSAC(Dyna, SAC):
         >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
         >>> task = Task(dynamics, cart_pole_reward)
         >>> agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), seed=0)
-        >>> agent.learn(total_timesteps=2 * 25).num_episodes
-        2
+        >>> agent.learn(total_timesteps=25).num_episodes
+        1
     """
 
 

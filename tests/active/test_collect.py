@@ -150,7 +150,7 @@ class TestFailures:
         [
             (throw(OSError("no gas")), "OSError: no gas"),
             (lambda Y: Y * float("nan"), r"measured \[nan\]"),
-            (lambda Y: Y + float("inf"), r"measured \[inf\]"),
+            pytest.param(lambda Y: Y + float("inf"), r"measured \[inf\]", marks=pytest.mark.slow),
         ],
     )
     def test_they_are_skipped_and_counted(self, laboratory, tmp_path, what, message):
@@ -196,7 +196,7 @@ class TestFailures:
         result = collect(**laboratory(oracle=oracle, batch_size=3, budget=6))
         assert (len(result.X), len(result.failed_X)) == (4, 2)
 
-    @pytest.mark.parametrize("at", [3, 6])
+    @pytest.mark.parametrize("at", [pytest.param(3, marks=pytest.mark.slow), 6])
     def test_each_output_is_learnt_from_its_own_measurements(self, laboratory, tmp_path, at):
         def oracle(killed_at=None):
             seen = []
@@ -329,7 +329,12 @@ class TestResuming:
 
     @pytest.mark.parametrize(
         ("batch_size", "at", "fit"),
-        [(1, 1, "given"), (1, 6, "given"), (2, 4, "given"), (2, 3, "default")],
+        [
+            pytest.param(1, 1, "given", marks=pytest.mark.slow),
+            pytest.param(1, 6, "given", marks=pytest.mark.slow),
+            (2, 4, "given"),
+            (2, 3, "default"),
+        ],
     )
     def test_an_interrupted_run_ends_as_if_it_had_not_been(
         self, laboratory, tmp_path, batch_size, at, fit
@@ -350,7 +355,7 @@ class TestResuming:
         assert same(result, whole)
         assert torch.equal(_parameters(result.model), _parameters(whole.model))
 
-    @pytest.mark.parametrize("learn", [False, True])
+    @pytest.mark.parametrize("learn", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_killed_at_any_byte(self, laboratory, tmp_path, learn):
         options = {"batch_size": 2, "budget": 6, "initial": 4}
         if learn:

@@ -1,6 +1,7 @@
 """A cart-pole, its crude physics, and dynamics of every model."""
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -9,6 +10,8 @@ from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.models import PaperRRA
 from gpadjust.physics import ODEPhysics
+
+TRUTH = (0.5, 0.5, 0.6, 0.1)
 
 
 def cart_pole(cart, pole, length, friction, step=0.1):
@@ -27,22 +30,29 @@ def cart_pole(cart, pole, length, friction, step=0.1):
     return ODEPhysics(rhs, step, 4, substeps=5)
 
 
+@cache
+def trial_of(seed, num_steps):
+    """The states and the actions of a trial, made once for all tests."""
+    truth = cart_pole(*TRUTH)
+    generator = torch.Generator().manual_seed(seed)
+    start = 0.2 * torch.randn(1, 4, generator=generator, dtype=torch.float64)
+    states = [start + torch.tensor([0, math.pi, 0, 0])]
+    actions = 20 * torch.rand(num_steps, 1, generator=generator, dtype=torch.float64) - 10
+    for action in actions.split(1):
+        states.append(truth(torch.cat([states[-1], action], -1)))
+    return torch.cat(states), actions
+
+
 class CartPole:
     spec = StateSpec(["x", "theta", "v", "omega"], ["force"], angles=["theta"])
 
     def __init__(self):
-        self.truth = cart_pole(0.5, 0.5, 0.6, 0.1)
+        self.truth = cart_pole(*TRUTH)
         self.crude = cart_pole(0.45, 0.6, 0.65, 0.0)
 
     def trial(self, seed, num_steps=25):
         """A trial of random actions from hanging: states, actions, next states."""
-        generator = torch.Generator().manual_seed(seed)
-        start = 0.2 * torch.randn(1, 4, generator=generator, dtype=torch.float64)
-        states = [start + torch.tensor([0, math.pi, 0, 0])]
-        actions = 20 * torch.rand(num_steps, 1, generator=generator, dtype=torch.float64) - 10
-        for action in actions.split(1):
-            states.append(self.truth(torch.cat([states[-1], action], -1)))
-        path = torch.cat(states)
+        path, actions = (t.clone() for t in trial_of(seed, num_steps))
         return path[:-1], actions, path[1:]
 
 
@@ -51,6 +61,7 @@ def cart_pole_system():
     return CartPole()
 
 
+FEW_SAMPLES = {"num_starts": 1, "num_screened": 8, "num_samples": 3, "num_draws": 16}
 _MODELS = {
     "GP": ZeroMeanGP,
     "PhysicsMean": PhysicsMeanGP,
@@ -80,10 +91,11 @@ def costly_kind(request):
 
 @pytest.fixture
 def make():
-    """Makes dynamics by the name of their model, with a quick search."""
+    """Makes dynamics by the name of their model, with a quick search and few samples."""
 
     def make(kind, spec, physics, **options):
-        options.setdefault("fit_options", {"num_starts": 4, "num_screened": 32})
+        sampled = FEW_SAMPLES if kind != "RRA-paper" else {"num_starts": 1, "num_screened": 8}
+        options.setdefault("fit_options", sampled)
         if kind.startswith("RRA"):
             options.setdefault("model_options", {"num_features": 32})
         physics = None if kind == "GP" else physics

@@ -13,6 +13,7 @@ from gpadjust.models import AdjustedGP, PaperRRA
 from gpadjust.physics import FunctionPhysics, PhysicsError
 
 SPEC = StateSpec(["x", "v"], ["a"])
+FEW_SAMPLES = {"num_starts": 1, "num_screened": 8, "num_samples": 3, "num_draws": 16}
 
 
 def push(X, strength=0.1):
@@ -46,7 +47,7 @@ def learnt():
     """Makes dynamics that have learnt from 12 transitions, then were conditioned on 4."""
 
     def learnt(physics=push, **options):
-        options.setdefault("fit_options", {"num_starts": 1, "num_screened": 8})
+        options.setdefault("fit_options", FEW_SAMPLES)
         dynamics = LearnedDynamics(SPEC, physics, **options)
         dynamics.update(*transitions())
         dynamics.condition(*transitions(4, seed=1))
@@ -135,7 +136,7 @@ DAMAGES = [
 def test_a_state_that_cannot_be_loaded_changes_nothing(learnt):
     dynamics = learnt()
     before = dynamics.state_dict()
-    other = LearnedDynamics(SPEC, push)
+    other = LearnedDynamics(SPEC, push, fit_options=FEW_SAMPLES)
     other.update(*transitions(20, seed=3))
     for change, error, message in DAMAGES:
         with pytest.raises(error, match=message):
@@ -197,7 +198,7 @@ def test_a_physics_may_differ_by_rounding(learnt):
     def still(X):
         return X[:, :2]
 
-    dynamics = LearnedDynamics(SPEC, still, model=PhysicsMeanGP)
+    dynamics = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW_SAMPLES)
     dynamics.update(*transitions())
     again = LearnedDynamics(SPEC, still, model=PhysicsMeanGP)
     again.load_state_dict(dynamics.state_dict())

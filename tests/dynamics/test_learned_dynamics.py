@@ -13,7 +13,14 @@ from gpadjust.models.hyperparameters import scaled_rbf
 from gpadjust.physics import ODEPhysics
 from gpadjust.validation import trust
 
-pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+)
+
+KINDS = ["CKA", "RRA"]
+KINDS += [
+    pytest.param(k, marks=pytest.mark.slow) for k in ("GP", "PhysicsMean", "Scale", "RRA-paper")
+]
 
 
 def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
@@ -26,9 +33,12 @@ def test_physics_that_is_the_truth_is_left_alone(cart_pole_system, make):
         torch.testing.assert_close(mean, next_states, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", KINDS)
 def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
     system = cart_pole_system
-    dynamics = make(kind, system.spec, system.crude)
+    fit_options = {"num_starts": 2, "num_screened": 16, "num_draws": 64} if kind == "RRA" else None
+    options = {"fit_options": fit_options} if fit_options else {}
+    dynamics = make(kind, system.spec, system.crude, **options)
     assert not dynamics.is_fitted
     for seed in range(2):
         dynamics.update(*system.trial(seed))
@@ -186,7 +196,7 @@ def test_a_model_of_the_user(cart_pole_system):
     system = cart_pole_system
 
     def dynamics(**options):
-        fit_options = {"num_starts": 1, "num_screened": 8}
+        fit_options = {"method": "map", "num_starts": 1, "num_screened": 8}
         options.setdefault("model_options", {"waves": 2, "center": 0.0})
         return LearnedDynamics(
             system.spec, system.crude, model=WavyCKA, fit_options=fit_options, **options
@@ -251,13 +261,13 @@ def test_samples_scatter_as_predicted(cart_pole_system, make):
     assert (noise_free < variance).all()
 
 
-@pytest.mark.parametrize("kind", ["GP", "CKA", "RRA"])
+@pytest.mark.parametrize("kind", [pytest.param("GP", marks=pytest.mark.slow), "CKA", "RRA"])
 def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     system = cart_pole_system
     dynamics = make(kind, system.spec, system.crude)
     states, actions, next_states = system.trial(0, 12)
     dynamics.update(states, actions, next_states + 0.02 * torch.randn_like(next_states))
-    k = 600
+    k = 300
     state, action = (t[:3] for t in system.trial(1)[:2])
     mean, variance = dynamics.predict(state, action, observation_noise=False)
     functions = dynamics.sample_functions(k, seed=0)
@@ -269,12 +279,12 @@ def test_sampled_functions_are_of_the_posterior(cart_pole_system, make, kind):
     torch.testing.assert_close(one, drawn[:, :1])
     error = (drawn.mean(0) - mean) / variance.sqrt()
     assert error.abs().max() < 5 / math.sqrt(k)
-    torch.testing.assert_close(drawn.var(0) / variance, torch.ones_like(mean), rtol=0, atol=0.3)
+    torch.testing.assert_close(drawn.var(0) / variance, torch.ones_like(mean), rtol=0, atol=0.4)
 
 
-def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, kind):
+def test_each_block_follows_a_function_of_its_own(cart_pole_system, make, costly_kind):
     system = cart_pole_system
-    dynamics = make(kind, system.spec, system.crude)
+    dynamics = make(costly_kind, system.spec, system.crude)
     dynamics.update(*system.trial(0, 12))
     functions = dynamics.model.sample_functions(3, seed=0)
     states, actions = (t[:6].reshape(3, 2, -1) for t in system.trial(1)[:2])

@@ -8,7 +8,9 @@ import torch
 from gpadjust import ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 
-pytestmark = pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:f_p is nearly zero", "ignore::gpadjust.inference.SamplingWarning"
+)
 
 
 @pytest.fixture
@@ -137,12 +139,12 @@ def test_declared_states_are_checked_where_they_were_measured():
         dynamics.update(states, actions, following)
 
 
-def test_a_physics_of_differences_is_still_found_out(cart_pole_system, holed):
+def test_a_physics_of_differences_is_still_found_out(cart_pole_system, make, holed):
     system = cart_pole_system
 
     def change(X):
         return system.crude(X) - X[:, :4]
 
-    for dynamics in (LearnedDynamics(system.spec, change), PhysicsDynamics(system.spec, change)):
+    for dynamics in (make("CKA", system.spec, change), PhysicsDynamics(system.spec, change)):
         with pytest.warns(UserWarning, match="seems to return the change"):
             dynamics.update(*holed)

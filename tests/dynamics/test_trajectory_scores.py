@@ -87,7 +87,7 @@ def test_one_step_is_that_of_the_predictions(cart_pole_system, make):
     dynamics.update(*system.trial(0))
     data = system.trial(1)
     one = dynamics.score(*data)
-    many = dynamics.score_trajectories(*data, horizons=[1], num_functions=159, max_windows=None)
+    many = dynamics.score_trajectories(*data, horizons=[1], num_functions=79, max_windows=None)
     assert many.num_windows.tolist() == [25]
     torch.testing.assert_close(many.nlpd[0], one.nlpd, rtol=0.2, atol=0.2)
     torch.testing.assert_close(many.coverage[0], one.coverage, rtol=0, atol=0.13)
@@ -111,7 +111,9 @@ def test_each_particle_keeps_its_function_and_noise_comes_once(uniform, noise):
         assert scores.energy[i].item() == pytest.approx(gaussian.item(), rel=0.1)
 
 
-@pytest.mark.parametrize("num_functions", [39, 50, 79])
+@pytest.mark.parametrize(
+    "num_functions", [39, *(pytest.param(n, marks=pytest.mark.slow) for n in (50, 79))]
+)
 def test_the_coverage_of_a_calibrated_model_is_nominal(uniform, num_functions):
     """The rate of each of many seeds is one more draw of the rates of its functions."""
     rates = 0.1 * torch.randn(200, dtype=torch.float64)

@@ -113,7 +113,7 @@ def profile(max_examples):
     )
 
 
-@profile(15)
+@profile(8)
 @given(kind=st.sampled_from(list(BUILD)), problem=problems())
 def test_any_data(kind, problem):
     check(kind, problem)

@@ -164,7 +164,14 @@ class TestOutputs:
 class TestManyPoints:
     """The search is made on some rows, and its best optima are refined on all."""
 
-    @pytest.fixture(params=["one input", "two inputs", "two outputs", "little noise"])
+    @pytest.fixture(
+        params=[
+            pytest.param("one input", marks=pytest.mark.slow),
+            pytest.param("two inputs", marks=pytest.mark.slow),
+            "two outputs",
+            "little noise",
+        ]
+    )
     def problem(self, request, uniform):
         d = 1 if request.param == "one input" else 2
         X = uniform(200, d, seed=3)

@@ -157,7 +157,8 @@ def test_leave_one_out_is_the_posterior_without_the_observation(held, data):
 
 class TestFunctions:
     @pytest.mark.parametrize(
-        "kind", [pytest.param(k, marks=pytest.mark.slow if k == "AR1" else ()) for k in KINDS]
+        "kind",
+        [pytest.param(k, marks=() if k in ("CKA", "RRA") else pytest.mark.slow) for k in KINDS],
     )
     def test_moments(self, kind, held, data, uniform, num_outputs):
         model, _ = held(kind, *data(num_outputs=num_outputs))

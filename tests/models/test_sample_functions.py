@@ -13,9 +13,9 @@ from gpadjust.gp import Term
 from gpadjust.models.sampled_functions import TermFeatures
 
 
-def test_moments(data, build, kind, num_outputs, uniform):
+def test_moments(data, build, costly_kind, num_outputs, uniform):
     X, Y = data(num_outputs=num_outputs, n=12)
-    model = build(kind, X, Y, input_transform=Normalize(2)).eval()
+    model = build(costly_kind, X, Y, input_transform=Normalize(2)).eval()
     Z = uniform(4, 2, high=2.0, seed=4)
     with torch.no_grad():
         values, posterior = model.sample_functions(1500, seed=0)(Z), model.posterior(Z)
@@ -88,15 +88,15 @@ def test_wrong_numbers(data, build, kind):
         model.sample_functions(1, num_features=7)
 
 
-def test_botorch_draws_paths(data, build, kind, num_outputs, uniform):
-    model = build(kind, *data(num_outputs=num_outputs)).eval()
+def test_botorch_draws_paths(data, build, costly_kind, num_outputs, uniform):
+    model = build(costly_kind, *data(num_outputs=num_outputs)).eval()
     Z = uniform(5, 2)
     shape = (4, 5) if num_outputs == 1 else (4, num_outputs, 5)
     for draw in (draw_matheron_paths, draw_kernel_feature_paths):
         assert draw(model, torch.Size([4]))(Z).shape == shape
     values = draw_matheron_paths(model, torch.Size([512]))(Z).detach()
     posterior = model.posterior(Z)
-    if kind != "RRA-paper":
+    if costly_kind != "RRA-paper":
         error = values.mean(0).reshape(num_outputs, 5).mT - posterior.mean
         assert (error.abs() < 0.25 * posterior.variance.sqrt()).all()
     assert MatheronPathModel(model, seed=0).posterior(Z).mean.shape == (5, num_outputs)

@@ -13,6 +13,8 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC
 
 POINT_SPEC = StateSpec(["x"], ["v"])
+QUICK = {"num_starts": 1, "num_screened": 0}
+FEW_SAMPLES = {**QUICK, "num_samples": 3, "num_draws": 16}
 
 
 class Point(gymnasium.Env):
@@ -53,9 +55,24 @@ def point_dynamics():
 
 
 @pytest.fixture
-def learnt_dynamics(point_dynamics):
+def crude_dynamics(point_dynamics):
+    """Makes dynamics that learn the point from a physics, by a quick search."""
+    quick = {"method": "map", **QUICK}
+    return lambda physics: LearnedDynamics(point_dynamics.spec, physics, fit_options=quick)
+
+
+@pytest.fixture
+def learnt_dynamics(crude_dynamics):
     """Makes dynamics that learn the point from a physics that errs."""
-    return lambda: LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
+    return lambda: crude_dynamics(lambda X: X[:, :1] + 0.4 * X[:, 1:])
+
+
+@pytest.fixture
+def sampled_dynamics(point_dynamics):
+    """As `learnt_dynamics`, by full Bayes, with few samples."""
+    return lambda: LearnedDynamics(
+        point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=FEW_SAMPLES
+    )
 
 
 @pytest.fixture
@@ -76,7 +93,10 @@ def point_task(point_dynamics, point_reward):
 
 @pytest.fixture
 def point_agent(point_env, point_task):
-    """Makes an agent for the point; parts of the task, options and arguments can be given."""
+    """Makes an agent for the point; parts of the task, options and arguments can be given.
+
+    It scores no trajectories, and makes an update for five steps in the model, unless it is told.
+    """
 
     def make(env=None, algorithm=DynaSAC, **given):
         def taken(kind, **defaults):
@@ -84,7 +104,8 @@ def point_agent(point_env, point_task):
             return {**defaults, **{name: given.pop(name) for name in names}}
 
         task = given.pop("task", None) or point_task(**taken(Task))
-        options = DynaOptions(**taken(DynaOptions, model_episodes=2))
+        few = {"model_episodes": 2, "updates_per_model_step": 0.2, "score_horizons": ()}
+        options = DynaOptions(**taken(DynaOptions, **few))
         defaults = {
             "policy": "MlpPolicy",
             "batch_size": 8,

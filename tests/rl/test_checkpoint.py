@@ -62,13 +62,11 @@ def wrapped(point_env):
 
 
 @pytest.fixture
-def kind_of_dynamics(point_dynamics):
+def kind_of_dynamics(point_dynamics, sampled_dynamics):
     """Makes dynamics of a kind."""
 
     def make(kind):
-        if kind == "physics":
-            return point_dynamics
-        return LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:])
+        return point_dynamics if kind == "physics" else sampled_dynamics()
 
     return make
 
@@ -84,8 +82,17 @@ def go_on(agent, *callbacks):
     return agent.learn(TOTAL - agent.num_timesteps, [*callbacks], reset_num_timesteps=False)
 
 
-@pytest.mark.parametrize(("kind", "step"), [("physics", 6), ("cka", 13)])
-@pytest.mark.parametrize("layers", [(), ("normalised",), ("monitored", "normalised")], ids=len)
+@pytest.mark.parametrize(
+    ("kind", "step", "layers"),
+    [
+        ("physics", 6, ("normalised",)),
+        ("cka", 13, ()),
+        ("cka", 13, ("monitored", "normalised")),
+        pytest.param("physics", 6, (), marks=pytest.mark.slow),
+        pytest.param("physics", 6, ("monitored", "normalised"), marks=pytest.mark.slow),
+        pytest.param("cka", 13, ("normalised",), marks=pytest.mark.slow),
+    ],
+)
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
     kind, layers, step, point_agent, point_task, kind_of_dynamics, wrapped, assert_same, tmp_path
 ):

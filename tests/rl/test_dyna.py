@@ -69,7 +69,7 @@ def model_rows(agent):
     ],
 )
 def test_updates_are_as_many_as_promised(point_agent, options, updates):
-    agent = point_agent(**options).learn(15)
+    agent = point_agent(**{"updates_per_model_step": 1} | options).learn(15)
     assert agent._n_updates == updates
 
 
@@ -120,7 +120,9 @@ def test_episodes_that_terminate_in_the_model_end_there(point_agent, point_env):
 
 @pytest.mark.parametrize("keep", [False, True])
 def test_after_last_model_episode_batches_hold_model_rows_only_if_kept(point_agent, keep):
-    agent = point_agent(last_model_episode=2, keep_model_data=keep, real_fraction=0.0)
+    agent = point_agent(
+        last_model_episode=2, keep_model_data=keep, real_fraction=0.0, updates_per_model_step=1
+    )
     mixed = []
     sample = agent.replay_buffer.sample
 
@@ -134,8 +136,8 @@ def test_after_last_model_episode_batches_hold_model_rows_only_if_kept(point_age
     assert model_rows(agent) == 2 * 2 * 5
 
 
-def test_a_long_run_in_pieces_goes_on(point_agent, learnt_dynamics):
-    dynamics = learnt_dynamics()
+def test_a_long_run_in_pieces_goes_on(point_agent, sampled_dynamics):
+    dynamics = sampled_dynamics()
     agent = point_agent(dynamics=dynamics)
     for total in (10, 20):  # the second call counts time steps from zero again
         agent.learn(10)
@@ -226,7 +228,10 @@ def test_a_first_episode_of_a_single_step_waits_for_the_second(
 ):
     dynamics = learnt_dynamics()
     agent = point_agent(
-        point_env(end=-9), terminated=lambda states: states[:, 0] > -9, dynamics=dynamics
+        point_env(end=-9),
+        terminated=lambda states: states[:, 0] > -9,
+        dynamics=dynamics,
+        updates_per_model_step=1,
     )
     assert agent.learn(1).num_episodes == 0
     agent.learn(2, reset_num_timesteps=False)
@@ -251,6 +256,7 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
         gamma=0.5,
         tau=0.05,
         policy_kwargs={"net_arch": [16]},
+        updates_per_model_step=1,
     )
     before = cost(agent)
     agent.learn(30)
@@ -261,13 +267,13 @@ def test_cart_pole(cart_pole):
     dynamics = LearnedDynamics(
         CART_POLE_SPEC,
         random_cart_pole_physics(0),
-        fit_options={"num_screened": 8, "num_starts": 1},
+        fit_options={"num_screened": 8, "num_starts": 1, "num_samples": 3, "num_draws": 16},
     )
     agent = DynaSAC(
         "MlpPolicy",
         cart_pole(),
         Task(dynamics, cart_pole_reward),
-        DynaOptions(model_episodes=1, sampling="trajectory"),
+        DynaOptions(model_episodes=1, sampling="trajectory", score_horizons=()),
         batch_size=8,
         policy_kwargs={"net_arch": [8]},
         seed=0,
@@ -343,8 +349,8 @@ def test_normalised_observations_are_what_the_policy_sees_in_the_model(
     np.testing.assert_allclose(in_model[0], env.normalize_obs(start), rtol=1e-6)
 
 
-def test_two_runs_are_the_same(point_agent, learnt_dynamics, assert_same):
-    agents = [point_agent(dynamics=learnt_dynamics(), seed=3).learn(10) for _ in range(2)]
+def test_two_runs_are_the_same(point_agent, sampled_dynamics, assert_same):
+    agents = [point_agent(dynamics=sampled_dynamics(), seed=3).learn(10) for _ in range(2)]
     assert_same(*agents)
 
 
@@ -375,7 +381,12 @@ def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynam
         point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
     )
     starts = torch.tensor([[0.6], [1.4], [0.8]])
-    agent = point_agent(dynamics=runaway, model_episodes=3, initial_states=lambda n: starts[:n])
+    agent = point_agent(
+        dynamics=runaway,
+        model_episodes=3,
+        initial_states=lambda n: starts[:n],
+        updates_per_model_step=1,
+    )
     agent.learn(5)
     assert agent.logger.name_to_value["model/left_bounds"] == 1
     assert model_rows(agent) == 1 + 2 * 5
@@ -411,12 +422,21 @@ def test_progress_bar(point_agent, capsys):
 # Saving and loading
 
 
+@pytest.fixture(scope="module")
+def once():
+    """What is made once for several tests, none of which changes it."""
+    return {}
+
+
 @pytest.fixture
-def saved(point_agent, learnt_dynamics, tmp_path):
+def saved(once, point_agent, learnt_dynamics, tmp_path_factory):
     """An agent after two episodes, and its file."""
-    agent = point_agent(dynamics=learnt_dynamics()).learn(10)
-    agent.save(tmp_path / "agent")
-    return agent, tmp_path / "agent.zip"
+    if not once:
+        agent = point_agent(dynamics=learnt_dynamics()).learn(10)
+        path = tmp_path_factory.mktemp("saved") / "agent.zip"
+        agent.save(path)
+        once["saved"] = agent, path
+    return once["saved"]
 
 
 def test_a_loaded_agent_predicts_the_same(saved):
@@ -443,9 +463,12 @@ def test_with_dynamics_but_no_environment_it_says_so(saved, learnt_dynamics, poi
         loaded.learn(5)
 
 
-def test_with_dynamics_a_loaded_agent_goes_on(saved, point_env, learnt_dynamics, point_task):
-    agent, path = saved
-    dynamics = learnt_dynamics()
+def test_with_dynamics_a_loaded_agent_goes_on(
+    point_agent, point_env, sampled_dynamics, point_task, tmp_path
+):
+    agent, path = point_agent(dynamics=sampled_dynamics()).learn(10), tmp_path / "agent.zip"
+    agent.save(path)
+    dynamics = sampled_dynamics()
     loaded = DynaSAC.load(path, env=point_env(), task=point_task(dynamics=dynamics))
     x = torch.linspace(0, 1, 5).double()[:, None]
     for one, other in zip(dynamics.predict(x, x), agent.task.dynamics.predict(x, x), strict=True):
@@ -569,13 +592,14 @@ def test_parameters_without_dynamics_are_refused_unless_told(saved, point_agent,
     assert not other.task.dynamics.is_fitted
 
 
-def test_a_task_that_is_given_after_loading_knows_what_was_learnt(saved, point_env, point_task):
+def test_a_task_that_is_given_after_loading_knows_what_was_learnt(
+    saved, point_env, point_task, crude_dynamics
+):
     agent, path = saved
     loaded = DynaSAC.load(path, env=point_env())
     known = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
     loaded.set_parameters(known, exact_match=False)
-    spec = agent.task.dynamics.spec
-    loaded.task = point_task(dynamics=LearnedDynamics(spec, agent.task.dynamics.physics))
+    loaded.task = point_task(dynamics=crude_dynamics(agent.task.dynamics.physics))
     loaded.learn(5, reset_num_timesteps=False)
     assert loaded.task.dynamics.num_transitions == 15
 
@@ -590,9 +614,9 @@ def test_parameters_are_taken_as_a_whole(saved, point_agent, learnt_dynamics, te
     assert other.task.dynamics.num_transitions == 5
 
 
-def test_another_physics_is_not_loaded(saved, point_task, point_dynamics):
+def test_another_physics_is_not_loaded(saved, point_task, crude_dynamics):
     _, path = saved
-    other = LearnedDynamics(point_dynamics.spec, lambda X: X[:, :1] + 0.1 * X[:, 1:])
+    other = crude_dynamics(lambda X: X[:, :1] + 0.1 * X[:, 1:])
     with pytest.raises(RuntimeError, match="physics"):
         DynaSAC.load(path, task=point_task(dynamics=other))
 
@@ -619,7 +643,7 @@ def test_a_wrong_reward_is_mended_and_nothing_is_lost(point_agent, point_task, l
 
 @pytest.mark.parametrize("fails", ["fit", "rollout"])
 def test_a_physics_that_fails_for_a_while_loses_no_transition(
-    point_agent, point_dynamics, fails, monkeypatch
+    point_agent, crude_dynamics, fails, monkeypatch
 ):
     """Where the dynamics learn, or after that, where particles move."""
     broken = []
@@ -629,7 +653,7 @@ def test_a_physics_that_fails_for_a_while_loses_no_transition(
             raise PhysicsError("the simulator's licence has expired")
         return X[:, :1] + 0.4 * X[:, 1:]
 
-    dynamics = LearnedDynamics(point_dynamics.spec, physics)
+    dynamics = crude_dynamics(physics)
     agent = point_agent(dynamics=dynamics)
     agent.learn(5)
     if fails == "rollout":
@@ -655,14 +679,14 @@ def test_other_dynamics_learn_all_that_there_is(point_agent, point_task, learnt_
     assert other.num_transitions == 15
 
 
-def test_transitions_at_which_the_physics_fails_are_left_out(point_agent, point_dynamics):
+def test_transitions_at_which_the_physics_fails_are_left_out(point_agent, crude_dynamics):
     def physics(X):
         bad = (X[:, 0] < 0.4).nonzero().flatten().tolist()
         if bad:
             raise PhysicsError("not below .4", bad)
         return X[:, :1] + 0.4 * X[:, 1:]
 
-    dynamics = LearnedDynamics(point_dynamics.spec, physics)
+    dynamics = crude_dynamics(physics)
     agent = point_agent(dynamics=dynamics)
     with pytest.warns(UserWarning, match=r"fails at \d of \d new transitions"):
         agent.learn(20)
@@ -864,7 +888,7 @@ def test_target_networks_are_updated_as_seldom_as_told(point_agent, monkeypatch)
     monkeypatch.setattr(
         SAC, "train", lambda agent, n, batch: chunks.append(n) or train(agent, n, batch)
     )
-    agent = point_agent(target_update_interval=10).learn(10)
+    agent = point_agent(target_update_interval=10, updates_per_model_step=1).learn(10)
     assert chunks == [5, 10, 5, 10]
     assert agent.owed_updates == 0
 
@@ -912,8 +936,8 @@ def logged_of(agent, episodes):
     return {name for name in agent.logger.name_to_value if name.startswith("model/")}
 
 
-def test_trajectories_are_scored_before_they_are_learnt(point_agent, learnt_dynamics):
-    agent = point_agent(dynamics=learnt_dynamics(), score_horizons=(4, 2, 9))
+def test_trajectories_are_scored_before_they_are_learnt(point_agent, sampled_dynamics):
+    agent = point_agent(dynamics=sampled_dynamics(), score_horizons=(4, 2, 9))
     assert agent.options.score_horizons == (2, 4, 9)
     scores = {f"model/{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (2, 4, 9)}
     assert not logged_of(agent, 1) & scores
@@ -927,14 +951,14 @@ def test_trajectories_are_scored_before_they_are_learnt(point_agent, learnt_dyna
 
 
 def test_without_doubt_energies_alone_are_logged(point_agent):
-    scores = {name for name in logged_of(point_agent(), 1) if "_" in name}
+    scores = {name for name in logged_of(point_agent(score_horizons=(1, 5)), 1) if "_" in name}
     assert scores >= {"model/energy_1", "model/energy_5"}
     assert not any("nlpd" in name or "coverage" in name for name in scores)
 
 
-def test_to_score_trajectories_changes_nothing(point_agent, learnt_dynamics, assert_same):
+def test_to_score_trajectories_changes_nothing(point_agent, sampled_dynamics, assert_same):
     one, other = (
-        point_agent(dynamics=learnt_dynamics(), score_horizons=horizons).learn(15)
+        point_agent(dynamics=sampled_dynamics(), score_horizons=horizons).learn(15)
         for horizons in ((1, 5), ())
     )
     assert not any("energy" in name for name in other.logger.name_to_value)
@@ -951,7 +975,7 @@ class Stiff(Own):
 def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(
     point_agent, point_dynamics
 ):
-    agent = point_agent(dynamics=Stiff(point_dynamics.spec))
+    agent = point_agent(dynamics=Stiff(point_dynamics.spec), score_horizons=(1, 5))
     with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass DynaOptions"):
         logged = logged_of(agent, 1)
     assert "model/coverage" in logged

@@ -19,15 +19,6 @@ FEW = CrossEntropyPlanner(
 TOTAL = 20  # four episodes of the point
 
 
-@pytest.fixture
-def learnt_dynamics(point_dynamics):
-    """Makes dynamics that learn the point from a physics that errs, with a quick search."""
-    quick = {"num_starts": 1, "num_screened": 0}
-    return lambda: LearnedDynamics(
-        point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=quick
-    )
-
-
 class PowerCut(Exception):  # noqa: N818
     pass
 
@@ -117,13 +108,9 @@ def test_an_episode_can_be_planned_anew(point_agent, learnt_dynamics, monkeypatc
 
 
 def test_without_exploration_nothing_changes(point_agent, learnt_dynamics, assert_same):
-    plain = point_agent(dynamics=learnt_dynamics()).learn(TOTAL)
-    none = point_agent(dynamics=learnt_dynamics(), exploration=None, explore_episodes=7).learn(
-        TOTAL
-    )
-    never = point_agent(dynamics=learnt_dynamics(), exploration=FEW, explore_episodes=0).learn(
-        TOTAL
-    )
+    plain = point_agent(dynamics=learnt_dynamics()).learn(10)
+    none = point_agent(dynamics=learnt_dynamics(), exploration=None, explore_episodes=7).learn(10)
+    never = point_agent(dynamics=learnt_dynamics(), exploration=FEW, explore_episodes=0).learn(10)
     assert_same(plain, none)
     assert_same(plain, never)
 
@@ -132,18 +119,25 @@ def test_two_runs_are_the_same_and_not_those_of_the_policy(
     point_agent, learnt_dynamics, assert_same
 ):
     one, other = (
-        point_agent(dynamics=learnt_dynamics(), exploration=FEW).learn(TOTAL) for _ in range(2)
+        point_agent(dynamics=learnt_dynamics(), exploration=FEW).learn(15) for _ in range(2)
     )
     assert_same(one, other)
-    plain = point_agent(dynamics=learnt_dynamics()).learn(TOTAL)
+    plain = point_agent(dynamics=learnt_dynamics()).learn(10)
     rows = slice(0, 5), slice(5, 10)
     for row, same in zip(rows, (True, False), strict=True):
         actions = (agent.replay_buffer.actions[row] for agent in (one, plain))
         assert np.array_equal(*actions) == same
 
 
-@pytest.mark.parametrize("step", [8, 13])
-@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize(
+    ("step", "normalised"),
+    [
+        (8, False),
+        (13, True),
+        pytest.param(8, True, marks=pytest.mark.slow),
+        pytest.param(13, False, marks=pytest.mark.slow),
+    ],
+)
 def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
     point_agent, point_env, learnt_dynamics, point_task, assert_same, tmp_path, step, normalised
 ):
@@ -164,7 +158,7 @@ def test_a_run_that_was_interrupted_ends_as_one_that_was_not(
 
 
 def test_a_run_that_was_interrupted_within_plans(
-    point_agent, point_env, learnt_dynamics, point_task, assert_same, tmp_path
+    point_agent, point_env, sampled_dynamics, point_task, assert_same, tmp_path
 ):
     """Of two environments whose episodes end at once, checkpoints lie in the middle of them."""
 
@@ -174,7 +168,7 @@ def test_a_run_that_was_interrupted_within_plans(
             Information(), num_random=4, num_policy=2, rounds=0, replan_every=2
         )
         return point_agent(
-            env, dynamics=learnt_dynamics(), exploration=options, train_freq=(3, "step")
+            env, dynamics=sampled_dynamics(), exploration=options, train_freq=(3, "step")
         )
 
     path, watched = tmp_path / "run.ckpt", Watches()
@@ -183,7 +177,7 @@ def test_a_run_that_was_interrupted_within_plans(
     with pytest.raises(PowerCut):
         make().learn(36, [EpisodeCheckpoint(path), Watches(cut=28)])
     env = DummyVecEnv([point_env, point_env])
-    second = resume(path, env, point_task(dynamics=learnt_dynamics()))
+    second = resume(path, env, point_task(dynamics=sampled_dynamics()))
     assert second.num_timesteps == 24
     assert any(episode is not None for episode in second.planned.under_way.values())
     second.learn(12, reset_num_timesteps=False)
