@@ -150,7 +150,7 @@ def test_a_physics_that_learns_is_stored_and_restored(learnt):
     gain = physics.gain.item()
     assert gain != 0.05
     state = dynamics.state_dict()
-    other = LearnedDynamics(SPEC, Gain())
+    other = LearnedDynamics(SPEC, Gain(), fit_options=FEW_SAMPLES)
     other.load_state_dict(state)
     states, actions, _ = transitions(seed=5)
     assert torch.equal(other.predict(states, actions).mean, dynamics.predict(states, actions).mean)
@@ -167,13 +167,14 @@ def test_dynamics_of_another_physics_are_refused(learnt):
     seen = PhysicsDynamics(SPEC, push)
     seen.update(*transitions())
     for one in (learnt(), seen):
-        other = type(one)(SPEC, stronger)
+        known = {"fit_options": FEW_SAMPLES} if isinstance(one, LearnedDynamics) else {}
+        other = type(one)(SPEC, stronger, **known)
         with pytest.raises(
             RuntimeError, match=r"another physics than 'stronger'.* of 'v', this one"
         ):
             other.load_state_dict(one.state_dict())
-        type(one)(SPEC, push).load_state_dict(one.state_dict())
-        other.load_state_dict(type(one)(SPEC, push).state_dict())  # it has seen nothing
+        type(one)(SPEC, push, **known).load_state_dict(one.state_dict())
+        other.load_state_dict(type(one)(SPEC, push, **known).state_dict())  # it has seen nothing
 
 
 def test_loading_asks_the_physics_at_three_rows(learnt):
@@ -183,7 +184,7 @@ def test_loading_asks_the_physics_at_three_rows(learnt):
         rows.append(len(X))
         return push(X)
 
-    LearnedDynamics(SPEC, counted).load_state_dict(learnt().state_dict())
+    LearnedDynamics(SPEC, counted, fit_options=FEW_SAMPLES).load_state_dict(learnt().state_dict())
     assert sum(rows) == 3
     seen = PhysicsDynamics(SPEC, push)
     seen.update(*transitions())
@@ -193,14 +194,15 @@ def test_loading_asks_the_physics_at_three_rows(learnt):
 
 def test_a_physics_may_differ_by_rounding(learnt):
     state = learnt().state_dict()
-    LearnedDynamics(SPEC, lambda X: push(X) * (1 + 1e-9)).load_state_dict(state)
+    nearly = LearnedDynamics(SPEC, lambda X: push(X) * (1 + 1e-9), fit_options=FEW_SAMPLES)
+    nearly.load_state_dict(state)
 
     def still(X):
         return X[:, :2]
 
     dynamics = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW_SAMPLES)
     dynamics.update(*transitions())
-    again = LearnedDynamics(SPEC, still, model=PhysicsMeanGP)
+    again = LearnedDynamics(SPEC, still, model=PhysicsMeanGP, fit_options=FEW_SAMPLES)
     again.load_state_dict(dynamics.state_dict())
     assert again.num_transitions == 12
 
@@ -222,7 +224,7 @@ def test_a_whole_turn_is_no_difference():
 
 def test_a_loaded_state_is_a_copy(learnt):
     state = learnt().state_dict()
-    dynamics = LearnedDynamics(SPEC, push)
+    dynamics = LearnedDynamics(SPEC, push, fit_options=FEW_SAMPLES)
     dynamics.load_state_dict(state)
     before = copy.deepcopy(state)
     state["transitions"]["states"].zero_()
