@@ -19,6 +19,7 @@ EXPERIMENTS = {
     "arm": ("Arm", "learners that reach with a muscle arm"),
     "exploration": ("Exploration", "cart-poles whose trials are random, SAC's or informative"),
     "foresight": ("Foresight", "do dynamics foresee the next trial, and know how well?"),
+    "planning": ("Planning", "cart-poles that are swung up by planning in several models"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gpadjust import CKA
+from gpadjust.control import CrossEntropy, Planner
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -48,14 +49,16 @@ def test_measuring(tmp_path, monkeypatch):
 def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[4:]
-    for long, short in (("=10 * 25", "=25"), ("model_episodes=20", "model_episodes=2")):
-        assert long in code
-        code = code.replace(long, short)
-    names = {}
+    assert "=2 * 25" in code
+    quick = "Planner(search=CrossEntropy(1), horizon=3, num_random=16)"
+    code = code.replace("=2 * 25", "=25").replace(
+        "MPCAgent(env, task,", f"MPCAgent(env, task, {quick}, first={quick},"
+    )
+    names = {"Planner": Planner, "CrossEntropy": CrossEntropy}
     exec(code, names)
     assert names["agent"].num_episodes == 1
     files = {path.name for path in tmp_path.iterdir()}
     assert files == {"cart_pole.ckpt", "cart_pole.ckpt.lock", "cart_pole.zip"}
-    assert "10 * 25" in again
-    exec(again.replace("10 * 25", "2 * 25"), names)
+    assert "5 * 25" in again
+    exec(again.replace("5 * 25", "2 * 25"), names)
     assert names["agent"].num_episodes == 2

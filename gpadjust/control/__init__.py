@@ -1,21 +1,36 @@
 """Tasks, and planning in dynamics models; Stable-Baselines3 is not needed."""
 
+from gpadjust.control.mpc import MPC
 from gpadjust.control.objectives import Information, Objective, Return
-from gpadjust.control.planner import CrossEntropyPlanner, Plan
+from gpadjust.control.planner import Plan, Planner
+from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy, rbf_policy
+from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
 from gpadjust.control.rollouts import Rollout, Rollouts
+from gpadjust.control.search import CrossEntropy, PathIntegral, Search
 from gpadjust.control.task import InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
-    "CrossEntropyPlanner",
+    "MPC",
+    "BoundedPolicy",
+    "CrossEntropy",
     "Information",
     "InitialStates",
     "Objective",
+    "PathIntegral",
     "Plan",
+    "Planner",
+    "PolicySearch",
     "Return",
     "Reward",
     "Rollout",
     "Rollouts",
+    "Search",
+    "SearchResult",
     "Step",
     "Task",
     "Termination",
+    "imitate",
+    "linear_policy",
+    "mlp_policy",
+    "rbf_policy",
 ]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import torch
 from torch import Tensor
 
+from gpadjust.control.option_checks import check_fraction
 from gpadjust.control.rollouts import Rollout
 from gpadjust.control.task import Task
 from gpadjust.dynamics.trajectory_information import TrajectoryInformation, check_informative
@@ -22,6 +24,11 @@ Score = Callable[[Rollout, Past | None], Tensor]
 
 class Objective(ABC):
     """What a planner looks for."""
+
+    @property
+    def compares_functions(self) -> bool:
+        """Whether it matters that the functions are followed from the same starts."""
+        return True
 
     def check(self, task: Task) -> None:  # noqa: B027 - most need nothing
         """Raise a TypeError if the task's dynamics cannot tell this worth."""
@@ -69,12 +76,48 @@ class Information(Objective):
 
 @dataclass(frozen=True)
 class Return(Objective):
-    """The sum of rewards of the steps ahead, averaged over the functions.
+    """The sum of rewards of the steps ahead, averaged over the functions, or a quantile of these.
 
     Leaving the bounds never pays: each step that an episode does not make for that costs a million
     times the largest reward, so that sequences that leave come after all others, and those that
-    leave later first. There is no discount.
+    leave later first.
+
+    Args:
+        discount: Factor of the rewards from a step to the next one.
+        quantile: Of the returns in the functions the one that counts, such as 0.2 to be careful
+            about what the model does not know. Default: their mean.
+        effort: What a step costs for each unit of its sum of squared actions, beside the rewards.
+        terminal_value: What a state at the end of the steps ahead is worth, ``N`` of states
+            ``N x state_dim``, such as the return from there on. Default: nothing.
+
+    Raises:
+        TypeError: If a number is of another kind, or ``terminal_value`` is no function.
+        ValueError: If a number is out of range.
     """
+
+    discount: float = 1.0
+    _: KW_ONLY
+    quantile: float | None = None
+    effort: float = 0.0
+    terminal_value: Callable[[Tensor], Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        """Check numbers and function."""
+        if self.discount != 1:
+            check_fraction("discount", self.discount, zero=False)
+        if self.quantile is not None:
+            check_fraction("quantile", self.quantile)
+        check_fraction("effort", self.effort, most=math.inf)
+        if self.terminal_value is not None and not callable(self.terminal_value):
+            raise TypeError(
+                "terminal_value must be a function of states, or None; found "
+                f"{self.terminal_value!r}."
+            )
+
+    @property
+    def compares_functions(self) -> bool:
+        """Whether it matters that the functions are followed from the same starts."""
+        return self.quantile is not None
 
     def of(self, task: Task) -> Score:
         """The return of rollouts; what has been is the same for all."""
@@ -83,12 +126,33 @@ class Return(Objective):
         def score(rollout: Rollout, past: Past | None) -> Tensor:
             nonlocal largest
             if not largest:  # of the first rollouts, so that later ones compare
-                largest = rollout.rewards.double().abs().max().clamp_min(1e-12)
+                largest = rollout.rewards.detach().double().abs().max().clamp_min(1e-12)
             lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
-            rewards = rollout.rewards.double().masked_fill(~rollout.made, 0.0)
-            return (rewards - 1e6 * largest * lost).sum(-1).mean(0)
+            rewards = rollout.rewards.double()
+            if self.effort:
+                rewards = rewards - self.effort * rollout.actions.square().sum(-1)
+            rewards = rewards.masked_fill(~rollout.made, 0.0) - 1e6 * largest * lost
+            weights = self.discount ** torch.arange(rewards.shape[-1] + 1, dtype=torch.float64)
+            returns = (weights[:-1] * rewards).sum(-1)
+            if self.terminal_value is not None:
+                returns = returns + weights[-1] * self._at_the_end(rollout)
+            if self.quantile is None:
+                return returns.mean(0)
+            return returns.quantile(self.quantile, dim=0)
 
         return score
+
+    def _at_the_end(self, rollout: Rollout) -> Tensor:
+        """What the last states are worth, ``k x n``; nothing where an episode has ended."""
+        assert self.terminal_value is not None, "asked before"
+        last, made = rollout.next_states[:, :, -1], rollout.made[:, :, -1]
+        values = torch.as_tensor(self.terminal_value(last.flatten(0, 1)))
+        if values.shape != (made.numel(),):
+            raise ValueError(
+                f"terminal_value must return one value per row, shape ({made.numel()},); found "
+                f"{tuple(values.shape)}."
+            )
+        return values.double().unflatten(0, made.shape).masked_fill(~made, 0.0)
 
 
 def _without_failures(rollout: Rollout) -> tuple[Tensor, ...]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, fields
+import math
+import time
+from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.control.action_sequences import cross_entropy, random_sequences
-from gpadjust.control.objectives import Objective, Past
+from gpadjust.control.objectives import Objective, Past, Return
+from gpadjust.control.option_checks import check_fraction, check_whole
 from gpadjust.control.rollouts import Policy, Rollouts
+from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
 from gpadjust.control.task import Task
 
 
@@ -27,68 +30,84 @@ class Plan(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CrossEntropyPlanner:
-    """Plans the actions of an episode by an objective, such as information or return.
+class Planner:
+    """Plans actions by an objective, such as return or information, in a model of the system.
 
-    Sequences of actions are proposed, random piecewise constant ones and a policy's own in the
-    model; each is followed through functions drawn from the posterior of the dynamics; and the one
-    that is worth most, on average over the functions, is taken, after some rounds of the
-    cross-entropy method. Give it to :class:`~gpadjust.rl.DynaSAC` as ``exploration``.
+    Sequences of actions are proposed; each is followed through the model, along its mean or
+    through functions drawn from its posterior; and a search improves them. At first they are random
+    piecewise constant ones and a policy's own. Where there is an earlier plan, most are drawn about
+    it. :class:`MPC` plans again at every step; as ``exploration`` of
+    :class:`~gpadjust.rl.DynaSAC` it plans whole episodes.
 
     Args:
-        objective: What to look for: :class:`Information`, :class:`Return`, or your own.
-        num_random: Number of random sequences.
-        num_policy: Number of sequences by the policy.
-        num_functions: How many functions each is followed through.
+        objective: What to look for: :class:`Return`, :class:`Information`, or your own.
+        search: How the sequences are improved: :class:`CrossEntropy` or :class:`PathIntegral`.
+        horizon: The most steps to look ahead. Default: to the end of the episode.
+        num_functions: How many functions of the posterior each sequence is followed through; None
+            for the mean of the model alone, which takes least time.
+        num_random: Number of random sequences, or of those drawn about an earlier plan.
+        num_policy: Number of sequences by the policy, if there is one.
         max_hold: The most steps that a random sequence holds an action.
-        rounds: Rounds of the cross-entropy method; 0 takes the best of the first sequences.
-        num_elites: How many sequences the next round is drawn about.
+        spread: Standard deviation of what is drawn about an earlier plan, as a share of the range
+            of the actions.
+        restarts: How many searches there are, of which the best is taken; one where there is an
+            earlier plan.
         replan_every: Number of steps after which the rest of the episode is planned anew, from
             where it is and with what it has already told. Default: the episode goes by the first
             plan.
+        seconds: After so many seconds of a plan no further round of the search begins.
 
     Raises:
-        TypeError: If the objective is none, or a number is not whole.
+        TypeError: If objective or search is none, or a number is of another kind.
         ValueError: If a number is out of range, or there is nothing to choose from.
 
     Example:
         >>> import torch
-        >>> from gpadjust.control import CrossEntropyPlanner, Return, Task
+        >>> from gpadjust.control import Planner, Return, Task
         >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
         >>> point = PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + X[:, 1:])
         >>> task = Task(point, lambda states, actions, next_states: -next_states[:, 0].abs())
         >>> bounds = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
-        >>> plan = CrossEntropyPlanner(Return()).plan(task, torch.ones(1).double(), bounds, 3)
+        >>> plan = Planner(Return()).plan(task, torch.ones(1).double(), bounds, 3)
         >>> plan.actions.shape, plan.value > -1
         (torch.Size([3, 1]), True)
     """
 
-    objective: Objective
+    objective: Objective = field(default_factory=Return)
+    search: Search = field(default_factory=CrossEntropy)
     _: KW_ONLY
+    horizon: int | None = None
+    num_functions: int | None = None
     num_random: int = 64
     num_policy: int = 16
-    num_functions: int = 3
     max_hold: int = 5
-    rounds: int = 2
-    num_elites: int = 8
+    spread: float = 0.1
+    restarts: int = 1
     replan_every: int | None = None
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
-        """Check objective and numbers."""
+        """Check objective, search and numbers."""
         if not isinstance(self.objective, Objective):
             raise TypeError(
                 "objective must be an object of an Objective, such as Information() or Return(); "
                 f"found {self.objective!r}."
             )
-        least = {"num_random": 0, "num_policy": 0, "rounds": 0}
-        for name in (entry.name for entry in fields(self) if entry.name != "objective"):
-            value = getattr(self, name)
-            if name == "replan_every" and value is None:
-                continue
-            if not isinstance(value, int) or isinstance(value, bool):
-                raise TypeError(f"{name} must be a whole number; found {value!r}.")
-            if value < least.get(name, 1):
-                raise ValueError(f"{name} must be at least {least.get(name, 1)}; found {value}.")
+        if not isinstance(self.search, Search):
+            raise TypeError(
+                "search must be an object of a Search, such as CrossEntropy() or PathIntegral(); "
+                f"found {self.search!r}."
+            )
+        for name in ("num_random", "num_policy"):
+            check_whole(name, getattr(self, name), 0)
+        for name in ("max_hold", "restarts"):
+            check_whole(name, getattr(self, name), 1)
+        for name in ("horizon", "num_functions", "replan_every"):
+            if getattr(self, name) is not None:
+                check_whole(name, getattr(self, name), 1)
+        check_fraction("spread", self.spread, zero=False)
+        if self.seconds is not None:
+            check_fraction("seconds", self.seconds, most=math.inf, zero=False)
         if not self.num_random + self.num_policy:
             raise ValueError(
                 "num_random and num_policy are both 0, so that there is no sequence of actions to "
@@ -114,12 +133,13 @@ class CrossEntropyPlanner:
                 not made.
             state: Where the episode is, ``state_dim``.
             action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``, finite.
-            num_steps: How many steps are ahead, ``T``. Default: the episode length of the task.
+            num_steps: How many steps are ahead; the plan is of these or of the horizon, ``T``.
+                Default: the episode length of the task.
             policy: Draws actions ``N x action_dim`` at states ``N x state_dim``. Default: none, and
                 random sequences in the place of its own.
             past: States and actions of the episode so far, ``t x state_dim`` and
                 ``t x action_dim``, which are not learnt yet.
-            known: A sequence to choose from as well, ``T x action_dim``.
+            known: An earlier plan, ``t x action_dim``; its last action is held where it is shorter.
 
         Raises:
             TypeError: If the dynamics cannot tell what the objective asks.
@@ -128,6 +148,57 @@ class CrossEntropyPlanner:
             RuntimeError: If the dynamics have learnt nothing yet.
             PhysicsError: If the physics fails at ``state``, whatever the action.
         """
+        begun = time.perf_counter()
+        num_steps = self._checked_steps(task, state, action_bounds, num_steps)
+        score = self.objective.of(task)
+        rollouts = Rollouts(task, self.num_functions)
+        known = None if known is None or not len(known) else known
+        deadline = math.inf if self.seconds is None else begun + self.seconds
+
+        def search() -> Plan:
+            first = self._proposed(rollouts, state, num_steps, action_bounds, policy, known)
+            return Plan(
+                *self.search.best(
+                    lambda sequences: score(rollouts.follow(state, sequences), past),
+                    first,
+                    action_bounds,
+                    deadline,
+                )
+            )
+
+        plans = [search() for _ in range(self.restarts if known is None else 1)]
+        return max(plans, key=lambda plan: plan.value)
+
+    def _proposed(
+        self,
+        rollouts: Rollouts,
+        state: Tensor,
+        num_steps: int,
+        bounds: Tensor,
+        policy: Policy | None,
+        known: Tensor | None,
+    ) -> Tensor:
+        """The sequences that a search begins with, ``n x num_steps x action_dim``."""
+        first = []
+        num_random = self.num_random
+        if policy is None:
+            num_random += self.num_policy
+        elif self.num_policy:
+            proposed = rollouts.propose(state, num_steps, policy, self.num_policy)
+            first.append(proposed.clamp(bounds[0], bounds[1]))
+        if known is None:
+            first.append(random_sequences(num_random, num_steps, bounds, self.max_hold))
+        else:
+            known = _resized(known, num_steps, bounds.shape[-1])
+            noise = correlated_noise(torch.Size((num_random, *known.shape)), 0.5)
+            drawn = known + self.spread * (bounds[1] - bounds[0]) * noise
+            first += [known.unsqueeze(0), torch.clamp(drawn, bounds[0], bounds[1])]
+        return torch.cat(first)
+
+    def _checked_steps(
+        self, task: Task, state: Tensor, action_bounds: Tensor, num_steps: int | None
+    ) -> int:
+        """How many steps to plan, once what is given is found to be right."""
         spec = task.dynamics.spec
         if state.shape != (spec.state_dim,):
             raise ValueError(
@@ -139,31 +210,20 @@ class CrossEntropyPlanner:
                 f"{action_bounds.tolist()}."
             )
         num_steps = task.episode_length if num_steps is None else num_steps
+        num_steps = self.horizon if num_steps is None else num_steps
         if num_steps is None or num_steps < 1:
             raise ValueError(
                 f"Expected num_steps as a number of steps >= 1, found {num_steps}; pass it, or "
-                "give the task an episode_length."
+                "give the task an episode_length, or the planner a horizon."
             )
-        if known is not None and known.shape != (num_steps, spec.action_dim):
-            raise ValueError(
-                f"Expected known of shape {num_steps} x {spec.action_dim}, found "
-                f"{tuple(known.shape)}."
-            )
-        score = self.objective.of(task)
-        rollouts = Rollouts(task, self.num_functions)
-        num_random = self.num_random + (self.num_policy if policy is None else 0)
-        first = [random_sequences(num_random, num_steps, action_bounds, self.max_hold)]
-        if policy is not None and self.num_policy:
-            proposed = rollouts.propose(state, num_steps, policy, self.num_policy)
-            first.append(proposed.clamp(action_bounds[0], action_bounds[1]))
-        if known is not None:
-            first.append(known.unsqueeze(0))
-        return Plan(
-            *cross_entropy(
-                lambda sequences: score(rollouts.follow(state, sequences), past),
-                torch.cat(first),
-                action_bounds,
-                self.rounds,
-                self.num_elites,
-            )
+        return num_steps if self.horizon is None else min(num_steps, self.horizon)
+
+
+def _resized(known: Tensor, num_steps: int, action_dim: int) -> Tensor:
+    """An earlier plan with as many steps."""
+    if known.dim() != 2 or known.shape[-1] != action_dim:
+        raise ValueError(
+            f"Expected known of shape {num_steps} x {action_dim}, found {tuple(known.shape)}."
         )
+    rows = torch.arange(num_steps).clamp_max(len(known) - 1)
+    return known[rows]

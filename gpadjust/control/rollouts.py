@@ -37,20 +37,26 @@ class Rollout(NamedTuple):
 
 
 class Rollouts:
-    """Runs episodes of a task from one state, each in every one of some sampled functions.
+    """Runs episodes of a task, each in every one of some functions of its dynamics.
 
     An episode ends where a state says so, or where it would leave the bounds or the finite numbers
-    or meet a failure of the physics; that last step is not made.
+    or meet a failure of the physics; that last step is not made. Gradients flow from the rewards to
+    the actions, as far as dynamics and reward have them; where an episode has none that is finite
+    (as where it ran away), it counts as zero.
 
     Args:
         task: The task; its dynamics must be fitted.
-        num_functions: Number ``k`` of functions, drawn from PyTorch's generator.
+        num_functions: Number ``k`` of functions, drawn from PyTorch's generator; None for the mean
+            of the dynamics, as a single one.
     """
 
-    def __init__(self, task: Task, num_functions: int) -> None:
+    def __init__(self, task: Task, num_functions: int | None) -> None:
         self.task = task
-        self.num_functions = num_functions
-        self.functions = task.dynamics.sample_functions(num_functions)
+        if num_functions is None:
+            self.num_functions, self.functions = 1, task.dynamics.mean_function()
+        else:
+            self.num_functions = num_functions
+            self.functions = task.dynamics.sample_functions(num_functions)
 
     def follow(self, state: Tensor, sequences: Tensor) -> Rollout:
         """Take given actions, whatever happens.
@@ -61,23 +67,34 @@ class Rollouts:
         """
         n, num_steps = sequences.shape[:2]
         every = sequences.expand(self.num_functions, *sequences.shape)
-        return self._run(state, n, num_steps, lambda t, states: every[:, :, t])
+        return self._run(state.expand(n, -1), num_steps, lambda t, states: every[:, :, t])
+
+    def act(self, states: Tensor, policy: Policy, num_steps: int) -> Rollout:
+        """Let a policy act.
+
+        Args:
+            states: Where the episodes start, ``n x state_dim``, or ``k x n x state_dim`` for starts
+                of its own in each function.
+            policy: Who acts.
+            num_steps: How long, ``T``.
+        """
+
+        def choose(t: int, states: Tensor) -> Tensor:
+            return policy(states.flatten(0, 1)).reshape(*states.shape[:2], -1)
+
+        return self._run(states, num_steps, choose)
 
     def propose(self, state: Tensor, num_steps: int, policy: Policy, n: int) -> Tensor:
         """The actions that a policy takes in ``n`` episodes, ``n x num_steps x action_dim``."""
         each = -(-n // self.num_functions)
-
-        def act(t: int, states: Tensor) -> Tensor:
-            return policy(states.flatten(0, 1)).reshape(*states.shape[:2], -1)
-
-        return self._run(state, each, num_steps, act).actions.flatten(0, 1)[:n]
+        return self.act(state.expand(each, -1), policy, num_steps).actions.flatten(0, 1)[:n]
 
     def _run(
-        self, state: Tensor, n: int, num_steps: int, choose: Callable[[int, Tensor], Tensor]
+        self, starts: Tensor, num_steps: int, choose: Callable[[int, Tensor], Tensor]
     ) -> Rollout:
         """Run episodes of actions that are chosen by the number of the step and the states."""
-        task = self.task.widened(state.unsqueeze(0))
-        states = state.expand(self.num_functions, n, -1).clone()
+        task = self.task.widened(starts.flatten(0, -2))
+        states = starts.expand(self.num_functions, *starts.shape[-2:]).clone()
         running = torch.ones(states.shape[:2], dtype=torch.bool)
         left = torch.zeros_like(running)
         steps: list[tuple[Tensor, ...]] = []
@@ -85,11 +102,11 @@ class Rollouts:
             actions = choose(t, states)
             # Where the episodes start the physics has to work; later, all may have come to where
             # it does not.
-            rows = states.flatten(0, 1), actions.flatten(0, 1)
-            step = task.step(*rows, self._move, some_must_succeed=t == 0)
+            at, taken = (_finite_gradient(part.flatten(0, 1)) for part in (states, actions))
+            step = task.step(at, taken, self._move, some_must_succeed=t == 0)
             following, rewards, ended, lost = (part.unflatten(0, running.shape) for part in step)
             made = running & ~lost
-            left |= running & lost
+            left = left | (running & lost)
             steps.append((states, actions, following, rewards, made))
             running = made & ~ended
             states = torch.where(running.unsqueeze(-1), following, states)
@@ -100,3 +117,12 @@ class Rollouts:
         """The next states of rows, of which each function has as many."""
         blocks = (rows.unflatten(0, (self.num_functions, -1)) for rows in (states, actions))
         return self.functions(*blocks).flatten(0, 1)
+
+
+def _finite_gradient(rows: Tensor) -> Tensor:
+    """The same rows; of those whose gradient is not finite none flows on, as rows are separate."""
+    if not rows.requires_grad:
+        return rows
+    rows = rows.view_as(rows)
+    rows.register_hook(lambda g: torch.where(g.isfinite().all(-1, keepdim=True), g, 0.0))
+    return rows

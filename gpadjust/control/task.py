@@ -140,14 +140,15 @@ class Task:
         return states
 
     def rewards(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-        """The known rewards ``N`` of transitions, checked."""
-        return _per_row(self.reward(states, actions, next_states), len(states), "reward")
+        """The known rewards ``N`` of transitions, checked; with their gradient to the states."""
+        rewards = _per_row(self.reward(states, actions, next_states), len(states), "reward")
+        return rewards if next_states.requires_grad else rewards.detach()
 
     def terminations(self, states: Tensor) -> Tensor:
         """Whether states ``N x state_dim`` end an episode, checked: ``N`` booleans."""
         if self.terminated is None:
             return torch.zeros(len(states), dtype=torch.bool)
-        return _per_row(self.terminated(states), len(states), "terminated").bool()
+        return _per_row(self.terminated(states.detach()), len(states), "terminated").bool()
 
     def step(
         self,
@@ -208,7 +209,7 @@ class Task:
 
 def _per_row(values: Any, n: int, name: str) -> Tensor:
     """Check what a function of the user's says of ``n`` rows."""
-    values = torch.as_tensor(values).detach()
+    values = torch.as_tensor(values)
     if values.shape != (n,):
         raise ValueError(
             f"{name} must return one value per row, shape ({n},); found {tuple(values.shape)}."

@@ -67,6 +67,17 @@ class Dynamics(ABC):
             ``k x N x action_dim`` to next states, each of the ``k`` blocks by its own draw.
         """
 
+    def mean_function(self) -> TransitionFunctions:
+        """The mean of the predictions, as a function of any ``k`` blocks; see `sample_functions`.
+
+        Later updates leave it as it is.
+        """
+        return lambda states, actions: self.predict(states, actions).mean
+
+    def before_data(self) -> Dynamics | None:
+        """What is known of the system before there are transitions; None if that is nothing."""
+        return self if self.is_fitted else None
+
     def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> TransitionScores:
         """Judge the predictions by transitions that were not learnt from.
 

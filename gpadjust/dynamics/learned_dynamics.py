@@ -20,6 +20,7 @@ from gpadjust.dynamics.incremental_fit import (
 from gpadjust.dynamics.learnt import Learnt, LearntState
 from gpadjust.dynamics.model_recipe import ModelRecipe
 from gpadjust.dynamics.next_state_physics import check_physics
+from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitResult, SampleResult
@@ -220,6 +221,13 @@ class LearnedDynamics(Dynamics):
             self.spec.complete(states, actions, following), self.spec.complete_variance(variance)
         )
 
+    def before_data(self) -> Dynamics | None:
+        """Itself, once it has learnt; before that its physics, if that is a single one."""
+        if self.is_fitted:
+            return self
+        alone = self.physics is not None and len(self._recipe.parts) == 1
+        return PhysicsDynamics(self.spec, self.physics) if alone and self.physics else None
+
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """Draw next states, noise included, row by row, from PyTorch's generator."""
         mean, variance = self._predict(states, actions, True)
@@ -242,10 +250,25 @@ class LearnedDynamics(Dynamics):
         """
         functions: Any = self.model.sample_functions(num_functions, seed)
 
-        @torch.no_grad()
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_blocks(states, actions, num_functions)
             values = functions.each(self.targets.inputs(states, actions))
+            return self.spec.complete(states, actions, self.targets.decode(states, values))
+
+        return step
+
+    def mean_function(self) -> TransitionFunctions:
+        """The mean of the predictions, as a function of any ``k`` blocks, with gradients.
+
+        Raises:
+            RuntimeError: If nothing was learnt yet.
+        """
+        functions = self.model.mean_functions()
+
+        def step(states: Tensor, actions: Tensor) -> Tensor:
+            self._check_pair(states, actions)
+            inputs = self.targets.inputs(states, actions)
+            values = functions(inputs.flatten(0, -2)).mean(0).unflatten(0, inputs.shape[:-1])
             return self.spec.complete(states, actions, self.targets.decode(states, values))
 
         return step

@@ -84,12 +84,18 @@ class PhysicsDynamics(Dynamics):
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
         """The next states, and zero variance."""
-        following = self._step(states, actions)
+        with torch.no_grad():
+            following = self._step(states, actions)
         return Prediction(following, torch.zeros_like(following))
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states."""
-        return self._step(states, actions)
+        with torch.no_grad():
+            return self._step(states, actions)
+
+    def mean_function(self) -> TransitionFunctions:
+        """The physics, with gradients as far as it has them."""
+        return self._step
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """The physics, whatever the number; the functions are those of :class:`LearnedDynamics`.
@@ -136,7 +142,8 @@ class PhysicsDynamics(Dynamics):
 
     def _change(self, states: Tensor, actions: Tensor) -> Tensor:
         """The change of the states that move."""
-        following = self._step(states, actions)
+        with torch.no_grad():
+            following = self._step(states, actions)
         return self.spec.change(states, following)[..., self.spec.moving]
 
     def _step(self, states: Tensor, actions: Tensor) -> Tensor:
@@ -144,8 +151,7 @@ class PhysicsDynamics(Dynamics):
         self._check_pair(states, actions)
         actions = actions.expand(*states.shape[:-1], -1)
         following = states.clone()
-        with torch.no_grad():
-            following[..., moving] = next_values(
-                self.physics, torch.cat([states[..., moving], actions], dim=-1), len(moving)
-            )
+        following[..., moving] = next_values(
+            self.physics, torch.cat([states[..., moving], actions], dim=-1), len(moving)
+        )
         return self.spec.remember(following, actions)

@@ -33,7 +33,7 @@ from gpadjust.models.posteriors import (
     mixture_interval,
     mixture_moments,
 )
-from gpadjust.models.sampled_functions import SampledFunctions, draw_functions
+from gpadjust.models.sampled_functions import SampledFunctions, draw_functions, mean_functions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.training_data import (
     ArrayLike,
@@ -329,6 +329,20 @@ class ExactGPBase(SingleTaskGP):
             torch.Size([3, 5, 1])
         """
         return draw_functions(self, num_functions, seed, num_features)
+
+    def mean_functions(self) -> Module:
+        """The posterior mean, as a function to be called anywhere: faster than ``predict``.
+
+        Returns:
+            A module that maps raw ``... x q x d`` to ``S x ... x q x m`` in the user's units: a
+            mean for each sample of the hyper-parameters, or a single one. Gradients flow to the
+            inputs as far as f_p allows. Later fits of the model leave it as it is.
+        """
+        return mean_functions(self)
+
+    def _mean_functions(self) -> Module:
+        """The functions of :meth:`mean_functions`, for each batch of the model."""
+        return SampledFunctions.mean(self)
 
     def _draw_functions(self, num_functions: int, num_features: int) -> Module:
         """The functions of :meth:`sample_functions`, for each batch of the model."""

@@ -145,6 +145,11 @@ class RRA(AdjustedGP):
         with torch.no_grad():
             return self.functions(self.weights().sample(Size([num_functions])))
 
+    def _mean_functions(self) -> SampledFunctions:
+        """As the base class, but exactly; see :meth:`functions`."""
+        with torch.no_grad():
+            return self.functions(self.weights().mean.unsqueeze(0))
+
     def pyro_model(self, X: Tensor | None = None, Y: Tensor | None = None) -> Tensor:
         r"""The regression as a Pyro model, in the user's units, for NUTS, SVI or any guide.
 

@@ -86,6 +86,18 @@ class SampledFunctions(Module):
             updates = [update if basis is None else basis * update for basis in bases]
             return cls(model, features, weights, updates)
 
+    @classmethod
+    def mean(cls, model: Any) -> SampledFunctions:
+        """The posterior mean of each batch of a model, as a single function."""
+        strategy, (train,) = model.strategy(), model.train_inputs
+        with torch.no_grad():
+            alpha = strategy.factors().alpha.unsqueeze(0)
+            bases = [term.weights(train) for term in model.terms]
+            updates = [alpha if basis is None else basis * alpha for basis in bases]
+            features = [TermFeatures(term, 0) for term in model.terms]
+            weights = [alpha[..., :0]] * len(features)
+            return cls(model, features, weights, updates)
+
     def forward(self, X: Tensor) -> Tensor:
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
         lead = torch.broadcast_shapes(X.shape[:-2], self.batch_shape)
@@ -144,14 +156,15 @@ class TermFeatures(Module):
 
     Args:
         term: The term.
-        num_features: Number of features of each stationary kernel.
+        num_features: Number of features of each stationary kernel; 0 for none of any term.
     """
 
     def __init__(self, term: Term, num_features: int) -> None:
         super().__init__()
         self.num_inputs = term.num_inputs
-        self.maps = ModuleList(_feature_maps(term.kernel, term.num_inputs, num_features))
-        self.mean_variance = term.mean_variance if term.learns_mean else None
+        kernel = term.kernel if num_features else None
+        self.maps = ModuleList(_feature_maps(kernel, term.num_inputs, num_features))
+        self.mean_variance = term.mean_variance if term.learns_mean and num_features else None
         with torch.no_grad():
             self.num_features = self(term.mean.new_zeros(1, term.num_inputs)).shape[-1]
 
@@ -272,6 +285,15 @@ def draw_functions(model: Any, num_functions: int, seed: int | None, num_feature
         order = torch.randperm(model.num_samples)
         each = take_samples(model, order[torch.arange(num_functions) % model.num_samples])
         return FunctionPerBatch(each._draw_functions(1, num_features))
+
+
+def mean_functions(model: Any) -> Module:
+    """A model's posterior means; see :meth:`~gpadjust.CKA.mean_functions`."""
+    model.eval()
+    if model.num_samples is None:
+        return model._mean_functions()
+    each = take_samples(model, torch.arange(model.num_samples))
+    return FunctionPerBatch(each._mean_functions())
 
 
 @contextmanager

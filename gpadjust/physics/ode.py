@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -12,6 +12,8 @@ from torchdiffeq import odeint
 
 from gpadjust.physics.base import Physics, whole_number
 from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.external_call import ExternalCall
+from gpadjust.physics.finite_difference import central_difference
 
 FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
 ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
@@ -40,6 +42,9 @@ class ODEPhysics(Physics):
         atol: Absolute tolerance of the adaptive methods, in the unit of the state.
         max_steps: The most steps that an adaptive method tries within ``step``.
         difference: Whether the output is the change of the state instead of the new state.
+        gradient: Where the gradient in X comes from: ``"autograd"``, or ``"finite-difference"``,
+            central differences in a single call, which is several times faster if there are many
+            substeps, with first derivatives only. (Parameters are learnt by autograd.)
         inputs: The columns of X that hold state and action, in this order. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: that of ``rhs``.
@@ -48,7 +53,7 @@ class ODEPhysics(Physics):
         TypeError: If ``rhs`` is not callable, or a setting is no number, or none that is whole
             where it counts something.
         ValueError: If ``step``, ``substeps``, ``state_dim`` or ``max_steps`` is not positive, a
-            tolerance is negative, or ``method`` is unknown.
+            tolerance is negative, or ``method`` or ``gradient`` is unknown.
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
@@ -71,6 +76,7 @@ class ODEPhysics(Physics):
         atol: float = 1e-9,
         max_steps: int = 10_000,
         difference: bool = False,
+        gradient: Literal["autograd", "finite-difference"] = "autograd",
         inputs: Sequence[int] | None = None,
         memo: int = 100_000,
         name: str | None = None,
@@ -91,6 +97,10 @@ class ODEPhysics(Physics):
                 f"Unknown method {method!r}; use one with a fixed step, {', '.join(FIXED_STEP)}, "
                 f"or an adaptive one, {', '.join(ADAPTIVE_STEP)}."
             )
+        if gradient not in ("autograd", "finite-difference"):
+            raise ValueError(
+                f"Unknown gradient {gradient!r}; use 'autograd' or 'finite-difference'."
+            )
         name = name or getattr(rhs, "__name__", type(rhs).__name__)
         super().__init__(inputs=inputs, memo=memo, name=name)
         self.rhs = rhs
@@ -102,6 +112,7 @@ class ODEPhysics(Physics):
         self.atol = atol
         self.max_steps = max_steps
         self.difference = difference
+        self.gradient = gradient
         self.num_outputs = state_dim
 
     def evaluate(self, X: Tensor) -> Tensor:
@@ -161,6 +172,17 @@ class ODEPhysics(Physics):
                 range(len(X)),
             ) from error
         return path[-1] - state if self.difference else path[-1]
+
+    def _differentiate(self, rows: Tensor) -> Tensor:
+        by_autograd = self.gradient == "autograd" or not rows.requires_grad
+        if by_autograd or any(p.requires_grad for p in self.parameters()):
+            return super()._differentiate(rows)
+
+        def jacobian(rows: Tensor) -> Tensor:
+            with torch.no_grad():
+                return central_difference(self._call, rows)
+
+        return ExternalCall.apply(rows, self._recall, jacobian)
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""

@@ -12,8 +12,11 @@ from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
 from gpadjust.rl.checkpoint import EpisodeCheckpoint, resume, save_checkpoint
 from gpadjust.rl.dyna import Dyna
+from gpadjust.rl.model_learner import ModelLearner
 from gpadjust.rl.model_vec_env import ModelVecEnv
-from gpadjust.rl.options import DynaOptions
+from gpadjust.rl.mpc_agent import MPCAgent
+from gpadjust.rl.options import DynaOptions, ModelOptions
+from gpadjust.rl.policy_search_agent import PolicySearchAgent
 
 __all__ = [
     "Dyna",
@@ -22,8 +25,12 @@ __all__ = [
     "DynaSAC",
     "DynaTD3",
     "EpisodeCheckpoint",
+    "MPCAgent",
     "MixedReplayBuffer",
+    "ModelLearner",
+    "ModelOptions",
     "ModelVecEnv",
+    "PolicySearchAgent",
     "resume",
     "save_checkpoint",
 ]

@@ -22,10 +22,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from gpadjust.control import Task
 from gpadjust.rl.agents import DynaSAC
 from gpadjust.rl.buffer import CompactReplayBuffer
-from gpadjust.rl.dyna import Dyna
+from gpadjust.rl.model_learner import ModelLearner
 from gpadjust.rl.random_state import RandomState
 
-Agent = TypeVar("Agent", bound=Dyna)
+Agent = TypeVar("Agent", bound=ModelLearner)
 _FORMAT = "gpadjust episode checkpoint, version 2"
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")
 _BUFFERS = ("replay_buffer", "model_buffer")
@@ -63,7 +63,7 @@ class EpisodeCheckpoint(BaseCallback):
         >>> # agent.learn(1250 - agent.num_timesteps, checkpoint, reset_num_timesteps=False)
     """
 
-    model: Dyna
+    model: ModelLearner
 
     def __init__(self, path: str | Path, every: int = 1) -> None:
         if every < 1:
@@ -74,9 +74,9 @@ class EpisodeCheckpoint(BaseCallback):
         self._rollouts = 0
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, Dyna):
+        if not isinstance(self.model, ModelLearner):
             raise TypeError(
-                "EpisodeCheckpoint is for Dyna agents, such as DynaSAC; found "
+                "EpisodeCheckpoint is for learners with a model, such as DynaSAC; found "
                 f"{type(self.model).__name__}."
             )
         if self.model.use_sde:
@@ -101,7 +101,7 @@ class EpisodeCheckpoint(BaseCallback):
         # Otherwise a callback stopped the run within an episode.
 
 
-def save_checkpoint(agent: Dyna, path: str | Path) -> None:
+def save_checkpoint(agent: ModelLearner, path: str | Path) -> None:
     """Write the state of a run between two episodes to a file, atomically; see :func:`resume`.
 
     Raises:
@@ -111,7 +111,7 @@ def save_checkpoint(agent: Dyna, path: str | Path) -> None:
         _write(agent, Path(path))
 
 
-def _write(agent: Dyna, path: Path) -> None:
+def _write(agent: ModelLearner, path: Path) -> None:
     saved = io.BytesIO()
     agent.save(saved)
     env = agent.get_env()
@@ -231,7 +231,11 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 
 def _check(
-    path: str | Path, manifest: dict[str, Any], env: VecEnv, task: Task, algorithm: type[Dyna]
+    path: str | Path,
+    manifest: dict[str, Any],
+    env: VecEnv,
+    task: Task,
+    algorithm: type[ModelLearner],
 ) -> None:
     """Raise a ValueError unless a checkpoint is of this agent, environment and task."""
     if not isinstance(task, Task):
@@ -257,7 +261,7 @@ def _check(
             )
 
 
-def _buffer(agent: Dyna, name: str) -> CompactReplayBuffer:
+def _buffer(agent: ModelLearner, name: str) -> CompactReplayBuffer:
     return agent.replay_buffer if name == "replay_buffer" else agent.replay_buffer.model_buffer
 
 
@@ -328,7 +332,7 @@ def _environment_state(vec_env: VecEnv) -> bytes:
 
 
 def _restore_environment(
-    agent: Dyna, vec_env: VecEnv, kept: list[dict[str, Any]], envs: list[Any] | None
+    agent: ModelLearner, vec_env: VecEnv, kept: list[dict[str, Any]], envs: list[Any] | None
 ) -> None:
     layers = _layers(vec_env)
     for layer, attributes in zip(layers, kept, strict=envs is not None):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
-import time
 import warnings
 from dataclasses import fields
 from pathlib import Path
@@ -12,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
@@ -23,16 +19,13 @@ from torch import Tensor
 
 from gpadjust.control import Task
 from gpadjust.rl.buffer import MixedReplayBuffer
-from gpadjust.rl.callbacks import DynaCallback
-from gpadjust.rl.foresight import foresight
+from gpadjust.rl.model_learner import ModelLearner
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
-from gpadjust.rl.planned_episodes import PlannedEpisode, PlannedEpisodes
-from gpadjust.rl.recorded_episodes import RecordedEpisodes
-from gpadjust.rl.task_learner import TaskLearner
+from gpadjust.rl.planned_episodes import PlannedEpisode
 
 
-class Dyna(TaskLearner):
+class Dyna(ModelLearner):
     r"""What an off-policy learner needs to learn from real episodes and from those in a model.
 
     After each real episode it updates on what it has, as the learner does; teaches the real
@@ -86,6 +79,8 @@ class Dyna(TaskLearner):
         AssertionError: By Stable-Baselines3, if the actions are no box.
     """
 
+    options_class = DynaOptions
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -122,13 +117,10 @@ class Dyna(TaskLearner):
                 f"{name} is an option of the model: pass DynaOptions({name}={kwargs[name]!r}) as "
                 "options."
             )
-        self.options = DynaOptions() if options is None else options
-        self.num_episodes = 0
-        self.planned = PlannedEpisodes()
         self.owed_updates = 0.0
-        self.model_hooks: list[DynaCallback] = []
         super().__init__(
             task,
+            DynaOptions() if options is None else options,
             policy,
             env,
             buffer_size=buffer_size,
@@ -138,63 +130,18 @@ class Dyna(TaskLearner):
             replay_buffer_class=buffer_class,
             **kwargs,
         )
-        self.wall_time = dict.fromkeys(("fit", "rollout", "update", "plan"), 0.0)
 
     # One iteration
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Update on what there is, learn the model, train in it; SB3 calls this."""
-        if not self.replay_buffer.size():
-            return  # all steps failed
+    def _update(self, gradient_steps: int, batch_size: int) -> None:
+        """The learner's own updates, on what there is."""
         serves = self.options.uses_model(self.num_episodes)
-        new = self._new_episodes()
-        if serves and new is not None and self.options.reward_tolerance is not None:
-            new.check(self.ready_task(), self.options.reward_tolerance)
         self.replay_buffer.mix = self.options.keep_model_data or serves
-        with self.timed("update"):
-            super().train(gradient_steps, batch_size)
-        if new is None:
-            return
-        metrics = self._learn_dynamics(new) if serves else {}
-        num_ended = self.replay_buffer.num_ended
-        self.replay_buffer.num_new = self.replay_buffer.num_ended = 0
-        self.num_episodes += num_ended
-        if serves:
-            for hook in self.model_hooks:
-                hook.on_model_fit(metrics)
-            self._train_in_model(self.options.model_episodes * num_ended, batch_size)
-            total = sum(self.wall_time.values())
-            for name, seconds in self.wall_time.items():
-                self.logger.record(f"model/share_{name}", seconds / total)
+        super()._update(gradient_steps, batch_size)
 
-    def _new_episodes(self) -> RecordedEpisodes | None:
-        """The real steps that the dynamics have not learnt, if an episode has ended."""
-        buffer, is_fitted = self.replay_buffer, self.ready_task().dynamics.is_fitted
-        if not buffer.num_ended:
-            return None
-        new = self.recorded_episodes(newest=buffer.num_new if is_fitted else None)
-        least = 1 if is_fitted else 2  # a first fit needs two
-        return new if new.num_transitions >= least else None
-
-    def _learn_dynamics(self, new: RecordedEpisodes) -> dict[str, float]:
-        """Score the dynamics on new transitions, and teach them these; return what is logged."""
-        task = self.model_task()
-        metrics: dict[str, float] = {}
-        start = time.perf_counter()
-        with self.timed("fit"):
-            transitions = new.learnable(task.dynamics)
-            if task.dynamics.is_fitted:
-                before = time.perf_counter()
-                horizons = self.options.score_horizons
-                metrics = foresight(task, transitions, self.recorded_episodes(), horizons)
-                metrics["score_seconds"] = time.perf_counter() - before
-            task.dynamics.update(*transitions)
-        metrics["fit_seconds"] = time.perf_counter() - start - metrics.get("score_seconds", 0.0)
-        # Dynamics without variances have no NLPD, short episodes no long trajectories.
-        metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
-        for name, value in metrics.items():
-            self.logger.record(f"model/{name}", value)
-        return metrics
+    def _improve(self, num_ended: int, batch_size: int) -> None:
+        """Train in the model."""
+        self._train_in_model(self.options.model_episodes * num_ended, batch_size)
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
         """Run model episodes, side by side, with updates at each step."""
@@ -252,7 +199,7 @@ class Dyna(TaskLearner):
         self.owed_updates -= updates
         if updates:
             with self.timed("update"):
-                super().train(updates, batch_size)
+                super()._update(updates, batch_size)
 
     # The model
 
@@ -308,25 +255,16 @@ class Dyna(TaskLearner):
 
     # Planned episodes
 
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The actions of a real step, and as the buffer keeps them; SB3 calls this."""
-        actions, scaled = super()._sample_action(learning_starts, action_noise, n_envs)
+    @property
+    def replan_every(self) -> int | None:
+        """Steps after which a planned episode is planned anew; None: it goes by one plan."""
         planner = self.options.exploration
-        if planner is None:
-            return actions, scaled
-        taken = [
-            self.planned.act(i, state, action, self._plans, self._plan, planner.replan_every)
-            for i, (state, action) in enumerate(
-                zip(self.last_states(), torch.from_numpy(actions), strict=True)
-            )
-        ]
-        scaled = self.policy.scale_action(torch.stack(taken).numpy())
-        return self.policy.unscale_action(scaled), scaled
+        return None if planner is None else planner.replan_every
 
     def _plans(self) -> bool:
         """Whether an episode that begins is to be planned."""
+        if self.options.exploration is None:
+            return False
         # The first is the policy's, even of dynamics that have learnt from other data.
         ready = self.num_episodes > 0 and self.ready_task().dynamics.is_fitted
         left = self.options.explore_episodes - self.planned.num_planned
@@ -343,7 +281,7 @@ class Dyna(TaskLearner):
             seen = task.dynamics.spec.observe(states).numpy()
             return _doubles(self.act_in_model(seen.astype(self.observation_space.dtype)))
 
-        bounds = _doubles(np.stack([self.action_space.low, self.action_space.high]))
+        bounds = self.action_bounds()
         with self.timed("plan"):
             plan = planner.plan(
                 task,
@@ -357,27 +295,6 @@ class Dyna(TaskLearner):
         self.logger.record("model/planned_value", plan.value)
         return plan.actions.clamp(bounds[0], bounds[1])
 
-    # What SB3 calls
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """As in SB3; it also notices where episodes end."""
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        for i in dones.nonzero()[0]:
-            self.planned.end(int(i))
-
-    def environments_reset(self) -> None:
-        """No plan holds any more."""
-        super().environments_reset()
-        self.planned.forget()
-
     def ready_task(self) -> Task:
         """The task, if the agent can learn with it; see :class:`TaskLearner`.
 
@@ -386,8 +303,6 @@ class Dyna(TaskLearner):
                 ``exploration`` asks.
         """
         task = super().ready_task()
-        if not isinstance(self.options, DynaOptions):
-            raise TypeError(f"options must be DynaOptions(...); found {self.options!r}.")
         if self.options.exploration is not None:
             self.options.exploration.objective.check(task)
         return task
@@ -399,19 +314,12 @@ class Dyna(TaskLearner):
         }
         super()._setup_model()
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        self.model_hooks = []  # callbacks that have some add themselves
-        return super()._setup_learn(*args, **kwargs)
-
     def load_replay_buffer(
         self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
     ) -> None:
         """As in SB3, for both buffers; the file is a pickle: open only one that you trust."""
         super().load_replay_buffer(path, truncate_last_traj)
         self.replay_buffer.model_buffer.device = self.device
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "model_hooks"]
 
 
 def _doubles(values: np.ndarray) -> Tensor:

@@ -7,9 +7,12 @@ import warnings
 from torch import Tensor
 
 from gpadjust.control import Task
+from gpadjust.dynamics import Dynamics, LearnedDynamics
 from gpadjust.dynamics.trajectory_scores import typical_change
+from gpadjust.models import AdjustedGP
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.recorded_episodes import RecordedEpisodes
+from gpadjust.validation.trust import trust
 
 _WINDOWS = 4  # of each horizon: some half second for a model of an episode
 
@@ -38,6 +41,7 @@ def foresight(
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
     if not horizons:
         return found
+    found["overrides"] = _overrides(dynamics, *transitions[:2])
     try:
         far = dynamics.score_trajectories(
             *transitions,
@@ -61,3 +65,13 @@ def foresight(
             f"energy_{horizon}": float(far.energy[i]),
         }
     return found
+
+
+def _overrides(dynamics: Dynamics, states: Tensor, actions: Tensor) -> float:
+    """The share of predictions in which data override the physics; nan without one."""
+    if not isinstance(dynamics, LearnedDynamics):
+        return float("nan")
+    model = dynamics.model
+    if not isinstance(model, AdjustedGP) or not model.rho_names:
+        return float("nan")
+    return float(trust(model, dynamics.targets.inputs(states, actions)).data.mean())

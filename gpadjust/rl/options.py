@@ -1,4 +1,4 @@
-"""How a Dyna agent uses its model."""
+"""How agents learn and use their models."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import get_args
 
-from gpadjust.control import CrossEntropyPlanner
+from gpadjust.control import Planner
 from gpadjust.dynamics.trajectory_scores import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
@@ -18,11 +18,44 @@ _WHOLE = {  # the least of each
     "num_particles": 1,
     "explore_episodes": 0,
 }
-_FRACTIONAL = {"updates_per_model_step": math.inf, "real_fraction": 1, "reward_tolerance": math.inf}
+_FRACTIONAL = {"updates_per_model_step": math.inf, "real_fraction": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
-class DynaOptions:
+class ModelOptions:
+    """How a model is learnt from real episodes.
+
+    Args:
+        reward_tolerance: How far the known rewards may be from the recorded ones, relative to the
+            largest of an episode; None to check neither rewards nor terminations, as noisy sensors
+            may need.
+        score_horizons: Numbers of steps over which each new episode is predicted before it is
+            learnt, open loop along its actions, to log how well (``model/coverage_15``). Some half
+            a second, and with a physics that is costly its evaluation at 39 particles of 4 windows
+            a step; () does without.
+
+    Raises:
+        TypeError: If something is of another kind.
+        ValueError: If a number is out of range.
+    """
+
+    reward_tolerance: float | None = 1e-3
+    score_horizons: tuple[int, ...] = (1, 5, 15)
+
+    def __post_init__(self) -> None:
+        """Check them."""
+        if self.reward_tolerance is not None:
+            check_number("reward_tolerance", self.reward_tolerance, math.inf)
+        if self.score_horizons != ():
+            object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
+
+    def uses_model(self, num_episodes: int) -> bool:
+        """Whether the model serves after so many real episodes."""
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynaOptions(ModelOptions):
     """How a Dyna agent uses its model.
 
     Args:
@@ -40,9 +73,7 @@ class DynaOptions:
             default, a real one for ten of the model, is what a uniform draw from both buffers would
             give with ten model episodes for each real one. (MBPO has 1/20; Janner et al. 2019.)
         model_buffer_size: How many model transitions are kept. Default: as ``buffer_size``.
-        reward_tolerance: How far the known rewards may be from the recorded ones, relative to the
-            largest of an episode; None to check neither rewards nor terminations, as noisy sensors
-            may need.
+        reward_tolerance: See :class:`ModelOptions`, like ``score_horizons``.
         num_particles: Model episodes that run side by side. Default: all.
         sampling: How they are sampled, by ``"step"`` or ``"trajectory"``, see
             :class:`ModelVecEnv`.
@@ -50,10 +81,6 @@ class DynaOptions:
             policy acts in all.
         explore_episodes: How many episodes after the first are planned, if there is an
             ``exploration``.
-        score_horizons: Numbers of steps over which each new episode is predicted before it is
-            learnt, open loop along its actions, to log how well (``model/coverage_15``). Some half
-            a second, and with a physics that is costly its evaluation at 39 particles of 4 windows
-            a step; () does without.
 
     Raises:
         TypeError: If something is of another kind.
@@ -67,15 +94,14 @@ class DynaOptions:
     refresh_model_data: bool = True
     real_fraction: float = 1 / 11
     model_buffer_size: int | None = None
-    reward_tolerance: float | None = 1e-3
     num_particles: int | None = None
     sampling: Sampling = "step"
-    exploration: CrossEntropyPlanner | None = None
+    exploration: Planner | None = None
     explore_episodes: int = 3
-    score_horizons: tuple[int, ...] = (1, 5, 15)
 
     def __post_init__(self) -> None:
         """Check them."""
+        super().__post_init__()
         optional = {entry.name for entry in fields(self) if entry.default is None}
         for name, least in _WHOLE.items():
             value = getattr(self, name)
@@ -86,26 +112,24 @@ class DynaOptions:
             if value < least:
                 raise ValueError(f"{name} must be at least {least}; found {value}.")
         for name, most in _FRACTIONAL.items():
-            value = getattr(self, name)
-            if value is None and name == "reward_tolerance":
-                continue
-            if not isinstance(value, Real) or isinstance(value, bool):
-                raise TypeError(f"{name} must be a number; found {value!r}.")
-            if not 0 <= float(value) <= most or math.isinf(value):
-                bounds = "finite and at least 0" if most == math.inf else f"in [0, {most}]"
-                raise ValueError(f"{name} must be {bounds}; found {value}.")
+            check_number(name, getattr(self, name), most)
         for name in ("keep_model_data", "refresh_model_data"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} must be True or False; found {getattr(self, name)!r}.")
         if self.sampling not in get_args(Sampling):
             raise ValueError(f"Unknown sampling {self.sampling!r}; use 'step' or 'trajectory'.")
-        if self.score_horizons != ():
-            object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
-        if not isinstance(self.exploration, (CrossEntropyPlanner, type(None))):
-            raise TypeError(
-                f"exploration must be a CrossEntropyPlanner, or None; found {self.exploration!r}."
-            )
+        if not isinstance(self.exploration, (Planner, type(None))):
+            raise TypeError(f"exploration must be a Planner, or None; found {self.exploration!r}.")
 
     def uses_model(self, num_episodes: int) -> bool:
         """Whether the model serves after so many real episodes."""
         return self.last_model_episode is None or num_episodes < self.last_model_episode
+
+
+def check_number(name: str, value: object, most: float) -> None:
+    """Raise an error unless an option is a number from 0 to ``most``, and finite."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name} must be a number; found {value!r}.")
+    if not 0 <= float(value) <= most or math.isinf(value):
+        bounds = "finite and at least 0" if most == math.inf else f"in [0, {most}]"
+        raise ValueError(f"{name} must be {bounds}; found {value}.")

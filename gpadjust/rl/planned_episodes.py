@@ -46,6 +46,10 @@ class PlannedEpisodes:
         """An environment begins another episode."""
         self.under_way.pop(environment, None)
 
+    def is_planned(self, environment: int) -> bool:
+        """Whether the episode of an environment goes by a plan."""
+        return self.under_way.get(environment) is not None
+
     def act(
         self,
         environment: int,

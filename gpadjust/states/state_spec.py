@@ -169,7 +169,7 @@ class StateSpec:
         """The change ``... x state_dim``, of angles the shortest way round."""
         change = next_states - states
         for i in self.angle_columns:
-            angle = change[..., i]
+            angle = change[..., i].clone()  # not a view of what is written, for autograd
             change[..., i] = torch.atan2(angle.sin(), angle.cos())
         return change
 

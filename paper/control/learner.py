@@ -14,7 +14,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 import gpadjust.models
-from gpadjust.control import CrossEntropyPlanner
+from gpadjust.control import Planner
 from gpadjust.control import Task as ControlTask
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
@@ -42,7 +42,7 @@ class System(NamedTuple):
     env: gym.Env[Any, Any]
     task: ControlTask
     recorder: Recorder
-    exploration: CrossEntropyPlanner | None = None
+    exploration: Planner | None = None
     explore_episodes: int = 0
 
 

@@ -13,8 +13,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gpadjust.control import CrossEntropyPlanner, Information
-from gpadjust.control.action_sequences import cross_entropy, random_sequences
+from gpadjust.control import CrossEntropy, Information, Planner
+from gpadjust.control.search import random_sequences
 from gpadjust.dynamics import Dynamics, PhysicsDynamics
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.envs import CART_POLE_SPEC, cart_pole_cost, cart_pole_start
@@ -42,7 +42,8 @@ def system(scenario: Scenario, settings: Settings, seed: int) -> System:
     recorder = ExplorationRecorder(settings, scenario.model is None, seed)
     plan: dict[str, Any] = {name: getattr(settings, name) for name in PLANS}
     num_planned = plan.pop("explore_episodes")
-    planner = CrossEntropyPlanner(Information(), **plan) if num_planned else None
+    search = CrossEntropy(plan.pop("rounds"), num_elites=plan.pop("num_elites"))
+    planner = Planner(Information(), search, **plan) if num_planned else None
     return System(found.env, found.task, recorder, planner, num_planned)
 
 
@@ -102,7 +103,7 @@ def make(num_starts: int = NUM_STARTS, rounds: int = 20, num_sequences: int = 10
                 return -cart_pole_cost(_path(real, start, sequences)[:, 1:]).mean(-1)
 
             first = random_sequences(num_sequences, NUM_STEPS, bounds, _MAX_HOLD)
-            best, _ = cross_entropy(gain, first, bounds, rounds, num_elites=10)
+            best, _ = CrossEntropy(rounds, num_elites=10).best(gain, first, bounds)
             wild = random_sequences(1, NUM_STEPS, bounds, _MAX_HOLD)[0]
             tables += [
                 _table(kind, _path(real, start, actions.unsqueeze(0))[0], actions)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from gpadjust.control import CrossEntropyPlanner, Return, Task
+from gpadjust.control import CrossEntropy, Planner, Return, Task
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward
 from gpadjust.envs.cart_pole.swing_up import MAX_FORCE
@@ -29,13 +29,11 @@ def run(experiment: Floor, system: str, seed: int, *, unfinished: Path) -> Recor
     settings = experiment.settings
     starts = fixed_starts(seed + 1) if "fixed" in system else torch.tensor([START_MEAN])
     task = Task(PhysicsDynamics(CART_POLE_SPEC, true_physics()), cart_pole_reward)
-    planner = CrossEntropyPlanner(
+    planner = Planner(
         Return(),
+        CrossEntropy(settings.rounds, num_elites=settings.elites),
         num_random=settings.sequences,
         num_policy=0,
-        num_functions=1,
-        rounds=settings.rounds,
-        num_elites=settings.elites,
     )
     bounds = torch.tensor([[-MAX_FORCE], [MAX_FORCE]], dtype=torch.float64)
     length = Settings().episode_length

@@ -5,8 +5,15 @@ import pickle
 import pytest
 import torch
 
-from gpadjust.control import CrossEntropyPlanner, Information, Return, Rollouts, Task
-from gpadjust.control.action_sequences import cross_entropy, random_sequences
+from gpadjust.control import (
+    CrossEntropy,
+    Information,
+    Planner,
+    Return,
+    Rollouts,
+    Task,
+)
+from gpadjust.control.search import random_sequences
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec, TrajectoryInformation
 from gpadjust.models import ZeroMeanGP
 from gpadjust.physics import PhysicsError
@@ -55,11 +62,11 @@ def test_the_cross_entropy_method_finds_an_optimum():
         return -(sequences - best).square().sum((-2, -1))
 
     first = random_sequences(60, 4, BOUNDS, max_hold=1)
-    found, value = cross_entropy(score, first, BOUNDS, rounds=12, num_elites=8)
+    found, value = CrossEntropy(12).best(score, first, BOUNDS)
     assert calls == [60] * 13
     assert value == pytest.approx(score(found.unsqueeze(0)).item())
     assert value > -1e-2
-    chosen, before = cross_entropy(score, first, BOUNDS, rounds=0, num_elites=8)
+    chosen, before = CrossEntropy(0).best(score, first, BOUNDS)
     assert before == score(first).max()
     assert (first == chosen).flatten(1).all(1).any()
     assert before < value
@@ -67,7 +74,7 @@ def test_the_cross_entropy_method_finds_an_optimum():
 
 def test_a_single_sequence_is_taken():
     only = torch.ones(1, 3, 1, dtype=torch.float64)
-    found, _ = cross_entropy(lambda s: s.sum((-2, -1)), only, BOUNDS, rounds=1, num_elites=8)
+    found, _ = CrossEntropy(1).best(lambda s: s.sum((-2, -1)), only, BOUNDS)
     assert torch.equal(found, only[0])
 
 
@@ -149,7 +156,7 @@ def test_the_policy_proposes(origin):
 
 
 def test_a_plan_goes_where_little_is_known(known_left, origin):
-    plan = CrossEntropyPlanner(Information(), num_random=24, rounds=1).plan(
+    plan = Planner(Information(), CrossEntropy(1), num_random=24).plan(
         task_of(known_left), origin, BOUNDS, 4
     )
     assert plan.actions.shape == (4, 1)
@@ -165,13 +172,13 @@ def test_more_rounds_teach_more(known_left, origin):
     values = []
     for rounds in (0, 4):
         torch.manual_seed(0)
-        options = CrossEntropyPlanner(Information(), num_random=16, num_policy=0, rounds=rounds)
+        options = Planner(Information(), CrossEntropy(rounds), num_random=16, num_policy=0)
         values.append(options.plan(task_of(known_left), origin, BOUNDS, 4).value)
     assert values[1] > values[0]
 
 
 def test_a_plan_may_be_the_policys(known_left, origin):
-    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=4, rounds=0)
+    options = Planner(Information(), CrossEntropy(0), num_random=0, num_policy=4)
     plan = options.plan(
         task_of(known_left), origin, BOUNDS, 3, policy=lambda s: torch.full_like(s, 9.0)
     )
@@ -184,7 +191,7 @@ def test_the_rest_of_an_episode_counts_what_the_episode_told(known_left):
     """Of what only the first steps can tell, a rest that repeats them tells less."""
     state = torch.zeros(1, dtype=torch.float64)
     held = torch.full((2, 1), 1.5, dtype=torch.float64)
-    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
+    options = Planner(Information(), CrossEntropy(0), num_random=0, num_policy=1)
     alone = options.plan(task_of(known_left), state, BOUNDS, 2, policy=lambda s: s * 0 + 1.5)
     states = torch.tensor([[0.0], [0.75]], dtype=torch.float64)
     both = options.plan(
@@ -196,7 +203,7 @@ def test_the_rest_of_an_episode_counts_what_the_episode_told(known_left):
 
 def test_a_known_sequence_is_kept_if_nothing_is_better(known_left, origin):
     known = torch.full((4, 1), 2.0, dtype=torch.float64)
-    options = CrossEntropyPlanner(Information(), num_random=0, num_policy=1, rounds=0)
+    options = Planner(Information(), CrossEntropy(0), num_random=0, num_policy=1)
     plan = options.plan(
         task_of(known_left), origin, BOUNDS, 4, policy=lambda s: s * 0 - 0.5, known=known
     )
@@ -205,14 +212,14 @@ def test_a_known_sequence_is_kept_if_nothing_is_better(known_left, origin):
 
 def test_a_state_from_which_every_step_leaves_the_bounds(known_left, origin):
     bounds = torch.tensor([[-0.1], [0.1]], dtype=torch.float64)
-    plan = CrossEntropyPlanner(Information(), num_random=4).plan(
+    plan = Planner(Information(), num_random=4).plan(
         task_of(known_left, state_bounds=bounds), origin, BOUNDS.new_tensor([[-1.0], [-0.5]]), 3
     )
     assert plan.value == 0
 
 
 def test_plans_are_those_of_the_generator(known_left, origin):
-    options = pickle.loads(pickle.dumps(CrossEntropyPlanner(Information(), num_random=8, rounds=1)))
+    options = pickle.loads(pickle.dumps(Planner(Information(), CrossEntropy(1), num_random=8)))
     plans = []
     for seed in (0, 0, 1):
         torch.manual_seed(seed)
@@ -227,18 +234,24 @@ def test_plans_are_those_of_the_generator(known_left, origin):
         ({"num_random": -1}, ValueError, "num_random must be at least 0; found -1"),
         ({"num_functions": 0}, ValueError, "num_functions must be at least 1; found 0"),
         ({"replan_every": 0}, ValueError, "replan_every must be at least 1; found 0"),
-        ({"rounds": 1.5}, TypeError, "rounds must be a whole number; found 1.5"),
+        (
+            {"search": "cem"},
+            TypeError,
+            "object of a Search, .* found 'cem'",
+        ),
+        ({"horizon": 1.5}, TypeError, "horizon must be a whole number; found 1.5"),
+        ({"spread": 0.0}, ValueError, "spread must be above 0 and below 1; found 0.0"),
         ({"max_hold": True}, TypeError, "max_hold must be a whole number; found True"),
         ({"num_random": 0, "num_policy": 0}, ValueError, "no sequence of actions to choose"),
     ],
 )
 def test_bad_options_are_refused(options, error, message):
     with pytest.raises(error, match=message):
-        CrossEntropyPlanner(Information(), **options)
+        Planner(Information(), **options)
 
 
 def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
-    options = CrossEntropyPlanner(Information())
+    options = Planner(Information())
     with pytest.raises(ValueError, match=r"state of shape 1, found \(2,\)"):
         options.plan(task_of(known_left), origin.repeat(2), BOUNDS, 3)
     with pytest.raises(ValueError, match=r"finite action_bounds of shape 2 x 1, found .*inf"):
@@ -261,8 +274,8 @@ def test_the_best_sequence_of_all_rounds_is_kept():
     bounds = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
     first = 2 * torch.rand(16, 4, 1, dtype=torch.float64) - 1
     first[3] = 0.7  # as good as can be, and never drawn again
-    found, score = cross_entropy(
-        lambda sequences: -(sequences - 0.7).square().sum((1, 2)), first, bounds, 3, 4
+    found, score = CrossEntropy(3, num_elites=4).best(
+        lambda sequences: -(sequences - 0.7).square().sum((1, 2)), first, bounds
     )
     assert score == 0
     assert torch.equal(found, first[3])
@@ -279,14 +292,14 @@ def test_staying_is_better_than_leaving_however_few_the_sequences(origin, seed):
         state_bounds=torch.tensor([[-0.2], [0.2]]),
     )
     bounds = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
-    planner = CrossEntropyPlanner(Return(), num_random=2, num_policy=1, rounds=3)
+    planner = Planner(Return(), CrossEntropy(3), num_random=2, num_policy=1)
     known = torch.zeros(3, 1, dtype=torch.float64)
     assert planner.plan(task, origin, bounds, 3, known=known).value >= -30.6
 
 
 def test_an_objective_is_asked_for():
     with pytest.raises(TypeError, match=r"Information\(\) or Return\(\); found 'return'"):
-        CrossEntropyPlanner("return")
+        Planner("return")
 
 
 # Returns
@@ -294,7 +307,7 @@ def test_an_objective_is_asked_for():
 
 def test_a_plan_of_the_greatest_return(origin):
     """From x = 0 the way to x = 1 and to stay there, by steps of v / 2 with v at most 2."""
-    planner = CrossEntropyPlanner(Return(), num_random=200, rounds=12, max_hold=1)
+    planner = Planner(Return(), CrossEntropy(12), num_random=200, max_hold=1)
     plan = planner.plan(half_steps(), origin, BOUNDS, 4)
     assert plan.value > -0.1
     reached = (plan.actions[:, 0] / 2).cumsum(0)
@@ -316,6 +329,6 @@ def test_a_return_is_the_sum_of_the_rewards_that_are_made(origin):
 def test_leaving_the_bounds_never_pays(origin):
     """Rewards are negative: an episode that ended early would have the greatest sum of them."""
     task = half_steps(state_bounds=torch.tensor([[-0.3], [0.9]]))
-    plan = CrossEntropyPlanner(Return(), num_random=100, rounds=6).plan(task, origin, BOUNDS, 5)
+    plan = Planner(Return(), CrossEntropy(6), num_random=100).plan(task, origin, BOUNDS, 5)
     rollout = Rollouts(task, 1).follow(origin, plan.actions.unsqueeze(0))
     assert rollout.made.all()

@@ -116,3 +116,23 @@ def test_features_make_the_kernel(uniform, outputs):
         expected = term.covariance(x, x).detach()
         close = {"rtol": 0, "atol": tolerance * expected.max().item()}
         torch.testing.assert_close((features @ features.mT).detach(), expected, **close)
+
+
+def test_means_are_those_of_the_predictions(data, build, kind, num_outputs, uniform):
+    model = build(kind, *data(num_outputs=num_outputs, n=9))
+    functions, Z = model.mean_functions(), uniform(2, 5, 2)
+    torch.testing.assert_close(functions(Z), model.predict(Z).mean.unsqueeze(0))
+    Z.requires_grad_(True)
+    (slope,) = torch.autograd.grad(functions(Z).sum(), Z)
+    (expected,) = torch.autograd.grad(model.predict(Z).mean.sum(), Z)
+    torch.testing.assert_close(slope, expected)
+
+
+def test_a_mean_for_each_sample_of_the_hyperparameters(data, build, uniform):
+    from gpadjust import fit
+
+    model = build("CKA", *data(n=9))
+    fit(model, num_samples=4, num_draws=32, num_starts=1, num_screened=8)
+    values, Z = model.mean_functions()(uniform(5, 2, seed=3)), uniform(5, 2, seed=3)
+    assert len(values) == model.num_samples
+    torch.testing.assert_close(values.mean(0), model.predict(Z).mean)

@@ -140,7 +140,7 @@ FAULTS = (
         "The generators are restored when the agent is read, not when it goes on to learn.",
     ),
     Fault(
-        "gpadjust/control/action_sequences.py",
+        "gpadjust/control/search.py",
         "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
         "drawn, score(drawn)",
         "The planner forgets its best sequences of earlier rounds.",

@@ -8,7 +8,7 @@ import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from gpadjust.control import CrossEntropyPlanner
+from gpadjust.control import Planner
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.envs import CART_POLE_SPEC, cart_pole_cost, random_cart_pole_physics
 from gpadjust.rl.random_state import RandomState
@@ -351,9 +351,9 @@ class TestExploration:
         assert experiment.system("cka-sac", 0).exploration is None
         for name, episodes in (("cka-info", 14), ("cka-info-3", 3), ("cka-random", 14)):
             system = experiment.system(name, 0)
-            assert isinstance(system.exploration, CrossEntropyPlanner)
+            assert isinstance(system.exploration, Planner)
             assert system.explore_episodes == episodes
-        assert experiment.system("cka-random", 0).exploration.rounds == 0
+        assert experiment.system("cka-random", 0).exploration.search.rounds == 0
 
 
 def test_floors(tmp_path, capsys):

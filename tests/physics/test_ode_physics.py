@@ -215,3 +215,19 @@ class TestCopies:
             pickle.dumps(physics)
         X = points(3, 2)
         assert torch.equal(pickle.loads(cloudpickle.dumps(physics))(X), physics(X))
+
+
+def test_gradients_by_finite_differences_are_those_of_autograd():
+    options = {"step": 0.5, "state_dim": 2}
+    X = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    spring = Spring().requires_grad_(False)
+    slopes = []
+    for gradient in ("autograd", "finite-difference"):
+        Y = ODEPhysics(spring, **options, gradient=gradient)(X)
+        slopes.append(torch.autograd.grad(Y.square().sum(), X)[0])
+    torch.testing.assert_close(*slopes, rtol=1e-8, atol=1e-8)
+    learnt = ODEPhysics(Spring(), **options, gradient="finite-difference")
+    learnt(X).sum().backward()  # parameters are learnt by autograd all the same
+    assert learnt.rhs.stiffness.grad.abs() > 0
+    with pytest.raises(ValueError, match="Unknown gradient 'none'; use 'autograd' or 'finite"):
+        ODEPhysics(decay, **options, gradient="none")

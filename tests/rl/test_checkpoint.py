@@ -518,7 +518,7 @@ def test_runs_that_could_not_be_resumed_are_refused(point_agent, point_env, tmp_
     path = tmp_path / "run.ckpt"
     with pytest.raises(ValueError, match="use_sde=False"):
         point_agent(use_sde=True).learn(5, EpisodeCheckpoint(path))
-    with pytest.raises(TypeError, match=r"EpisodeCheckpoint is for Dyna agents.*found SAC"):
+    with pytest.raises(TypeError, match=r"is for learners with a model.*found SAC"):
         SAC("MlpPolicy", point_env()).learn(5, EpisodeCheckpoint(path))
     with pytest.raises(ValueError, match="every must be at least 1; found 0"):
         EpisodeCheckpoint(path, every=0)

@@ -8,13 +8,13 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from gpadjust.control import CrossEntropyPlanner, Information, Plan
+from gpadjust.control import CrossEntropy, Information, Plan, Planner
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.models import PaperRRA
 from gpadjust.rl import DynaOptions, DynaSAC, EpisodeCheckpoint, resume
 
-FEW = CrossEntropyPlanner(
-    Information(), num_random=6, num_policy=3, rounds=1, num_elites=2, num_functions=2
+FEW = Planner(
+    Information(), CrossEntropy(1, num_elites=2), num_random=6, num_policy=3, num_functions=2
 )
 TOTAL = 20  # four episodes of the point
 
@@ -74,7 +74,7 @@ def test_planned_actions_are_taken_and_stored_in_sb3s_scale(
         seen.append((state, num_steps, bounds, others))
         return Plan(chosen, 1.0)
 
-    monkeypatch.setattr(CrossEntropyPlanner, "plan", plan)
+    monkeypatch.setattr(Planner, "plan", plan)
     watched = Watches()
     agent = point_agent(dynamics=learnt_dynamics(), exploration=FEW, explore_episodes=1)
     agent.learn(10, watched)
@@ -92,17 +92,15 @@ def test_planned_actions_are_taken_and_stored_in_sb3s_scale(
 
 def test_an_episode_can_be_planned_anew(point_agent, learnt_dynamics, monkeypatch):
     calls = []
-    plan = CrossEntropyPlanner.plan
+    plan = Planner.plan
 
     def watched(self, task, state, bounds, num_steps, **others):
         past, known = others["past"], others["known"]
         calls.append((num_steps, past and len(past[0]), known is not None and len(known)))
         return plan(self, task, state, bounds, num_steps, **others)
 
-    monkeypatch.setattr(CrossEntropyPlanner, "plan", watched)
-    options = CrossEntropyPlanner(
-        Information(), num_random=3, num_policy=0, rounds=0, replan_every=2
-    )
+    monkeypatch.setattr(Planner, "plan", watched)
+    options = Planner(Information(), CrossEntropy(0), num_random=3, num_policy=0, replan_every=2)
     point_agent(dynamics=learnt_dynamics(), exploration=options, explore_episodes=1).learn(15)
     assert calls == [(5, None, False), (3, 2, 3), (1, 4, 1)]
 
@@ -164,8 +162,8 @@ def test_a_run_that_was_interrupted_within_plans(
 
     def make():
         env = DummyVecEnv([point_env, point_env])
-        options = CrossEntropyPlanner(
-            Information(), num_random=4, num_policy=2, rounds=0, replan_every=2
+        options = Planner(
+            Information(), CrossEntropy(0), num_random=4, num_policy=2, replan_every=2
         )
         return point_agent(
             env, dynamics=sampled_dynamics(), exploration=options, train_freq=(3, "step")

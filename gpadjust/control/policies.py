@@ -1,0 +1,129 @@
+"""Policies that gradients can improve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from gpadjust.states import StateSpec
+
+
+class BoundedPolicy(nn.Module):
+    r"""Actions within bounds, from what the policy sees of a state.
+
+    .. math:: a = \frac{h + l}{2} + \frac{h - l}{2} \tanh(\pi(z)), \quad z = (o - m) / s,
+
+    where o is the observation (:meth:`~gpadjust.states.StateSpec.observe`) and :math:`\pi` the
+    body, whose output is without bounds.
+
+    Args:
+        body: Maps ``N x observation_dim`` to ``N x action_dim``, in float64.
+        spec: What the entries of states and actions are.
+        action_bounds: Lower and upper bounds l and h of the actions, ``2 x action_dim``.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.control import linear_policy
+        >>> from gpadjust.states import StateSpec
+        >>> policy = linear_policy(StateSpec(["x"], ["force"]), torch.tensor([[-2.0], [2.0]]))
+        >>> policy(torch.zeros(3, 1, dtype=torch.float64)).shape
+        torch.Size([3, 1])
+    """
+
+    middle: Tensor
+    reach: Tensor
+    origin: Tensor
+    unit: Tensor
+
+    def __init__(self, body: nn.Module, spec: StateSpec, action_bounds: Tensor) -> None:
+        super().__init__()
+        low, high = torch.as_tensor(action_bounds, dtype=torch.float64)
+        self.body = body
+        self.spec = spec
+        self.register_buffer("middle", (low + high) / 2)
+        self.register_buffer("reach", (high - low) / 2)
+        self.register_buffer("origin", torch.zeros(spec.observation_dim, dtype=torch.float64))
+        self.register_buffer("unit", torch.ones(spec.observation_dim, dtype=torch.float64))
+
+    def forward(self, states: Tensor) -> Tensor:
+        """Actions ``N x action_dim`` at states ``N x state_dim``."""
+        return self.act(self.spec.observe(states))
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Actions ``N x action_dim`` at observations ``N x observation_dim``."""
+        raw = self.body((observations - self.origin) / self.unit)
+        return self.middle + self.reach * raw.tanh()
+
+    def look_at(self, states: Tensor) -> None:
+        """Take the scale of what is seen from states ``N x state_dim``; once, before training."""
+        seen = self.spec.observe(states)
+        self.origin.copy_(seen.mean(0))
+        spread = seen.std(0, correction=0)
+        self.unit.copy_(torch.where(spread > 1e-6 * seen.abs().amax(0), spread, 1.0))
+
+
+def mlp_policy(
+    spec: StateSpec,
+    action_bounds: Tensor,
+    net_arch: Sequence[int] = (64, 64),
+    activation: type[nn.Module] = nn.Tanh,
+) -> BoundedPolicy:
+    """A network of layers.
+
+    Args:
+        spec: What the entries of states and actions are.
+        action_bounds: ``2 x action_dim``.
+        net_arch: The widths of the hidden layers.
+        activation: What follows each of these.
+    """
+    widths = [spec.observation_dim, *net_arch]
+    layers: list[nn.Module] = []
+    for width, following in pairwise(widths):
+        layers += [nn.Linear(width, following, dtype=torch.float64), activation()]
+    last = nn.Linear(widths[-1], spec.action_dim, dtype=torch.float64)
+    with torch.no_grad():
+        last.weight.mul_(0.1)  # gentle actions at first
+        last.bias.zero_()
+    return BoundedPolicy(nn.Sequential(*layers, last), spec, action_bounds)
+
+
+def linear_policy(spec: StateSpec, action_bounds: Tensor) -> BoundedPolicy:
+    """A linear function of what is seen.
+
+    Args:
+        spec: What the entries of states and actions are.
+        action_bounds: ``2 x action_dim``.
+    """
+    return mlp_policy(spec, action_bounds, net_arch=())
+
+
+def rbf_policy(spec: StateSpec, action_bounds: Tensor, num_centres: int = 50) -> BoundedPolicy:
+    """A sum of bells, as PILCO has it (Deisenroth and Rasmussen 2011).
+
+    Args:
+        spec: What the entries of states and actions are.
+        action_bounds: ``2 x action_dim``.
+        num_centres: Number of bells.
+    """
+    body = nn.Sequential(
+        _Bells(spec.observation_dim, num_centres),
+        nn.Linear(num_centres, spec.action_dim, dtype=torch.float64),
+    )
+    return BoundedPolicy(body, spec, action_bounds)
+
+
+class _Bells(nn.Module):
+    """Bells of what is seen, ``N x num_centres``."""
+
+    def __init__(self, num_inputs: int, num_centres: int) -> None:
+        super().__init__()
+        self.centres = nn.Parameter(torch.randn(num_centres, num_inputs, dtype=torch.float64))
+        self.log_widths = nn.Parameter(torch.zeros(num_inputs, dtype=torch.float64))
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Heights at ``N x num_inputs``."""
+        gap = (seen.unsqueeze(-2) - self.centres) / self.log_widths.exp()
+        return (-gap.square().sum(-1) / 2).exp()

@@ -1,0 +1,246 @@
+"""Policies that are improved by gradients through a model."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from gpadjust.control.objectives import Objective, Return
+from gpadjust.control.option_checks import check_fraction, check_whole
+from gpadjust.control.planner import Planner
+from gpadjust.control.policies import BoundedPolicy
+from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.task import Task
+
+
+class SearchResult(NamedTuple):
+    """What a search has reached.
+
+    Args:
+        values: What the objective said in each update, ``updates``; of drawn functions and starts.
+        left_bounds: The share of episodes that left the bounds in the last tenth of the updates.
+        seconds: How long it took.
+    """
+
+    values: Tensor
+    left_bounds: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class PolicySearch:
+    """Improves a policy along whole episodes in functions drawn from the dynamics.
+
+    Each update lets the policy act in ``num_functions`` functions from ``num_starts`` states each,
+    and follows the gradient of the objective back through all steps, through policy, f_p and what
+    was learnt (Deisenroth and Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). Each
+    function is deterministic and stays the same along an episode; new ones are drawn as the search
+    goes on, so that the policy cannot lean on the errors of a few. A black box as physics has the
+    gradients of its finite differences.
+
+    Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
+    matters), plans do: with a ``guide`` the policy first imitates plans of some episodes.
+
+    Args:
+        objective: What to look for. Default: the mean return; ``Return(quantile=0.2)`` is careful.
+        updates: Gradient steps (Adam).
+        num_starts: Number of starts of each update, in each function.
+        num_functions: Number of functions that each is followed through; None for the mean.
+        redraw_every: Number of updates after which other functions are drawn.
+        learning_rate: At the start; it decays to a tenth along a cosine.
+        max_grad_norm: The norm at which gradients are clipped.
+        guide: Plans the episodes that the policy imitates when it is improved for the first time.
+        num_guides: How many.
+
+    Raises:
+        TypeError: If something is of another kind.
+        ValueError: If a number is out of range.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.control import PolicySearch, Task, linear_policy
+        >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
+        >>> spec = StateSpec(["x"], ["v"])
+        >>> task = Task(
+        ...     PhysicsDynamics(spec, lambda X: X[:, :1] + 0.5 * X[:, 1:]),
+        ...     lambda states, actions, next_states: -next_states[:, 0].square(),
+        ...     initial_states=lambda n: torch.randn(n, 1, dtype=torch.float64),
+        ...     episode_length=5,
+        ... )
+        >>> _ = torch.manual_seed(0)
+        >>> policy = linear_policy(spec, torch.tensor([[-1.0], [1.0]]))
+        >>> result = PolicySearch(updates=30, learning_rate=0.1).improve(policy, task)
+        >>> bool(result.values[-5:].mean() > result.values[:5].mean())
+        True
+    """
+
+    objective: Objective = field(default_factory=Return)
+    _: KW_ONLY
+    updates: int = 150
+    num_starts: int = 24
+    num_functions: int | None = 6
+    redraw_every: int = 5
+    learning_rate: float = 3e-3
+    max_grad_norm: float = 1.0
+    guide: Planner | None = None
+    num_guides: int = 16
+
+    def __post_init__(self) -> None:
+        """Check the options."""
+        if not isinstance(self.objective, Objective):
+            raise TypeError(
+                f"objective must be an object of an Objective, such as Return(); found "
+                f"{self.objective!r}."
+            )
+        for name in ("updates", "num_starts", "redraw_every", "num_guides"):
+            check_whole(name, getattr(self, name), 1)
+        if self.num_functions is not None:
+            check_whole("num_functions", self.num_functions, 1)
+        for name in ("learning_rate", "max_grad_norm"):
+            check_fraction(name, getattr(self, name), most=math.inf, zero=False)
+        if not isinstance(self.guide, Planner | None):
+            raise TypeError(f"guide must be a Planner, or None; found {self.guide!r}.")
+
+    def improve(
+        self,
+        policy: Callable[[Tensor], Tensor],
+        task: Task,
+        *,
+        guided: bool = True,
+        progress: Callable[[int, float], None] | None = None,
+    ) -> SearchResult:
+        """Improve a policy; the randomness is PyTorch's global generator.
+
+        Args:
+            policy: A module from states ``N x state_dim`` to actions ``N x action_dim``, whose
+                parameters are changed; after an error they are as before.
+            task: The task, whose dynamics are fitted. It must say where episodes start and how
+                long they are.
+            guided: Whether the policy imitates the ``guide`` first, if there is one.
+            progress: Called after each update with its number and what the objective said.
+
+        Raises:
+            TypeError: If the policy is no module with parameters.
+            ValueError: If the task leaves something open.
+            RuntimeError: If the dynamics have learnt nothing yet, or no gradient flows from the
+                rewards to the policy.
+            PhysicsError: If the physics fails at all starts.
+        """
+        if not isinstance(policy, nn.Module) or not [*policy.parameters()]:
+            raise TypeError(
+                f"policy must be a module with parameters, such as mlp_policy(...); found "
+                f"{policy!r}."
+            )
+        if task.episode_length is None:
+            raise ValueError("A policy search needs a task with episode_length; found None.")
+        before = {name: t.detach().clone() for name, t in policy.state_dict().items()}
+        try:
+            if guided and self.guide is not None:
+                imitate(policy, *self.plans(task, policy_bounds(policy)))
+            return self._improve(policy, task, task.episode_length, progress)
+        except BaseException:
+            policy.load_state_dict(before)
+            raise
+
+    def plans(self, task: Task, action_bounds: Tensor) -> tuple[Tensor, Tensor]:
+        """States ``N x state_dim`` and actions ``N x action_dim`` of episodes by the guide."""
+        assert self.guide is not None, "asked before"
+        rollouts, parts = Rollouts(task, None), []
+        for start in task.draw_initial_states(self.num_guides):
+            plan = self.guide.plan(task, start, action_bounds)
+            with torch.no_grad():
+                rollout = rollouts.follow(start, plan.actions.unsqueeze(0))
+            parts.append([part[rollout.made] for part in (rollout.states, rollout.actions)])
+        states, actions = (torch.cat(column) for column in zip(*parts, strict=True))
+        return states, actions
+
+    def _improve(
+        self,
+        policy: nn.Module,
+        task: Task,
+        length: int,
+        progress: Callable[[int, float], None] | None,
+    ) -> SearchResult:
+        begun = time.perf_counter()
+        parameters = [p for p in policy.parameters() if p.requires_grad]
+        optimizer = torch.optim.Adam(parameters, lr=self.learning_rate)
+        rate = torch.optim.lr_scheduler.CosineAnnealingLR(
+            optimizer, self.updates, eta_min=self.learning_rate / 10
+        )
+        score = self.objective.of(task)
+        values, left = [], []
+        for i in range(self.updates):
+            if i % self.redraw_every == 0:
+                rollouts = Rollouts(task, self.num_functions)
+            rollout = rollouts.act(self._starts(task, rollouts.num_functions), policy, length)
+            value = score(rollout, None).mean() / length
+            if not value.requires_grad:
+                raise RuntimeError(
+                    "No gradient flows from the rewards to the policy: the task's reward or the "
+                    "dynamics are computed without PyTorch's autograd. Write the reward in torch, "
+                    "without .detach() and .numpy()."
+                )
+            optimizer.zero_grad()
+            (-value).backward()
+            norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+            if norm.isfinite():
+                optimizer.step()
+            rate.step()
+            values.append(value.detach())
+            left.append(rollout.left_bounds.double().mean())
+            if progress is not None:
+                progress(i + 1, float(value.detach()))
+        last = torch.stack(left[-max(1, self.updates // 10) :])
+        return SearchResult(torch.stack(values), float(last.mean()), time.perf_counter() - begun)
+
+    def _starts(self, task: Task, num_functions: int) -> Tensor:
+        """Starts of an update: others in each function, unless these are compared at the same."""
+        if self.objective.compares_functions:
+            return task.draw_initial_states(self.num_starts)
+        starts = task.draw_initial_states(num_functions * self.num_starts)
+        return starts.unflatten(0, (num_functions, self.num_starts))
+
+
+def policy_bounds(policy: nn.Module) -> Tensor:
+    """The bounds of a policy's actions, ``2 x action_dim``.
+
+    Raises:
+        TypeError: If it does not say them.
+    """
+    if not isinstance(policy, BoundedPolicy):
+        raise TypeError(
+            "A guide plans within the bounds of the actions, which only a BoundedPolicy says, such "
+            f"as mlp_policy(...); found {type(policy).__name__}."
+        )
+    return torch.stack([policy.middle - policy.reach, policy.middle + policy.reach])
+
+
+def imitate(
+    policy: nn.Module, states: Tensor, actions: Tensor, *, epochs: int = 400, rate: float = 5e-3
+) -> float:
+    """Let a policy do what was done, by least squares.
+
+    Args:
+        policy: A module from states to actions.
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+        epochs: Steps of Adam, all rows at once.
+        rate: Its learning rate.
+
+    Returns:
+        The root mean square error in the end, in shares of the actions' standard deviation.
+    """
+    scale = actions.std().clamp_min(1e-12)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=rate)
+    for _ in range(epochs):
+        loss = ((policy(states) - actions) / scale).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return float(loss.detach().sqrt())

@@ -1,0 +1,176 @@
+"""The search for the sequence of actions that scores best."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+
+import torch
+from torch import Tensor
+
+from gpadjust.control.option_checks import check_fraction, check_whole
+
+SequenceScore = Callable[[Tensor], Tensor]
+"""Scores ``n`` of sequences ``n x T x action_dim``, higher is better."""
+
+
+class Search(ABC):
+    """Improves sequences of actions, round by round, until there is no time left."""
+
+    rounds: int
+
+    @abstractmethod
+    def best(
+        self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf
+    ) -> tuple[Tensor, float]:
+        """Search, from PyTorch's generator.
+
+        Args:
+            score: What is sought; it is asked once a round, about as many sequences as there are
+                first ones.
+            first: The sequences to begin with, ``n x T x action_dim``.
+            bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
+            deadline: The time of ``time.perf_counter`` at which no further round begins.
+
+        Returns:
+            The sequence, ``T x action_dim``, and its score.
+        """
+
+
+@dataclass(frozen=True)
+class CrossEntropy(Search):
+    """The cross-entropy method (Rubinstein 1999).
+
+    Each round draws as many sequences as the first ones from a normal distribution with mean and
+    standard deviation of the best so far, step by step, clipped to the bounds. The best stay.
+
+    Args:
+        rounds: Rounds after the first sequences; 0 takes the best of these.
+        num_elites: How many are the best.
+        correlation: Of the deviations from the mean of a step and the next one, in [0, 1): higher
+            for smoother actions (Pinneri et al. 2020).
+
+    Raises:
+        TypeError: If a number is of another kind.
+        ValueError: If it is out of range.
+    """
+
+    rounds: int = 2
+    _: KW_ONLY
+    num_elites: int = 8
+    correlation: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_whole("rounds", self.rounds, 0)
+        check_whole("num_elites", self.num_elites, 1)
+        check_fraction("correlation", self.correlation)
+
+    def best(
+        self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf
+    ) -> tuple[Tensor, float]:
+        """Search; see :class:`Search`."""
+        sequences, scores = first, score(first)
+        for _ in range(self.rounds):
+            if time.perf_counter() > deadline:
+                break
+            elites = scores.topk(min(self.num_elites, len(scores))).indices
+            sequences, scores = sequences[elites], scores[elites]
+            mean, sd = sequences.mean(0), sequences.std(0, correction=0)
+            noise = correlated_noise(first.shape, self.correlation)
+            drawn = torch.clamp(mean + sd * noise, bounds[0], bounds[1])
+            sequences, scores = torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])
+        found = int(scores.argmax())
+        return sequences[found], float(scores[found])
+
+
+@dataclass(frozen=True)
+class PathIntegral(Search):
+    r"""Model predictive path integral control (Williams et al. 2017): MPPI.
+
+    Of sequences with scores :math:`J_i` the mean with weights
+    :math:`\propto \exp((J_i - \max J) / (\lambda\, s))` is taken, where s is the standard
+    deviation of the scores; each further round draws sequences about it.
+
+    Args:
+        rounds: Rounds after the first sequences.
+        temperature: The temperature :math:`\lambda`, in standard deviations of the scores: small
+            for the best sequence, large for the mean of all.
+        spread: Standard deviation of what is drawn about the mean, as a share of the range of the
+            actions.
+        correlation: As of :class:`CrossEntropy`.
+
+    Raises:
+        TypeError: If a number is of another kind.
+        ValueError: If it is out of range.
+    """
+
+    rounds: int = 1
+    _: KW_ONLY
+    temperature: float = 0.1
+    spread: float = 0.15
+    correlation: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_whole("rounds", self.rounds, 0)
+        check_fraction("temperature", self.temperature, most=math.inf, zero=False)
+        check_fraction("spread", self.spread, zero=False)
+        check_fraction("correlation", self.correlation)
+
+    def best(
+        self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf
+    ) -> tuple[Tensor, float]:
+        """Search; see :class:`Search`."""
+        sequences, scores = first, score(first)
+        for _ in range(self.rounds):
+            if time.perf_counter() > deadline:
+                break
+            mean = self._mean(sequences, scores)
+            noise = correlated_noise(first.shape, self.correlation)
+            noise[0] = 0.0  # the mean itself is among them
+            sequences = mean + self.spread * (bounds[1] - bounds[0]) * noise
+            sequences = torch.clamp(sequences, bounds[0], bounds[1])
+            scores = score(sequences)
+        found = self._mean(sequences, scores)
+        return found, float(score(found.unsqueeze(0)))
+
+    def _mean(self, sequences: Tensor, scores: Tensor) -> Tensor:
+        scale = scores.std(correction=0).clamp_min(torch.finfo(scores.dtype).tiny)
+        weights = torch.softmax((scores - scores.max()) / (self.temperature * scale), dim=0)
+        return torch.einsum("n,nta->ta", weights, sequences)
+
+
+def random_sequences(n: int, num_steps: int, bounds: Tensor, max_hold: int) -> Tensor:
+    """Draw piecewise constant sequences, from PyTorch's generator.
+
+    Each holds its actions, uniform within the bounds, for a number of steps of its own, from 1 to
+    ``max_hold``.
+
+    Args:
+        n: Number of sequences.
+        num_steps: Their length ``T``.
+        bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
+        max_hold: The most steps that an action is held.
+
+    Returns:
+        ``n x T x action_dim``.
+    """
+    low, high = bounds
+    actions = low + (high - low) * torch.rand(n, num_steps, len(low), dtype=torch.float64)
+    hold = torch.randint(1, max_hold + 1, (n, 1))
+    rows = torch.arange(num_steps) // hold
+    return actions.gather(1, rows.unsqueeze(-1).expand_as(actions))
+
+
+def correlated_noise(shape: torch.Size, correlation: float) -> Tensor:
+    """Standard normal noise ``n x T x a`` whose steps are correlated, from PyTorch's generator."""
+    noise = torch.randn(shape, dtype=torch.float64)
+    if correlation:
+        fresh = math.sqrt(1 - correlation**2)
+        for t in range(1, shape[1]):
+            noise[:, t] = correlation * noise[:, t - 1] + fresh * noise[:, t]
+    return noise

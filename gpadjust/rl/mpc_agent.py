@@ -1,0 +1,174 @@
+"""An agent that plans each step of its real episodes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from torch import Tensor
+
+from gpadjust.control import MPC, Planner, Task
+from gpadjust.control.mpc import EACH_STEP, PlanState
+from gpadjust.rl.buffer import MixedReplayBuffer
+from gpadjust.rl.episode_loop import EpisodeLoop
+from gpadjust.rl.model_learner import ModelLearner
+from gpadjust.rl.options import ModelOptions
+from gpadjust.rl.planned_episodes import PlannedEpisode
+
+
+class MPCAgent(ModelLearner, EpisodeLoop):
+    """Model predictive control in dynamics that learn from each real episode.
+
+    There is no policy to be trained: real steps are those of :class:`~gpadjust.control.MPC`, which
+    plans them in the newest model. Before the first episode it plans in the physics; without one,
+    that episode's actions are random. Callbacks, loggers, ``save`` and ``load``, checkpoints, and
+    what errors leave are as of :class:`Dyna`; ``predict`` serves ``evaluate_policy``.
+
+    Args:
+        env: The real environment; observations are those of the spec of the dynamics.
+        task: What is known of the system; the rewards and terminations are compared with those of
+            each real episode.
+        each_step: Plans at each step but the first.
+        first: Plans when an episode begins, see :class:`~gpadjust.control.MPC`.
+        options: How the model is learnt.
+        action_noise: As in SB3: what is added to the planned actions of real episodes.
+        buffer_size: Real transitions that are kept.
+        train_freq: As in SB3. Default: after each episode; with several environments give a number
+            of steps.
+        kwargs: Further arguments of ``OffPolicyAlgorithm``.
+
+    Raises:
+        ValueError: As :class:`Dyna`.
+        TypeError: As :class:`Dyna`.
+
+    Example:
+        >>> import gymnasium
+        >>> from gpadjust.control import CrossEntropy, Planner, Task
+        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.rl import MPCAgent
+        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+        >>> task = Task(
+        ...     LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward
+        ... )
+        >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
+        >>> agent = MPCAgent(env, task, quick, first=quick, seed=0)
+        >>> agent.learn(total_timesteps=2 * 25).num_episodes
+        2
+    """
+
+    def __init__(
+        self,
+        env: GymEnv | str | None,
+        task: Task | None = None,
+        each_step: Planner = EACH_STEP,
+        *,
+        first: Planner | None = None,
+        options: ModelOptions | None = None,
+        action_noise: ActionNoise | None = None,
+        buffer_size: int = 100_000,
+        train_freq: int | tuple[int, str] = (1, "episode"),
+        policy: type[BasePolicy] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self.each_step = each_step
+        self.first = first
+        super().__init__(
+            task,
+            ModelOptions() if options is None else options,
+            Unmoved if policy is None else policy,
+            env,
+            learning_rate=0.0,
+            buffer_size=buffer_size,
+            train_freq=train_freq,
+            action_noise=action_noise,
+            replay_buffer_class=MixedReplayBuffer,
+            **kwargs,
+        )
+
+    @property
+    def mpc(self) -> MPC | None:
+        """The policy, in the newest model, or the physics; None if nothing is known yet."""
+        task = self.model_task()
+        dynamics = task.dynamics.before_data()
+        if dynamics is None:
+            return None
+        known = replace(task, dynamics=dynamics)
+        return MPC(known, self.action_bounds(), self.each_step, first=self.first)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: PlanState | None = None,  # type: ignore[override]
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, PlanState | None]:
+        """Plan actions; see :meth:`gpadjust.control.MPC.predict`.
+
+        Raises:
+            RuntimeError: If there is neither a physics nor a real episode to plan with.
+        """
+        mpc = self.mpc
+        if mpc is None:
+            raise RuntimeError(
+                f"{type(self).__name__} knows nothing of the system yet; call `learn`, or give the "
+                "dynamics a physics."
+            )
+        normalizer = self._vec_normalize_env
+        seen: Any = observation if normalizer is None else normalizer.unnormalize_obs(observation)
+        with self.timed("plan"):
+            return mpc.predict(seen, state, episode_start, deterministic)
+
+    @property
+    def replan_every(self) -> int | None:
+        """Steps between two plans: one, unless the planner says otherwise."""
+        return self.each_step.replan_every or 1
+
+    def _plans(self) -> bool:
+        return True
+
+    def _plan(self, episode: PlannedEpisode, state: Tensor) -> Tensor:
+        """Plan the steps ahead, or draw them, if nothing is known."""
+        mpc, steps_done = self.mpc, len(episode.states)
+        if mpc is None:
+            return super()._plan(episode, state)
+        known = episode.ahead if len(episode.ahead) else None
+        with self.timed("plan"):
+            plan = mpc.plan(state, known, steps_done)
+        if not steps_done:
+            whole = len(plan.actions) >= self.episode_length()
+            self.promised_reward = plan.value / len(plan.actions) if whole else None
+        actions = plan.actions.clone()
+        if self.action_noise is not None:
+            low, high = self.action_bounds()
+            noise = torch.from_numpy(self.action_noise()).double() * (high - low) / 2
+            actions[0] = torch.clamp(actions[0] + noise, low, high)
+        return actions
+
+    def _policy_actions(
+        self, learning_starts: int, action_noise: ActionNoise | None, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        middle = self._middle_action().numpy().astype(self.action_space.dtype)
+        actions = np.tile(middle, (n_envs, 1))
+        return actions, self.policy.scale_action(actions)
+
+
+class Unmoved(BasePolicy):
+    """A policy without parameters, in the place of one that is trained."""
+
+    def __init__(
+        self, observation_space: Any, action_space: Any, *args: Any, **kwargs: Any
+    ) -> None:
+        super().__init__(observation_space, action_space)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        """The middle of the actions, ``n x action_dim``."""
+        space = self.action_space
+        assert isinstance(space, spaces.Box), "checked when the agent was made"
+        return torch.as_tensor((space.low + space.high) / 2).expand(len(observation), -1)

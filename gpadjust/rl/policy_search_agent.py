@@ -1,0 +1,171 @@
+"""An agent whose policy is improved by gradients through the model."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import Any, Literal
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from torch import Tensor
+
+from gpadjust.control import PolicySearch, Task, linear_policy, mlp_policy, rbf_policy
+from gpadjust.rl.buffer import MixedReplayBuffer
+from gpadjust.rl.episode_loop import EpisodeLoop
+from gpadjust.rl.model_learner import ModelLearner
+from gpadjust.rl.options import ModelOptions
+from gpadjust.states import StateSpec
+
+PolicyKind = Literal["mlp", "linear", "rbf"]
+_KINDS = {"mlp": mlp_policy, "linear": linear_policy, "rbf": rbf_policy}
+_SCALES = 1000  # starts from which the policy's inputs are scaled
+
+
+class PolicySearchAgent(ModelLearner, EpisodeLoop):
+    """Policy search in dynamics that learn from each real episode.
+
+    The policy is trained in the physics before the first real episode, and after each one in the
+    newest model, by :class:`~gpadjust.control.PolicySearch`, from where it was. Without a physics
+    the first episode's actions are random. Callbacks, loggers, ``save`` and ``load``, checkpoints,
+    and what errors leave are as of :class:`Dyna`.
+
+    Args:
+        policy: ``"mlp"``, ``"linear"`` or ``"rbf"``.
+        env: The real environment; observations are those of the spec of the dynamics.
+        task: What is known of the system, in PyTorch's functions, as gradients flow through them.
+        search: How the policy is improved.
+        options: How the model is learnt.
+        buffer_size: Real transitions that are kept.
+        train_freq: As in SB3. Default: after each episode; with several environments give a number
+            of steps.
+        policy_kwargs: Further arguments of the policy, such as ``net_arch``.
+        kwargs: Further arguments of ``OffPolicyAlgorithm``, such as ``action_noise``.
+
+    Raises:
+        ValueError: As :class:`Dyna`, or if there is no such policy.
+        TypeError: As :class:`Dyna`.
+
+    Example:
+        >>> import gymnasium
+        >>> from gpadjust.control import PolicySearch, Task
+        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.envs import cart_pole_start
+        >>> from gpadjust.rl import PolicySearchAgent
+        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> task = Task(dynamics, cart_pole_reward, initial_states=cart_pole_start)
+        >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
+        >>> agent = PolicySearchAgent("linear", env, task, search, seed=0)
+        >>> agent.learn(total_timesteps=25).num_episodes
+        1
+    """
+
+    policy: SearchedPolicy
+
+    def __init__(
+        self,
+        policy: PolicyKind | type[BasePolicy],
+        env: GymEnv | str | None,
+        task: Task | None = None,
+        search: PolicySearch | None = None,
+        options: ModelOptions | None = None,
+        *,
+        buffer_size: int = 100_000,
+        train_freq: int | tuple[int, str] = (1, "episode"),
+        policy_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if isinstance(policy, str) and policy not in _KINDS:
+            raise ValueError(f"There is no policy {policy!r}, but there are {', '.join(_KINDS)}.")
+        self.search = PolicySearch() if search is None else search
+        if not isinstance(self.search, PolicySearch):
+            raise TypeError(f"search must be a PolicySearch(...); found {search!r}.")
+        self.is_trained = False
+        if task is not None and isinstance(policy, str):
+            spec = task.dynamics.spec
+            policy_kwargs = {"kind": policy, "spec": spec, **(policy_kwargs or {})}
+        super().__init__(
+            task,
+            ModelOptions() if options is None else options,
+            SearchedPolicy if isinstance(policy, str) else policy,
+            env,
+            learning_rate=0.0,
+            buffer_size=buffer_size,
+            train_freq=train_freq,
+            policy_kwargs=policy_kwargs,
+            replay_buffer_class=MixedReplayBuffer,
+            **kwargs,
+        )
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        """Train in what is known before the first real episode."""
+        result = super()._setup_learn(*args, **kwargs)
+        task = self.model_task()
+        known = task.dynamics.before_data()
+        if not self.is_trained and known is not None and task.initial_states is not None:
+            self._search(replace(task, dynamics=known))
+        return result
+
+    def _plans(self) -> bool:
+        return not self.is_trained  # actions are random
+
+    def _improve(self, num_ended: int, batch_size: int) -> None:
+        self._search(self.model_task())
+
+    def _search(self, task: Task) -> None:
+        """Improve the policy in a model."""
+        module = self.policy.module
+        if not self.is_trained:
+            module.look_at(task.draw_initial_states(_SCALES))
+        with self.timed("update"):
+            result = self.search.improve(module, task, guided=not self.is_trained)
+        self.is_trained = True
+        late = result.values[-max(1, len(result.values) // 10) :]
+        self.promised_reward = float(late.mean())
+        self.logger.record("model/search_left_bounds", result.left_bounds)
+        self.logger.record("model/search_seconds", result.seconds)
+        if result.left_bounds > 0.1:
+            warnings.warn(
+                f"{result.left_bounds:.0%} of the episodes of the policy left the bounds of the "
+                "states in the model, so it is not to be trusted there. Penalise such states in "
+                "the reward, widen state_bounds of the task, or take more updates.",
+                UserWarning,
+                stacklevel=2,
+            )
+
+
+class SearchedPolicy(BasePolicy):
+    """A policy of :mod:`gpadjust.control` as Stable-Baselines3 has them.
+
+    Args:
+        observation_space: The observations of the spec.
+        action_space: A box.
+        lr_schedule: Not used.
+        kind: ``"mlp"``, ``"linear"`` or ``"rbf"``.
+        spec: What the entries of states and actions are.
+        kwargs: Further arguments of the policy.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Any = None,
+        *,
+        kind: PolicyKind = "mlp",
+        spec: StateSpec,
+        **kwargs: Any,
+    ) -> None:
+        kwargs.pop("use_sde", None)
+        super().__init__(observation_space, action_space)
+        bounds = torch.stack([torch.as_tensor(b) for b in (action_space.low, action_space.high)])
+        self.module = _KINDS[kind](spec, bounds, **kwargs)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        """The actions, ``n x action_dim``."""
+        return self.module.act(torch.as_tensor(observation).double()).float()

@@ -1,0 +1,138 @@
+"""Cart-poles with what no parameter of f_p describes, and f_p with its parameters fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.dynamics.transitions import Transitions
+from gpadjust.envs import CART_POLE_SPEC, REAL_CART_POLE, CartPoleSwingUpEnv
+from gpadjust.envs.cart_pole.system import SUBSTEPS, TIME_STEP, CartPoleEquation
+from gpadjust.physics import ODEPhysics
+from paper.planning import FRICTIONS, SENSORS
+
+_SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
+
+
+@dataclass(frozen=True)
+class FrictionEquation(CartPoleEquation):
+    r"""The equation with dry friction of the cart and drag of the pole.
+
+    The force on the cart is less by :math:`d \tanh(\dot{x} / 0.05)`; on the pole acts a torque
+    :math:`-k \dot\theta |\dot\theta|`.
+
+    Args:
+        dry: The dry friction d, in N.
+        drag: The drag k, in N m s²/rad².
+    """
+
+    dry: float = 0.0
+    drag: float = 0.0
+
+    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
+        """The time derivative of the state ``... x 4``, with the action ``... x 1``."""
+        theta, x_dot, theta_dot = state.unbind(-1)[1:]
+        dry = self.dry * (x_dot / _SOFT).tanh()
+        rates = super().__call__(state, action - dry.unsqueeze(-1))
+        torque = -self.drag * theta_dot * theta_dot.abs()
+        m, length = self.pole_mass, self.pole_length
+        total = self.cart_mass + m
+        inertia = 4 * total - 3 * m * theta.cos().square()
+        x_ddot = 6 * theta.cos() * torque / (length * inertia)
+        theta_ddot = 12 * total * torque / (m * length**2 * inertia)
+        zero = torch.zeros_like(torque)
+        return rates + torch.stack([zero, zero, x_ddot, theta_ddot], dim=-1)
+
+
+class Sensors(gym.ObservationWrapper[Any, Any, Any]):
+    """Observations of the cart-pole with noise; its reward is that of the true state."""
+
+    def observation(self, observation: Any) -> Any:
+        """Add the noise to the state, by the environment's generator."""
+        spec = CART_POLE_SPEC
+        state = spec.decode(torch.from_numpy(observation.astype(np.float64)))
+        sd = np.array([SENSORS[name] for name in spec.states])
+        noise = torch.from_numpy(sd * self.unwrapped.np_random.normal(size=len(sd)))
+        return spec.observe(state + noise).numpy().astype(np.float32)
+
+
+def equation(system: str) -> CartPoleEquation:
+    """The equation of motion of a system."""
+    if system not in FRICTIONS:
+        return REAL_CART_POLE
+    dry, drag = FRICTIONS[system]
+    real = REAL_CART_POLE
+    masses = (real.cart_mass, real.pole_mass)
+    return FrictionEquation(*masses, real.pole_length, real.damping, dry=dry, drag=drag)
+
+
+def environment(system: str, episode_length: int) -> gym.Env[Any, Any]:
+    """The real system."""
+    env: gym.Env[Any, Any] = CartPoleSwingUpEnv(equation=equation(system))
+    env = Sensors(env) if system == "sensors" else env
+    return gym.wrappers.TimeLimit(env, episode_length)
+
+
+class LearntEquation(nn.Module):
+    """The cart-pole's equation of motion with masses, length and friction to be learnt.
+
+    Args:
+        start: Where they begin; a friction of 0 at 0.05.
+    """
+
+    def __init__(self, start: CartPoleEquation) -> None:
+        super().__init__()
+        numbers = (start.cart_mass, start.pole_mass, start.pole_length, start.damping or 0.05)
+        self.logs = nn.Parameter(torch.tensor(numbers, dtype=torch.float64).log())
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """The time derivative of the state."""
+        known = object.__new__(CartPoleEquation)
+        names = ("cart_mass", "pole_mass", "pole_length", "damping")
+        for name, value in zip(names, self.logs.exp(), strict=True):
+            object.__setattr__(known, name, value)  # tensors, which its checks would refuse
+        object.__setattr__(known, "gravity", 9.82)
+        return known(state, action)
+
+
+class FittedPhysics(PhysicsDynamics):
+    """f_p alone, its parameters fitted to all transitions, by least squares of one step.
+
+    Args:
+        start: The equation whose parameters they are at first.
+    """
+
+    def __init__(self, start: CartPoleEquation) -> None:
+        self.equation = LearntEquation(start)
+        physics = ODEPhysics(
+            self.equation, TIME_STEP, 4, substeps=SUBSTEPS, memo=0, name="fitted_cart_pole"
+        )
+        super().__init__(CART_POLE_SPEC, physics)
+        self._data: Transitions | None = None
+
+    def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
+        """Fit the parameters to these and earlier transitions."""
+        data = self._checked(states, actions, next_states)
+        data = self._data = data if self._data is None else self._data.append(data)
+        truth = self.spec.change(data.states, data.next_states)
+        scale = truth.square().mean(0).sqrt()
+        optimizer = torch.optim.LBFGS(
+            self.equation.parameters(), max_iter=60, line_search_fn="strong_wolfe"
+        )
+        rows = torch.cat([data.states, data.actions], dim=-1)
+
+        def closure() -> Tensor:
+            optimizer.zero_grad()
+            error = self.spec.change(data.next_states, self.physics(rows)) / scale
+            loss: Tensor = error.square().mean()
+            loss.backward()
+            return loss
+
+        optimizer.step(closure)
+        self.physics.forget()

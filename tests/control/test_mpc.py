@@ -1,0 +1,147 @@
+"""A policy that plans at every step."""
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from gpadjust.control import MPC, CrossEntropy, PathIntegral, Planner, Return, Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.envs import CART_POLE_SPEC, CartPoleSwingUpEnv, cart_pole_reward
+from gpadjust.envs.cart_pole.system import REAL_CART_POLE, equation_physics
+
+SPEC = StateSpec(["x"], ["v"])
+BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
+
+
+def to_one(states, actions, next_states):
+    return -(next_states[:, 0] - 1).abs()
+
+
+@pytest.fixture
+def task():
+    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+    return Task(dynamics, to_one, episode_length=6)
+
+
+def quick(rounds=3, **options):
+    return Planner(search=CrossEntropy(rounds), num_random=48, num_policy=0, max_hold=1, **options)
+
+
+@pytest.mark.parametrize("search", [CrossEntropy(3), PathIntegral(3)])
+def test_it_reaches_a_goal_and_stays(task, search):
+    planner = Planner(search=search, horizon=3, num_random=64, max_hold=2)
+    mpc = MPC(task, BOUNDS, planner, first=planner)
+    x, plan = np.zeros(1), None
+    for _ in range(6):
+        action, plan = mpc.predict(x, plan)
+        x = x + 0.5 * action
+    assert abs(x - 1) < 0.1
+
+
+def test_plans_go_on_from_earlier_ones_and_end_with_the_episode(task, monkeypatch):
+    asked = []
+    real = Planner.plan
+
+    def plan(self, task, state, bounds, num_steps=None, **others):
+        found = real(self, task, state, bounds, num_steps, **others)
+        asked.append((self.horizon, num_steps, others["known"], found.actions))
+        return found
+
+    monkeypatch.setattr(Planner, "plan", plan)
+    mpc = MPC(task, BOUNDS, quick(horizon=2), first=quick(horizon=5))
+    x, state = np.zeros((2, 1)), None
+    for t in range(3):
+        starts = np.array([t == 0, t in (0, 2)])
+        _, state = mpc.predict(x, state, starts)
+    horizons = [each[0] for each in asked]
+    assert horizons == [5, 5, 2, 2, 2, 5]  # the second one begins anew
+    assert [each[1] for each in asked] == [6, 6, 5, 5, 4, 6]
+    assert asked[0][2] is None
+    assert torch.equal(asked[2][2], asked[0][3][1:])
+    assert state[1].tolist() == [3, 1]
+
+
+def test_deterministic_actions_are_always_the_same(task):
+    mpc = MPC(task, BOUNDS, quick(0))
+    before = torch.get_rng_state()
+    first, again = (mpc.predict(np.zeros(1), deterministic=True)[0] for _ in range(2))
+    assert first == again
+    assert torch.equal(torch.get_rng_state(), before)
+    other = MPC(task, BOUNDS, quick(0), seed=1).predict(np.zeros(1))[0]
+    assert first != other
+
+
+def test_sb3_evaluates_it():
+    known = PhysicsDynamics(CART_POLE_SPEC, equation_physics(REAL_CART_POLE))
+    task = Task(known, cart_pole_reward, episode_length=4)
+    import gymnasium
+
+    env = gymnasium.wrappers.TimeLimit(CartPoleSwingUpEnv(), 4)
+    few = quick(1, horizon=3)
+    mpc = MPC(task, torch.tensor([[-10.0], [10.0]]), few, first=few)
+    mean, _ = evaluate_policy(mpc, env, n_eval_episodes=1, warn=False)
+    assert -4 <= mean <= 0
+
+
+def test_a_careful_plan_keeps_away_from_what_is_not_known():
+    """Beyond x = 0 nobody knows what v does: the mean gains there, a low quantile loses."""
+    x = torch.linspace(-2, 0, 30, dtype=torch.float64).unsqueeze(-1)
+    v = torch.zeros_like(x).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
+    fit = {"method": "map", "num_starts": 1, "num_screened": 0}
+    dynamics = LearnedDynamics(SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:], fit_options=fit)
+    noise = 0.3 * torch.randn(30, 1, generator=torch.Generator().manual_seed(1)).double()
+    dynamics.update(x, v, x + 0.5 * v + noise * (x + 2))
+    task = Task(dynamics, lambda s, a, n: n[:, 0], episode_length=2)
+    values = {}
+    for quantile in (None, 0.1):
+        torch.manual_seed(0)
+        planner = quick(0, objective=Return(quantile=quantile), num_functions=20)
+        values[quantile] = planner.plan(task, torch.zeros(1).double(), BOUNDS).value
+    assert values[0.1] < values[None]
+
+
+def test_a_budget_of_time_ends_the_search(task):
+    calls = []
+    dynamics = PhysicsDynamics(SPEC, lambda X: (calls.append(len(X)), X[:, :1] + X[:, 1:])[1])
+    within = Task(dynamics, to_one, episode_length=4)
+    planner = quick(1000, seconds=1e-6)
+    planner.plan(within, torch.zeros(1).double(), BOUNDS)
+    assert len(calls) == 4  # the first sequences only
+
+
+@pytest.mark.parametrize(
+    ("objective", "expected"),
+    [
+        (Return(0.5), -(1 + 0.5 + 0.25)),
+        (Return(effort=0.1), -3 - 0.1 * 0),
+        (Return(terminal_value=lambda states: 10 + states[:, 0]), -3 + 10),
+    ],
+)
+def test_returns_are_as_described(task, objective, expected):
+    from gpadjust.control import Rollouts
+
+    rollout = Rollouts(task, None).follow(torch.zeros(1).double(), torch.zeros(1, 3, 1).double())
+    assert objective.of(task)(rollout, None).item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Return(0.0), ValueError, "discount must be above 0 and below 1; found 0.0"),
+        (lambda: Return(quantile=1.0), ValueError, "quantile must be at least 0 and below 1"),
+        (lambda: Return(terminal_value=3), TypeError, "must be a function of states, or None"),
+        (lambda: CrossEntropy(1.5), TypeError, "rounds must be a whole number; found 1.5"),
+        (lambda: PathIntegral(temperature=0), ValueError, "temperature must be above 0; found 0"),
+        (lambda: CrossEntropy(correlation=1.0), ValueError, "correlation must be .* below 1"),
+    ],
+)
+def test_bad_options_are_refused(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+def test_somebody_must_say_how_far_to_plan():
+    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :1])
+    with pytest.raises(ValueError, match="give the task an episode_length, or the planner a hor"):
+        MPC(Task(dynamics, to_one), BOUNDS, quick())

@@ -1,0 +1,192 @@
+"""Policies that gradients improve."""
+
+import pytest
+import torch
+
+from gpadjust.control import (
+    CrossEntropy,
+    Planner,
+    PolicySearch,
+    Return,
+    Rollouts,
+    Task,
+    imitate,
+    linear_policy,
+    mlp_policy,
+    rbf_policy,
+)
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.physics import BlackBoxPhysics, PhysicsError
+
+SPEC = StateSpec(["x"], ["v"])
+BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)
+QUICK = {"method": "map", "num_starts": 1, "num_screened": 0}
+
+
+def to_zero(states, actions, next_states):
+    return -next_states[:, 0].square()
+
+
+def starts(n):
+    return torch.randn(n, 1, dtype=torch.float64)
+
+
+def step(X):
+    return X[:, :1] + 0.5 * X[:, 1:]
+
+
+def task_of(dynamics, **parts):
+    return Task(dynamics, to_zero, initial_states=starts, episode_length=4, **parts)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    """Dynamics that have learnt that the system moves twice as far as its physics says."""
+    torch.manual_seed(0)
+    x, v = torch.randn(2, 25, 1, dtype=torch.float64)
+    dynamics = LearnedDynamics(SPEC, lambda X: X[:, :1] + 0.25 * X[:, 1:], fit_options=QUICK)
+    dynamics.update(x, v, x + 0.5 * v)
+    return dynamics
+
+
+@pytest.mark.parametrize("make", [mlp_policy, linear_policy, rbf_policy])
+def test_policies_keep_to_the_bounds(make):
+    torch.manual_seed(0)
+    policy = make(SPEC, BOUNDS)
+    policy.look_at(10 + starts(50))
+    actions = policy(100 * starts(200))
+    assert actions.shape == (200, 1)
+    assert actions.min() >= -1
+    assert actions.max() <= 2
+
+
+@pytest.mark.parametrize("kind", ["physics", "black box", "learnt", "mean of learnt"])
+def test_the_optimum_is_found(learnt, kind):
+    """To bring x to 0 in steps of v / 2: -2 x, within the bounds."""
+    torch.manual_seed(0)
+    black_box = BlackBoxPhysics(lambda X: X[:, :1] + 0.5 * X[:, 1:])
+    dynamics = {
+        "physics": PhysicsDynamics(SPEC, step),
+        "black box": PhysicsDynamics(SPEC, black_box),
+    }.get(kind, learnt)
+    policy = linear_policy(SPEC, BOUNDS)
+    functions = None if kind.startswith("mean") else 3
+    search = PolicySearch(updates=120, num_functions=functions, learning_rate=0.05)
+    result = search.improve(policy, task_of(dynamics))
+    assert result.values.shape == (120,)
+    assert result.left_bounds == 0
+    action = policy(torch.tensor([[0.2], [-0.2]], dtype=torch.float64)).squeeze()
+    assert action[0] < -0.2
+    assert action[1] > 0.2
+
+
+def test_gradients_are_those_of_finite_differences(learnt):
+    policy = linear_policy(SPEC, BOUNDS)
+    torch.manual_seed(0)
+    rollouts, at = Rollouts(task_of(learnt), 2), starts(3)
+    score = Return().of(task_of(learnt))
+
+    def value(weight):
+        found = torch.func.functional_call(policy, {"body.0.weight": weight}, at)
+        del found
+        policy.body[0].weight.data.copy_(weight)
+        return score(rollouts.act(at, policy, 3), None).sum()
+
+    weight = torch.tensor([[0.3]], dtype=torch.float64)
+    value(weight).backward()
+    slope = policy.body[0].weight.grad.item()
+    with torch.no_grad():
+        expected = (value(weight + 1e-5) - value(weight - 1e-5)).item() / 2e-5
+    assert slope == pytest.approx(expected, rel=1e-6)
+
+
+def test_runaways_and_failures_cost_those_particles_only():
+    def physics(X):
+        bad = (X[:, 0].abs() > 1.5).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError("too far", rows=bad)
+        return (X[:, :1].abs() + 1e-300).sqrt().log() * 0 + step(X)
+
+    torch.manual_seed(0)
+    policy = linear_policy(SPEC, BOUNDS)
+    result = PolicySearch(updates=30, learning_rate=0.05).improve(
+        policy, task_of(PhysicsDynamics(SPEC, physics))
+    )
+    assert result.values.isfinite().all()
+    assert 0 < result.left_bounds < 1
+    assert all(p.isfinite().all() for p in policy.parameters())
+    assert policy.body[0].weight.item() < -0.05
+
+
+def test_a_guide_shows_what_gradients_do_not_find():
+    """The reward is flat but near x = 2, which no gradient from about 0 tells of."""
+    torch.manual_seed(0)
+
+    def reward(states, actions, next_states):
+        return torch.exp(-100 * (next_states[:, 0] - 2).square())
+
+    task = Task(
+        PhysicsDynamics(SPEC, step),
+        reward,
+        initial_states=lambda n: starts(n) / 10,
+        episode_length=5,
+    )
+    guide = Planner(search=CrossEntropy(4), num_random=64, num_policy=0)
+    values = {}
+    for name, each in (("alone", None), ("guided", guide)):
+        policy = mlp_policy(SPEC, BOUNDS, (16,))
+        search = PolicySearch(updates=20, num_functions=None, guide=each, num_guides=4)
+        values[name] = search.improve(policy, task).values[-5:].mean()
+    assert values["alone"] < 0.1
+    assert values["guided"] > 0.3
+
+
+def test_imitation_does_what_was_done():
+    torch.manual_seed(0)
+    states = starts(40)
+    policy = mlp_policy(SPEC, BOUNDS, (16,))
+    assert imitate(policy, states, 0.5 + states.tanh()) < 0.1
+
+
+def test_an_error_leaves_the_policy_as_it_was():
+    policy = linear_policy(SPEC, BOUNDS)
+    before = policy.body[0].weight.clone()
+
+    def stop(update, value):
+        if update == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        PolicySearch(updates=5).improve(policy, task_of(PhysicsDynamics(SPEC, step)), progress=stop)
+    assert torch.equal(policy.body[0].weight, before)
+
+
+def test_rewards_without_gradient_are_told():
+    task = Task(
+        PhysicsDynamics(SPEC, step),
+        lambda s, a, n: -n[:, 0].detach().square(),
+        initial_states=starts,
+        episode_length=3,
+    )
+    with pytest.raises(RuntimeError, match="Write the reward in torch"):
+        PolicySearch(updates=1).improve(linear_policy(SPEC, BOUNDS), task)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda t, p: (t, lambda s: s), TypeError, "policy must be a module with parameters"),
+        (lambda t, p: (Task(t.dynamics, to_zero), p), ValueError, "task with episode_length"),
+    ],
+)
+def test_bad_arguments_are_refused(change, error, message):
+    task, policy = change(task_of(PhysicsDynamics(SPEC, step)), linear_policy(SPEC, BOUNDS))
+    with pytest.raises(error, match=message):
+        PolicySearch(updates=1).improve(policy, task)
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(ValueError, match="updates must be at least 1; found 0"):
+        PolicySearch(updates=0)
+    with pytest.raises(TypeError, match="guide must be a Planner, or None; found 3"):
+        PolicySearch(guide=3)

@@ -1,0 +1,84 @@
+"""The experiment on planning in the first trials."""
+
+import pytest
+import torch
+
+from gpadjust.envs import REAL_CART_POLE, random_cart_pole_physics
+from paper.common.runner import rounded
+from paper.planning import LEARNERS, SYSTEMS, Planning, Settings
+from paper.planning.run import dynamics
+from paper.planning.systems import FittedPhysics, FrictionEquation, environment, equation
+
+TINY = Settings(
+    trials=2,
+    episode_length=5,
+    horizon=2,
+    sequences=12,
+    rounds=0,
+    elites=3,
+    first_sequences=12,
+    first_rounds=0,
+    restarts=1,
+)
+
+
+def test_a_run_and_its_tables(tmp_path):
+    experiment = Planning(out=tmp_path, runs=1, jobs=1, settings=TINY, learners=("phy", "gp"))
+    assert len(experiment.tasks()) == 2 * len(SYSTEMS)
+    records = []
+    for learner in experiment.learners:
+        found = rounded(experiment.run("sensors", learner, 0, unfinished=tmp_path / "x"))
+        assert all(0 <= cost <= 1 for cost in found["trials"]["cost"])
+        assert len(found["trials"]["cost"]) == 2
+        records.append({"system": "sensors", "learner": learner, "seed": 0, **found})
+    tables = experiment.tables(records)
+    assert {*tables} == {"sensors", "targets", "seconds"}
+    assert "not run" in tables["targets"].text
+    assert [path.name for path in experiment.draw(records)] == ["planning.png"]
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_all_models_are_known(learner):
+    assert dynamics("friction", learner, 0).spec.states[0] == "x"
+
+
+def test_unknown_names_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="--systems: there is no 'moon', but there are plain"):
+        Planning(out=tmp_path, systems=("moon",)).check()
+
+
+def test_friction_takes_energy_and_is_none_at_rest():
+    torch.manual_seed(0)
+    states = torch.randn(20, 4, dtype=torch.float64)
+    nothing = torch.zeros(20, 1, dtype=torch.float64)
+    rough = equation("friction")
+    assert isinstance(rough, FrictionEquation)
+
+    def power(equation):
+        state = states.clone().requires_grad_(True)
+        (slope,) = torch.autograd.grad(REAL_CART_POLE.energy(state).sum(), state)
+        return (slope * equation(states, nothing)).sum(-1)
+
+    speed, spin = states[:, 2], states[:, 3]
+    lost = rough.dry * speed * (speed / 0.05).tanh() + rough.drag * spin.abs() ** 3
+    torch.testing.assert_close(power(rough), power(REAL_CART_POLE) - lost)
+    states[:, 2:] = 0
+    torch.testing.assert_close(rough(states, nothing), REAL_CART_POLE(states, nothing))
+
+
+def test_fitted_physics_finds_the_parameters():
+    env = environment("plain", 25)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    rows, actions = [env.unwrapped.state], []
+    for _ in range(25):
+        action = env.action_space.sample()
+        env.step(action)
+        actions.append(torch.from_numpy(action).double())
+        rows.append(env.unwrapped.state)
+    states = torch.stack([torch.from_numpy(row) for row in rows])
+    fitted = FittedPhysics(random_cart_pole_physics(3).rhs)
+    fitted.update(states[:-1], torch.stack(actions), states[1:])
+    real = (REAL_CART_POLE.cart_mass, REAL_CART_POLE.pole_mass)
+    real = torch.tensor([*real, REAL_CART_POLE.pole_length, REAL_CART_POLE.damping])
+    torch.testing.assert_close(fitted.equation.logs.exp(), real.double(), rtol=0.02, atol=0)

@@ -1,0 +1,216 @@
+"""Agents that plan, and agents whose policy is searched for, in the same loop as Dyna's."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import NormalActionNoise
+
+from gpadjust.control import CrossEntropy, Planner, PolicySearch, Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
+from gpadjust.models import ZeroMeanGP
+from gpadjust.rl import (
+    EpisodeCheckpoint,
+    ModelOptions,
+    MPCAgent,
+    PolicySearchAgent,
+    resume,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
+QUICK = {"method": "map", "num_starts": 1, "num_screened": 0}
+PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, num_policy=0, max_hold=1)
+SEARCH = PolicySearch(updates=12, num_starts=6, num_functions=2, learning_rate=0.05)
+KINDS = [MPCAgent, PolicySearchAgent]
+
+
+@pytest.fixture
+def dynamics(point_dynamics):
+    def make(physics=lambda X: X[:, :1] + 0.4 * X[:, 1:], **options):
+        return LearnedDynamics(point_dynamics.spec, physics, fit_options=QUICK, **options)
+
+    return make
+
+
+@pytest.fixture
+def make_agent(point_env, point_task, dynamics):
+    """An agent of either kind for the point."""
+
+    def make(kind, env=None, options=None, **given):
+        parts = {"dynamics": dynamics(), "initial_states": near_one}
+        names = {"dynamics", "reward", "initial_states", "state_bounds"} & {*given}
+        task = point_task(**{**parts, **{name: given.pop(name) for name in names}})
+        env = point_env() if env is None else env
+        options = options or ModelOptions(score_horizons=())
+        common = {"options": options, "seed": 0, "device": "cpu", "buffer_size": 500, **given}
+        if kind is MPCAgent:
+            return MPCAgent(env, task, PLAN, first=PLAN, **common)
+        return PolicySearchAgent("linear", env, task, SEARCH, **common)
+
+    return make
+
+
+def near_one(n):
+    return 0.5 + torch.rand(n, 1, dtype=torch.float64)
+
+
+class PowerCutError(Exception):
+    pass
+
+
+def cut_at(step):
+    def callback(local, _):
+        if local["self"].num_timesteps == step:
+            raise PowerCutError
+        return True
+
+    return callback
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_learns_the_system_and_brings_the_point_home(make_agent, kind, point_env):
+    agent = make_agent(kind).learn(15)
+    assert agent.num_episodes == 3
+    assert agent.task.dynamics.num_transitions == 15
+    mean, _ = evaluate_policy(agent, point_env(), n_eval_episodes=2, warn=False)
+    assert mean > -1  # to stay costs some 5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_first_episode_goes_by_the_physics(make_agent, kind):
+    """Of the point's real cost the physics, a fifth too weak, saves most."""
+    agent = make_agent(kind).learn(5)
+    assert agent.recorded_episodes().rewards.sum() > -1.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_a_physics_the_first_episode_is_random(make_agent, kind, dynamics):
+    agent = make_agent(kind, dynamics=dynamics(None, model=ZeroMeanGP))
+    with pytest.raises(RuntimeError, match="knows nothing") if kind is MPCAgent else no_error():
+        agent.predict(np.ones(1, dtype=np.float32))
+    agent.learn(5)
+    actions = agent.recorded_episodes().actions
+    assert actions.unique().numel() > 1
+    agent.learn(5, reset_num_timesteps=False)
+    assert agent.recorded_episodes().num_transitions == 10
+
+
+def no_error():
+    from contextlib import nullcontext
+
+    return nullcontext()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("step", [7, 11])
+def test_an_interrupted_run_ends_as_another(make_agent, kind, step, tmp_path, tensors_of):
+    path = tmp_path / "run.ckpt"
+    whole = make_agent(kind).learn(15)
+    with pytest.raises(PowerCutError):
+        make_agent(kind).learn(15, callback=[EpisodeCheckpoint(path), as_callback(cut_at(step))])
+    fresh = make_agent(kind)
+    agent = resume(path, fresh.get_env(), fresh.task, algorithm=kind)
+    agent.learn(15 - agent.num_timesteps, EpisodeCheckpoint(path), reset_num_timesteps=False)
+    expected, found = tensors_of(whole), tensors_of(agent)
+    assert expected.keys() == found.keys()
+    for name, value in expected.items():
+        same = torch.equal(value, found[name]) if torch.is_tensor(value) else value == found[name]
+        assert same, name
+
+
+def as_callback(function):
+    from stable_baselines3.common.callbacks import ConvertCallback
+
+    return ConvertCallback(function)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_saved_and_loaded(make_agent, kind, tmp_path):
+    agent = make_agent(kind).learn(5)
+    agent.save(tmp_path / "agent.zip")
+    fresh = make_agent(kind)
+    loaded = kind.load(tmp_path / "agent.zip", env=fresh.get_env(), task=fresh.task)
+    seen = np.array([0.7], dtype=np.float32)
+    actions = [each.predict(seen, deterministic=True)[0] for each in (agent, loaded)]
+    np.testing.assert_array_equal(*actions)
+    loaded.learn(5, reset_num_timesteps=False)
+    assert loaded.task.dynamics.num_transitions > 5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_error_loses_no_episode(make_agent, kind, point_reward):
+    from dataclasses import replace
+
+    agent = make_agent(kind, reward=lambda s, a, n: -3 * n[:, 0].square())
+    with pytest.raises(ValueError, match="is not the environment's"):
+        agent.learn(5)
+    agent.task = replace(agent.task, reward=point_reward)
+    agent.learn(5, reset_num_timesteps=False)
+    assert agent.task.dynamics.num_transitions == 10
+
+
+def test_noise_explores(make_agent):
+    noise = NormalActionNoise(np.zeros(1), 0.5 * np.ones(1))
+    plain, noisy = (make_agent(MPCAgent, action_noise=each).learn(5) for each in (None, noise))
+    assert not torch.equal(plain.recorded_episodes().actions, noisy.recorded_episodes().actions)
+    assert noisy.recorded_episodes().actions.abs().max() <= 2
+
+
+def test_several_environments(make_agent, point_env):
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    env = DummyVecEnv([point_env, point_env])
+    agent = make_agent(MPCAgent, env, train_freq=(5, "step")).learn(20)
+    assert agent.num_episodes == 4
+
+
+def test_promises_that_are_not_kept_are_told(make_agent):
+    """The physics says that any action helps, but the system goes the other way."""
+
+    def wrong(X):
+        return X[:, :1] - 0.9 * X[:, 1:]
+
+    known = make_agent(MPCAgent).task.dynamics.spec
+    agent = make_agent(
+        PolicySearchAgent, dynamics=PhysicsDynamics(known, wrong), options=ModelOptions()
+    )
+    with pytest.warns(UserWarning, match="where the model promised .* do not trust"):
+        agent.learn(5)
+
+
+def test_what_is_promised_and_found_is_logged(make_agent):
+    agent = make_agent(PolicySearchAgent).learn(10)
+    found = agent.logger.name_to_value
+    assert {"model/real_reward", "model/promised_reward", "model/search_left_bounds"} <= {*found}
+
+
+def test_policies_that_leave_the_bounds_are_told(make_agent):
+    bounds = torch.tensor([[0.99], [1.01]], dtype=torch.float64)
+    agent = make_agent(
+        PolicySearchAgent, state_bounds=bounds, initial_states=lambda n: torch.ones(n, 1).double()
+    )
+    with pytest.warns(UserWarning, match="left the bounds of the states in the model"):
+        agent.learn(5)
+
+
+def test_bad_arguments_are_refused(point_env, point_task):
+    with pytest.raises(ValueError, match="no policy 'Mlp', but there are mlp, linear, rbf"):
+        PolicySearchAgent("Mlp", point_env(), point_task())
+    with pytest.raises(TypeError, match=r"search must be a PolicySearch\(...\); found 3"):
+        PolicySearchAgent("mlp", point_env(), point_task(), 3)
+    with pytest.raises(ValueError, match="MPCAgent needs a task to learn"):
+        MPCAgent(point_env(), None)
+    with pytest.raises(TypeError, match=r"options must be ModelOptions\(...\); found 1"):
+        MPCAgent(point_env(), point_task(), options=1)
+
+
+@pytest.mark.slow
+def test_the_cart_pole_swings_up_in_two_trials():
+    from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+
+    env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+    f_p = random_cart_pole_physics(3)
+    task = Task(LearnedDynamics(CART_POLE_SPEC, f_p), cart_pole_reward)
+    agent = MPCAgent(env, task, seed=3).learn(50)
+    assert agent.recorded_episodes(newest=25).rewards.mean() > -0.45
