@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gpadjust.control.option_checks import check_fraction
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
-PlanState = tuple[NDArray[np.float64], NDArray[np.int64]]
-"""What is planned for each episode, ``n_envs x T x action_dim``, and how many steps it has made."""
-
 EACH_STEP = Planner(
-    search=CrossEntropy(1, num_elites=12, correlation=0.5), horizon=10, num_random=256, num_policy=0
+    search=CrossEntropy(1, num_elites=12, correlation=0.5),
+    horizon=8,
+    num_random=128,
+    num_policy=0,
+    spread=0.15,
 )
-"""The default plan of a step: two looks at 256 sequences of ten steps."""
+"""The default plan of a step: two looks at 128 sequences of eight steps."""
 
 FIRST = Planner(
     search=CrossEntropy(12, num_elites=12, correlation=0.5),
@@ -30,6 +33,25 @@ FIRST = Planner(
     restarts=3,
 )
 """The default plan of an episode that begins: the whole of it, in some seconds."""
+
+
+class Planned(NamedTuple):
+    """What is planned in an episode.
+
+    Args:
+        actions: Those of the steps ahead, ``T x action_dim``.
+        promised: The rewards of all its steps, those made included, as they were foreseen when it
+            was last planned to its end.
+        steps_done: How many it has made.
+    """
+
+    actions: Tensor
+    promised: Tensor
+    steps_done: int
+
+
+PlanState = tuple[Planned, ...]
+"""What is planned of each episode."""
 
 
 class MPC:
@@ -44,6 +66,9 @@ class MPC:
         each_step: Plans at each step but the first.
         first: Plans when an episode begins. Default: with three searches of the whole episode, or
             as far as ``each_step`` looks if the task does not say how long it is.
+        tolerance: Where the plan of a step is worth less than what was promised of its steps when
+            the whole was planned, by more than this share of the range of the promised rewards (a
+            step, on average), the rest is planned as when it began. None for never.
         seed: Of the searches of deterministic actions, which are the same for the same observation
             and plan.
 
@@ -71,8 +96,11 @@ class MPC:
         each_step: Planner = EACH_STEP,
         *,
         first: Planner | None = None,
+        tolerance: float | None = 0.25,
         seed: int = 0,
     ) -> None:
+        if tolerance is not None:
+            check_fraction("tolerance", tolerance, most=math.inf, zero=False)
         if task.episode_length is None and each_step.horizon is None:
             raise ValueError(
                 "Nobody says how far to plan; give the task an episode_length, or the planner a "
@@ -85,6 +113,7 @@ class MPC:
             horizon = each_step.horizon if task.episode_length is None else None
             first = replace(FIRST, objective=each_step.objective, horizon=horizon)
         self.first = first
+        self.tolerance = tolerance
         self.seed = seed
 
     def predict(
@@ -108,37 +137,45 @@ class MPC:
         spec = self.task.dynamics.spec
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
         states = spec.decode(rows)
-        n = len(states)
-        begins = np.ones(n, dtype=bool) if state is None else np.zeros(n, dtype=bool)
-        if episode_start is not None:
-            begins = begins | np.atleast_1d(episode_start).astype(bool)
-        known = [torch.empty(0, spec.action_dim, dtype=torch.float64)] * n
-        done = np.zeros(n, dtype=np.int64)
+        episodes: list[Planned | None] = [None] * len(states)
         if state is not None:
-            known = [torch.from_numpy(plan[~np.isnan(plan).any(-1)]) for plan in state[0]]
-            done = np.where(begins, 0, state[1])
-        plans = []
+            begins = np.zeros(len(states), dtype=bool) if episode_start is None else episode_start
+            pairs = zip(state, np.atleast_1d(begins), strict=True)
+            episodes = [None if new else earlier for earlier, new in pairs]
         with seeded(self.seed if deterministic else None):
-            for i in range(n):
-                earlier = None if begins[i] else known[i]
-                plans.append(self.plan(states[i], earlier, int(done[i])).actions)
-        actions = torch.stack([plan[0] for plan in plans])
-        length = max(len(plan) for plan in plans)
-        ahead = np.full((n, max(length - 1, 1), spec.action_dim), np.nan)
-        for i, plan in enumerate(plans):
-            ahead[i, : len(plan) - 1] = plan[1:].numpy()
-        found = actions.numpy().astype(np.float32)
-        return (found if np.ndim(observation) > 1 else found[0]), (ahead, done + 1)
+            plans = [self.plan(*pair) for pair in zip(states, episodes, strict=True)]
+        actions = torch.stack([plan.actions[0] for plan in plans]).numpy().astype(np.float32)
+        return (actions if np.ndim(observation) > 1 else actions[0]), tuple(
+            Planned(plan.actions[1:], plan.promised, plan.steps_done + 1) for plan in plans
+        )
 
-    def plan(self, state: Tensor, known: Tensor | None, steps_done: int) -> Plan:
+    def plan(self, state: Tensor, earlier: Planned | None = None) -> Planned:
         """Plan the steps ahead of an episode that is at a state.
 
         Args:
             state: Where it is, ``state_dim``.
-            known: What was planned; None at the start.
-            steps_done: How many steps it has made.
+            earlier: What was planned by then; None at the start.
         """
+        steps_done = 0 if earlier is None else earlier.steps_done
         length = self.task.episode_length
         left = None if length is None else max(length - steps_done, 1)
-        planner = self.first if known is None or not len(known) else self.each_step
-        return planner.plan(self.task, state, self.action_bounds, left, known=known)
+        if earlier is not None and len(earlier.actions):
+            plan = self.each_step.plan(
+                self.task, state, self.action_bounds, left, known=earlier.actions
+            )
+            if not self._disappoints(plan, earlier):
+                beyond = earlier.actions[len(plan.actions) :]
+                return Planned(torch.cat([plan.actions, beyond]), earlier.promised, steps_done)
+        plan = self.first.plan(self.task, state, self.action_bounds, left)
+        made = plan.rewards[:0] if earlier is None else earlier.promised[:steps_done]
+        return Planned(plan.actions, torch.cat([made, plan.rewards]), steps_done)
+
+    def _disappoints(self, plan: Plan, earlier: Planned) -> bool:
+        """Whether a plan is worth much less than what was promised of its steps."""
+        if self.tolerance is None:
+            return False
+        promised = earlier.promised[earlier.steps_done :][: len(plan.rewards)]
+        if not len(promised):  # an episode may be longer than what was planned
+            return False
+        loss = (promised - plan.rewards[: len(promised)]).mean()
+        return bool(loss > self.tolerance * (earlier.promised.max() - earlier.promised.min()))

@@ -23,10 +23,13 @@ class Plan(NamedTuple):
     Args:
         actions: ``T x action_dim``.
         value: What the objective says of it.
+        rewards: What the model says of each step, ``T``, averaged over its functions; 0 after the
+            end of the episode.
     """
 
     actions: Tensor
     value: float
+    rewards: Tensor
 
 
 @dataclass(frozen=True)
@@ -156,15 +159,19 @@ class Planner:
         deadline = math.inf if self.seconds is None else begun + self.seconds
 
         def search() -> Plan:
+            asked: list[tuple[Tensor, Tensor]] = []
+
+            def scored(sequences: Tensor) -> Tensor:
+                rollout = rollouts.follow(state, sequences)
+                rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
+                asked.append((sequences, rewards))
+                return score(rollout, past)
+
             first = self._proposed(rollouts, state, num_steps, action_bounds, policy, known)
-            return Plan(
-                *self.search.best(
-                    lambda sequences: score(rollouts.follow(state, sequences), past),
-                    first,
-                    action_bounds,
-                    deadline,
-                )
-            )
+            actions, value = self.search.best(scored, first, action_bounds, deadline)
+            sequences, rewards = (torch.cat(column) for column in zip(*asked, strict=True))
+            found = (sequences == actions).all(-1).all(-1)
+            return Plan(actions, value, rewards[found][0])
 
         plans = [search() for _ in range(self.restarts if known is None else 1)]
         return max(plans, key=lambda plan: plan.value)

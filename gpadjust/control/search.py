@@ -36,7 +36,7 @@ class Search(ABC):
             deadline: The time of ``time.perf_counter`` at which no further round begins.
 
         Returns:
-            The sequence, ``T x action_dim``, and its score.
+            The sequence, ``T x action_dim``, one of those whose score was asked, and its score.
         """
 
 

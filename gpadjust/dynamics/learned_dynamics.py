@@ -26,7 +26,10 @@ from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, ExactGPBase, Prediction
 from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.models.sampled_functions import check_num_features
 from gpadjust.states import StateSpec
+
+_MEAN_ROWS = 256  # kernel rows of a mean: transitions times samples of the hyper-parameters
 
 
 class LearnedDynamics(Dynamics):
@@ -58,12 +61,14 @@ class LearnedDynamics(Dynamics):
             all fits ``method``, ``num_samples``, ``num_draws`` and ``seed``. By default the
             hyper-parameters are sampled, and what is predicted has their uncertainty, too;
             ``"map"`` takes the most likely ones.
+        num_features: Number of random features that stand for each kernel in sampled functions, an
+            even one. Fewer are faster: 256 for a policy search, whose functions are many.
 
     Raises:
         TypeError: If an argument is of another type, or the model needs a physics that is missing
             or takes none that is given.
-        ValueError: If ``target`` or an option is unknown, or a physics returns the change of the
-            state.
+        ValueError: If ``target`` or an option is unknown, a number is none of those above, or a
+            physics returns the change of the state.
 
     Example:
         >>> import torch
@@ -87,8 +92,10 @@ class LearnedDynamics(Dynamics):
         encode_angles: bool = True,
         model_options: Mapping[str, Any] | None = None,
         fit_options: DynamicsFitOptions | None = None,
+        num_features: int = 1024,
     ) -> None:
         super().__init__(spec)
+        check_num_features(num_features)
         if not isinstance(encode_angles, bool):
             raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
         self.targets = TransitionTargets(spec, target)
@@ -97,8 +104,10 @@ class LearnedDynamics(Dynamics):
         self.fit_result: FitResult | SampleResult | None = None
         self._recipe = ModelRecipe(self.targets, self.physics, model, model_options, encode_angles)
         self.fit_options = checked_fit_options(fit_options, model)
+        self.num_features = num_features
         self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions
+        self._means: tuple[ExactGPBase, Any] | None = None  # of a model, made once
 
     @property
     def is_fitted(self) -> bool:
@@ -248,7 +257,7 @@ class LearnedDynamics(Dynamics):
             ValueError: If ``num_functions`` is no positive whole number.
             RuntimeError: If nothing was learnt yet.
         """
-        functions: Any = self.model.sample_functions(num_functions, seed)
+        functions: Any = self.model.sample_functions(num_functions, seed, self.num_features)
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_blocks(states, actions, num_functions)
@@ -260,10 +269,17 @@ class LearnedDynamics(Dynamics):
     def mean_function(self) -> TransitionFunctions:
         """The mean of the predictions, as a function of any ``k`` blocks, with gradients.
 
+        Of many transitions it is that of two or more of the hyper-parameters' samples, as many as
+        keep it quick, which differ less the more is known.
+
         Raises:
             RuntimeError: If nothing was learnt yet.
         """
-        functions = self.model.mean_functions()
+        model = self.model
+        if self._means is None or self._means[0] is not model:
+            most = max(2, _MEAN_ROWS // self.num_transitions)
+            self._means = model, model.mean_functions(most)
+        _, functions = self._means
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_pair(states, actions)

@@ -330,15 +330,22 @@ class ExactGPBase(SingleTaskGP):
         """
         return draw_functions(self, num_functions, seed, num_features)
 
-    def mean_functions(self) -> Module:
+    def mean_functions(self, most: int | None = None) -> Module:
         """The posterior mean, as a function to be called anywhere: faster than ``predict``.
+
+        Args:
+            most: The most samples of the hyper-parameters to take, evenly of those held. Default:
+                all.
 
         Returns:
             A module that maps raw ``... x q x d`` to ``S x ... x q x m`` in the user's units: a
             mean for each sample of the hyper-parameters, or a single one. Gradients flow to the
             inputs as far as f_p allows. Later fits of the model leave it as it is.
+
+        Raises:
+            ValueError: If ``most`` is no whole number of at least 1.
         """
-        return mean_functions(self)
+        return mean_functions(self, most)
 
     def _mean_functions(self) -> Module:
         """The functions of :meth:`mean_functions`, for each batch of the model."""

@@ -272,12 +272,8 @@ class FunctionPerBatch(Module):
 def draw_functions(model: Any, num_functions: int, seed: int | None, num_features: int) -> Module:
     """Draw functions from a model's posterior; see :meth:`~gpadjust.CKA.sample_functions`."""
     check_number(num_functions, "num_functions")
-    check_number(num_features, "num_features")
+    check_num_features(num_features)
     seed = None if seed is None else whole_number("seed", seed)
-    if num_features % 2:
-        raise ValueError(
-            f"Expected num_features to be even (sines and cosines), got {num_features}."
-        )
     model.eval()
     with seeded(seed):
         if model.num_samples is None:
@@ -287,12 +283,15 @@ def draw_functions(model: Any, num_functions: int, seed: int | None, num_feature
         return FunctionPerBatch(each._draw_functions(1, num_features))
 
 
-def mean_functions(model: Any) -> Module:
+def mean_functions(model: Any, most: int | None) -> Module:
     """A model's posterior means; see :meth:`~gpadjust.CKA.mean_functions`."""
+    if most is not None:
+        check_number(most, "most")
     model.eval()
     if model.num_samples is None:
         return model._mean_functions()
-    each = take_samples(model, torch.arange(model.num_samples))
+    taken = model.num_samples if most is None else min(most, model.num_samples)
+    each = take_samples(model, torch.arange(taken) * model.num_samples // taken)
     return FunctionPerBatch(each._mean_functions())
 
 
@@ -309,3 +308,10 @@ def check_number(number: int, name: str) -> None:
     """Raise a ValueError unless ``number`` is a whole number of at least 1."""
     if not isinstance(number, int) or isinstance(number, bool) or number < 1:
         raise ValueError(f"Expected {name} to be a whole number >= 1, got {number!r}.")
+
+
+def check_num_features(number: int) -> None:
+    """Raise a ValueError unless random features may be so many."""
+    check_number(number, "num_features")
+    if number % 2:
+        raise ValueError(f"Expected num_features to be even (sines and cosines), got {number}.")

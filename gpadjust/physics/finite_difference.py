@@ -32,12 +32,43 @@ def central_difference(
         >>> central_difference(lambda X: X[:, :1] * X[:, 1:] ** 2, X)
         tensor([[[ 4.0000, 12.0000]]], dtype=torch.float64)
     """
-    n, d = X.shape
+    sides = _sides(X, step)
+    return _slope(sides, function(sides.reshape(-1, X.shape[1])))
+
+
+def value_and_central_difference(
+    function: Callable[[Tensor], Tensor], X: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The values of a function at rows ``N x d`` and its Jacobian, in one call.
+
+    Args:
+        function: Maps ``(2 d + 1) N x d`` rows, the first of which are those of X.
+        X: ``N x d``.
+
+    Returns:
+        ``N x m`` and, as of :func:`central_difference`, ``N x m x d``.
+
+    Example:
+        >>> X = torch.tensor([[3.0]], dtype=torch.float64)
+        >>> value_and_central_difference(lambda X: X**2, X)
+        (tensor([[9.]], dtype=torch.float64), tensor([[[6.0000]]], dtype=torch.float64))
+    """
+    sides = _sides(X, None)
+    Y = function(torch.cat([X, sides.reshape(-1, X.shape[1])]))
+    return Y[: len(X)], _slope(sides, Y[len(X) :])
+
+
+def _sides(X: Tensor, step: Tensor | None) -> Tensor:
+    """Each row moved along each column, up and down: ``2 x N x d x d``."""
     if step is None:
         step = torch.finfo(X.dtype).eps ** (1 / 3) * X.abs().clamp(min=1.0)
-    moves = torch.diag_embed(step.expand(n, d))
-    sides = torch.stack([X.unsqueeze(1) + moves, X.unsqueeze(1) - moves])
+    moves = torch.diag_embed(step.expand(X.shape))
+    return torch.stack([X.unsqueeze(1) + moves, X.unsqueeze(1) - moves])
+
+
+def _slope(sides: Tensor, values: Tensor) -> Tensor:
+    """The Jacobian from what a function is on both sides."""
     # The distance that rounding left, not 2 h.
     width = (sides[0] - sides[1]).diagonal(dim1=-2, dim2=-1)
-    upper, lower = function(sides.reshape(-1, d)).reshape(2, n, d, -1)
+    upper, lower = values.reshape(*sides.shape[:3], -1)
     return ((upper - lower) / width.unsqueeze(-1)).mT

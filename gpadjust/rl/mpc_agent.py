@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 
 from gpadjust.control import MPC, Planner, Task
-from gpadjust.control.mpc import EACH_STEP, PlanState
+from gpadjust.control.mpc import EACH_STEP, Planned, PlanState
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.episode_loop import EpisodeLoop
 from gpadjust.rl.model_learner import ModelLearner
@@ -138,12 +138,13 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         mpc, steps_done = self.mpc, len(episode.states)
         if mpc is None:
             return super()._plan(episode, state)
-        known = episode.ahead if len(episode.ahead) else None
+        earlier = Planned(episode.ahead, episode.promised, steps_done) if steps_done else None
         with self.timed("plan"):
-            plan = mpc.plan(state, known, steps_done)
+            plan = mpc.plan(state, earlier)
+        episode.promised = plan.promised
         if not steps_done:
-            whole = len(plan.actions) >= self.episode_length()
-            self.promised_reward = plan.value / len(plan.actions) if whole else None
+            whole = len(plan.promised) >= self.episode_length()
+            self.promised_reward = float(plan.promised.mean()) if whole else None
         actions = plan.actions.clone()
         if self.action_noise is not None:
             low, high = self.action_bounds()

@@ -17,11 +17,14 @@ class PlannedEpisode:
         ahead: The actions that are planned, ``T x action_dim``.
         states: What it has seen, ``t x state_dim``.
         actions: What it has done, ``t x action_dim``.
+        promised: The rewards of its steps, as they were foreseen when it was planned; empty if
+            nobody asks.
     """
 
     ahead: Tensor
     states: Tensor
     actions: Tensor
+    promised: Tensor
 
 
 class PlannedEpisodes:
@@ -72,7 +75,8 @@ class PlannedEpisodes:
         """
         if environment not in self.under_way:
             nothing = state.new_empty(0, len(action))
-            begun = PlannedEpisode(nothing, state.new_empty(0, len(state)), nothing)
+            seen, promised = state.new_empty(0, len(state)), state.new_empty(0)
+            begun = PlannedEpisode(nothing, seen, nothing, promised)
             self.under_way[environment] = begun if begins() else None
             self.num_planned += self.under_way[environment] is not None
         episode = self.under_way[environment]

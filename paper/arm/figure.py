@@ -71,7 +71,7 @@ def _map(maps: pd.DataFrame, experiment: Control) -> Path:
     for name, ax in zip(titles, axes, strict=True):
         by_target = maps[maps["scenario"] == name].groupby("target")["all_steps"]
         mean, sd = by_target.mean().to_numpy(), by_target.std().fillna(0).to_numpy()
-        _draw_arm(ax)
+        draw_arm(ax)
         dots = ax.scatter(
             targets[:, 0],
             targets[:, 1],
@@ -95,7 +95,7 @@ def _map(maps: pd.DataFrame, experiment: Control) -> Path:
     return save(figure, experiment.out / "map.png")
 
 
-def _draw_arm(ax: Axes) -> None:
+def draw_arm(ax: Axes) -> None:
     """The arm where episodes start."""
     upper = REAL_ARM.lengths[0]
     elbow = 100 * upper * np.array([math.cos(START_MEAN[0]), math.sin(START_MEAN[0])])

@@ -42,10 +42,12 @@ class Settings:
     """real trials of a run, the first of which goes by f_p"""
     episode_length: int = 25
     """steps of 0.1 s"""
-    horizon: int = 10
+    horizon: int = 8
     """steps that are planned ahead at each step"""
-    sequences: int = 256
+    sequences: int = 128
     """of these, in each round of the cross-entropy method"""
+    spread: float = 0.15
+    """of these about the earlier plan, in shares of the range of forces"""
     rounds: int = 1
     """of these after the first"""
     elites: int = 12

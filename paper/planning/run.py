@@ -70,6 +70,7 @@ def planners(settings: Settings) -> tuple[Planner, Planner]:
         horizon=settings.horizon,
         num_random=settings.sequences,
         num_policy=0,
+        spread=settings.spread,
     )
     first = Planner(
         search=CrossEntropy(settings.first_rounds, num_elites=elites, correlation=correlation),

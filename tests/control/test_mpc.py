@@ -45,11 +45,11 @@ def test_plans_go_on_from_earlier_ones_and_end_with_the_episode(task, monkeypatc
 
     def plan(self, task, state, bounds, num_steps=None, **others):
         found = real(self, task, state, bounds, num_steps, **others)
-        asked.append((self.horizon, num_steps, others["known"], found.actions))
+        asked.append((self.horizon, num_steps, others.get("known"), found.actions))
         return found
 
     monkeypatch.setattr(Planner, "plan", plan)
-    mpc = MPC(task, BOUNDS, quick(horizon=2), first=quick(horizon=5))
+    mpc = MPC(task, BOUNDS, quick(horizon=2), first=quick(horizon=5), tolerance=None)
     x, state = np.zeros((2, 1)), None
     for t in range(3):
         starts = np.array([t == 0, t in (0, 2)])
@@ -59,7 +59,30 @@ def test_plans_go_on_from_earlier_ones_and_end_with_the_episode(task, monkeypatc
     assert [each[1] for each in asked] == [6, 6, 5, 5, 4, 6]
     assert asked[0][2] is None
     assert torch.equal(asked[2][2], asked[0][3][1:])
-    assert state[1].tolist() == [3, 1]
+    assert torch.equal(asked[4][2][1:], asked[0][3][3:])  # beyond the horizon, as planned before
+    assert [each.steps_done for each in state] == [3, 1]
+
+
+def test_what_disappoints_is_planned_anew(monkeypatch):
+    """The model has no wind; where it has blown the point far away, the whole rest is planned."""
+    task = Task(PhysicsDynamics(SPEC, lambda X: X.sum(-1, True)), to_one, episode_length=8)
+    begun = []
+    real = Planner.plan
+
+    def plan(self, task, state, *others, **known):
+        begun.append(self.horizon)
+        return real(self, task, state, *others, **known)
+
+    monkeypatch.setattr(Planner, "plan", plan)
+    for tolerance, asked in ((0.25, [None, 2, 2, None, 2]), (None, [None, 2, 2, 2])):
+        begun.clear()
+        mpc = MPC(task, BOUNDS, quick(horizon=2), first=quick(), tolerance=tolerance)
+        _, state = mpc.predict(np.zeros(1))
+        for x in (1.0, -4.0, -3.0):
+            before, (action, state) = state, mpc.predict(np.array([x]), state)
+        assert begun == asked
+        assert len(state[0].promised) == 8
+        assert len(state[0].actions) == 4
 
 
 def test_deterministic_actions_are_always_the_same(task):

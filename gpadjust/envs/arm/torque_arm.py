@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -156,7 +157,12 @@ def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
     )
 
 
-def torque_arm_physics(gains: tuple[float, float] = (8.0, 4.0)) -> ODEPhysics:
+def torque_arm_physics(
+    gains: tuple[float, float] = (8.0, 4.0),
+    *,
+    substeps: int = SUBSTEPS,
+    gradient: Literal["autograd", "finite-difference"] = "autograd",
+) -> ODEPhysics:
     """The state of the arm 0.2 s later, under torques that follow the actions at once.
 
     Unlike the environment, it does not clip actions.
@@ -181,7 +187,8 @@ def torque_arm_physics(gains: tuple[float, float] = (8.0, 4.0)) -> ODEPhysics:
         torque_arm(gains),
         step=ARM_TIME_STEP,
         state_dim=4,
-        substeps=SUBSTEPS,
+        substeps=substeps,
         memo=0,
         name="torque_arm",
+        gradient=gradient,
     )

@@ -1,0 +1,115 @@
+"""Reaching with a muscle arm in the first trials, by gradients through what is known of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+from paper.common.experiment import Experiment, Task
+
+SYSTEMS = {
+    "plain": "as the paper's",
+    "memory": "the previous action is seen",
+    "sensors": "noisy sensors",
+    "strength": "f_p twice as strong",
+}
+"""The arms, by name."""
+
+LEARNERS = {
+    "cka": "CKA",
+    "phymean": "physics mean",
+    "phy": "f_p alone",
+    "fitted": "f_p, parameters fitted",
+    "gp": "GP",
+    "ensemble": "f_p and an ensemble of networks",
+}
+"""What the policy is trained in, by name."""
+
+SENSORS = {"angles": 0.0175, "velocities": 0.05}
+"""Standard deviations of the noise of sensors in rad and rad/s, of the arm that has some; what they
+say is not filtered."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What decides the numbers; found with other seeds (``tuning.py``)."""
+
+    trials: int = 4
+    """real trials of a run"""
+    long_trials: int = 10
+    """of CKA on the paper's arm"""
+    episode_length: int = 15
+    """steps of 0.2 s"""
+    updates: int = 100
+    """gradient steps after each trial, and before the first one"""
+    starts: int = 24
+    """of each update, in each function"""
+    functions: int = 6
+    """of each update"""
+    learning_rate: float = 3e-3
+    """at the start of the updates"""
+    noise: float = 0.15
+    """standard deviation of what is added to the actions of the first trials"""
+    noisy_trials: int = 2
+    """how many these are"""
+    features: int = 256
+    """random features of a kernel"""
+    substeps: int = 8
+    """of f_p's integration"""
+    strength: float = 0.5
+    """of the muscles; a healthy arm's is 1"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reaching(Experiment):
+    """An arm of six muscles reaches after a few trials, computed by OpenSim."""
+
+    out: Path = Path("results/reaching")
+    settings: Settings = field(default_factory=Settings)
+    systems: tuple[str, ...] = ()
+    """the arms, by name; all of them, unless some are given"""
+    learners: tuple[str, ...] = ()
+    """the models, by name; all of them, unless some are given"""
+
+    name: ClassVar[str] = "reaching"
+    key: ClassVar[tuple[str, ...]] = ("system", "learner", "seed")
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
+
+    def check(self) -> None:
+        """Whether there are the arms and the models, and OpenSim."""
+        from gpadjust.envs.arm.opensim_model import load_opensim
+
+        for option, given, known in (
+            ("systems", self.systems, SYSTEMS),
+            ("learners", self.learners, LEARNERS),
+        ):
+            unknown = [name for name in given if name not in known]
+            if unknown:
+                raise ValueError(
+                    f"--{option}: there is no {unknown[0]!r}, but there are {', '.join(known)}"
+                )
+        if self.settings.trials < 1:
+            raise ValueError(f"--trials: expected at least 1, got {self.settings.trials}")
+        load_opensim()
+
+    def tasks(self) -> list[Task]:
+        """System by system, seed by seed, so that what is done first can be compared."""
+        return [
+            (system, learner, seed)
+            for system in self.systems or SYSTEMS
+            for seed in self.seeds
+            for learner in self.learners or LEARNERS
+        ]
+
+    def trials(self, system: str, learner: str) -> int:
+        """How many trials a run has."""
+        is_long = (system, learner) == ("plain", "cka")
+        return self.settings.long_trials if is_long else self.settings.trials
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings, and what the arm has beside."""
+        system, learner = kind
+        settings = {**asdict(self.settings), "trials": self.trials(system, learner)}
+        del settings["long_trials"]
+        return {**settings, **({"sensors": SENSORS} if system == "sensors" else {})}

@@ -1,0 +1,123 @@
+"""One run: trials of the arm, each with a policy trained in what is known of it by then."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.noise import NormalActionNoise
+
+from gpadjust.control import PolicySearch, Task
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.envs import arm_reward, arm_start
+from gpadjust.inference import SamplingWarning
+from gpadjust.models import CKA, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.rl import ModelOptions, PolicySearchAgent
+from paper.arm import Settings as ArmSettings
+from paper.arm.system import memory_start, reach, score
+from paper.common.experiment import Record
+from paper.reaching import Reaching, Settings
+from paper.reaching.ensemble import ResidualEnsemble
+from paper.reaching.systems import (
+    FittedArm,
+    NoisyPolicy,
+    as_physics,
+    believed,
+    environment,
+    spec_of,
+)
+
+MAPPED = (1, 3, 9)
+"""Trials after which the errors at each target are kept."""
+
+_MODELS: dict[str, Any] = {"cka": CKA, "phymean": PhysicsMeanGP, "gp": ZeroMeanGP}
+
+
+def run(experiment: Reaching, system: str, learner: str, seed: int, *, unfinished: Path) -> Record:
+    """Make the trials; return the hand's errors after each, and times."""
+    warnings.simplefilter("ignore", SamplingWarning)
+    warnings.filterwarnings("ignore", message="A step of the last real episode")
+    warnings.filterwarnings("ignore", message=".* of the episodes of the policy left the bounds")
+    settings, trials = experiment.settings, experiment.trials(system, learner)
+    agent = make_agent(experiment, system, learner, seed)
+    rows, maps = [], {}
+    for trial in range(1, trials + 1):
+        if trial > settings.noisy_trials:
+            agent.action_noise = None
+        before, start = dict(agent.wall_time), time.process_time()
+        agent.learn(settings.episode_length, reset_num_timesteps=False)
+        spent = time.process_time() - start
+        errors = evaluate(agent, system, settings, seed)
+        rows.append(
+            {
+                **{name: float(np.sqrt(np.square(e).mean())) for name, e in errors.items()},
+                "promised_cost": -(agent.promised_reward or float("nan")),
+                **{f"{p}_seconds": agent.wall_time[p] - before[p] for p in ("update", "fit")},
+                "cpu_seconds": spent,
+            }
+        )
+        if trial in MAPPED:
+            maps[f"{trial}"] = errors["all_steps"].tolist()
+    return {"trials": {name: [row[name] for row in rows] for name in rows[0]}, "maps": maps}
+
+
+def evaluate(agent: Any, system: str, settings: Settings, seed: int) -> dict[str, Any]:
+    """The hand's error at each target, in cm: root mean squares over all and the last steps."""
+    arm = ArmSettings(
+        strength=settings.strength,
+        memory=system == "memory",
+        episode_length=settings.episode_length,
+    )
+    policy = NoisyPolicy(agent, seed) if system == "sensors" else agent
+    found: dict[str, Any] = score(reach(policy, arm))
+    return found
+
+
+def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> PolicySearchAgent:
+    """Who learns, at the start."""
+    settings = experiment.settings
+    task = Task(
+        dynamics(settings, system, learner),
+        arm_reward,
+        initial_states=memory_start if system == "memory" else arm_start,
+        episode_length=settings.episode_length,
+    )
+    search = PolicySearch(
+        updates=settings.updates,
+        num_starts=settings.starts,
+        num_functions=settings.functions,
+        learning_rate=settings.learning_rate,
+    )
+    # Of actions scaled to [-1, 1], as SB3 has it.
+    sd = 2 * settings.noise * np.ones(4)
+    return PolicySearchAgent(
+        "mlp",
+        environment(system, settings),
+        task,
+        search,
+        ModelOptions(reward_tolerance=None, score_horizons=()),
+        action_noise=NormalActionNoise(np.zeros(4), sd),
+        seed=seed,
+        device="cpu",
+    )
+
+
+def dynamics(settings: Settings, system: str, learner: str) -> Dynamics:
+    """What the policy is trained in, at its start."""
+    spec, equation = spec_of(system), believed(system)
+    if learner == "fitted":
+        return FittedArm(spec, equation, settings)
+    physics = as_physics(equation, settings)
+    if learner == "phy":
+        return PhysicsDynamics(spec, physics)
+    if learner == "ensemble":
+        return ResidualEnsemble(spec, physics)
+    return LearnedDynamics(
+        spec,
+        None if learner == "gp" else physics,
+        model=_MODELS[learner],
+        num_features=settings.features,
+    )
