@@ -13,7 +13,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 
-from gpadjust.control import PolicySearch, Task, linear_policy, mlp_policy, rbf_policy
+from gpadjust.control import PolicySearch, Rollouts, Task, linear_policy, mlp_policy, rbf_policy
+from gpadjust.control.search import random_sequences
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.episode_loop import EpisodeLoop
 from gpadjust.rl.model_learner import ModelLearner
@@ -22,7 +23,7 @@ from gpadjust.states import StateSpec
 
 PolicyKind = Literal["mlp", "linear", "rbf"]
 _KINDS = {"mlp": mlp_policy, "linear": linear_policy, "rbf": rbf_policy}
-_SCALES = 1000  # starts from which the policy's inputs are scaled
+_EPISODES, _MAX_HOLD = 128, 5  # of random actions, by which the policy's inputs are scaled
 
 
 class PolicySearchAgent(ModelLearner, EpisodeLoop):
@@ -121,7 +122,7 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         """Improve the policy in a model."""
         module = self.policy.module
         if not self.is_trained:
-            module.look_at(task.draw_initial_states(_SCALES))
+            module.look_at(self._random_states(task))
         with self.timed("update"):
             result = self.search.improve(module, task, guided=not self.is_trained)
         self.is_trained = True
@@ -137,6 +138,17 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
                 UserWarning,
                 stacklevel=2,
             )
+
+    def _random_states(self, task: Task) -> Tensor:
+        """States ``N x state_dim`` of episodes of random actions in a model."""
+        length = task.episode_length
+        assert length is not None, "asked before"
+        steps = random_sequences(_EPISODES, length, self.action_bounds(), _MAX_HOLD).unbind(1)
+        taken = iter(steps)
+        with torch.no_grad():
+            starts = task.draw_initial_states(_EPISODES)
+            rollout = Rollouts(task, None).act(starts, lambda states: next(taken), length)
+        return torch.cat([starts, rollout.next_states[rollout.made]])
 
 
 class SearchedPolicy(BasePolicy):

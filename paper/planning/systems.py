@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import optimize
 from torch import Tensor, nn
 
 from gpadjust.dynamics import PhysicsDynamics
@@ -122,17 +125,28 @@ class FittedPhysics(PhysicsDynamics):
         data = self._data = data if self._data is None else self._data.append(data)
         truth = self.spec.change(data.states, data.next_states)
         scale = truth.square().mean(0).sqrt()
-        optimizer = torch.optim.LBFGS(
-            self.equation.parameters(), max_iter=60, line_search_fn="strong_wolfe"
-        )
         rows = torch.cat([data.states, data.actions], dim=-1)
 
-        def closure() -> Tensor:
-            optimizer.zero_grad()
-            error = self.spec.change(data.next_states, self.physics(rows)) / scale
-            loss: Tensor = error.square().mean()
-            loss.backward()
-            return loss
+        def residuals() -> Tensor:
+            return self.spec.change(data.next_states, self.physics(rows)) / scale
 
-        optimizer.step(closure)
+        least_squares_fit(self.equation.logs, residuals)
         self.physics.forget()
+
+
+def least_squares_fit(logs: nn.Parameter, residuals: Callable[[], Tensor]) -> None:
+    """Move logarithms of parameters to least squares, each within a factor of five of where it is.
+
+    Args:
+        logs: The parameters.
+        residuals: What depends on them, of any shape.
+    """
+
+    def at(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        with torch.no_grad():
+            logs.copy_(torch.from_numpy(values))
+            return residuals().flatten().numpy()
+
+    start, room = logs.detach().numpy().copy(), np.log(5)
+    found = optimize.least_squares(at, start, bounds=(start - room, start + room))
+    at(found.x)

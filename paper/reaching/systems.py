@@ -17,6 +17,7 @@ from gpadjust.envs import ARM_MEMORY_SPEC, ARM_SPEC, MuscleArmEnv, RememberActio
 from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, ArmEquation, torque_arm
 from gpadjust.physics import ODEPhysics
 from gpadjust.states import StateSpec
+from paper.planning.systems import least_squares_fit
 from paper.reaching import SENSORS, Settings
 
 GAINS = {"strength": (16.0, 8.0)}
@@ -145,18 +146,9 @@ class FittedArm(PhysicsDynamics):
         truth = (data.next_states - data.states)[:, :4]
         scale = truth.square().mean(0).sqrt()
         rows = torch.cat([data.states[:, :4], data.actions], dim=-1)
-        optimizer = torch.optim.LBFGS(
-            self.equation.parameters(), max_iter=40, line_search_fn="strong_wolfe"
-        )
-        self.equation.requires_grad_(True)
 
-        def closure() -> Tensor:
-            optimizer.zero_grad()
-            error = (data.states[:, :4] + truth - self.physics(rows)) / scale
-            loss: Tensor = error.square().mean()
-            loss.backward()
-            return loss
+        def residuals() -> Tensor:
+            return (data.states[:, :4] + truth - self.physics(rows)) / scale
 
-        optimizer.step(closure)
-        self.equation.requires_grad_(False)
+        least_squares_fit(self.equation.logs, residuals)
         self.physics.forget()
