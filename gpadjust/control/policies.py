@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from gpadjust.states import StateSpec
 
+_NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
+
 
 class BoundedPolicy(nn.Module):
     r"""Actions within bounds, from what the policy sees of a state.
@@ -70,6 +72,7 @@ def mlp_policy(
     action_bounds: Tensor,
     net_arch: Sequence[int] = (64, 64),
     activation: type[nn.Module] = nn.Tanh,
+    first_actions: Sequence[float] | None = None,
 ) -> BoundedPolicy:
     """A network of layers.
 
@@ -78,6 +81,11 @@ def mlp_policy(
         action_bounds: ``2 x action_dim``.
         net_arch: The widths of the hidden layers.
         activation: What follows each of these.
+        first_actions: About what it does before it has learnt, ``action_dim`` numbers within the
+            bounds. Default: their middle, which for muscles, say, is to tense them all.
+
+    Raises:
+        ValueError: If ``first_actions`` are beyond the bounds, or another number of them.
     """
     widths = [spec.observation_dim, *net_arch]
     layers: list[nn.Module] = []
@@ -86,33 +94,57 @@ def mlp_policy(
     last = nn.Linear(widths[-1], spec.action_dim, dtype=torch.float64)
     with torch.no_grad():
         last.weight.mul_(0.1)  # gentle actions at first
-        last.bias.zero_()
+        last.bias.copy_(_before_tanh(first_actions, action_bounds))
     return BoundedPolicy(nn.Sequential(*layers, last), spec, action_bounds)
 
 
-def linear_policy(spec: StateSpec, action_bounds: Tensor) -> BoundedPolicy:
+def linear_policy(
+    spec: StateSpec, action_bounds: Tensor, first_actions: Sequence[float] | None = None
+) -> BoundedPolicy:
     """A linear function of what is seen.
 
-    Args:
-        spec: What the entries of states and actions are.
-        action_bounds: ``2 x action_dim``.
+    Arguments and errors are those of :func:`mlp_policy`.
     """
-    return mlp_policy(spec, action_bounds, net_arch=())
+    return mlp_policy(spec, action_bounds, (), first_actions=first_actions)
 
 
-def rbf_policy(spec: StateSpec, action_bounds: Tensor, num_centres: int = 50) -> BoundedPolicy:
+def rbf_policy(
+    spec: StateSpec,
+    action_bounds: Tensor,
+    num_centres: int = 50,
+    first_actions: Sequence[float] | None = None,
+) -> BoundedPolicy:
     """A sum of bells, as PILCO has it (Deisenroth and Rasmussen 2011).
 
     Args:
         spec: What the entries of states and actions are.
         action_bounds: ``2 x action_dim``.
         num_centres: Number of bells.
+        first_actions: As of :func:`mlp_policy`.
+
+    Raises:
+        ValueError: As :func:`mlp_policy`.
     """
-    body = nn.Sequential(
-        _Bells(spec.observation_dim, num_centres),
-        nn.Linear(num_centres, spec.action_dim, dtype=torch.float64),
-    )
+    last = nn.Linear(num_centres, spec.action_dim, dtype=torch.float64)
+    with torch.no_grad():
+        last.bias.copy_(_before_tanh(first_actions, action_bounds))
+    body = nn.Sequential(_Bells(spec.observation_dim, num_centres), last)
     return BoundedPolicy(body, spec, action_bounds)
+
+
+def _before_tanh(actions: Sequence[float] | None, action_bounds: Tensor) -> Tensor:
+    """What the tanh of a policy makes these actions of, ``action_dim``; 0 for None."""
+    low, high = torch.as_tensor(action_bounds, dtype=torch.float64)
+    if actions is None:
+        return torch.zeros_like(low)
+    given = torch.as_tensor(actions, dtype=torch.float64)
+    if given.shape != low.shape or not ((given >= low) & (given <= high)).all():
+        raise ValueError(
+            f"first_actions must be {len(low)} numbers within {low.tolist()} and {high.tolist()}; "
+            f"found {given.tolist()}."
+        )
+    share = (2 * given - low - high) / (high - low)
+    return share.clamp(-_NEAR, _NEAR).atanh()
 
 
 class _Bells(nn.Module):

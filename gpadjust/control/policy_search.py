@@ -24,11 +24,13 @@ class SearchResult(NamedTuple):
 
     Args:
         values: What the objective said in each update, ``updates``; of drawn functions and starts.
-        left_bounds: The share of episodes that left the bounds in the last tenth of the updates.
+        reward: The mean reward of a step in the last tenth of the updates.
+        left_bounds: The share of episodes that left the bounds there.
         seconds: How long it took.
     """
 
     values: Tensor
+    reward: float
     left_bounds: float
     seconds: float
 
@@ -174,7 +176,7 @@ class PolicySearch:
             optimizer, self.updates, eta_min=self.learning_rate / 10
         )
         score = self.objective.of(task)
-        values, left = [], []
+        values, rewards, left = [], [], []
         for i in range(self.updates):
             if i % self.redraw_every == 0:
                 rollouts = Rollouts(task, self.num_functions)
@@ -193,11 +195,13 @@ class PolicySearch:
                 optimizer.step()
             rate.step()
             values.append(value.detach())
+            rewards.append(rollout.rewards.detach()[rollout.made].mean())
             left.append(rollout.left_bounds.double().mean())
             if progress is not None:
                 progress(i + 1, float(value.detach()))
-        last = torch.stack(left[-max(1, self.updates // 10) :])
-        return SearchResult(torch.stack(values), float(last.mean()), time.perf_counter() - begun)
+        late = slice(-max(1, self.updates // 10), None)
+        reward, share = (float(torch.stack(each[late]).mean()) for each in (rewards, left))
+        return SearchResult(torch.stack(values), reward, share, time.perf_counter() - begun)
 
     def _starts(self, task: Task, num_functions: int) -> Tensor:
         """Starts of an update: others in each function, unless these are compared at the same."""

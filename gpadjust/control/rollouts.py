@@ -14,6 +14,9 @@ Policy = Callable[[Tensor], Tensor]
 """Actions ``N x action_dim`` at states ``N x state_dim``."""
 
 
+_MOST_MEDIANS = 30.0
+
+
 class Rollout(NamedTuple):
     """``n`` episodes of ``T`` steps in each of ``k`` functions.
 
@@ -102,7 +105,7 @@ class Rollouts:
             actions = choose(t, states)
             # Where the episodes start the physics has to work; later, all may have come to where
             # it does not.
-            at, taken = (_finite_gradient(part.flatten(0, 1)) for part in (states, actions))
+            at, taken = (_tamed_gradient(part.flatten(0, 1)) for part in (states, actions))
             step = task.step(at, taken, self._move, some_must_succeed=t == 0)
             following, rewards, ended, lost = (part.unflatten(0, running.shape) for part in step)
             made = running & ~lost
@@ -119,10 +122,24 @@ class Rollouts:
         return self.functions(*blocks).flatten(0, 1)
 
 
-def _finite_gradient(rows: Tensor) -> Tensor:
-    """The same rows; of those whose gradient is not finite none flows on, as rows are separate."""
+def _tamed_gradient(rows: Tensor) -> Tensor:
+    """The same rows; of those whose gradient is not finite, or far from the others', less flows on.
+
+    Rows are separate episodes; where one runs away, its gradient would outweigh all others.
+    """
     if not rows.requires_grad:
         return rows
     rows = rows.view_as(rows)
-    rows.register_hook(lambda g: torch.where(g.isfinite().all(-1, keepdim=True), g, 0.0))
+    rows.register_hook(_tamed)
     return rows
+
+
+def _tamed(gradient: Tensor) -> Tensor:
+    """Gradients of rows, none longer than so many times their median."""
+    gradient = torch.where(gradient.isfinite().all(-1, keepdim=True), gradient, 0.0)
+    lengths = gradient.norm(dim=-1, keepdim=True)
+    flowing = lengths > 0
+    if not flowing.any():
+        return gradient
+    most = _MOST_MEDIANS * lengths[flowing].median()
+    return gradient * (most / lengths.clamp_min(most))

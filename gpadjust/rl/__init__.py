@@ -7,6 +7,7 @@ except ImportError as error:
         'gpadjust.rl needs Stable-Baselines3 and Gymnasium; run `pip install "gpadjust[rl]"`.'
     ) from error
 
+from gpadjust.rl.actor_policy import actor_policy
 from gpadjust.rl.agents import DynaSAC, DynaTD3
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.callbacks import DynaCallback
@@ -31,6 +32,7 @@ __all__ = [
     "ModelOptions",
     "ModelVecEnv",
     "PolicySearchAgent",
+    "actor_policy",
     "resume",
     "save_checkpoint",
 ]

@@ -126,8 +126,7 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         with self.timed("update"):
             result = self.search.improve(module, task, guided=not self.is_trained)
         self.is_trained = True
-        late = result.values[-max(1, len(result.values) // 10) :]
-        self.promised_reward = float(late.mean())
+        self.promised_reward = result.reward
         self.logger.record("model/search_left_bounds", result.left_bounds)
         self.logger.record("model/search_seconds", result.seconds)
         if result.left_bounds > 0.1:

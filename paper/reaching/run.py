@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from stable_baselines3.common.noise import NormalActionNoise
+from torch import Tensor
 
 from gpadjust.control import PolicySearch, Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
@@ -16,10 +18,11 @@ from gpadjust.envs import arm_reward, arm_start
 from gpadjust.inference import SamplingWarning
 from gpadjust.models import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.rl import ModelOptions, PolicySearchAgent
+from gpadjust.states import StateSpec
 from paper.arm import Settings as ArmSettings
 from paper.arm.system import memory_start, reach, score
 from paper.common.experiment import Record
-from paper.reaching import Reaching, Settings
+from paper.reaching import BOUNDS, Reaching, Settings
 from paper.reaching.ensemble import ResidualEnsemble
 from paper.reaching.systems import (
     FittedArm,
@@ -84,11 +87,12 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
         arm_reward,
         initial_states=memory_start if system == "memory" else arm_start,
         episode_length=settings.episode_length,
+        state_bounds=bounds(spec_of(system)),
     )
     search = PolicySearch(
         updates=settings.updates,
         num_starts=settings.starts,
-        num_functions=settings.functions,
+        num_functions=None,
         learning_rate=settings.learning_rate,
     )
     # Of actions scaled to [-1, 1], as SB3 has it.
@@ -100,9 +104,18 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
         search,
         ModelOptions(reward_tolerance=None, score_horizons=()),
         action_noise=NormalActionNoise(np.zeros(4), sd),
+        policy_kwargs={"first_actions": [settings.first_action] * 4},
         seed=seed,
         device="cpu",
     )
+
+
+def bounds(spec: StateSpec) -> Tensor:
+    """Those of the states, ``2 x state_dim``; of targets and actions there are none."""
+    limits = torch.tensor([[-np.inf], [np.inf]], dtype=torch.float64).repeat(1, spec.state_dim)
+    for columns, name in ((slice(0, 2), "angles"), (slice(2, 4), "velocities")):
+        limits[:, columns] = torch.tensor(BOUNDS[name]).double().unsqueeze(-1)
+    return limits
 
 
 def dynamics(settings: Settings, system: str, learner: str) -> Dynamics:
@@ -119,5 +132,4 @@ def dynamics(settings: Settings, system: str, learner: str) -> Dynamics:
         spec,
         None if learner == "gp" else physics,
         model=_MODELS[learner],
-        num_features=settings.features,
     )

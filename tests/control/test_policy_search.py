@@ -60,6 +60,38 @@ def test_policies_keep_to_the_bounds(make):
     assert actions.max() <= 2
 
 
+@pytest.mark.parametrize("make", [mlp_policy, linear_policy, rbf_policy])
+def test_policies_begin_where_they_are_told_to(make):
+    states = torch.zeros(1, 1, dtype=torch.float64)
+    policy = make(SPEC, BOUNDS, first_actions=[-0.8])
+    for parameter in policy.body[-1].parameters():
+        if parameter.dim() > 1:
+            parameter.data.zero_()
+    torch.testing.assert_close(policy(states), torch.full((1, 1), -0.8).double())
+    with pytest.raises(ValueError, match=r"must be 1 numbers within \[-1.0\] and \[2.0\]; found \[3"):
+        make(SPEC, BOUNDS, first_actions=[3.0])
+
+
+def test_an_episode_that_runs_away_does_not_outweigh_the_others():
+    """Of 21 starts one is where the physics is a thousand times as steep."""
+
+    def steep(X):
+        return torch.where(X[:, :1] > 5, 1e3 * (X[:, :1] - 5) + 5, X[:, :1]) + 0.5 * X[:, 1:]
+
+    policy = linear_policy(SPEC, BOUNDS)
+    x = torch.linspace(-1, 1, 21, dtype=torch.float64).unsqueeze(-1)
+
+    def slope(starts):
+        policy.zero_grad()
+        rollout = Rollouts(task_of(PhysicsDynamics(SPEC, steep)), None).act(starts, policy, 4)
+        rollout.rewards.sum().backward()
+        return policy.body[-1].weight.grad.clone()
+
+    usual = slope(x)
+    x[20] = 6.0
+    assert slope(x).abs() < 20 * usual.abs()
+
+
 @pytest.mark.parametrize("kind", ["physics", "black box", "learnt", "mean of learnt"])
 def test_the_optimum_is_found(learnt, kind):
     """To bring x to 0 in steps of v / 2: -2 x, within the bounds."""
