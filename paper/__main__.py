@@ -20,6 +20,7 @@ EXPERIMENTS = {
     "exploration": ("Exploration", "cart-poles whose trials are random, SAC's or informative"),
     "foresight": ("Foresight", "do dynamics foresee the next trial, and know how well?"),
     "planning": ("Planning", "cart-poles that are swung up by planning in several models"),
+    "reaching": ("Reaching", "muscle arms that reach after a few trials, by several models"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

@@ -13,7 +13,7 @@ from gpadjust.states import StateSpec
 
 
 def actor_policy(agent: SAC | TD3, spec: StateSpec) -> BoundedPolicy:
-    """The actor of an agent as a policy, with the same parameters: what improves one, improves both.
+    """The actor of an agent as a policy that shares its parameters: who improves it improves both.
 
     Args:
         agent: SAC, TD3, DDPG, or a descendant such as :class:`DynaSAC`; its observations are those
@@ -74,5 +74,7 @@ class _Body(nn.Module):
         actor = self.actor
         features = actor.extract_features(observations.float(), actor.features_extractor)
         if hasattr(actor, "latent_pi"):  # SAC
-            return actor.mu(actor.latent_pi(features)).double()  # type: ignore[no-any-return]
-        return actor.mu[:-1](features).double()  # type: ignore[no-any-return]
+            mean: Tensor = actor.mu(actor.latent_pi(features))
+            return mean.double()
+        raw: Tensor = actor.mu[:-1](features)
+        return raw.double()

@@ -102,10 +102,10 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         known = replace(task, dynamics=dynamics)
         return MPC(known, self.action_bounds(), self.each_step, first=self.first)
 
-    def predict(
+    def predict(  # type: ignore[override]
         self,
         observation: np.ndarray | dict[str, np.ndarray],
-        state: PlanState | None = None,  # type: ignore[override]
+        state: PlanState | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, PlanState | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -13,7 +14,15 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 
-from gpadjust.control import PolicySearch, Rollouts, Task, linear_policy, mlp_policy, rbf_policy
+from gpadjust.control import (
+    BoundedPolicy,
+    PolicySearch,
+    Rollouts,
+    Task,
+    linear_policy,
+    mlp_policy,
+    rbf_policy,
+)
 from gpadjust.control.search import random_sequences
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.episode_loop import EpisodeLoop
@@ -22,7 +31,11 @@ from gpadjust.rl.options import ModelOptions
 from gpadjust.states import StateSpec
 
 PolicyKind = Literal["mlp", "linear", "rbf"]
-_KINDS = {"mlp": mlp_policy, "linear": linear_policy, "rbf": rbf_policy}
+_KINDS: dict[str, Callable[..., BoundedPolicy]] = {
+    "mlp": mlp_policy,
+    "linear": linear_policy,
+    "rbf": rbf_policy,
+}
 _EPISODES, _MAX_HOLD = 128, 5  # of random actions, by which the policy's inputs are scaled
 
 
@@ -52,7 +65,7 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
 
     Example:
         >>> import gymnasium
-        >>> from gpadjust.control import PolicySearch, Task
+        >>> from gpadjust.control import BoundedPolicy, PolicySearch, Task
         >>> from gpadjust.dynamics import LearnedDynamics
         >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
         >>> from gpadjust.envs import cart_pole_start

@@ -17,7 +17,7 @@ from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.envs import CART_POLE_SPEC, REAL_CART_POLE, CartPoleSwingUpEnv
 from gpadjust.envs.cart_pole.system import SUBSTEPS, TIME_STEP, CartPoleEquation
-from gpadjust.physics import ODEPhysics
+from gpadjust.physics import ODEPhysics, PhysicsError
 from paper.planning import FRICTIONS, SENSORS
 
 _SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
@@ -139,7 +139,8 @@ def least_squares_fit(logs: nn.Parameter, residuals: Callable[[], Tensor]) -> No
 
     Args:
         logs: The parameters.
-        residuals: What depends on them, of any shape.
+        residuals: What depends on them, of any shape; where it raises a PhysicsError, they are far
+            off.
     """
 
     def at(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -147,6 +148,13 @@ def least_squares_fit(logs: nn.Parameter, residuals: Callable[[], Tensor]) -> No
             logs.copy_(torch.from_numpy(values))
             return residuals().flatten().numpy()
 
+    def tried(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        try:
+            return at(values)
+        except PhysicsError:
+            return np.full_like(first, 1e3)
+
     start, room = logs.detach().numpy().copy(), np.log(5)
-    found = optimize.least_squares(at, start, bounds=(start - room, start + room))
+    first = at(start)
+    found = optimize.least_squares(tried, start, bounds=(start - room, start + room))
     at(found.x)

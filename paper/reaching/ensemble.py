@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -22,7 +23,7 @@ class Networks(nn.Module):
     def __init__(self, number: int, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
         sizes = (inputs, hidden, hidden, outputs)
-        pairs = list(zip(sizes, sizes[1:], strict=False))
+        pairs = [*pairwise(sizes)]
         self.weights = nn.ParameterList(
             torch.randn(number, a, b, dtype=torch.float64) / a**0.5 for a, b in pairs
         )

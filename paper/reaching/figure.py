@@ -27,7 +27,9 @@ _WORST = 30  # cm, the end of the colours
 def draw(records: Sequence[Record], experiment: Reaching) -> list[Path]:
     """Draw curves and maps; return their files."""
     found = [_curves(records, experiment)]
-    maps = [record for record in records if (record["system"], record["learner"]) == ("plain", "cka")]
+    maps = [
+        record for record in records if (record["system"], record["learner"]) == ("plain", "cka")
+    ]
     return [*found, _maps(maps, experiment)] if maps else found
 
 
@@ -58,8 +60,16 @@ def _maps(records: Sequence[Record], experiment: Reaching) -> Path:
     for trial, ax in zip(shown, axes, strict=True):
         mean = maps[maps["episode"] == trial].groupby("target")["all_steps"].mean()
         draw_arm(ax)
-        style = {"cmap": "viridis_r", "vmin": 0, "vmax": _WORST, "zorder": 2}
-        dots = ax.scatter(targets[:, 0], targets[:, 1], c=mean.to_numpy(), s=18, **style)
+        dots = ax.scatter(
+            targets[:, 0],
+            targets[:, 1],
+            c=mean.to_numpy(),
+            s=18,
+            cmap="viridis_r",
+            vmin=0,
+            vmax=_WORST,
+            zorder=2,
+        )
         ax.set_aspect("equal")
     figure.supxlabel("along the upper arm at 0°, cm", fontsize="medium")
     figure.supylabel("across, cm", fontsize="medium")

@@ -75,7 +75,7 @@ def _errors(own: pd.DataFrame, measure: str, last: int) -> str:
     rows = []
     for name in names:
         late = own[(own["scenario"] == name) & own["episode"].between(3, last)][measure]
-        gap = curves.paired_difference(name, 1, last).text(".1f") if "cka" in names else "–"
+        gap = curves.paired_difference(name, 1, last).text(".1f") if "cka" in names else ""
         cells = [number(curves.mean_at(name, i), ".1f") for i in shown]
         row = [LEARNERS[name], f"{len(curves.seeds(name))}", *cells]
         rows.append([*row, number(late.max(), ".1f"), gap])

@@ -79,7 +79,7 @@ def test_what_disappoints_is_planned_anew(monkeypatch):
         mpc = MPC(task, BOUNDS, quick(horizon=2), first=quick(), tolerance=tolerance)
         _, state = mpc.predict(np.zeros(1))
         for x in (1.0, -4.0, -3.0):
-            before, (action, state) = state, mpc.predict(np.array([x]), state)
+            _, state = mpc.predict(np.array([x]), state)
         assert begun == asked
         assert len(state[0].promised) == 8
         assert len(state[0].actions) == 4

@@ -68,7 +68,7 @@ def test_policies_begin_where_they_are_told_to(make):
         if parameter.dim() > 1:
             parameter.data.zero_()
     torch.testing.assert_close(policy(states), torch.full((1, 1), -0.8).double())
-    with pytest.raises(ValueError, match=r"must be 1 numbers within \[-1.0\] and \[2.0\]; found \[3"):
+    with pytest.raises(ValueError, match=r"1 numbers within \[-1.0\] and \[2.0\]; found \[3"):
         make(SPEC, BOUNDS, first_actions=[3.0])
 
 

@@ -13,7 +13,6 @@ from paper.reaching.systems import FittedArm, LearntArm, as_physics, spec_of
 TINY = Settings(trials=1, long_trials=1, updates=2, starts=3, substeps=6)
 
 
-@pytest.mark.opensim
 def test_a_run_and_its_tables(tmp_path):
     experiment = Reaching(out=tmp_path, runs=1, jobs=1, settings=TINY, systems=("sensors", "plain"))
     experiment.check()
@@ -29,7 +28,7 @@ def test_a_run_and_its_tables(tmp_path):
         "targets",
         "seconds",
     }
-    assert "1 run" in tables["targets"].text
+    assert "too few runs of cka" in tables["targets"].text
     assert [path.name for path in experiment.draw(records)] == ["curves.png", "map.png"]
 
 
@@ -45,7 +44,7 @@ def test_unknown_names_are_refused():
 
 
 def transitions(physics, n=40):
-    """Of an arm with one more kilogram in the hand."""
+    """Of an arm, at states all over."""
     torch.manual_seed(0)
     states = torch.randn(n, 6, dtype=torch.float64)
     actions = torch.rand(n, 4, dtype=torch.float64)
@@ -59,7 +58,9 @@ def test_fitted_physics_finds_the_parameters():
     real.logs.copy_(torch.tensor([0.1, -0.2, 0.3, -0.1, 0.2]))
     fitted = FittedArm(spec_of("plain"), torque_arm(), TINY)
     fitted.update(*transitions(as_physics(real, TINY)))
-    torch.testing.assert_close(fitted.equation.logs, real.logs, rtol=0, atol=1e-3)
+    # Torques, damping and masses may all be as many times as large.
+    found, expected = (equation.logs - equation.logs[0] for equation in (fitted.equation, real))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-3)
 
 
 def test_networks_learn_what_physics_lacks():
