@@ -43,11 +43,13 @@ class Planned(NamedTuple):
         promised: The rewards of all its steps, those made included, as they were foreseen when it
             was last planned to its end.
         steps_done: How many it has made.
+        left_bounds: As of the newest :class:`Plan`.
     """
 
     actions: Tensor
     promised: Tensor
     steps_done: int
+    left_bounds: float = 0.0
 
 
 PlanState = tuple[Planned, ...]
@@ -165,10 +167,12 @@ class MPC:
             )
             if not self._disappoints(plan, earlier):
                 beyond = earlier.actions[len(plan.actions) :]
-                return Planned(torch.cat([plan.actions, beyond]), earlier.promised, steps_done)
+                actions = torch.cat([plan.actions, beyond])
+                return Planned(actions, earlier.promised, steps_done, plan.left_bounds)
         plan = self.first.plan(self.task, state, self.action_bounds, left)
         made = plan.rewards[:0] if earlier is None else earlier.promised[:steps_done]
-        return Planned(plan.actions, torch.cat([made, plan.rewards]), steps_done)
+        promised = torch.cat([made, plan.rewards])
+        return Planned(plan.actions, promised, steps_done, plan.left_bounds)
 
     def _disappoints(self, plan: Plan, earlier: Planned) -> bool:
         """Whether a plan is worth much less than what was promised of its steps."""

@@ -25,11 +25,14 @@ class Plan(NamedTuple):
         value: What the objective says of it.
         rewards: What the model says of each step, ``T``, averaged over its functions; 0 after the
             end of the episode.
+        left_bounds: The share of the functions in which it leaves the bounds of the states, or
+            meets a failure of the physics.
     """
 
     actions: Tensor
     value: float
     rewards: Tensor
+    left_bounds: float
 
 
 @dataclass(frozen=True)
@@ -159,19 +162,20 @@ class Planner:
         deadline = math.inf if self.seconds is None else begun + self.seconds
 
         def search() -> Plan:
-            asked: list[tuple[Tensor, Tensor]] = []
+            asked: list[tuple[Tensor, Tensor, Tensor]] = []
 
             def scored(sequences: Tensor) -> Tensor:
                 rollout = rollouts.follow(state, sequences)
                 rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
-                asked.append((sequences, rewards))
+                left = rollout.left_bounds.double().mean(0)
+                asked.append((sequences, rewards, left))
                 return score(rollout, past)
 
             first = self._proposed(rollouts, state, num_steps, action_bounds, policy, known)
             actions, value = self.search.best(scored, first, action_bounds, deadline)
-            sequences, rewards = (torch.cat(column) for column in zip(*asked, strict=True))
-            found = (sequences == actions).all(-1).all(-1)
-            return Plan(actions, value, rewards[found][0])
+            sequences, rewards, left = (torch.cat(column) for column in zip(*asked, strict=True))
+            found = int((sequences == actions).all(-1).all(-1).nonzero()[0])
+            return Plan(actions, value, rewards[found], float(left[found]))
 
         plans = [search() for _ in range(self.restarts if known is None else 1)]
         return max(plans, key=lambda plan: plan.value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -145,6 +146,16 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         if not steps_done:
             whole = len(plan.promised) >= self.episode_length()
             self.promised_reward = float(plan.promised.mean()) if whole else None
+            self.logger.record("model/plan_left_bounds", plan.left_bounds)
+            if plan.left_bounds > 0.1:
+                warnings.warn(
+                    f"The best plan of an episode leaves the bounds of the states in "
+                    f"{plan.left_bounds:.0%} of the functions that it was followed through, so it "
+                    "is not to be trusted there. Penalise such states in the reward, widen "
+                    "state_bounds of the task, or search longer (MPCAgent(first=...)).",
+                    UserWarning,
+                    stacklevel=2,
+                )
         actions = plan.actions.clone()
         if self.action_noise is not None:
             low, high = self.action_bounds()

@@ -16,7 +16,7 @@ from gpadjust.envs.cart_pole.system import equation_physics
 from paper.planning import Settings
 from paper.planning.run import planners
 
-SEEDS = range(100, 108)
+SEEDS = range(100, 112)
 
 
 def main() -> None:
@@ -34,25 +34,32 @@ def main() -> None:
         start = cart_pole_start(1)[0]
         begun[seed] = start, first.plan(task, start, bounds).actions
     two = CrossEntropy(1, num_elites=12, correlation=0.5)
-    tried: list[tuple[int, int, str, Search]] = [
-        (8, 256, "2 rounds", two),
-        (10, 256, "2 rounds", two),
-        (12, 256, "2 rounds", two),
-        (12, 512, "2 rounds", two),
-        (12, 256, "1 round", CrossEntropy(0)),
-        (15, 256, "2 rounds", two),
-        (25, 256, "2 rounds", two),
-        (10, 256, "2 rounds, path integral", PathIntegral(1)),
+    one = CrossEntropy(0, num_elites=12, correlation=0.5)
+    tried: list[tuple[int, int, float, str, Search]] = [
+        (8, 96, 0.15, "2", two),
+        (8, 128, 0.1, "2", two),
+        (8, 128, 0.15, "2", two),
+        (8, 128, 0.2, "2", two),
+        (10, 64, 0.1, "2", CrossEntropy(1, num_elites=6, correlation=0.5)),
+        (10, 128, 0.1, "2", two),
+        (10, 128, 0.15, "2", two),
+        (10, 128, 0.2, "2", two),
+        (10, 256, 0.1, "2", two),
+        (10, 256, 0.1, "1", one),
+        (10, 256, 0.1, "1, path integral", PathIntegral(0)),
+        (12, 128, 0.15, "2", two),
     ]
-    for horizon, number, name, search in tried:
-        each = Planner(search=search, horizon=horizon, num_random=number, num_policy=0)
+    for horizon, number, spread, name, search in tried:
+        each = Planner(
+            search=search, horizon=horizon, num_random=number, num_policy=0, spread=spread
+        )
         costs, begin = [], time.perf_counter()
         for seed in seeds:
             torch.manual_seed(seed)
             costs.append(_trial(task, each, bounds, *begun[seed]))
         spent = (time.perf_counter() - begin) / len(seeds) / Settings().episode_length
         mean, worst = sum(costs) / len(costs), max(costs)
-        print(f"| {horizon} steps, {number}, {name} | {mean:.3f} | {worst:.3f} | {spent:.3f} |")
+        print(f"| {horizon}, {number}, {spread}, {name} | {mean:.3f} | {worst:.3f} | {spent:.3f} |")
 
 
 def _trial(

@@ -97,7 +97,9 @@ def as_physics(equation: Any, settings: Settings) -> ODEPhysics:
 
 
 class LearntArm(nn.Module):
-    """The arm's equation of motion with masses, damping and strengths to be learnt.
+    """The arm's equation of motion with the forearm's mass, damping and strengths to be learnt.
+
+    The upper arm's mass stays: were all as many times as large, the arm would move as before.
 
     Args:
         start: Where they begin.
@@ -106,12 +108,12 @@ class LearntArm(nn.Module):
     def __init__(self, start: ArmEquation) -> None:
         super().__init__()
         self.start = start
-        self.logs = nn.Parameter(torch.zeros(5, dtype=torch.float64))
+        self.logs = nn.Parameter(torch.zeros(4, dtype=torch.float64))
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """The time derivative of the state."""
-        upper, fore, damping, shoulder, elbow = self.logs.exp()
-        start, factors = self.start, (upper, fore)
+        fore, damping, shoulder, elbow = self.logs.exp()
+        start, factors = self.start, (1.0, fore)
         values = {
             **asdict(start),
             "masses": tuple(f * m for f, m in zip(factors, start.masses, strict=True)),

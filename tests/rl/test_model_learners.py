@@ -185,6 +185,17 @@ def test_what_is_promised_and_found_is_logged(make_agent):
     assert {"model/real_reward", "model/promised_reward", "model/search_left_bounds"} <= {*found}
 
 
+def test_plans_that_leave_the_bounds_are_told(make_agent, dynamics):
+    bounds = torch.tensor([[-2.0], [2.0]], dtype=torch.float64)
+    away = dynamics(lambda X: X[:, :1] + 3.0)
+    agent = make_agent(MPCAgent, dynamics=away, state_bounds=bounds)
+    with pytest.warns(
+        UserWarning, match="leaves the bounds of the states in 100% of the functions"
+    ):
+        agent.learn(2)
+    assert agent.logger.name_to_value["model/plan_left_bounds"] == 1
+
+
 def test_policies_that_leave_the_bounds_are_told(make_agent):
     bounds = torch.tensor([[0.99], [1.01]], dtype=torch.float64)
     agent = make_agent(
