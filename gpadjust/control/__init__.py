@@ -1,6 +1,6 @@
 """Tasks, and planning in dynamics models; Stable-Baselines3 is not needed."""
 
-from gpadjust.control.mpc import MPC
+from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.objectives import Information, Objective, Return
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy, rbf_policy
@@ -18,6 +18,7 @@ __all__ = [
     "Objective",
     "PathIntegral",
     "Plan",
+    "Planned",
     "Planner",
     "PolicySearch",
     "Return",
