@@ -17,14 +17,16 @@ from gpadjust.control.search import CrossEntropy
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
+_SHORTEST = 8  # steps ahead
+
 EACH_STEP = Planner(
     search=CrossEntropy(1, num_elites=12, correlation=0.5),
-    horizon=8,
+    horizon=_SHORTEST,
     num_random=128,
     num_policy=0,
     spread=0.15,
 )
-"""The default plan of a step: two looks at 128 sequences of eight steps."""
+"""The default plan of a step: two looks at 128 sequences, of eight steps or more."""
 
 FIRST = Planner(
     search=CrossEntropy(12, num_elites=12, correlation=0.5),
@@ -65,7 +67,10 @@ class MPC:
     Args:
         task: The task; its dynamics must be fitted.
         action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``.
-        each_step: Plans at each step but the first.
+        each_step: Plans at each step but the first. Default: two looks at 128 sequences of a third
+            of the episode, of eight steps at least. A horizon must be as long as the manoeuvre
+            needs, as energy must be put into a pole before it can stand: try it in f_p alone
+            (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
         first: Plans when an episode begins. Default: with three searches of the whole episode, or
             as far as ``each_step`` looks if the task does not say how long it is.
         tolerance: Where the plan of a step is worth less than what was promised of its steps when
@@ -95,7 +100,7 @@ class MPC:
         self,
         task: Task,
         action_bounds: Tensor,
-        each_step: Planner = EACH_STEP,
+        each_step: Planner | None = None,
         *,
         first: Planner | None = None,
         tolerance: float | None = 0.25,
@@ -103,7 +108,11 @@ class MPC:
     ) -> None:
         if tolerance is not None:
             check_fraction("tolerance", tolerance, most=math.inf, zero=False)
-        if task.episode_length is None and each_step.horizon is None:
+        length = task.episode_length
+        if each_step is None:
+            third = 0 if length is None else length // 3
+            each_step = replace(EACH_STEP, horizon=max(third, _SHORTEST))
+        if length is None and each_step.horizon is None:
             raise ValueError(
                 "Nobody says how far to plan; give the task an episode_length, or the planner a "
                 "horizon."
@@ -112,7 +121,7 @@ class MPC:
         self.action_bounds = torch.as_tensor(action_bounds, dtype=torch.float64)
         self.each_step = each_step
         if first is None:
-            horizon = each_step.horizon if task.episode_length is None else None
+            horizon = each_step.horizon if length is None else None
             first = replace(FIRST, objective=each_step.objective, horizon=horizon)
         self.first = first
         self.tolerance = tolerance

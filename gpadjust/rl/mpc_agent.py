@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 
 from gpadjust.control import MPC, Planner, Task
-from gpadjust.control.mpc import EACH_STEP, Planned, PlanState
+from gpadjust.control.mpc import Planned, PlanState
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.episode_loop import EpisodeLoop
 from gpadjust.rl.model_learner import ModelLearner
@@ -35,7 +35,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         env: The real environment; observations are those of the spec of the dynamics.
         task: What is known of the system; the rewards and terminations are compared with those of
             each real episode.
-        each_step: Plans at each step but the first.
+        each_step: Plans at each step but the first, see :class:`~gpadjust.control.MPC`.
         first: Plans when an episode begins, see :class:`~gpadjust.control.MPC`.
         options: How the model is learnt.
         action_noise: As in SB3: what is added to the planned actions of real episodes.
@@ -68,7 +68,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         self,
         env: GymEnv | str | None,
         task: Task | None = None,
-        each_step: Planner = EACH_STEP,
+        each_step: Planner | None = None,
         *,
         first: Planner | None = None,
         options: ModelOptions | None = None,
@@ -129,7 +129,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
     @property
     def replan_every(self) -> int | None:
         """Steps between two plans: one, unless the planner says otherwise."""
-        return self.each_step.replan_every or 1
+        return 1 if self.each_step is None else self.each_step.replan_every or 1
 
     def _plans(self) -> bool:
         return True

@@ -43,9 +43,10 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
     """Policy search in dynamics that learn from each real episode.
 
     The policy is trained in the physics before the first real episode, and after each one in the
-    newest model, by :class:`~gpadjust.control.PolicySearch`, from where it was. Without a physics
-    the first episode's actions are random. Callbacks, loggers, ``save`` and ``load``, checkpoints,
-    and what errors leave are as of :class:`Dyna`.
+    newest model, by :class:`~gpadjust.control.PolicySearch`, from where it was. Without a physics,
+    or if the task does not say where episodes start, the first episode's actions are random.
+    Callbacks, loggers, ``save`` and ``load``, checkpoints, and what errors leave are as of
+    :class:`Dyna`.
 
     Args:
         policy: ``"mlp"``, ``"linear"`` or ``"rbf"``.
