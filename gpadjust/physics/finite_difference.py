@@ -50,8 +50,9 @@ def value_and_central_difference(
 
     Example:
         >>> X = torch.tensor([[3.0]], dtype=torch.float64)
-        >>> value_and_central_difference(lambda X: X**2, X)
-        (tensor([[9.]], dtype=torch.float64), tensor([[[6.0000]]], dtype=torch.float64))
+        >>> values, slope = value_and_central_difference(lambda X: X**2, X)
+        >>> values.item(), round(slope.item(), 6)
+        (9.0, 6.0)
     """
     sides = _sides(X, None)
     Y = function(torch.cat([X, sides.reshape(-1, X.shape[1])]))
