@@ -66,14 +66,18 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
 
     Example:
         >>> import gymnasium
-        >>> from gpadjust.control import BoundedPolicy, PolicySearch, Task
+        >>> import torch
+        >>> from gpadjust.control import PolicySearch, Task
         >>> from gpadjust.dynamics import LearnedDynamics
         >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
         >>> from gpadjust.envs import cart_pole_start
         >>> from gpadjust.rl import PolicySearchAgent
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
         >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
-        >>> task = Task(dynamics, cart_pole_reward, initial_states=cart_pole_start)
+        >>> bounds = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
+        >>> task = Task(
+        ...     dynamics, cart_pole_reward, initial_states=cart_pole_start, state_bounds=bounds
+        ... )
         >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
         >>> agent = PolicySearchAgent("linear", env, task, search, seed=0)
         >>> agent.learn(total_timesteps=25).num_episodes
