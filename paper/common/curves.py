@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
+from paper.common.experiment import Record
 from paper.common.statistics import Difference
+
+
+def load_trials(records: Sequence[Record]) -> pd.DataFrame:
+    """A row for each trial of the runs of a comparison; a learner is a ``scenario``."""
+    rows = [
+        {
+            "system": record["system"],
+            "scenario": record["learner"],
+            "seed": record["seed"],
+            "episode": i + 1,
+            **{name: values[i] for name, values in record["trials"].items()},
+        }
+        for record in records
+        for i in range(len(next(iter(record["trials"].values()))))
+    ]
+    return pd.DataFrame(rows)
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from paper.common.experiment import Experiment, Task
+from paper.common.comparison import Comparison
 
 SYSTEMS = {
     "plain": "as the paper's",
@@ -63,42 +64,16 @@ class Settings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planning(Experiment):
+class Planning(Comparison):
     """Cart-poles that are swung up by planning, with several models of them."""
 
     out: Path = Path("results/planning")
     settings: Settings = field(default_factory=Settings)
-    systems: tuple[str, ...] = ()
-    """the cart-poles, by name; all of them, unless some are given"""
-    learners: tuple[str, ...] = ()
-    """the models, by name; all of them, unless some are given"""
 
     name: ClassVar[str] = "planning"
-    key: ClassVar[tuple[str, ...]] = ("system", "learner", "seed")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
-
-    def check(self) -> None:
-        """Whether there are the systems and the models."""
-        for option, given, known in (
-            ("systems", self.systems, SYSTEMS),
-            ("learners", self.learners, LEARNERS),
-        ):
-            unknown = [name for name in given if name not in known]
-            if unknown:
-                raise ValueError(
-                    f"--{option}: there is no {unknown[0]!r}, but there are {', '.join(known)}"
-                )
-        if self.settings.trials < 1:
-            raise ValueError(f"--trials: expected at least 1, got {self.settings.trials}")
-
-    def tasks(self) -> list[Task]:
-        """System by system, seed by seed, so that what is done first can be compared."""
-        return [
-            (system, learner, seed)
-            for system in self.systems or SYSTEMS
-            for seed in self.seeds
-            for learner in self.learners or LEARNERS
-        ]
+    known_systems: ClassVar[Mapping[str, str]] = SYSTEMS
+    known_learners: ClassVar[Mapping[str, str]] = LEARNERS
+    packages: ClassVar[tuple[str, ...]] = (*Comparison.packages, "stable_baselines3")
 
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and what the system has that f_p lacks."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from paper.common.curves import load_trials
 from paper.common.experiment import Record
 from paper.common.figures import draw_quartiles, one_legend, panels, save
 from paper.planning import LEARNERS, SYSTEMS, Planning
-from paper.planning.tables import load
 
 COLORS = {
     "cka": "navy",
@@ -23,7 +23,7 @@ COLORS = {
 
 def draw(records: Sequence[Record], experiment: Planning) -> list[Path]:
     """Draw the cost of the trials, models over each other, a panel for each system."""
-    trials = load(records)
+    trials = load_trials(records)
     systems = [name for name in SYSTEMS if name in set(trials["system"])]
     figure, axes = panels([SYSTEMS[name] for name in systems], 2, (4.2, 3), width=8.4)
     for ax, system in zip(axes, systems, strict=True):

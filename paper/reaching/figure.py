@@ -7,11 +7,12 @@ from pathlib import Path
 
 from gpadjust.envs import arm_targets, hand_position
 from paper.arm.figure import BOUND, draw_arm
+from paper.common.curves import load_trials
 from paper.common.experiment import Record
 from paper.common.figures import draw_quartiles, one_legend, panels, save
 from paper.reaching import LEARNERS, SYSTEMS, Reaching
 from paper.reaching.run import MAPPED
-from paper.reaching.tables import load, load_maps
+from paper.reaching.tables import load_maps
 
 COLORS = {
     "cka": "navy",
@@ -35,7 +36,7 @@ def draw(records: Sequence[Record], experiment: Reaching) -> list[Path]:
 
 def _curves(records: Sequence[Record], experiment: Reaching) -> Path:
     """The hand's error over the trials, models over each other, a panel for each arm."""
-    trials = load(records)
+    trials = load_trials(records)
     systems = [name for name in SYSTEMS if name in set(trials["system"])]
     figure, axes = panels([SYSTEMS[name] for name in systems], 2, (4.2, 3), width=8.4)
     for ax, system in zip(axes, systems, strict=True):

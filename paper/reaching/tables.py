@@ -7,28 +7,12 @@ from collections.abc import Sequence
 import pandas as pd
 
 from paper.common.claims import Claim, Finding, judge, met
-from paper.common.curves import Curves
+from paper.common.curves import Curves, load_trials
 from paper.common.experiment import Record, Table
 from paper.common.tables import claims_table, markdown, number
 from paper.reaching import LEARNERS, SYSTEMS, Reaching
 
 _SHOWN = (1, 2, 3, 4, 6, 10)  # trials
-
-
-def load(records: Sequence[Record]) -> pd.DataFrame:
-    """A row for each trial."""
-    rows = [
-        {
-            "system": record["system"],
-            "scenario": record["learner"],
-            "seed": record["seed"],
-            "episode": i + 1,
-            **{name: values[i] for name, values in record["trials"].items()},
-        }
-        for record in records
-        for i in range(len(record["trials"]["all_steps"]))
-    ]
-    return pd.DataFrame(rows)
 
 
 def load_maps(records: Sequence[Record]) -> pd.DataFrame:
@@ -52,7 +36,7 @@ def load_maps(records: Sequence[Record]) -> pd.DataFrame:
 
 def tables(records: Sequence[Record], experiment: Reaching) -> dict[str, Table]:
     """All tables, by name."""
-    trials, last = load(records), experiment.settings.trials
+    trials, last = load_trials(records), experiment.settings.trials
     found = {}
     for system, label in SYSTEMS.items():
         own = trials[trials["system"] == system]
