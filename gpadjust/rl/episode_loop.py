@@ -6,6 +6,8 @@ from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from gpadjust.control.option_checks import check_whole
+
 
 class EpisodeLoop(OffPolicyAlgorithm):
     """An off-policy algorithm of Stable-Baselines3 that makes real episodes and updates nothing.
@@ -14,14 +16,32 @@ class EpisodeLoop(OffPolicyAlgorithm):
 
     Args:
         args: As of ``OffPolicyAlgorithm``.
+        random_steps: Episodes that begin before so many real steps have random actions. (SB3's
+            ``learning_starts`` would put off learning, too.)
         kwargs: As of ``OffPolicyAlgorithm``.
+
+    Raises:
+        TypeError: If ``random_steps`` is no whole number.
+        ValueError: If it is negative.
     """
 
-    def __init__(self, *args: Any, _init_setup_model: bool = True, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        random_steps: int = 0,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        check_whole("random_steps", random_steps, 0)
+        self.random_steps = random_steps
         fixed = {"learning_starts": 0, "gradient_steps": 1, "support_multi_env": True}
         super().__init__(*args, **{**kwargs, **fixed})
         if _init_setup_model:
             self._setup_model()
+
+    def begins_at_random(self) -> bool:
+        """Whether an episode that begins now has random actions, as it was asked for."""
+        return self.num_timesteps < self.random_steps
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Nothing is updated."""

@@ -42,6 +42,8 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         buffer_size: Real transitions that are kept.
         train_freq: As in SB3. Default: after each episode; with several environments give a number
             of steps.
+        random_steps: Episodes that begin before so many real steps have random actions, held for
+            up to five steps. Default: the first one is planned in the physics.
         kwargs: Further arguments of ``OffPolicyAlgorithm``.
 
     Raises:
@@ -75,6 +77,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         action_noise: ActionNoise | None = None,
         buffer_size: int = 100_000,
         train_freq: int | tuple[int, str] = (1, "episode"),
+        random_steps: int = 0,
         policy: type[BasePolicy] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -88,6 +91,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
             learning_rate=0.0,
             buffer_size=buffer_size,
             train_freq=train_freq,
+            random_steps=random_steps,
             action_noise=action_noise,
             replay_buffer_class=MixedReplayBuffer,
             **kwargs,
@@ -137,13 +141,15 @@ class MPCAgent(ModelLearner, EpisodeLoop):
     def _plan(self, episode: PlannedEpisode, state: Tensor) -> Tensor:
         """Plan the steps ahead, or draw them, if nothing is known."""
         mpc, steps_done = self.mpc, len(episode.states)
-        if mpc is None:
+        begins = not steps_done
+        at_random = self.begins_at_random() if begins else not len(episode.promised)
+        if mpc is None or at_random:
             return super()._plan(episode, state)
-        earlier = Planned(episode.ahead, episode.promised, steps_done) if steps_done else None
+        earlier = Planned(episode.ahead, episode.promised, steps_done) if not begins else None
         with self.timed("plan"):
             plan = mpc.plan(state, earlier)
         episode.promised = plan.promised
-        if not steps_done:
+        if begins:
             whole = len(plan.promised) >= self.episode_length()
             self.promised_reward = float(plan.promised.mean()) if whole else None
             self.logger.record("model/plan_left_bounds", plan.left_bounds)

@@ -57,6 +57,9 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         buffer_size: Real transitions that are kept.
         train_freq: As in SB3. Default: after each episode; with several environments give a number
             of steps.
+        random_steps: Episodes that begin before so many real steps have random actions, held for
+            up to five steps; the policy is then trained after them. Default: it is trained in the
+            physics before the first one.
         policy_kwargs: Further arguments of the policy, such as ``net_arch``.
         kwargs: Further arguments of ``OffPolicyAlgorithm``, such as ``action_noise``.
 
@@ -96,6 +99,7 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         *,
         buffer_size: int = 100_000,
         train_freq: int | tuple[int, str] = (1, "episode"),
+        random_steps: int = 0,
         policy_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -116,6 +120,7 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
             learning_rate=0.0,
             buffer_size=buffer_size,
             train_freq=train_freq,
+            random_steps=random_steps,
             policy_kwargs=policy_kwargs,
             replay_buffer_class=MixedReplayBuffer,
             **kwargs,
@@ -126,12 +131,13 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         result = super()._setup_learn(*args, **kwargs)
         task = self.model_task()
         known = task.dynamics.before_data()
-        if not self.is_trained and known is not None and task.initial_states is not None:
+        waits = self.is_trained or self.begins_at_random()
+        if not waits and known is not None and task.initial_states is not None:
             self._search(replace(task, dynamics=known))
         return result
 
     def _plans(self) -> bool:
-        return not self.is_trained  # actions are random
+        return not self.is_trained or self.begins_at_random()  # actions are random
 
     def _improve(self, num_ended: int, batch_size: int) -> None:
         self._search(self.model_task())

@@ -16,7 +16,7 @@ from torch import Tensor
 from gpadjust import CKA, BlackBoxPhysics, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import AngleInput
 from gpadjust.envs import REAL_CART_POLE, CartPoleEquation, random_cart_pole_physics
-from gpadjust.envs.cart_pole.system import SUBSTEPS, TIME_STEP
+from gpadjust.envs.cart_pole.system import SUBSTEP, TIME_STEP
 from gpadjust.physics import ODEPhysics
 from paper.active import PROBLEMS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
@@ -118,8 +118,9 @@ def _cart_pole(seed: int) -> Problem:
 
 def _change(equation: CartPoleEquation | Callable[[Tensor, Tensor], Tensor]) -> ODEPhysics:
     """The change of the state in a time step, from state and force."""
+    substeps = round(TIME_STEP / SUBSTEP)
     return ODEPhysics(
-        equation, TIME_STEP, state_dim=4, substeps=SUBSTEPS, difference=True, name="cart_pole"
+        equation, TIME_STEP, state_dim=4, substeps=substeps, difference=True, name="cart_pole"
     )
 
 

@@ -7,35 +7,50 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from gpadjust.control import CrossEntropy, Planner, Task
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gpadjust.control import CrossEntropy, Planner, PolicySearch, Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+from gpadjust.envs import (
+    CART_POLE_SPEC,
+    cart_pole_reward,
+    cart_pole_start,
+    random_cart_pole_physics,
+)
 from gpadjust.envs.cart_pole.system import CartPoleEquation, equation_physics
 from gpadjust.inference import SamplingWarning
 from gpadjust.models import CKA, RRA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.rl import ModelOptions, MPCAgent
+from gpadjust.rl import ModelOptions, MPCAgent, PolicySearchAgent
 from paper.common.experiment import Record
-from paper.planning import Planning, Settings
-from paper.planning.systems import FittedPhysics, environment, equation
+from paper.planning import BOUND, Planning, Settings
+from paper.planning.systems import FittedPhysics, environment, equation, mc_pilco_reward
 
-_MODELS: dict[str, Any] = {"cka": CKA, "phymean": PhysicsMeanGP, "rra": RRA}
+_MODELS: dict[str, Any] = {"cka": CKA, "search": CKA, "phymean": PhysicsMeanGP, "rra": RRA}
 
 
 def run(experiment: Planning, system: str, learner: str, seed: int, *, unfinished: Path) -> Record:
     """Make the trials; return cost and times of each."""
     warnings.simplefilter("ignore", SamplingWarning)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
-    settings, agent = experiment.settings, make_agent(experiment, system, learner, seed)
+    settings = experiment.settings_of(system)
+    agent = make_agent(experiment, system, learner, seed)
+    real: Any = agent.get_env()
     rows: list[dict[str, Any]] = []
     for _ in range(settings.trials):
         before, start = dict(agent.wall_time), time.process_time()
         agent.learn(settings.episode_length, reset_num_timesteps=False)
         costs = -agent.recorded_episodes(newest=settings.episode_length).rewards
+        (seen,) = real.get_attr("episodes")
+        late = np.stack(seen[len(rows)])[-round(1 / settings.time_step) :]
         seconds = {name: agent.wall_time[name] - before[name] for name in ("plan", "fit")}
         rows.append(
             {
                 "cost": costs.mean().item(),
                 "last_cost": costs[-5:].mean().item(),
+                "last_offset": np.abs(late[:, 0]).max().item(),
+                "last_lean": np.abs(np.degrees(wrapped(late[:, 1]))).max().item(),
                 "promised_cost": -(agent.promised_reward or float("nan")),
                 **{f"{name}_seconds": spent for name, spent in seconds.items()},
                 "cpu_seconds": time.process_time() - start,
@@ -44,22 +59,37 @@ def run(experiment: Planning, system: str, learner: str, seed: int, *, unfinishe
     return {"trials": {name: [row[name] for row in rows] for name in rows[0]}}
 
 
-def make_agent(experiment: Planning, system: str, learner: str, seed: int) -> MPCAgent:
+def make_agent(
+    experiment: Planning, system: str, learner: str, seed: int
+) -> MPCAgent | PolicySearchAgent:
     """Who plans, at the start."""
-    settings = experiment.settings
-    task = Task(
-        dynamics(system, learner, seed), cart_pole_reward, episode_length=settings.episode_length
-    )
+    settings = experiment.settings_of(system)
+    env, length = environment(system, settings), settings.episode_length
     each_step, first = planners(settings)
-    return MPCAgent(
-        environment(system, settings.episode_length),
-        task,
-        each_step,
-        first=first,
-        options=ModelOptions(reward_tolerance=None, score_horizons=()),
-        seed=seed,
-        device="cpu",
+    task = Task(
+        dynamics(settings, system, learner, seed),
+        mc_pilco_reward if system == "mc-pilco" else cart_pole_reward,
+        initial_states=cart_pole_start,
+        episode_length=length,
+        state_bounds=torch.tensor([[-BOUND] * 4, [BOUND] * 4]) if learner == "search" else None,
     )
+    common: dict[str, Any] = {
+        "options": ModelOptions(reward_tolerance=None, score_horizons=()),
+        "random_steps": settings.random_trials * length,
+        "seed": seed,
+        "device": "cpu",
+    }
+    if learner != "search":
+        return MPCAgent(env, task, each_step, first=first, **common)
+    search = PolicySearch(
+        updates=settings.updates,
+        num_starts=settings.starts,
+        num_functions=None,
+        learning_rate=settings.learning_rate,
+        guide=first,
+        num_guides=settings.guides,
+    )
+    return PolicySearchAgent("mlp", env, task, search, **common)
 
 
 def planners(settings: Settings) -> tuple[Planner, Planner]:
@@ -81,17 +111,23 @@ def planners(settings: Settings) -> tuple[Planner, Planner]:
     return each_step, first
 
 
-def dynamics(system: str, learner: str, seed: int) -> Dynamics:
+def dynamics(settings: Settings, system: str, learner: str, seed: int) -> Dynamics:
     """What is planned in, at its start."""
+    time_step = settings.time_step
     if learner == "oracle":
-        return PhysicsDynamics(CART_POLE_SPEC, equation_physics(equation(system)))
-    physics = random_cart_pole_physics(seed)
+        return PhysicsDynamics(CART_POLE_SPEC, equation_physics(equation(system), time_step))
+    physics = random_cart_pole_physics(seed, time_step)
     if learner == "phy":
         return PhysicsDynamics(CART_POLE_SPEC, physics)
     if learner == "fitted":
         known: Any = physics.rhs
         assert isinstance(known, CartPoleEquation), "as it is made"
-        return FittedPhysics(known)
+        return FittedPhysics(known, time_step)
     if learner == "gp":
         return LearnedDynamics(CART_POLE_SPEC, model=ZeroMeanGP)
     return LearnedDynamics(CART_POLE_SPEC, physics, model=_MODELS[learner])
+
+
+def wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles in [-pi, pi)."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.envs import CART_POLE_SPEC, REAL_CART_POLE, CartPoleSwingUpEnv
-from gpadjust.envs.cart_pole.system import SUBSTEPS, TIME_STEP, CartPoleEquation
-from gpadjust.physics import ODEPhysics, PhysicsError
-from paper.planning import FRICTIONS, SENSORS
+from gpadjust.envs.cart_pole.system import START_MEAN, CartPoleEquation, equation_physics
+from gpadjust.physics import PhysicsError
+from paper.planning import FRICTIONS, SENSORS, SMALL_NOISE, Settings
 
 _SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
 
@@ -54,15 +54,57 @@ class FrictionEquation(CartPoleEquation):
 
 
 class Sensors(gym.ObservationWrapper[Any, Any, Any]):
-    """Observations of the cart-pole with noise; its reward is that of the true state."""
+    """Observations of the cart-pole with noise; its reward is that of the true state.
+
+    Args:
+        env: The cart-pole.
+        sd: Standard deviations of the noise, by the name of the entry.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], sd: Mapping[str, float]) -> None:
+        super().__init__(env)
+        self.sd = np.array([sd[name] for name in CART_POLE_SPEC.states])
 
     def observation(self, observation: Any) -> Any:
         """Add the noise to the state, by the environment's generator."""
         spec = CART_POLE_SPEC
         state = spec.decode(torch.from_numpy(observation.astype(np.float64)))
-        sd = np.array([SENSORS[name] for name in spec.states])
-        noise = torch.from_numpy(sd * self.unwrapped.np_random.normal(size=len(sd)))
+        noise = torch.from_numpy(self.sd * self.unwrapped.np_random.normal(size=len(self.sd)))
         return spec.observe(state + noise).numpy().astype(np.float32)
+
+
+class Still(gym.Wrapper[Any, Any, Any, Any]):
+    """Episodes of the cart-pole that start nearly still."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Start from about the hanging pole at rest."""
+        self.env.reset(seed=seed)
+        start = self.unwrapped.np_random.normal(START_MEAN, SMALL_NOISE)
+        return self.env.reset(options={"state": start})
+
+
+class Watched(gym.Wrapper[Any, Any, Any, Any]):
+    """Keeps the true states of an episode.
+
+    Attributes:
+        episodes: Those of each episode, ``T x 4``, the newest last.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.episodes: list[list[NDArray[np.float64]]] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begin an episode."""
+        self.episodes.append([])
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        """Make a step."""
+        result = self.env.step(action)
+        unwrapped: Any = self.unwrapped
+        self.episodes[-1].append(unwrapped.state)
+        return result
 
 
 def equation(system: str) -> CartPoleEquation:
@@ -75,11 +117,26 @@ def equation(system: str) -> CartPoleEquation:
     return FrictionEquation(*masses, real.pole_length, real.damping, dry=dry, drag=drag)
 
 
-def environment(system: str, episode_length: int) -> gym.Env[Any, Any]:
+def environment(system: str, settings: Settings) -> Watched:
     """The real system."""
-    env: gym.Env[Any, Any] = CartPoleSwingUpEnv(equation=equation(system))
-    env = Sensors(env) if system == "sensors" else env
-    return gym.wrappers.TimeLimit(env, episode_length)
+    env: gym.Env[Any, Any] = CartPoleSwingUpEnv(
+        equation=equation(system), time_step=settings.time_step
+    )
+    if system == "sensors":
+        env = Sensors(env, SENSORS)
+    elif system == "mc-pilco":
+        env = Sensors(Still(env), dict.fromkeys(CART_POLE_SPEC.states, SMALL_NOISE))
+    return Watched(gym.wrappers.TimeLimit(env, settings.episode_length))
+
+
+def mc_pilco_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """The reward of that protocol, of transitions ``N x ...``: how far pole and cart are off.
+
+    That of the others is of the tip alone, under which the cart may swing.
+    """
+    x, theta = next_states[:, 0], next_states[:, 1]
+    lean = torch.atan2(theta.sin(), theta.cos())
+    return torch.expm1(-(lean / 3).square() - x.square())
 
 
 class LearntEquation(nn.Module):
@@ -109,13 +166,12 @@ class FittedPhysics(PhysicsDynamics):
 
     Args:
         start: The equation whose parameters they are at first.
+        time_step: In s.
     """
 
-    def __init__(self, start: CartPoleEquation) -> None:
+    def __init__(self, start: CartPoleEquation, time_step: float) -> None:
         self.equation = LearntEquation(start)
-        physics = ODEPhysics(
-            self.equation, TIME_STEP, 4, substeps=SUBSTEPS, memo=0, name="fitted_cart_pole"
-        )
+        physics = equation_physics(self.equation, time_step, name="fitted_cart_pole")
         super().__init__(CART_POLE_SPEC, physics)
         self._data: Transitions | None = None
 

@@ -106,6 +106,17 @@ def test_step_agrees_with_scipy(states_and_forces):
     torch.testing.assert_close(fine(X), expected, rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("time_step", [0.01, 0.05, 0.13])
+def test_time_steps_can_be_others(time_step, states_and_forces):
+    X = torch.cat(states_and_forces(10), dim=-1)
+    fine = ODEPhysics(REAL_CART_POLE, step=time_step, state_dim=4, substeps=100)
+    physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1, time_step)
+    torch.testing.assert_close(physics(X), fine(X), rtol=0, atol=2e-3)
+    assert physics.step / physics.substeps <= 0.02 + 1e-12
+    believed = random_cart_pole_physics(3, time_step)
+    assert (believed.step, believed.rhs) == (time_step, random_cart_pole_physics(3).rhs)
+
+
 def test_hanging_is_stable_and_upright_is_not():
     nudge = torch.tensor([[0.0, 0.01, 0.0, 0.0], [0.0, math.pi + 0.01, 0.0, 0.0]])
     rates = REAL_CART_POLE(nudge, torch.zeros(2, 1))[:, 3]
@@ -143,6 +154,9 @@ def test_what_is_no_number_or_state_is_refused():
         random_cart_pole_physics(1.5)
     with pytest.raises(ValueError, match="seed must not be negative; found -1"):
         random_cart_pole_physics(-1)
+    for time_step in (0, -0.1, math.nan):
+        with pytest.raises(ValueError, match="time_step must be a positive number of seconds"):
+            random_cart_pole_physics(0, time_step)
     for start in (cart_pole_start, arm_start):
         with pytest.raises(ValueError, match="n must not be negative; found -1"):
             start(-1)

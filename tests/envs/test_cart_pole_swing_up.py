@@ -106,6 +106,21 @@ def test_another_equation_changes_the_system():
     assert np.isclose(cost, 1 - math.exp(-2 * 2.0**2))
 
 
+def test_another_time_step_is_seen_in_steps_and_frames():
+    whole, halves = CartPoleSwingUpEnv(), CartPoleSwingUpEnv(time_step=0.05)
+    assert (whole.metadata["render_fps"], halves.metadata["render_fps"]) == (10, 20)
+    start = {"state": [0.0, 3.0, 0.1, 0.0]}
+    for env in (whole, halves):
+        env.reset(options=start)
+    push = np.array([4.0], dtype=np.float32)
+    whole.step(push)
+    halves.step(push)
+    halves.step(push)
+    np.testing.assert_allclose(halves.state, whole.state, atol=1e-5)
+    with pytest.raises(TypeError, match="time_step must be a number; found 'fast'"):
+        CartPoleSwingUpEnv(time_step="fast")
+
+
 def test_equal_seeds_give_equal_trajectories():
     first, second = CartPoleSwingUpEnv(), CartPoleSwingUpEnv()
     for _ in range(2):

@@ -1,13 +1,21 @@
 """The experiment on planning in the first trials."""
 
+import numpy as np
 import pytest
 import torch
 
 from gpadjust.envs import REAL_CART_POLE, random_cart_pole_physics
+from gpadjust.envs.cart_pole.system import START_MEAN, equation_physics
 from paper.common.runner import rounded
-from paper.planning import LEARNERS, SYSTEMS, Planning, Settings
+from paper.planning import LEARNERS, SMALL_NOISE, SYSTEMS, Planning, Settings
 from paper.planning.run import dynamics
-from paper.planning.systems import FittedPhysics, FrictionEquation, environment, equation
+from paper.planning.systems import (
+    FittedPhysics,
+    FrictionEquation,
+    environment,
+    equation,
+    mc_pilco_reward,
+)
 
 TINY = Settings(
     trials=2,
@@ -19,6 +27,9 @@ TINY = Settings(
     first_sequences=12,
     first_rounds=0,
     restarts=1,
+    updates=2,
+    starts=4,
+    guides=1,
 )
 
 
@@ -39,7 +50,7 @@ def test_a_run_and_its_tables(tmp_path):
 
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_all_models_are_known(learner):
-    assert dynamics("friction", learner, 0).spec.states[0] == "x"
+    assert dynamics(TINY, "friction", learner, 0).spec.states[0] == "x"
 
 
 def test_unknown_names_are_refused(tmp_path):
@@ -66,8 +77,45 @@ def test_friction_takes_energy_and_is_none_at_rest():
     torch.testing.assert_close(rough(states, nothing), REAL_CART_POLE(states, nothing))
 
 
+def test_mc_pilcos_protocol_has_small_steps_still_starts_and_noise():
+    """Half a step twice, from the true state that is watched, is what noisy sensors see."""
+    settings = Planning().settings_of("mc-pilco")
+    assert settings.trials - settings.random_trials == 5
+    assert settings.episode_length * settings.time_step == 3
+    env = environment("mc-pilco", settings)
+    starts, seen = [], []
+    for seed in range(30):
+        observation, _ = env.reset(seed=seed)
+        starts.append(env.unwrapped.state)
+        seen.append(np.array([observation[0], *observation[3:]]) - starts[-1][[0, 2, 3]])
+    for found in (starts - np.array(START_MEAN), seen):
+        assert np.std(found) == pytest.approx(SMALL_NOISE, rel=0.25)
+    env.step(np.array([3.0], dtype=np.float32))
+    row = torch.tensor([[*starts[-1], 3.0]])
+    torch.testing.assert_close(
+        torch.from_numpy(np.stack(env.episodes[-1])),
+        equation_physics(REAL_CART_POLE, 0.05)(row.double()),
+        rtol=0,
+        atol=1e-9,
+    )
+
+
+def test_mc_pilcos_cost_is_that_of_angle_and_place():
+    states = torch.tensor([[0.0, 2 * np.pi, 9.0, 9.0], [1.0, 0.0, 0.0, 0.0], [0.0, 3.0, 0.0, 0.0]])
+    found = mc_pilco_reward(states, states, states.double())
+    expected = torch.tensor([0.0, np.exp(-1) - 1, np.exp(-1) - 1], dtype=torch.float64)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+
+
+def test_a_policy_is_searched_for_and_the_last_second_is_watched(tmp_path):
+    experiment = Planning(out=tmp_path, runs=1, jobs=1, settings=TINY)
+    trials = experiment.run("plain", "search", 0, unfinished=tmp_path / "x")["trials"]
+    assert len(trials["cost"]) == 2
+    assert all(0 <= lean <= 180 for lean in trials["last_lean"])
+
+
 def test_fitted_physics_finds_the_parameters():
-    env = environment("plain", 25)
+    env = environment("plain", Settings())
     env.action_space.seed(0)
     env.reset(seed=0)
     rows, actions = [env.unwrapped.state], []
@@ -77,7 +125,7 @@ def test_fitted_physics_finds_the_parameters():
         actions.append(torch.from_numpy(action).double())
         rows.append(env.unwrapped.state)
     states = torch.stack([torch.from_numpy(row) for row in rows])
-    fitted = FittedPhysics(random_cart_pole_physics(3).rhs)
+    fitted = FittedPhysics(random_cart_pole_physics(3).rhs, 0.1)
     fitted.update(states[:-1], torch.stack(actions), states[1:])
     real = (REAL_CART_POLE.cart_mass, REAL_CART_POLE.pole_mass)
     real = torch.tensor([*real, REAL_CART_POLE.pole_length, REAL_CART_POLE.damping])

@@ -96,6 +96,17 @@ def test_without_a_physics_the_first_episode_is_random(make_agent, kind, dynamic
     assert agent.recorded_episodes().num_transitions == 10
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_first_episodes_can_be_random(make_agent, kind):
+    """Two episodes of five steps begin before the sixth step; the third is brought home."""
+    agent = make_agent(kind, random_steps=6).learn(15)
+    rewards = agent.recorded_episodes().rewards.reshape(3, 5).sum(1)
+    assert rewards[:2].max() < -1.5 < rewards[2]
+    for wrong, error in ((-1, ValueError), (1.5, TypeError)):
+        with pytest.raises(error, match="random_steps must be"):
+            make_agent(kind, random_steps=wrong)
+
+
 def no_error():
     from contextlib import nullcontext
 

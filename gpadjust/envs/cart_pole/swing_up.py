@@ -31,9 +31,10 @@ MAX_START = 100.0  # far beyond what forces do; the equation can be integrated t
 class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
     r"""Swing up the pole of a cart-pole and balance it, by pushing the cart.
 
-    The pole hangs at first. The action, a force in [-10, 10] N, is held for 0.1 s; stronger forces
-    are clipped. The observation is :math:`[x, \sin\theta, \cos\theta, \dot{x}, \dot\theta]`, with
-    the angle from upright; ``state`` has the true state in float64. The reward is minus the cost
+    The pole hangs at first. The action, a force in [-10, 10] N, is held for a time step; stronger
+    forces are clipped. The observation is
+    :math:`[x, \sin\theta, \cos\theta, \dot{x}, \dot\theta]`, with the angle from upright;
+    ``state`` has the true state in float64. The reward is minus the cost
     of :func:`~gpadjust.envs.cart_pole_cost` of the state that was reached, in [-1, 0]; the
     ``info`` of a step has the ``"cost"``. An episode does not terminate; ``gym.make`` truncates it
     after 25 steps.
@@ -49,10 +50,12 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         encode_angle: Whether the observation has sine and cosine in place of the angle. Without,
             it is the state :math:`[x, \theta, \dot{x}, \dot\theta]`, the angle not wrapped.
         equation: The system. Default: the real one.
+        time_step: In s.
 
     Raises:
-        TypeError: If ``encode_angle`` is no bool or ``equation`` no equation.
-        ValueError: If there is no such render mode.
+        TypeError: If ``encode_angle`` is no bool, ``equation`` no equation or ``time_step`` no
+            number.
+        ValueError: If there is no such render mode, or ``time_step`` is not positive.
 
     Example:
         >>> import gymnasium
@@ -73,6 +76,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         *,
         encode_angle: bool = True,
         equation: CartPoleEquation = REAL_CART_POLE,
+        time_step: float = TIME_STEP,
     ) -> None:
         super().__init__(render_mode)
         if not isinstance(encode_angle, bool):
@@ -82,7 +86,8 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
                 f"equation must be a CartPoleEquation, such as REAL_CART_POLE; found {equation!r}."
             )
         self.equation = equation
-        self.physics = equation_physics(equation)
+        self.physics = equation_physics(equation, time_step)
+        self.metadata = {**self.metadata, "render_fps": max(round(1 / time_step), 1)}
         self.state_spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
         high = [np.inf, 1.0, 1.0, np.inf, np.inf] if encode_angle else [np.inf] * 4
         bound = np.array(high, dtype=np.float32)
@@ -128,7 +133,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Push the cart for 0.1 s.
+        """Push the cart for a time step.
 
         Args:
             action: The force in N, of shape ``(1,)``; clipped to [-10, 10].

@@ -7,16 +7,17 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gpadjust.envs.argument_checks import check_count
 from gpadjust.physics import ODEPhysics
 from gpadjust.physics.base import whole_number
+from gpadjust.physics.ode import is_finite
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import check_columns
 
 TIME_STEP = 0.1
-SUBSTEPS = 5  # of 0.02 s: a single Euler step of 0.1 s errs by 0.3 rad/s
+SUBSTEP = 0.02  # s, the longest: a single Euler step of 0.1 s errs by 0.3 rad/s
 START_MEAN = (0.0, math.pi, 0.0, 0.0)
 START_STD = 0.2
 
@@ -131,9 +132,13 @@ REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6,
 
 
 def cart_pole_physics(
-    cart_mass: float, pole_mass: float, pole_length: float, damping: float
+    cart_mass: float,
+    pole_mass: float,
+    pole_length: float,
+    damping: float,
+    time_step: float = TIME_STEP,
 ) -> ODEPhysics:
-    """The state of a cart-pole 0.1 s later, under a force that is held.
+    """The state of a cart-pole a time step later, under a force that is held.
 
     It does not limit the force, as the environment does.
 
@@ -142,27 +147,32 @@ def cart_pole_physics(
         pole_mass: The mass of the pole, in kg.
         pole_length: The length of the pole, in m.
         damping: The friction between cart and track, in N s/m.
+        time_step: In s.
 
     Returns:
         A physics of columns ``[x, theta, x_dot, theta_dot, force]``, by Runge-Kutta of order four
-        with substeps of 0.02 s.
+        with substeps of at most 0.02 s.
 
     Example:
         >>> physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1)
         >>> physics(torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
         tensor([[0.0081, 0.0206, 0.1627, 0.4233]], dtype=torch.float64)
     """
-    return equation_physics(CartPoleEquation(cart_mass, pole_mass, pole_length, damping))
+    equation = CartPoleEquation(cart_mass, pole_mass, pole_length, damping)
+    return equation_physics(equation, time_step)
 
 
-def equation_physics(equation: CartPoleEquation) -> ODEPhysics:
-    """A time step of this equation."""
-    return ODEPhysics(
-        equation, step=TIME_STEP, state_dim=4, substeps=SUBSTEPS, memo=0, name="cart_pole"
-    )
+def equation_physics(
+    equation: CartPoleEquation | nn.Module, time_step: float = TIME_STEP, name: str = "cart_pole"
+) -> ODEPhysics:
+    """A time step, in s, of such an equation."""
+    if not (is_finite("time_step", time_step) and time_step > 0):
+        raise ValueError(f"time_step must be a positive number of seconds; found {time_step}.")
+    substeps = math.ceil(round(time_step / SUBSTEP, 6))
+    return ODEPhysics(equation, time_step, state_dim=4, substeps=substeps, memo=0, name=name)
 
 
-def random_cart_pole_physics(seed: int) -> ODEPhysics:
+def random_cart_pole_physics(seed: int, time_step: float = TIME_STEP) -> ODEPhysics:
     """The physics as someone may believe it to be, who has not measured the system.
 
     The masses are drawn from U(0.4, 0.6) kg for the cart and U(0.5, 0.7) kg for the pole, the
@@ -170,20 +180,22 @@ def random_cart_pole_physics(seed: int) -> ODEPhysics:
 
     Args:
         seed: The same seed gives the same physics.
+        time_step: In s.
 
     Returns:
         A physics as :func:`cart_pole_physics` builds it; ``physics.rhs`` has the parameters.
 
     Raises:
         TypeError: If ``seed`` is no whole number.
-        ValueError: If it is negative.
+        ValueError: If it is negative, or ``time_step`` not positive.
     """
     if whole_number("seed", seed) < 0:
         raise ValueError(f"seed must not be negative; found {seed}.")
     cart_mass, pole_mass, pole_length = np.random.default_rng(seed).uniform(
         [0.4, 0.5, 0.5], [0.6, 0.7, 0.7]
     )
-    return cart_pole_physics(float(cart_mass), float(pole_mass), float(pole_length), damping=0.0)
+    drawn = (float(cart_mass), float(pole_mass), float(pole_length))
+    return cart_pole_physics(*drawn, damping=0.0, time_step=time_step)
 
 
 def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_length) -> Tensor:
