@@ -71,13 +71,12 @@ class ModelLearner(TaskLearner):
         new = self._new_episodes()
         if serves and new is not None and self.options.reward_tolerance is not None:
             new.check(self.ready_task(), self.options.reward_tolerance)
-        if new is not None:
-            self._compare_promise(new)
         with self.timed("update"):
             self._update(gradient_steps, batch_size)
         if new is None:
             return
         metrics = self._learn_dynamics(new) if serves else {}
+        self._compare_promise(new, metrics.get("overrides", 0.0))
         num_ended = self.replay_buffer.num_ended
         self.replay_buffer.num_new = self.replay_buffer.num_ended = 0
         self.num_episodes += num_ended
@@ -125,11 +124,13 @@ class ModelLearner(TaskLearner):
             self.logger.record(f"model/{name}", value)
         return metrics
 
-    def _compare_promise(self, new: RecordedEpisodes) -> None:
+    def _compare_promise(self, new: RecordedEpisodes, overrides: float) -> None:
         """Log what new episodes gave beside what was promised of them, and warn if it was less.
 
         There is a warning if the mean reward of a step is lower by more than a quarter of the range
-        of all recorded rewards.
+        of all recorded rewards. It also says if data had overridden the physics in most of the
+        predictions. (That alone is no fault: where a model has learnt without noise that its
+        physics is a little off, they do so nearly everywhere.)
         """
         real, promised = float(new.rewards.mean()), self.promised_reward
         self.logger.record("model/real_reward", real)
@@ -139,11 +140,15 @@ class ModelLearner(TaskLearner):
         recorded = self.recorded_episodes().rewards
         span = max(float(recorded.max()), promised) - float(recorded.min())
         if promised - real > span / 4:
+            blame = (
+                f"In {overrides:.0%} of its predictions data had overridden the physics; "
+                "gpadjust.validation.trust tells where. "
+            )
             warnings.warn(
                 f"A step of the last real episode gave a reward of {real:.3g} on average, where "
-                f"the model promised {promised:.3g}: do not trust what is done in it yet. More "
-                "episodes, a careful objective (Return(quantile=0.2)), or a better physics may "
-                "help.",
+                f"the model promised {promised:.3g}: do not trust what is done in it yet. "
+                f"{blame if overrides > 0.5 else ''}More episodes, a careful objective "
+                "(Return(quantile=0.2)), or a better physics may help.",
                 UserWarning,
                 stacklevel=4,
             )

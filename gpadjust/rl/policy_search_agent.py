@@ -148,7 +148,9 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         if not self.is_trained:
             module.look_at(self._random_states(task))
         with self.timed("update"):
-            result = self.search.improve(module, task, guided=not self.is_trained)
+            result = self.search.improve(
+                module, task, guided=not self.is_trained, progress=self._report
+            )
         self.is_trained = True
         self.promised_reward = result.reward
         self.logger.record("model/search_left_bounds", result.left_bounds)
@@ -161,6 +163,12 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
                 UserWarning,
                 stacklevel=2,
             )
+
+    def _report(self, update: int, value: float) -> None:
+        """Say how far a search is, ten times, where SB3 prints its log."""
+        updates = self.search.updates
+        if update % max(1, updates // 10) == 0 or update == updates:
+            self.logger.info(f"policy search: update {update} of {updates}, value {value:.4g}")
 
     def _random_states(self, task: Task) -> Tensor:
         """States ``N x state_dim`` of episodes of random actions in a model."""

@@ -135,9 +135,13 @@ class TaskLearner(OffPolicyAlgorithm):
 
     def last_states(self) -> Tensor:
         """Where the real environments are, ``n_envs x state_dim``."""
+        return self.ready_task().dynamics.spec.decode(self._last_observations())
+
+    def _last_observations(self) -> Tensor:
+        """What the real environments have shown last, ``n_envs x observation_dim``."""
         seen = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         assert isinstance(seen, np.ndarray), "observations are boxes"
-        return self.ready_task().dynamics.spec.decode(torch.from_numpy(seen.astype(np.float64)))
+        return torch.from_numpy(seen.astype(np.float64))
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -202,6 +206,7 @@ class TaskLearner(OffPolicyAlgorithm):
         )
         self._num_stored = self.num_timesteps
         before = RandomState.capture()
+        task.dynamics.spec.check_observations(self._last_observations())
         states = self.last_states()
         # Of a single state much would look right that is not.
         twice = torch.cat([states, states])

@@ -18,6 +18,8 @@ from gpadjust.states.spec_checks import (
     checked_names,
 )
 
+_OFF_CIRCLE = 0.3  # of a sine and cosine that noisy sensors show
+
 
 @dataclass(frozen=True)
 class StateSpec:
@@ -164,6 +166,33 @@ class StateSpec:
             for name in self.states
         ]
         return torch.stack(columns, dim=-1)
+
+    def check_observations(self, observations: Tensor) -> None:
+        """Check that sine and cosine of each angle are where they should be.
+
+        Args:
+            observations: ``... x observation_dim``; sensors may be noisy.
+
+        Raises:
+            ValueError: If the two entries of an angle are far from the unit circle.
+        """
+        check_columns(observations, self.observation_dim, "observations")
+        first = 0
+        for name in self.states:
+            if name not in self.angles:
+                first += 1
+                continue
+            pairs = observations[..., first : first + 2].reshape(-1, 2)
+            off = (pairs.norm(dim=-1) - 1).abs()
+            if len(off) and off.max() > _OFF_CIRCLE:
+                found = ", ".join(f"{value:.3g}" for value in pairs[int(off.argmax())])
+                raise ValueError(
+                    f"Entries {first} and {first + 1} of an observation must be sine and cosine of "
+                    f"the angle {name!r}, found {found}. Correct the order of the states of the "
+                    "StateSpec, or which of them are angles; or wrap the environment so that it "
+                    "observes what the spec says."
+                )
+            first += 2
 
     def change(self, states: Tensor, next_states: Tensor) -> Tensor:
         """The change ``... x state_dim``, of angles the shortest way round."""

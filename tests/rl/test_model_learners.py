@@ -190,6 +190,48 @@ def test_promises_that_are_not_kept_are_told(make_agent):
         agent.learn(5)
 
 
+def test_a_promise_that_data_made_against_the_physics_is_told(make_agent, dynamics):
+    """After an episode the model knows that the point moves some ten times as far."""
+    known = dynamics(lambda X: X[:, :1] + 0.05 * X[:, 1:])
+    agent = make_agent(PolicySearchAgent, dynamics=known, options=ModelOptions()).learn(5)
+    agent.promised_reward = 10.0
+    with pytest.warns(UserWarning, match="In 100% of its predictions data had overridden the phys"):
+        agent.learn(5, reset_num_timesteps=False)
+    assert agent.logger.name_to_value["model/overrides"] == 1
+
+
+def test_observations_in_another_order_cost_no_episode():
+    from gymnasium.wrappers import TransformObservation
+
+    from gpadjust.envs import (
+        CART_POLE_SPEC,
+        CartPoleSwingUpEnv,
+        cart_pole_reward,
+        random_cart_pole_physics,
+    )
+
+    env = CartPoleSwingUpEnv()
+    order = [0, 3, 1, 2, 4]
+    shuffled = TransformObservation(env, lambda seen: seen[order], env.observation_space)
+    task = Task(
+        LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)),
+        cart_pole_reward,
+        episode_length=25,
+    )
+    agent = MPCAgent(shuffled, task, PLAN, first=PLAN, seed=0)
+    with pytest.raises(ValueError, match="sine and cosine of the angle 'theta'"):
+        agent.learn(25)
+    assert agent.num_timesteps == 0
+
+
+def test_a_search_reports_where_sb3_prints(make_agent, capsys):
+    make_agent(PolicySearchAgent, verbose=1).learn(5)
+    said = capsys.readouterr().out
+    assert "policy search: update 12 of 12, value" in said
+    make_agent(PolicySearchAgent).learn(5)
+    assert "policy search" not in capsys.readouterr().out
+
+
 def test_what_is_promised_and_found_is_logged(make_agent):
     agent = make_agent(PolicySearchAgent).learn(10)
     found = agent.logger.name_to_value

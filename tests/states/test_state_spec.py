@@ -53,6 +53,19 @@ def test_observations_are_decoded(angle, position):
     torch.testing.assert_close(change, torch.zeros(1, 2).double(), rtol=0, atol=1e-9)
 
 
+def test_sine_and_cosine_that_are_elsewhere_are_found():
+    """What CartPole-like environments show: x, its velocity, sine, cosine, angular velocity."""
+    spec = StateSpec(["x", "theta", "v", "w"], ["force"], angles=["theta"])
+    angles = torch.linspace(-3, 3, 7)
+    noisy = torch.stack([0 * angles, 1.1 * angles.sin(), 1.1 * angles.cos(), angles, angles], -1)
+    spec.check_observations(noisy)
+    spec.check_observations(noisy[:0])
+    swapped = noisy[:, [0, 3, 1, 2, 4]]
+    with pytest.raises(ValueError, match=r"Entries 1 and 2 of .* of the angle 'theta', found -?\d"):
+        spec.check_observations(swapped)
+    ARM.check_observations(ARM.observe(torch.randn(5, 3)))
+
+
 def test_equal_specs_are_equal_and_hashable():
     again = StateSpec(
         ["goal", "q", "v"], ("torque",), angles=("q",), exogenous=["goal"], integrated={"q": "v"},
