@@ -86,13 +86,13 @@ class Settings:
     """of these"""
     correlation: float = 0.5
     """of deviations of a step and the next"""
-    updates: int = 100
+    updates: int = 150
     """of the policy, after each trial, where one is searched for"""
     starts: int = 48
     """of an update"""
     learning_rate: float = 3e-3
     """at the start of the updates"""
-    guides: int = 16
+    guides: int = 32
     """planned episodes that the policy imitates at first"""
 
 

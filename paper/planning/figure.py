@@ -31,7 +31,7 @@ def draw(records: Sequence[Record], experiment: Planning) -> list[Path]:
             own = trials[(trials["system"] == system) & (trials["scenario"] == name)]
             if len(own):
                 draw_quartiles(ax, own, "cost", color=COLORS[name], label=label)
-        ax.set_xticks(range(1, experiment.settings.trials + 1))
+        ax.set_xticks(range(1, experiment.settings_of(system).trials + 1))
     figure.supxlabel("trial", fontsize="medium")
     figure.supylabel("cost, median and quartiles", fontsize="medium")
     one_legend(figure, axes, ncols=4)
