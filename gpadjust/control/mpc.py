@@ -187,6 +187,8 @@ class MPC:
         """Whether a plan is worth much less than what was promised of its steps."""
         if self.tolerance is None:
             return False
+        if plan.left_bounds > earlier.left_bounds:
+            return True  # its missing rewards would look like good ones
         promised = earlier.promised[earlier.steps_done :][: len(plan.rewards)]
         if not len(promised):  # an episode may be longer than what was planned
             return False

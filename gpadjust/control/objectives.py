@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gpadjust.control.option_checks import check_fraction
 from gpadjust.control.rollouts import Rollout
-from gpadjust.control.task import Task
+from gpadjust.control.task import Task, per_row
 from gpadjust.dynamics.trajectory_information import TrajectoryInformation, check_informative
 
 Past = tuple[Tensor, Tensor]
@@ -79,8 +79,9 @@ class Return(Objective):
     """The sum of rewards of the steps ahead, averaged over the functions, or a quantile of these.
 
     Leaving the bounds never pays: each step that an episode does not make for that costs a million
-    times the largest reward, so that sequences that leave come after all others, and those that
-    leave later first.
+    times the largest that was at stake in the first rollouts (reward, effort or terminal value of
+    an episode), so that sequences that leave come after all others, and those that leave later
+    first. Beside it such an episode has the gradient of how far it left, for a policy to come back.
 
     Args:
         discount: Factor of the rewards from a step to the next one.
@@ -125,17 +126,19 @@ class Return(Objective):
 
         def score(rollout: Rollout, past: Past | None) -> Tensor:
             nonlocal largest
-            if not largest:  # of the first rollouts, so that later ones compare
-                largest = rollout.rewards.detach().double().abs().max().clamp_min(1e-12)
-            lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
             rewards = rollout.rewards.double()
             if self.effort:
                 rewards = rewards - self.effort * rollout.actions.square().sum(-1)
-            rewards = rewards.masked_fill(~rollout.made, 0.0) - 1e6 * largest * lost
             weights = self.discount ** torch.arange(rewards.shape[-1] + 1, dtype=torch.float64)
-            returns = (weights[:-1] * rewards).sum(-1)
-            if self.terminal_value is not None:
-                returns = returns + weights[-1] * self._at_the_end(rollout)
+            ends = weights[-1] * self._at_the_end(rollout)
+            if not largest:  # of the first rollouts, so that later ones compare
+                largest = torch.maximum(*(part.detach().abs().max() for part in (rewards, ends)))
+            returns = (weights[:-1] * rewards.masked_fill(~rollout.made, 0.0)).sum(-1) + ends
+            if rollout.left_bounds.any():
+                lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
+                missed = 1e6 * (weights[:-1] * lost).sum(-1)
+                price = torch.where(largest > 0, largest, 1.0)
+                returns = returns - price * (missed + len(weights) * rollout.overshoot)
             if self.quantile is None:
                 return returns.mean(0)
             return returns.quantile(self.quantile, dim=0)
@@ -144,14 +147,10 @@ class Return(Objective):
 
     def _at_the_end(self, rollout: Rollout) -> Tensor:
         """What the last states are worth, ``k x n``; nothing where an episode has ended."""
-        assert self.terminal_value is not None, "asked before"
         last, made = rollout.next_states[:, :, -1], rollout.made[:, :, -1]
-        values = torch.as_tensor(self.terminal_value(last.flatten(0, 1)))
-        if values.shape != (made.numel(),):
-            raise ValueError(
-                f"terminal_value must return one value per row, shape ({made.numel()},); found "
-                f"{tuple(values.shape)}."
-            )
+        if self.terminal_value is None:
+            return torch.zeros(made.shape, dtype=torch.float64)
+        values = per_row(self.terminal_value(last.flatten(0, 1)), made.numel(), "terminal_value")
         return values.double().unflatten(0, made.shape).masked_fill(~made, 0.0)
 
 

@@ -14,7 +14,7 @@ from gpadjust.control.objectives import Objective, Past, Return
 from gpadjust.control.option_checks import check_fraction, check_whole
 from gpadjust.control.rollouts import Policy, Rollouts
 from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
-from gpadjust.control.task import Task
+from gpadjust.control.task import Task, per_row
 
 
 class Plan(NamedTuple):
@@ -169,7 +169,7 @@ class Planner:
                 rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
                 left = rollout.left_bounds.double().mean(0)
                 asked.append((sequences, rewards, left))
-                return score(rollout, past)
+                return per_row(score(rollout, past), len(sequences), type(self.objective).__name__)
 
             first = self._proposed(rollouts, state, num_steps, action_bounds, policy, known)
             actions, value = self.search.best(scored, first, action_bounds, deadline)

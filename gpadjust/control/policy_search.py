@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.objectives import Objective, Return
 from gpadjust.control.option_checks import check_fraction, check_whole
 from gpadjust.control.planner import Planner
@@ -92,6 +93,7 @@ class PolicySearch:
     max_grad_norm: float = 1.0
     guide: Planner | None = None
     num_guides: int = 16
+    guide_noise: float = 0.1
 
     def __post_init__(self) -> None:
         """Check the options."""
@@ -153,13 +155,26 @@ class PolicySearch:
     def plans(self, task: Task, action_bounds: Tensor) -> tuple[Tensor, Tensor]:
         """States ``N x state_dim`` and actions ``N x action_dim`` of episodes by the guide."""
         assert self.guide is not None, "asked before"
-        rollouts, parts = Rollouts(task, None), []
-        for start in task.draw_initial_states(self.num_guides):
-            plan = self.guide.plan(task, start, action_bounds)
-            with torch.no_grad():
-                rollout = rollouts.follow(start, plan.actions.unsqueeze(0))
-            parts.append([part[rollout.made] for part in (rollout.states, rollout.actions)])
-        states, actions = (torch.cat(column) for column in zip(*parts, strict=True))
+        assert task.episode_length is not None, "asked before"
+        guide = MPC(task, action_bounds, first=self.guide)
+        low, high = guide.action_bounds
+        rollouts, rows = Rollouts(task, None), []
+        for state in task.draw_initial_states(self.num_guides):
+            planned: Planned | None = None
+            for t in range(task.episode_length):
+                planned = guide.plan(state, planned)
+                action = planned.actions[:1]
+                rows.append((state.unsqueeze(0), action))
+                noise = self.guide_noise * (high - low) * torch.randn_like(action)
+                pushed = torch.clamp(action + noise, low, high)
+                with torch.no_grad():
+                    step = rollouts.follow(state, pushed.unsqueeze(0))
+                made = step.made[0, 0, 0]
+                if not made:
+                    break
+                state = step.next_states[0, 0, 0]
+                planned = Planned(planned.actions[1:], planned.promised, t + 1)
+        states, actions = (torch.cat(column) for column in zip(*rows, strict=True))
         return states, actions
 
     def _improve(

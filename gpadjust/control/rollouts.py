@@ -29,6 +29,8 @@ class Rollout(NamedTuple):
             means nothing.
         left_bounds: Whether the step after the last one that was made would have left the bounds,
             or the physics failed there, ``k x n`` booleans.
+        overshoot: How far that step would have left them, ``k x n``; 0 where none would have. See
+            :class:`~gpadjust.control.task.Step`.
     """
 
     states: Tensor
@@ -37,6 +39,7 @@ class Rollout(NamedTuple):
     rewards: Tensor
     made: Tensor
     left_bounds: Tensor
+    overshoot: Tensor
 
 
 class Rollouts:
@@ -100,6 +103,7 @@ class Rollouts:
         states = starts.expand(self.num_functions, *starts.shape[-2:]).clone()
         running = torch.ones(states.shape[:2], dtype=torch.bool)
         left = torch.zeros_like(running)
+        overshoot = torch.zeros(running.shape, dtype=torch.float64)
         steps: list[tuple[Tensor, ...]] = []
         for t in range(num_steps):
             actions = choose(t, states)
@@ -107,14 +111,16 @@ class Rollouts:
             # it does not.
             at, taken = (_tamed_gradient(part.flatten(0, 1)) for part in (states, actions))
             step = task.step(at, taken, self._move, some_must_succeed=t == 0)
-            following, rewards, ended, lost = (part.unflatten(0, running.shape) for part in step)
+            parts = (part.unflatten(0, running.shape) for part in step)
+            following, rewards, ended, lost, beyond = parts
             made = running & ~lost
             left = left | (running & lost)
+            overshoot = torch.where(running, beyond, overshoot)
             steps.append((states, actions, following, rewards, made))
             running = made & ~ended
             states = torch.where(running.unsqueeze(-1), following, states)
         columns = [torch.stack(parts, dim=2) for parts in zip(*steps, strict=True)]
-        return Rollout._make([*columns, left])
+        return Rollout._make([*columns, left, overshoot])
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states of rows, of which each function has as many."""

@@ -93,12 +93,14 @@ class PathIntegral(Search):
 
     Of sequences with scores :math:`J_i` the mean with weights
     :math:`\propto \exp((J_i - \max J) / (\lambda\, s))` is taken, where s is the standard
-    deviation of the scores; each further round draws sequences about it.
+    deviation of the best quarter of the scores, as others may be those of sequences that leave the
+    bounds; each further round draws sequences about it. The result is the last mean, or the best
+    sequence of all if that scores better.
 
     Args:
         rounds: Rounds after the first sequences.
-        temperature: The temperature :math:`\lambda`, in standard deviations of the scores: small
-            for the best sequence, large for the mean of all.
+        temperature: The temperature :math:`\lambda`, in those standard deviations: small for the
+            best sequence, large for the mean of all.
         spread: Standard deviation of what is drawn about the mean, as a share of the range of the
             actions.
         correlation: As of :class:`CrossEntropy`.
@@ -110,7 +112,7 @@ class PathIntegral(Search):
 
     rounds: int = 1
     _: KW_ONLY
-    temperature: float = 0.1
+    temperature: float = 0.2
     spread: float = 0.15
     correlation: float = 0.5
 
@@ -126,6 +128,7 @@ class PathIntegral(Search):
     ) -> tuple[Tensor, float]:
         """Search; see :class:`Search`."""
         sequences, scores = first, score(first)
+        asked = [(sequences, scores)]
         for _ in range(self.rounds):
             if time.perf_counter() > deadline:
                 break
@@ -135,11 +138,16 @@ class PathIntegral(Search):
             sequences = mean + self.spread * (bounds[1] - bounds[0]) * noise
             sequences = torch.clamp(sequences, bounds[0], bounds[1])
             scores = score(sequences)
-        found = self._mean(sequences, scores)
-        return found, float(score(found.unsqueeze(0)))
+            asked.append((sequences, scores))
+        found = self._mean(sequences, scores).unsqueeze(0)
+        asked.append((found, score(found)))
+        sequences, scores = (torch.cat(column) for column in zip(*asked, strict=True))
+        best = int(scores.argmax())
+        return sequences[best], float(scores[best])
 
     def _mean(self, sequences: Tensor, scores: Tensor) -> Tensor:
-        scale = scores.std(correction=0).clamp_min(torch.finfo(scores.dtype).tiny)
+        scale = scores.topk(-(-len(scores) // 4)).values.std(correction=0)
+        scale = scale.clamp_min(torch.finfo(scores.dtype).tiny)
         weights = torch.softmax((scores - scores.max()) / (self.temperature * scale), dim=0)
         return torch.einsum("n,nta->ta", weights, sequences)
 

@@ -32,12 +32,15 @@ class Step(NamedTuple):
         terminated: ``N`` booleans: whether the next state ends the episode; not where it left.
         left_bounds: ``N`` booleans: whether it would have left the bounds or the finite numbers, or
             the physics failed.
+        overshoot: ``N``: how far it would have, in halves of the width between the bounds, summed
+            over the states; with its gradient, which leads back. 0 where that is not finite.
     """
 
     next_states: Tensor
     rewards: Tensor
     terminated: Tensor
     left_bounds: Tensor
+    overshoot: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +144,14 @@ class Task:
 
     def rewards(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
         """The known rewards ``N`` of transitions, checked; with their gradient to the states."""
-        rewards = _per_row(self.reward(states, actions, next_states), len(states), "reward")
+        rewards = per_row(self.reward(states, actions, next_states), len(states), "reward")
         return rewards if next_states.requires_grad else rewards.detach()
 
     def terminations(self, states: Tensor) -> Tensor:
         """Whether states ``N x state_dim`` end an episode, checked: ``N`` booleans."""
         if self.terminated is None:
             return torch.zeros(len(states), dtype=torch.bool)
-        return _per_row(self.terminated(states.detach()), len(states), "terminated").bool()
+        return per_row(self.terminated(states.detach()), len(states), "terminated").bool()
 
     def step(
         self,
@@ -173,12 +176,18 @@ class Task:
         move = self.dynamics.sample if move is None else move
         following = step_or_nan(move, states, actions, some_must_succeed=some_must_succeed)
         left = ~following.isfinite().all(-1)
+        overshoot = following.new_zeros(len(following))
         if self.state_bounds is not None:
             low, high = self.state_bounds
-            left |= ((following < low) | (following > high)).any(-1)
+            beyond = (low - following).clamp_min(0.0) + (following - high).clamp_min(0.0)
+            left |= (beyond > 0).any(-1)
+            width = (high - low) / 2
+            beyond = beyond / torch.where(width.isfinite(), width, 1.0)
+            overshoot = torch.where(beyond.isfinite(), beyond, 0.0).sum(-1)
         following = torch.where(left.unsqueeze(-1), states, following)
         rewards = self.rewards(states, actions, following)
-        return Step(following, rewards, self.terminations(following) & ~left, left)
+        ended = self.terminations(following) & ~left
+        return Step(following, rewards, ended, left, overshoot)
 
     def widened(self, states: Tensor) -> Task:
         """This task, or one whose bounds give way to states ``N x state_dim`` beyond them."""
@@ -207,7 +216,7 @@ class Task:
         }
 
 
-def _per_row(values: Any, n: int, name: str) -> Tensor:
+def per_row(values: Any, n: int, name: str) -> Tensor:
     """Check what a function of the user's says of ``n`` rows."""
     values = torch.as_tensor(values)
     if values.shape != (n,):

@@ -68,6 +68,9 @@ class RecordedEpisodes:
         if buffer.full and starts[:, 1:].any():
             starts[:, 0] = False  # what came before the oldest row is lost
         self._starts = torch.from_numpy(starts.flatten()[happened])
+        # Those of an episode under way say nothing yet of how far one goes.
+        whole = np.flip(np.maximum.accumulate(np.flip(ended, axis=1), axis=1), axis=1)
+        self._whole = torch.from_numpy(whole.flatten()[happened])
 
     @property
     def num_transitions(self) -> int:
@@ -79,9 +82,14 @@ class RecordedEpisodes:
         starts = self.states[self._starts]
         return starts[torch.randint(len(starts), (n,))]
 
-    def bounds(self) -> Tensor:
-        """Bounds ``2 x state_dim`` far beyond what was seen; none of angles, constants, actions."""
-        seen = torch.cat([self.states, self.next_states])
+    def bounds(self) -> Tensor | None:
+        """Bounds ``2 x state_dim`` far beyond what was seen in episodes that have ended.
+
+        There are none of angles, constants and actions; None if no episode has ended.
+        """
+        if not self._whole.any():
+            return None
+        seen = torch.cat([self.states[self._whole], self.next_states[self._whole]])
         low, high = seen.amin(0), seen.amax(0)
         reach = _REACH * (high - low) / 2
         reach[high == low] = torch.inf  # that it has not moved yet tells nothing

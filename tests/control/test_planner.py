@@ -316,10 +316,12 @@ def test_a_plan_of_the_greatest_return(origin):
 
 def test_a_return_is_the_sum_of_the_rewards_that_are_made(origin):
     sequences = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
+    beyond = (1.5 - 1.2) / 5.1  # in halves of the width
+    worst = -0.5 - 1.5 * (2e6 + 4 * beyond)
     for parts, expected in [
         ({}, [-0.5 - 0.5 - 0.5, -1.0 - 1.5 - 1.0]),
         ({"terminated": lambda states: states[:, 0] > 1.2}, [-0.5 - 0.5, -1.0 - 1.5 - 1.0]),
-        ({"state_bounds": torch.tensor([[-9.0], [1.2]])}, [-0.5 - 2 * 1.5e6, -1.0 - 1.5 - 1.0]),
+        ({"state_bounds": torch.tensor([[-9.0], [1.2]])}, [worst, -1.0 - 1.5 - 1.0]),
     ]:
         task = half_steps(**parts)
         score = Return().of(task)(Rollouts(task, 2).follow(origin, sequences), None)
