@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.control.option_checks import check_fraction
+from gpadjust.control.option_checks import ArrayLike, check_fraction, checked_action_bounds
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.task import Task
@@ -46,12 +46,15 @@ class Planned(NamedTuple):
             was last planned to its end.
         steps_done: How many it has made.
         left_bounds: As of the newest :class:`Plan`.
+        reward: What was promised of a step that is made, on average, when it was last planned to
+            its end.
     """
 
     actions: Tensor
     promised: Tensor
     steps_done: int
     left_bounds: float = 0.0
+    reward: float = math.nan
 
 
 PlanState = tuple[Planned, ...]
@@ -72,7 +75,8 @@ class MPC:
             needs, as energy must be put into a pole before it can stand: try it in f_p alone
             (:class:`~gpadjust.dynamics.PhysicsDynamics`) first.
         first: Plans when an episode begins. Default: with three searches of the whole episode, or
-            as far as ``each_step`` looks if the task does not say how long it is.
+            as far as ``each_step`` looks if the task does not say how long it is; objective,
+            functions and seconds are those of ``each_step``.
         tolerance: Where the plan of a step is worth less than what was promised of its steps when
             the whole was planned, by more than this share of the range of the promised rewards (a
             step, on average), the rest is planned as when it began. None for never.
@@ -80,7 +84,9 @@ class MPC:
             and plan.
 
     Raises:
-        ValueError: If there is neither an episode length nor a horizon.
+        TypeError: If a planner is none.
+        ValueError: If there is neither an episode length nor a horizon, or ``action_bounds`` are no
+            bounds.
 
     Example:
         >>> import numpy as np
@@ -99,7 +105,7 @@ class MPC:
     def __init__(
         self,
         task: Task,
-        action_bounds: Tensor,
+        action_bounds: ArrayLike,
         each_step: Planner | None = None,
         *,
         first: Planner | None = None,
@@ -112,17 +118,24 @@ class MPC:
         if each_step is None:
             third = 0 if length is None else length // 3
             each_step = replace(EACH_STEP, horizon=max(third, _SHORTEST))
-        if length is None and each_step.horizon is None:
+        check_planner("each_step", each_step)
+        if first is None:
+            first = replace(
+                FIRST,
+                objective=each_step.objective,
+                num_functions=each_step.num_functions,
+                seconds=each_step.seconds,
+                horizon=each_step.horizon if length is None else None,
+            )
+        check_planner("first", first)
+        if length is None and None in (each_step.horizon, first.horizon):
             raise ValueError(
-                "Nobody says how far to plan; give the task an episode_length, or the planner a "
+                "Nobody says how far to plan; give the task an episode_length, or the planners a "
                 "horizon."
             )
         self.task = task
-        self.action_bounds = torch.as_tensor(action_bounds, dtype=torch.float64)
+        self.action_bounds = checked_action_bounds(action_bounds, task.dynamics.spec)
         self.each_step = each_step
-        if first is None:
-            horizon = each_step.horizon if length is None else None
-            first = replace(FIRST, objective=each_step.objective, horizon=horizon)
         self.first = first
         self.tolerance = tolerance
         self.seed = seed
@@ -157,7 +170,8 @@ class MPC:
             plans = [self.plan(*pair) for pair in zip(states, episodes, strict=True)]
         actions = torch.stack([plan.actions[0] for plan in plans]).numpy().astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), tuple(
-            Planned(plan.actions[1:], plan.promised, plan.steps_done + 1) for plan in plans
+            plan._replace(actions=plan.actions[1:], steps_done=plan.steps_done + 1)
+            for plan in plans
         )
 
     def plan(self, state: Tensor, earlier: Planned | None = None) -> Planned:
@@ -177,11 +191,12 @@ class MPC:
             if not self._disappoints(plan, earlier):
                 beyond = earlier.actions[len(plan.actions) :]
                 actions = torch.cat([plan.actions, beyond])
-                return Planned(actions, earlier.promised, steps_done, plan.left_bounds)
+                return earlier._replace(actions=actions, left_bounds=plan.left_bounds)
         plan = self.first.plan(self.task, state, self.action_bounds, left)
         made = plan.rewards[:0] if earlier is None else earlier.promised[:steps_done]
         promised = torch.cat([made, plan.rewards])
-        return Planned(plan.actions, promised, steps_done, plan.left_bounds)
+        reward = float(plan.rewards.sum() / plan.made.sum().clamp_min(1e-12))
+        return Planned(plan.actions, promised, steps_done, plan.left_bounds, reward)
 
     def _disappoints(self, plan: Plan, earlier: Planned) -> bool:
         """Whether a plan is worth much less than what was promised of its steps."""
@@ -194,3 +209,9 @@ class MPC:
             return False
         loss = (promised - plan.rewards[: len(promised)]).mean()
         return bool(loss > self.tolerance * (earlier.promised.max() - earlier.promised.min()))
+
+
+def check_planner(name: str, planner: object) -> None:
+    """Raise a TypeError unless an option is a planner."""
+    if not isinstance(planner, Planner):
+        raise TypeError(f"{name} must be a Planner(...); found {planner!r}.")

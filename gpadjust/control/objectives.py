@@ -15,6 +15,8 @@ from gpadjust.control.rollouts import Rollout
 from gpadjust.control.task import Task, per_row
 from gpadjust.dynamics.trajectory_information import TrajectoryInformation, check_informative
 
+_BACK = 10.0  # largest rewards of a step: few episodes of a policy must outweigh those that stay
+
 Past = tuple[Tensor, Tensor]
 """States ``t x state_dim`` and actions ``t x action_dim`` of an episode so far."""
 
@@ -32,6 +34,9 @@ class Objective(ABC):
 
     def check(self, task: Task) -> None:  # noqa: B027 - most need nothing
         """Raise a TypeError if the task's dynamics cannot tell this worth."""
+
+    def check_functions(self, num_functions: int | None) -> None:  # noqa: B027 - as above
+        """Raise a ValueError if it means nothing of so many functions; None for the mean."""
 
     @abstractmethod
     def of(self, task: Task) -> Score:
@@ -120,6 +125,15 @@ class Return(Objective):
         """Whether it matters that the functions are followed from the same starts."""
         return self.quantile is not None
 
+    def check_functions(self, num_functions: int | None) -> None:
+        """Raise a ValueError for a quantile over a single function."""
+        if self.quantile is not None and (num_functions or 1) < 2:
+            raise ValueError(
+                f"Return(quantile={self.quantile}) is one over functions, but num_functions is "
+                f"{num_functions}, {'the mean alone' if num_functions is None else 'one of them'}; "
+                "give num_functions of at least 2, such as 16."
+            )
+
     def of(self, task: Task) -> Score:
         """The return of rollouts; what has been is the same for all."""
         largest = torch.zeros((), dtype=torch.float64)
@@ -138,7 +152,7 @@ class Return(Objective):
                 lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
                 missed = 1e6 * (weights[:-1] * lost).sum(-1)
                 price = torch.where(largest > 0, largest, 1.0)
-                returns = returns - price * (missed + len(weights) * rollout.overshoot)
+                returns = returns - price * (missed + _BACK * len(weights) * rollout.overshoot)
             if self.quantile is None:
                 return returns.mean(0)
             return returns.quantile(self.quantile, dim=0)

@@ -11,10 +11,15 @@ import torch
 from torch import Tensor
 
 from gpadjust.control.objectives import Objective, Past, Return
-from gpadjust.control.option_checks import check_fraction, check_whole
+from gpadjust.control.option_checks import (
+    ArrayLike,
+    check_fraction,
+    check_whole,
+    checked_action_bounds,
+)
 from gpadjust.control.rollouts import Policy, Rollouts
 from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
-from gpadjust.control.task import Task, per_row
+from gpadjust.control.task import Task
 
 
 class Plan(NamedTuple):
@@ -27,12 +32,14 @@ class Plan(NamedTuple):
             end of the episode.
         left_bounds: The share of the functions in which it leaves the bounds of the states, or
             meets a failure of the physics.
+        made: The share of the functions in which each step is made, ``T``: 0 after the end.
     """
 
     actions: Tensor
     value: float
     rewards: Tensor
     left_bounds: float
+    made: Tensor
 
 
 @dataclass(frozen=True)
@@ -58,10 +65,12 @@ class Planner:
             of the actions.
         restarts: How many searches there are, of which the best is taken; one where there is an
             earlier plan.
-        replan_every: Number of steps after which the rest of the episode is planned anew, from
+        replan_every: Number of steps after which the rest of a real episode is planned anew, from
             where it is and with what it has already told. Default: the episode goes by the first
-            plan.
-        seconds: After so many seconds of a plan no further round of the search begins.
+            plan, but with :class:`~gpadjust.rl.MPCAgent`, which plans each step. (:class:`MPC` by
+            itself plans whenever it is asked.)
+        seconds: After so many seconds of a plan no further round of a search begins, and no further
+            search.
 
     Raises:
         TypeError: If objective or search is none, or a number is of another kind.
@@ -111,6 +120,12 @@ class Planner:
         for name in ("horizon", "num_functions", "replan_every"):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), 1)
+        self.objective.check_functions(self.num_functions)
+        if (self.replan_every or 1) > (self.horizon or math.inf):
+            raise ValueError(
+                f"replan_every={self.replan_every} is beyond horizon={self.horizon}, so that there "
+                "would be steps without a plan; raise the horizon, or plan more often."
+            )
         check_fraction("spread", self.spread, zero=False)
         if self.seconds is not None:
             check_fraction("seconds", self.seconds, most=math.inf, zero=False)
@@ -125,7 +140,7 @@ class Planner:
         self,
         task: Task,
         state: Tensor,
-        action_bounds: Tensor,
+        action_bounds: ArrayLike,
         num_steps: int | None = None,
         *,
         policy: Policy | None = None,
@@ -155,29 +170,35 @@ class Planner:
             PhysicsError: If the physics fails at ``state``, whatever the action.
         """
         begun = time.perf_counter()
-        num_steps = self._checked_steps(task, state, action_bounds, num_steps)
+        action_bounds = checked_action_bounds(action_bounds, task.dynamics.spec)
+        num_steps = self._checked_steps(task, state, num_steps)
         score = self.objective.of(task)
         rollouts = Rollouts(task, self.num_functions)
         known = None if known is None or not len(known) else known
         deadline = math.inf if self.seconds is None else begun + self.seconds
 
         def search() -> Plan:
-            asked: list[tuple[Tensor, Tensor, Tensor]] = []
+            asked: list[tuple[Tensor, ...]] = []
 
             def scored(sequences: Tensor) -> Tensor:
                 rollout = rollouts.follow(state, sequences)
                 rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
-                left = rollout.left_bounds.double().mean(0)
-                asked.append((sequences, rewards, left))
-                return per_row(score(rollout, past), len(sequences), type(self.objective).__name__)
+                left, made = (part.double().mean(0) for part in (rollout.left_bounds, rollout.made))
+                asked.append((sequences, rewards, left, made))
+                return self._checked_scores(score(rollout, past), len(sequences))
 
             first = self._proposed(rollouts, state, num_steps, action_bounds, policy, known)
             actions, value = self.search.best(scored, first, action_bounds, deadline)
-            sequences, rewards, left = (torch.cat(column) for column in zip(*asked, strict=True))
+            columns = (torch.cat(column) for column in zip(*asked, strict=True))
+            sequences, rewards, left, made = columns
             found = int((sequences == actions).all(-1).all(-1).nonzero()[0])
-            return Plan(actions, value, rewards[found], float(left[found]))
+            return Plan(actions, value, rewards[found], float(left[found]), made[found])
 
-        plans = [search() for _ in range(self.restarts if known is None else 1)]
+        plans = [search()]
+        for _ in range(self.restarts - 1 if known is None else 0):
+            if time.perf_counter() > deadline:
+                break
+            plans.append(search())
         return max(plans, key=lambda plan: plan.value)
 
     def _proposed(
@@ -206,19 +227,23 @@ class Planner:
             first += [known.unsqueeze(0), torch.clamp(drawn, bounds[0], bounds[1])]
         return torch.cat(first)
 
-    def _checked_steps(
-        self, task: Task, state: Tensor, action_bounds: Tensor, num_steps: int | None
-    ) -> int:
+    def _checked_scores(self, scores: Tensor, n: int) -> Tensor:
+        """What the objective says of ``n`` sequences; -inf is a score, too."""
+        if scores.shape != (n,) or scores.isnan().any():
+            name = type(self.objective).__name__
+            found = "nan" if scores.shape == (n,) else f"shape {tuple(scores.shape)}"
+            raise ValueError(
+                f"{name} must return one score per sequence, shape ({n},), none of them nan; found "
+                f"{found}."
+            )
+        return scores
+
+    def _checked_steps(self, task: Task, state: Tensor, num_steps: int | None) -> int:
         """How many steps to plan, once what is given is found to be right."""
         spec = task.dynamics.spec
         if state.shape != (spec.state_dim,):
             raise ValueError(
                 f"Expected state of shape {spec.state_dim}, found {tuple(state.shape)}."
-            )
-        if action_bounds.shape != (2, spec.action_dim) or not action_bounds.isfinite().all():
-            raise ValueError(
-                f"Expected finite action_bounds of shape 2 x {spec.action_dim}, found "
-                f"{action_bounds.tolist()}."
             )
         num_steps = task.episode_length if num_steps is None else num_steps
         num_steps = self.horizon if num_steps is None else num_steps

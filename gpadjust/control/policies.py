@@ -8,6 +8,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from gpadjust.control.option_checks import ArrayLike, checked_action_bounds
 from gpadjust.states import StateSpec
 
 _NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
@@ -40,9 +41,9 @@ class BoundedPolicy(nn.Module):
     origin: Tensor
     unit: Tensor
 
-    def __init__(self, body: nn.Module, spec: StateSpec, action_bounds: Tensor) -> None:
+    def __init__(self, body: nn.Module, spec: StateSpec, action_bounds: ArrayLike) -> None:
         super().__init__()
-        low, high = torch.as_tensor(action_bounds, dtype=torch.float64)
+        low, high = checked_action_bounds(action_bounds, spec)
         self.body = body
         self.spec = spec
         self.register_buffer("middle", (low + high) / 2)
@@ -69,7 +70,7 @@ class BoundedPolicy(nn.Module):
 
 def mlp_policy(
     spec: StateSpec,
-    action_bounds: Tensor,
+    action_bounds: ArrayLike,
     net_arch: Sequence[int] = (64, 64),
     activation: type[nn.Module] = nn.Tanh,
     first_actions: Sequence[float] | None = None,
@@ -94,12 +95,12 @@ def mlp_policy(
     last = nn.Linear(widths[-1], spec.action_dim, dtype=torch.float64)
     with torch.no_grad():
         last.weight.mul_(0.1)  # gentle actions at first
-        last.bias.copy_(_before_tanh(first_actions, action_bounds))
+        last.bias.copy_(_before_tanh(first_actions, checked_action_bounds(action_bounds, spec)))
     return BoundedPolicy(nn.Sequential(*layers, last), spec, action_bounds)
 
 
 def linear_policy(
-    spec: StateSpec, action_bounds: Tensor, first_actions: Sequence[float] | None = None
+    spec: StateSpec, action_bounds: ArrayLike, first_actions: Sequence[float] | None = None
 ) -> BoundedPolicy:
     """A linear function of what is seen.
 
@@ -110,7 +111,7 @@ def linear_policy(
 
 def rbf_policy(
     spec: StateSpec,
-    action_bounds: Tensor,
+    action_bounds: ArrayLike,
     num_centres: int = 50,
     first_actions: Sequence[float] | None = None,
 ) -> BoundedPolicy:
@@ -127,14 +128,14 @@ def rbf_policy(
     """
     last = nn.Linear(num_centres, spec.action_dim, dtype=torch.float64)
     with torch.no_grad():
-        last.bias.copy_(_before_tanh(first_actions, action_bounds))
+        last.bias.copy_(_before_tanh(first_actions, checked_action_bounds(action_bounds, spec)))
     body = nn.Sequential(_Bells(spec.observation_dim, num_centres), last)
     return BoundedPolicy(body, spec, action_bounds)
 
 
 def _before_tanh(actions: Sequence[float] | None, action_bounds: Tensor) -> Tensor:
     """What the tanh of a policy makes these actions of, ``action_dim``; 0 for None."""
-    low, high = torch.as_tensor(action_bounds, dtype=torch.float64)
+    low, high = action_bounds
     if actions is None:
         return torch.zeros_like(low)
     given = torch.as_tensor(actions, dtype=torch.float64)

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.objectives import Objective, Return
 from gpadjust.control.option_checks import check_fraction, check_whole
 from gpadjust.control.planner import Planner
@@ -47,6 +46,8 @@ class PolicySearch:
     goes on, so that the policy cannot lean on the errors of a few. A black box as physics has the
     gradients of its finite differences.
 
+    Of the last tenth of the updates, if that is more than one, the best policy is kept.
+
     Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
     matters), plans do: with a ``guide`` the policy first imitates plans of some episodes.
 
@@ -58,7 +59,7 @@ class PolicySearch:
         redraw_every: Number of updates after which other functions are drawn.
         learning_rate: At the start; it decays to a tenth along a cosine.
         max_grad_norm: The norm at which gradients are clipped.
-        guide: Plans the episodes that the policy imitates when it is improved for the first time.
+        guide: Plans the episodes that the policy imitates before it is improved.
         num_guides: How many.
 
     Raises:
@@ -93,7 +94,6 @@ class PolicySearch:
     max_grad_norm: float = 1.0
     guide: Planner | None = None
     num_guides: int = 16
-    guide_noise: float = 0.1
 
     def __post_init__(self) -> None:
         """Check the options."""
@@ -106,6 +106,7 @@ class PolicySearch:
             check_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
             check_whole("num_functions", self.num_functions, 1)
+        self.objective.check_functions(self.num_functions)
         for name in ("learning_rate", "max_grad_norm"):
             check_fraction(name, getattr(self, name), most=math.inf, zero=False)
         if not isinstance(self.guide, Planner | None):
@@ -126,7 +127,8 @@ class PolicySearch:
                 parameters are changed; after an error they are as before.
             task: The task, whose dynamics are fitted. It must say where episodes start and how
                 long they are.
-            guided: Whether the policy imitates the ``guide`` first, if there is one.
+            guided: Whether the policy imitates the ``guide`` first, if there is one: not where a
+                policy that has learnt is to go on.
             progress: Called after each update with its number and what the objective said.
 
         Raises:
@@ -143,6 +145,8 @@ class PolicySearch:
             )
         if task.episode_length is None:
             raise ValueError("A policy search needs a task with episode_length; found None.")
+        home = next(policy.parameters()).device
+        policy.to("cpu")  # where the dynamics are
         before = {name: t.detach().clone() for name, t in policy.state_dict().items()}
         try:
             if guided and self.guide is not None:
@@ -151,30 +155,19 @@ class PolicySearch:
         except BaseException:
             policy.load_state_dict(before)
             raise
+        finally:
+            policy.to(home)
 
     def plans(self, task: Task, action_bounds: Tensor) -> tuple[Tensor, Tensor]:
         """States ``N x state_dim`` and actions ``N x action_dim`` of episodes by the guide."""
         assert self.guide is not None, "asked before"
-        assert task.episode_length is not None, "asked before"
-        guide = MPC(task, action_bounds, first=self.guide)
-        low, high = guide.action_bounds
-        rollouts, rows = Rollouts(task, None), []
-        for state in task.draw_initial_states(self.num_guides):
-            planned: Planned | None = None
-            for t in range(task.episode_length):
-                planned = guide.plan(state, planned)
-                action = planned.actions[:1]
-                rows.append((state.unsqueeze(0), action))
-                noise = self.guide_noise * (high - low) * torch.randn_like(action)
-                pushed = torch.clamp(action + noise, low, high)
-                with torch.no_grad():
-                    step = rollouts.follow(state, pushed.unsqueeze(0))
-                made = step.made[0, 0, 0]
-                if not made:
-                    break
-                state = step.next_states[0, 0, 0]
-                planned = Planned(planned.actions[1:], planned.promised, t + 1)
-        states, actions = (torch.cat(column) for column in zip(*rows, strict=True))
+        rollouts, parts = Rollouts(task, None), []
+        for start in task.draw_initial_states(self.num_guides):
+            plan = self.guide.plan(task, start, action_bounds)
+            with torch.no_grad():
+                rollout = rollouts.follow(start, plan.actions.unsqueeze(0))
+            parts.append([part[rollout.made] for part in (rollout.states, rollout.actions)])
+        states, actions = (torch.cat(column) for column in zip(*parts, strict=True))
         return states, actions
 
     def _improve(
@@ -192,6 +185,8 @@ class PolicySearch:
         )
         score = self.objective.of(task)
         values, rewards, left = [], [], []
+        late = max(1, self.updates // 10)
+        best, kept = -math.inf, policy.state_dict()
         for i in range(self.updates):
             if i % self.redraw_every == 0:
                 rollouts = Rollouts(task, self.num_functions)
@@ -203,6 +198,9 @@ class PolicySearch:
                     "dynamics are computed without PyTorch's autograd. Write the reward in torch, "
                     "without .detach() and .numpy()."
                 )
+            if late > 1 and i >= self.updates - late and float(value.detach()) > best:
+                best = float(value.detach())
+                kept = {name: t.detach().clone() for name, t in policy.state_dict().items()}
             optimizer.zero_grad()
             (-value).backward()
             norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
@@ -214,8 +212,9 @@ class PolicySearch:
             left.append(rollout.left_bounds.double().mean())
             if progress is not None:
                 progress(i + 1, float(value.detach()))
-        late = slice(-max(1, self.updates // 10), None)
-        reward, share = (float(torch.stack(each[late]).mean()) for each in (rewards, left))
+        if late > 1:
+            policy.load_state_dict(kept)
+        reward, share = (float(torch.stack(each[-late:]).mean()) for each in (rewards, left))
         return SearchResult(torch.stack(values), reward, share, time.perf_counter() - begun)
 
     def _starts(self, task: Task, num_functions: int) -> Tensor:
@@ -253,9 +252,9 @@ def imitate(
         rate: Its learning rate.
 
     Returns:
-        The root mean square error in the end, in shares of the actions' standard deviation.
+        The root mean square error in the end, in shares of each action's standard deviation.
     """
-    scale = actions.std().clamp_min(1e-12)
+    scale = actions.std(0, correction=0).clamp_min(1e-12)
     optimizer = torch.optim.Adam(policy.parameters(), lr=rate)
     for _ in range(epochs):
         loss = ((policy(states) - actions) / scale).square().mean()

@@ -20,9 +20,11 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from gpadjust.control import Task
-from gpadjust.rl.agents import DynaSAC
+from gpadjust.rl.agents import DynaSAC, DynaTD3
 from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.rl.model_learner import ModelLearner
+from gpadjust.rl.mpc_agent import MPCAgent
+from gpadjust.rl.policy_search_agent import PolicySearchAgent
 from gpadjust.rl.random_state import RandomState
 
 Agent = TypeVar("Agent", bound=ModelLearner)
@@ -151,8 +153,8 @@ def resume(
     path: str | Path,
     env: GymEnv,
     task: Task,
-    algorithm: type[Agent] = DynaSAC,  # type: ignore[assignment]
-) -> Agent:
+    algorithm: type[ModelLearner] | None = None,
+) -> Any:
     """Read the agent of a run that :class:`EpisodeCheckpoint` wrote, ready to go on.
 
     Go on with ``agent.learn(total - agent.num_timesteps, reset_num_timesteps=False)``.
@@ -167,7 +169,8 @@ def resume(
         env: The environment, made and wrapped as for the first part of the run. What it wraps is
             replaced by the one of the checkpoint, in its state.
         task: The task of the run, its dynamics fitted or not.
-        algorithm: The class of the agent.
+        algorithm: The class of the agent. Default: the one of the library that the checkpoint
+            names; give one of your own.
 
     Returns:
         The agent. ``learn`` restores the random generators; until then you may use them.
@@ -178,6 +181,8 @@ def resume(
         RuntimeError: If the run had other dynamics, or another physics.
     """
     manifest, parts = _read(path)
+    if algorithm is None:
+        algorithm = _of_the_library(manifest["algorithm"])
     vec_env = algorithm._wrap_env(env, verbose=0)
     _check(path, manifest, vec_env, task, algorithm)
     agent = algorithm.load(
@@ -191,6 +196,17 @@ def resume(
     agent._random_state = RandomState.from_arrays(_unpacked(parts["random.npz"]))
     _restore_environment(agent, vec_env, *pickle.loads(parts["environment.pkl"]))
     return agent
+
+
+def _of_the_library(name: str) -> type[ModelLearner]:
+    """The class of an agent by its name."""
+    known = {each.__name__: each for each in (DynaSAC, DynaTD3, MPCAgent, PolicySearchAgent)}
+    if name not in known:
+        raise ValueError(
+            f"The checkpoint is of the class {name!r}, which is none of {', '.join(known)}; pass "
+            "algorithm, the class of the agent."
+        )
+    return known[name]
 
 
 def _locked(path: Path) -> AcquireReturnProxy[Any]:

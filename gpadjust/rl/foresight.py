@@ -39,9 +39,9 @@ def foresight(
     found = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
     names = [dynamics.spec.states[i] for i in dynamics.spec.moving]
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
+    found["overrides"] = _overrides(dynamics, *transitions[:2])
     if not horizons:
         return found
-    found["overrides"] = _overrides(dynamics, *transitions[:2])
     try:
         far = dynamics.score_trajectories(
             *transitions,
@@ -53,7 +53,7 @@ def foresight(
     except (NotImplementedError, PhysicsError) as error:  # scores are not worth an episode
         warnings.warn(
             f"There are no scores of trajectories, as their particles cannot move: {error} Pass "
-            "DynaOptions(score_horizons=()) to do without.",
+            "options with score_horizons=() to do without.",
             UserWarning,
             stacklevel=4,
         )

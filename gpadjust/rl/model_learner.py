@@ -47,6 +47,7 @@ class ModelLearner(TaskLearner):
         num_episodes: Real episodes that have ended and were learnt from.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"``, ``"update"`` and ``"plan"``.
         promised_reward: What the model promised of a step of the next real episode, or None.
+        promises: What it had promised of those that have ended and were not learnt from yet.
         planned: The real episodes that go by plans; ``planned.num_planned`` is their number.
     """
 
@@ -57,6 +58,7 @@ class ModelLearner(TaskLearner):
         self.num_episodes = 0
         self.planned = PlannedEpisodes()
         self.promised_reward: float | None = None
+        self.promises: list[float | None] = []
         self.model_hooks: list[DynaCallback] = []
         super().__init__(task, *args, **kwargs)
         self.wall_time = dict.fromkeys(("fit", "rollout", "update", "plan"), 0.0)
@@ -132,10 +134,13 @@ class ModelLearner(TaskLearner):
         predictions. (That alone is no fault: where a model has learnt without noise that its
         physics is a little off, they do so nearly everywhere.)
         """
-        real, promised = float(new.rewards.mean()), self.promised_reward
+        real = float(new.rewards.mean())
         self.logger.record("model/real_reward", real)
-        if promised is None:
-            return
+        promises, self.promises = self.promises, []
+        kept = [each for each in promises if each is not None]
+        if not kept or len(kept) < len(promises):
+            return  # of actions that were random, say
+        promised = sum(kept) / len(kept)
         self.logger.record("model/promised_reward", promised)
         recorded = self.recorded_episodes().rewards
         span = max(float(recorded.max()), promised) - float(recorded.min())
@@ -148,7 +153,7 @@ class ModelLearner(TaskLearner):
                 f"A step of the last real episode gave a reward of {real:.3g} on average, where "
                 f"the model promised {promised:.3g}: do not trust what is done in it yet. "
                 f"{blame if overrides > 0.5 else ''}More episodes, a careful objective "
-                "(Return(quantile=0.2)), or a better physics may help.",
+                "(Return(quantile=0.2), with num_functions=16), or a better physics may help.",
                 UserWarning,
                 stacklevel=4,
             )
@@ -210,8 +215,10 @@ class ModelLearner(TaskLearner):
     ) -> None:
         """As in SB3; it also notices where episodes end."""
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        for i in dones.nonzero()[0]:
-            self.planned.end(int(i))
+        for i in map(int, dones.nonzero()[0]):
+            episode = self.planned.under_way.get(i)
+            self.promises.append(self.promised_reward if episode is None else episode.promise)
+            self.planned.end(i)
 
     def environments_reset(self) -> None:
         """No plan holds any more."""

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from torch import Tensor
 
 from gpadjust.control import MPC, Planner, Task
-from gpadjust.control.mpc import Planned, PlanState
+from gpadjust.control.mpc import PlanState, check_planner
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.episode_loop import EpisodeLoop
 from gpadjust.rl.model_learner import ModelLearner
@@ -28,8 +28,9 @@ class MPCAgent(ModelLearner, EpisodeLoop):
 
     There is no policy to be trained: real steps are those of :class:`~gpadjust.control.MPC`, which
     plans them in the newest model. Before the first episode it plans in the physics; without one,
-    that episode's actions are random. Callbacks, loggers, ``save`` and ``load``, checkpoints, and
-    what errors leave are as of :class:`Dyna`; ``predict`` serves ``evaluate_policy``.
+    or with several, that episode's actions are random. Callbacks, loggers, ``save`` and ``load``,
+    checkpoints, and what errors leave are as of :class:`Dyna`; ``predict`` serves
+    ``evaluate_policy``.
 
     Args:
         env: The real environment; observations are those of the spec of the dynamics.
@@ -37,6 +38,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
             each real episode.
         each_step: Plans at each step but the first, see :class:`~gpadjust.control.MPC`.
         first: Plans when an episode begins, see :class:`~gpadjust.control.MPC`.
+        tolerance: How much a plan may disappoint, see :class:`~gpadjust.control.MPC`.
         options: How the model is learnt.
         action_noise: As in SB3: what is added to the planned actions of real episodes.
         buffer_size: Real transitions that are kept.
@@ -73,6 +75,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         each_step: Planner | None = None,
         *,
         first: Planner | None = None,
+        tolerance: float | None = 0.25,
         options: ModelOptions | None = None,
         action_noise: ActionNoise | None = None,
         buffer_size: int = 100_000,
@@ -81,14 +84,17 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         policy: type[BasePolicy] | None = None,
         **kwargs: Any,
     ) -> None:
+        for name, planner in (("each_step", each_step), ("first", first)):
+            if planner is not None:
+                check_planner(name, planner)
         self.each_step = each_step
         self.first = first
+        self.tolerance = tolerance
         super().__init__(
             task,
             ModelOptions() if options is None else options,
             Unmoved if policy is None else policy,
             env,
-            learning_rate=0.0,
             buffer_size=buffer_size,
             train_freq=train_freq,
             random_steps=random_steps,
@@ -105,7 +111,9 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         if dynamics is None:
             return None
         known = replace(task, dynamics=dynamics)
-        return MPC(known, self.action_bounds(), self.each_step, first=self.first)
+        return MPC(
+            known, self.action_bounds(), self.each_step, first=self.first, tolerance=self.tolerance
+        )
 
     def predict(  # type: ignore[override]
         self,
@@ -142,16 +150,17 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         """Plan the steps ahead, or draw them, if nothing is known."""
         mpc, steps_done = self.mpc, len(episode.states)
         begins = not steps_done
-        at_random = self.begins_at_random() if begins else not len(episode.promised)
+        at_random = self.begins_at_random() if begins else episode.planned is None
         if mpc is None or at_random:
             return super()._plan(episode, state)
-        earlier = Planned(episode.ahead, episode.promised, steps_done) if not begins else None
+        earlier = episode.planned
+        if earlier is not None:
+            earlier = earlier._replace(actions=episode.ahead, steps_done=steps_done)
         with self.timed("plan"):
-            plan = mpc.plan(state, earlier)
-        episode.promised = plan.promised
+            plan = episode.planned = mpc.plan(state, earlier)
         if begins:
             whole = len(plan.promised) >= self.episode_length()
-            self.promised_reward = float(plan.promised.mean()) if whole else None
+            episode.promise = self.promised_reward = plan.reward if whole else None
             self.logger.record("model/plan_left_bounds", plan.left_bounds)
             if plan.left_bounds > 0.1:
                 warnings.warn(
@@ -165,8 +174,9 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         actions = plan.actions.clone()
         if self.action_noise is not None:
             low, high = self.action_bounds()
-            noise = torch.from_numpy(self.action_noise()).double() * (high - low) / 2
-            actions[0] = torch.clamp(actions[0] + noise, low, high)
+            drawn = np.atleast_2d(self.action_noise())  # SB3 makes one for each environment
+            noise = torch.from_numpy(drawn[episode.environment % len(drawn)]).double()
+            actions[0] = torch.clamp(actions[0] + noise * (high - low) / 2, low, high)
         return actions
 
     def _policy_actions(

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gpadjust.control.mpc import Planned
+
 
 @dataclass
 class PlannedEpisode:
@@ -17,14 +19,17 @@ class PlannedEpisode:
         ahead: The actions that are planned, ``T x action_dim``.
         states: What it has seen, ``t x state_dim``.
         actions: What it has done, ``t x action_dim``.
-        promised: The rewards of its steps, as they were foreseen when it was planned; empty if
-            nobody asks.
+        environment: The number of its environment.
+        planned: What a planner keeps of it from step to step; None where actions are random.
+        promise: The reward of a step that was promised of it when it began, if one was.
     """
 
     ahead: Tensor
     states: Tensor
     actions: Tensor
-    promised: Tensor
+    environment: int
+    planned: Planned | None = None
+    promise: float | None = None
 
 
 class PlannedEpisodes:
@@ -74,9 +79,8 @@ class PlannedEpisodes:
             replan_every: Number of steps after which they are planned anew.
         """
         if environment not in self.under_way:
-            nothing = state.new_empty(0, len(action))
-            seen, promised = state.new_empty(0, len(state)), state.new_empty(0)
-            begun = PlannedEpisode(nothing, seen, nothing, promised)
+            nothing, unseen = state.new_empty(0, len(action)), state.new_empty(0, len(state))
+            begun = PlannedEpisode(nothing, unseen, nothing, environment)
             self.under_way[environment] = begun if begins() else None
             self.num_planned += self.under_way[environment] is not None
         episode = self.under_way[environment]

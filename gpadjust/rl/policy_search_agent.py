@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
@@ -44,8 +45,8 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
 
     The policy is trained in the physics before the first real episode, and after each one in the
     newest model, by :class:`~gpadjust.control.PolicySearch`, from where it was. Without a physics,
-    or if the task does not say where episodes start, the first episode's actions are random.
-    Callbacks, loggers, ``save`` and ``load``, checkpoints, and what errors leave are as of
+    with several, or if the task does not say where episodes start, the first episode's actions are
+    random. Callbacks, loggers, ``save`` and ``load``, checkpoints, and what errors leave are as of
     :class:`Dyna`.
 
     Args:
@@ -108,6 +109,12 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         self.search = PolicySearch() if search is None else search
         if not isinstance(self.search, PolicySearch):
             raise TypeError(f"search must be a PolicySearch(...); found {search!r}.")
+        if not isinstance(policy, str | type):
+            raise TypeError(
+                f"policy must be one of {', '.join(map(repr, _KINDS))}; found a "
+                f"{type(policy).__name__}. A module of your own is improved by "
+                "PolicySearch(...).improve(module, task)."
+            )
         self.is_trained = False
         if task is not None and isinstance(policy, str):
             spec = task.dynamics.spec
@@ -117,7 +124,6 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
             ModelOptions() if options is None else options,
             SearchedPolicy if isinstance(policy, str) else policy,
             env,
-            learning_rate=0.0,
             buffer_size=buffer_size,
             train_freq=train_freq,
             random_steps=random_steps,
@@ -140,7 +146,20 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         return not self.is_trained or self.begins_at_random()  # actions are random
 
     def _improve(self, num_ended: int, batch_size: int) -> None:
-        self._search(self.model_task())
+        if not self.begins_at_random():
+            self._search(self.model_task())
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """The policy's actions, as in SB3; the policy sees what ``VecNormalize`` was given."""
+        normalizer = self._vec_normalize_env
+        seen: Any = observation if normalizer is None else normalizer.unnormalize_obs(observation)
+        return super().predict(seen, state, episode_start, deterministic)
 
     def _search(self, task: Task) -> None:
         """Improve the policy in a model."""
@@ -204,10 +223,15 @@ class SearchedPolicy(BasePolicy):
         spec: StateSpec,
         **kwargs: Any,
     ) -> None:
-        kwargs.pop("use_sde", None)
+        for name in ("use_sde", "normalize_images"):  # SB3 gives them to all
+            kwargs.pop(name, None)
         super().__init__(observation_space, action_space)
+        self._made_of = {"kind": kind, "spec": spec, **kwargs}
         bounds = torch.stack([torch.as_tensor(b) for b in (action_space.low, action_space.high)])
         self.module = _KINDS[kind](spec, bounds, **kwargs)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self._made_of}
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         """The actions, ``n x action_dim``."""

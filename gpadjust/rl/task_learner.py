@@ -119,7 +119,11 @@ class TaskLearner(OffPolicyAlgorithm):
         task = self.ready_task()
         if task.episode_length is not None:
             return task.episode_length
-        assert self.env is not None, "checked when learning starts"
+        if self.env is None:
+            raise ValueError(
+                "Nobody says how long an episode is; give the task an episode_length, or the agent "
+                "an environment: load(..., env=env)."
+            )
         spec = self.env.get_attr("spec")[0]
         length = None if spec is None else spec.max_episode_steps
         if length is None:

@@ -88,7 +88,7 @@ class Settings:
     """of deviations of a step and the next"""
     updates: int = 150
     """of the policy, after each trial, where one is searched for"""
-    starts: int = 48
+    starts: int = 192
     """of an update"""
     learning_rate: float = 3e-3
     """at the start of the updates"""

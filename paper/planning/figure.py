@@ -17,6 +17,7 @@ COLORS = {
     "fitted": "tab:brown",
     "gp": "tab:red",
     "rra": "tab:green",
+    "search": "tab:cyan",
     "oracle": "black",
 }
 

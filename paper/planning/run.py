@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from pathlib import Path
@@ -45,13 +46,14 @@ def run(experiment: Planning, system: str, learner: str, seed: int, *, unfinishe
         (seen,) = real.get_attr("episodes")
         late = np.stack(seen[len(rows)])[-round(1 / settings.time_step) :]
         seconds = {name: agent.wall_time[name] - before[name] for name in ("plan", "fit")}
+        promised = agent.promised_reward
         rows.append(
             {
                 "cost": costs.mean().item(),
                 "last_cost": costs[-5:].mean().item(),
                 "last_offset": np.abs(late[:, 0]).max().item(),
                 "last_lean": np.abs(np.degrees(wrapped(late[:, 1]))).max().item(),
-                "promised_cost": -(agent.promised_reward or float("nan")),
+                "promised_cost": math.nan if promised is None else -promised,
                 **{f"{name}_seconds": spent for name, spent in seconds.items()},
                 "cpu_seconds": time.process_time() - start,
             }

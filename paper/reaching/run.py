@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from pathlib import Path
@@ -54,10 +55,11 @@ def run(experiment: Reaching, system: str, learner: str, seed: int, *, unfinishe
         agent.learn(settings.episode_length, reset_num_timesteps=False)
         spent = time.process_time() - start
         errors = evaluate(agent, system, settings, seed)
+        promised = agent.promised_reward
         rows.append(
             {
                 **{name: float(np.sqrt(np.square(e).mean())) for name, e in errors.items()},
-                "promised_cost": -(agent.promised_reward or float("nan")),
+                "promised_cost": math.nan if promised is None else -promised,
                 **{f"{p}_seconds": agent.wall_time[p] - before[p] for p in ("update", "fit")},
                 "cpu_seconds": spent,
             }

@@ -166,5 +166,5 @@ def test_bad_options_are_refused(make, error, message):
 
 def test_somebody_must_say_how_far_to_plan():
     dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :1])
-    with pytest.raises(ValueError, match="give the task an episode_length, or the planner a hor"):
+    with pytest.raises(ValueError, match="give the task an episode_length, or the planners a hor"):
         MPC(Task(dynamics, to_one), BOUNDS, quick())

@@ -1,6 +1,7 @@
 """Plans of episodes that teach, and the search that makes them."""
 
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +9,8 @@ import torch
 from gpadjust.control import (
     CrossEntropy,
     Information,
+    Objective,
+    PathIntegral,
     Planner,
     Return,
     Rollouts,
@@ -254,7 +257,7 @@ def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
     options = Planner(Information())
     with pytest.raises(ValueError, match=r"state of shape 1, found \(2,\)"):
         options.plan(task_of(known_left), origin.repeat(2), BOUNDS, 3)
-    with pytest.raises(ValueError, match=r"finite action_bounds of shape 2 x 1, found .*inf"):
+    with pytest.raises(ValueError, match=r"finite action_bounds of shape 2 x 1, .* found .*inf"):
         options.plan(task_of(known_left), origin, BOUNDS * torch.inf, 3)
     with pytest.raises(TypeError, match="found PhysicsDynamics"):
         options.plan(half_steps(), origin, BOUNDS, 3)
@@ -317,7 +320,7 @@ def test_a_plan_of_the_greatest_return(origin):
 def test_a_return_is_the_sum_of_the_rewards_that_are_made(origin):
     sequences = torch.tensor([[[1.0], [2.0], [0.0]], [[0.0], [-1.0], [1.0]]], dtype=torch.float64)
     beyond = (1.5 - 1.2) / 5.1  # in halves of the width
-    worst = -0.5 - 1.5 * (2e6 + 4 * beyond)
+    worst = -0.5 - 1.5 * (2e6 + 40 * beyond)
     for parts, expected in [
         ({}, [-0.5 - 0.5 - 0.5, -1.0 - 1.5 - 1.0]),
         ({"terminated": lambda states: states[:, 0] > 1.2}, [-0.5 - 0.5, -1.0 - 1.5 - 1.0]),
@@ -334,3 +337,65 @@ def test_leaving_the_bounds_never_pays(origin):
     plan = Planner(Return(), CrossEntropy(6), num_random=100).plan(task, origin, BOUNDS, 5)
     rollout = Rollouts(task, 1).follow(origin, plan.actions.unsqueeze(0))
     assert rollout.made.all()
+
+
+@pytest.mark.parametrize("search", [CrossEntropy(6), PathIntegral(6)])
+def test_searches_keep_within_bounds(search, origin):
+    """Most random sequences leave; the reward asks to go as far as one may."""
+    torch.manual_seed(0)
+    task = half_steps(state_bounds=torch.tensor([[-0.8], [0.8]]))
+    plan = Planner(Return(), search, num_random=64, num_policy=0).plan(task, origin, BOUNDS, 6)
+    assert plan.left_bounds == 0
+    assert plan.made.tolist() == [1] * 6
+    assert plan.value > -3  # to stay costs 6
+
+
+def test_leaving_does_not_pay_where_rewards_are_none(origin):
+    task = replace(
+        half_steps(state_bounds=torch.tensor([[-0.8], [0.8]])),
+        reward=lambda states, actions, next_states: 0 * next_states[:, 0],
+    )
+    far = Return(terminal_value=lambda states: -100 * (states[:, 0] - 3).square())
+    plan = Planner(far, num_random=64).plan(task, origin, BOUNDS, 3)
+    assert plan.left_bounds == 0
+
+
+def test_scores_that_are_none_are_told(origin):
+    task = half_steps()
+    for terminal, found in (
+        (lambda states: states[:, 0].log(), r"terminal_value returned .*nan"),
+        (lambda states: states, r"terminal_value must return one value per row, shape"),
+    ):
+        with pytest.raises(ValueError, match=found):
+            Planner(Return(terminal_value=terminal)).plan(task, origin, BOUNDS, 2)
+
+
+def test_an_objective_must_score_each_sequence(origin):
+    class Wrong(Objective):
+        def of(self, task):
+            return lambda rollout, past: rollout.rewards.sum(-1)  # k x n
+
+    with pytest.raises(ValueError, match=r"Wrong must return one score per seq.* shape \(1, 80\)"):
+        Planner(Wrong()).plan(half_steps(), origin, BOUNDS, 2)
+
+
+def test_no_search_begins_when_time_is_up(origin):
+    counted = []
+
+    def reward(states, actions, next_states):
+        counted.append(len(states))
+        return -next_states[:, 0].abs()
+
+    planner = Planner(Return(), restarts=5, seconds=1e-6, num_random=8, num_policy=0)
+    planner.plan(replace(half_steps(), reward=reward), origin, BOUNDS, 2)
+    assert len(counted) == 2  # two steps of the first round of one search
+
+
+def test_impossible_bounds_and_careful_plans_of_the_mean_are_refused(origin):
+    with pytest.raises(ValueError, match="Each lower one of action_bounds must be below its upp"):
+        Planner().plan(half_steps(), origin, [[1.0], [-1.0]], 2)
+    with pytest.raises(ValueError, match="is one over functions, but num_functions is 1, one of"):
+        Planner(Return(quantile=0.1), num_functions=1)
+    with pytest.raises(ValueError, match="replan_every=6 is beyond horizon=4"):
+        Planner(horizon=4, replan_every=6)
+    assert len(Planner().plan(half_steps(), origin, [[-1.0], [1.0]], 2).actions) == 2

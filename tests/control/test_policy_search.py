@@ -222,3 +222,27 @@ def test_bad_options_are_refused():
         PolicySearch(updates=0)
     with pytest.raises(TypeError, match="guide must be a Planner, or None; found 3"):
         PolicySearch(guide=3)
+
+
+def test_a_policy_comes_back_from_the_bounds():
+    """The reward lies beyond them; within, the nearest is best."""
+    torch.manual_seed(0)
+    task = Task(
+        PhysicsDynamics(SPEC, step),
+        lambda states, actions, next_states: -(next_states[:, 0] - 3).square(),
+        initial_states=lambda n: starts(n) / 4,
+        episode_length=5,
+        state_bounds=torch.tensor([[-1.0], [1.0]]),
+    )
+    policy = mlp_policy(SPEC, BOUNDS, (16,))
+    search = PolicySearch(updates=120, num_functions=None, learning_rate=0.02)
+    search.improve(policy, task)
+    with torch.no_grad():
+        rollout = Rollouts(task, None).act(task.draw_initial_states(64), policy, 5)
+    assert rollout.left_bounds.double().mean() < 0.3
+    assert rollout.rewards.mean() > -6  # to stay where it is costs 9
+
+
+def test_a_careful_search_needs_functions():
+    with pytest.raises(ValueError, match="num_functions is None, the mean alone; give num_func"):
+        PolicySearch(Return(quantile=0.2), num_functions=None)

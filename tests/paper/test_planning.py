@@ -8,6 +8,7 @@ from gpadjust.envs import REAL_CART_POLE, random_cart_pole_physics
 from gpadjust.envs.cart_pole.system import START_MEAN, equation_physics
 from paper.common.runner import rounded
 from paper.planning import LEARNERS, SMALL_NOISE, SYSTEMS, Planning, Settings
+from paper.planning.figure import COLORS
 from paper.planning.run import dynamics
 from paper.planning.systems import (
     FittedPhysics,
@@ -46,6 +47,10 @@ def test_a_run_and_its_tables(tmp_path):
     assert {*tables} == {"sensors", "targets", "seconds"}
     assert "not run" in tables["targets"].text
     assert [path.name for path in experiment.draw(records)] == ["planning.png"]
+
+
+def test_all_models_have_a_colour():
+    assert COLORS.keys() == LEARNERS.keys()
 
 
 @pytest.mark.parametrize("learner", LEARNERS)

@@ -976,7 +976,7 @@ def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(
     point_agent, point_dynamics
 ):
     agent = point_agent(dynamics=Stiff(point_dynamics.spec), score_horizons=(1, 5))
-    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass DynaOptions"):
+    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass options"):
         logged = logged_of(agent, 1)
     assert "model/coverage" in logged
     assert "model/energy_1" not in logged

@@ -1,5 +1,7 @@
 """Agents that plan, and agents whose policy is searched for, in the same loop as Dyna's."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -101,7 +103,9 @@ def test_the_first_episodes_can_be_random(make_agent, kind):
     """Two episodes of five steps begin before the sixth step; the third is brought home."""
     agent = make_agent(kind, random_steps=6).learn(15)
     rewards = agent.recorded_episodes().rewards.reshape(3, 5).sum(1)
-    assert rewards[:2].max() < -1.5 < rewards[2]
+    assert rewards[:2].max() < -2 < rewards[2]
+    agent.learn(5)
+    assert agent.recorded_episodes(newest=5).rewards.sum() > -2  # random no more
     for wrong, error in ((-1, ValueError), (1.5, TypeError)):
         with pytest.raises(error, match="random_steps must be"):
             make_agent(kind, random_steps=wrong)
@@ -151,8 +155,6 @@ def test_it_is_saved_and_loaded(make_agent, kind, tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_error_loses_no_episode(make_agent, kind, point_reward):
-    from dataclasses import replace
-
     agent = make_agent(kind, reward=lambda s, a, n: -3 * n[:, 0].square())
     with pytest.raises(ValueError, match="is not the environment's"):
         agent.learn(5)
@@ -278,3 +280,78 @@ def test_the_cart_pole_swings_up_in_two_trials():
     task = Task(LearnedDynamics(CART_POLE_SPEC, f_p), cart_pole_reward)
     agent = MPCAgent(env, task, seed=3).learn(50)
     assert agent.recorded_episodes(newest=25).rewards.mean() > -0.45
+
+
+def test_several_environments_explore_by_noise_of_their_own(make_agent, point_env):
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    env = DummyVecEnv([point_env, point_env])
+    noise = NormalActionNoise(np.zeros(1), 0.5 * np.ones(1))
+    agent = make_agent(MPCAgent, env, train_freq=(5, "step"), action_noise=noise).learn(20)
+    first, second = agent.recorded_episodes().actions.reshape(2, -1)
+    assert not torch.equal(first, second)
+
+
+def test_a_searched_policy_sees_what_is_not_normalised(make_agent, point_env):
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    agent = make_agent(PolicySearchAgent, VecNormalize(DummyVecEnv([point_env])))
+    agent.learn(15)
+    episodes = agent.recorded_episodes(newest=1)
+    with torch.no_grad():
+        before = agent.policy.module(episodes.next_states)
+    env = agent.get_vec_normalize_env()
+    seen = env.normalize_obs(episodes.next_states.numpy())
+    action, _ = agent.predict(seen, deterministic=True)
+    np.testing.assert_allclose(action, before.numpy(), atol=1e-4)
+
+
+def test_promises_are_of_the_steps_that_are_made_and_of_no_random_ones(make_agent, point_task):
+    """Each step costs 1 until the point is home, which ends the episode; no warning is given."""
+    agent = make_agent(
+        MPCAgent,
+        reward=lambda states, actions, next_states: -torch.ones(len(states)).double(),
+        options=ModelOptions(reward_tolerance=None, score_horizons=()),
+    )
+    agent.task = replace(agent.task, terminated=lambda states: states[:, 0].abs() < 0.5)
+    agent.first = replace(PLAN, horizon=None)
+    agent.learn(5)
+    assert agent.promised_reward == pytest.approx(-1)
+    random = make_agent(PolicySearchAgent, random_steps=20, options=ModelOptions())
+    random.learn(15)
+    assert "model/promised_reward" not in random.logger.name_to_value
+
+
+def test_what_has_no_effect_is_refused(make_agent):
+    for option, value in {"learning_starts": 9, "gradient_steps": 7, "learning_rate": 1.0}.items():
+        with pytest.raises(TypeError, match=f"MPCAgent has no {option}, .* give .* instead"):
+            make_agent(MPCAgent, **{option: value})
+    with pytest.raises(ValueError, match=r"computes on the CPU, .* found device 'cuda'"):
+        make_agent(PolicySearchAgent, device="cuda")
+    with pytest.raises(TypeError, match=r"first must be a Planner\(\.\.\.\); found 3"):
+        MPCAgent(None, None, first=3)
+    with pytest.raises(TypeError, match=r"policy must be one of 'mlp', .* found a Linear"):
+        PolicySearchAgent(torch.nn.Linear(1, 1), None)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_checkpoint_knows_its_class(make_agent, kind, tmp_path):
+    path = tmp_path / "run.ckpt"
+    agent = make_agent(kind).learn(5, EpisodeCheckpoint(path))
+    assert type(resume(path, agent.get_env(), make_agent(kind).task)) is kind
+
+
+def test_a_searched_policy_is_saved_by_itself(make_agent, tmp_path):
+    policy = make_agent(PolicySearchAgent).learn(5).policy
+    policy.save(tmp_path / "policy.zip")
+    again = type(policy).load(tmp_path / "policy.zip", device="cpu")
+    seen = np.array([0.4], dtype=np.float32)
+    assert np.array_equal(again.predict(seen)[0], policy.predict(seen)[0])
+
+
+def test_a_planner_that_was_loaded_says_what_it_needs(make_agent, tmp_path):
+    agent = make_agent(MPCAgent).learn(5)
+    agent.save(tmp_path / "agent.zip")
+    again = MPCAgent.load(tmp_path / "agent.zip", task=replace(agent.task, episode_length=None))
+    with pytest.raises(ValueError, match="give the task an episode_length, or the agent an env"):
+        again.predict(np.ones(1, dtype=np.float32))

@@ -72,7 +72,7 @@ def test_planned_actions_are_taken_and_stored_in_sb3s_scale(
 
     def plan(self, task, state, bounds, num_steps, **others):
         seen.append((state, num_steps, bounds, others))
-        return Plan(chosen, 1.0, torch.zeros(5), 0.0)
+        return Plan(chosen, 1.0, torch.zeros(5), 0.0, torch.ones(5))
 
     monkeypatch.setattr(Planner, "plan", plan)
     watched = Watches()
