@@ -41,13 +41,43 @@ def test_decision_beside_the_physics(benchmark, task):
     benchmark(lambda: mpc.plan(state, earlier))
     states = cart_pole_start(128)
     rows = torch.cat([states, torch.zeros(128, 1, dtype=torch.float64)], dim=-1)
-    physics, spent = task.dynamics.physics, []
-    for _ in range(10):
-        start = time.perf_counter()
-        for _ in range(16):
-            physics(rows)
-        spent.append(time.perf_counter() - start)
-    ratio = benchmark.stats["median"] / sorted(spent)[5]
+    physics = task.dynamics.physics
+    ratio = benchmark.stats["median"] / (16 * median_seconds(lambda: physics(rows)))
     benchmark.extra_info["decision / its evaluations of f_p"] = round(ratio, 2)
     print(f"{benchmark.stats['median']:.3f} s; {ratio:.2f} times its evaluations of f_p")
     assert ratio < 3
+
+
+def test_mean_beside_its_matrix_products(benchmark, task):
+    """What the mean adds to f_p, beside the kernels that it cannot do without, and their products.
+
+    They are those of rho and delta, of four states, under two samples of the hyper-parameters.
+    """
+    benchmark.group = "the mean of the model at 128 states"
+    mean, physics = task.dynamics.mean_function(), task.dynamics.physics
+    states, actions = cart_pole_start(128), torch.zeros(128, 1, dtype=torch.float64)
+    rows = torch.cat([states, actions], dim=-1)
+    at, known = (torch.randn(16, n, 6, dtype=torch.float64) for n in (128, 100))
+    weights = torch.randn(16, 100, 1, dtype=torch.float64)
+
+    with torch.no_grad():
+        benchmark(lambda: mean(states.unsqueeze(0), actions.unsqueeze(0)))
+        of_physics = median_seconds(lambda: physics(rows))
+        of_products = median_seconds(lambda: (at @ known.mT).exp_() @ weights)
+    ratio = (benchmark.stats["median"] - of_physics) / of_products
+    benchmark.extra_info["the mean without f_p / its products"] = round(ratio, 2)
+    print(
+        f"{1e3 * benchmark.stats['median']:.2f} ms, f_p {1e3 * of_physics:.2f}, products "
+        f"{1e3 * of_products:.2f}: {ratio:.2f} times these"
+    )
+    assert ratio < 12
+
+
+def median_seconds(call):
+    """The time of a call, the median of 100."""
+    spent = []
+    for _ in range(100):
+        start = time.perf_counter()
+        call()
+        spent.append(time.perf_counter() - start)
+    return sorted(spent)[50]
