@@ -30,9 +30,30 @@ def tables(records: Sequence[Record], experiment: Planning) -> dict[str, Table]:
     if "plain" in found:
         text = found["plain"].text + "\n" + _of_dyna(experiment, last)
         found["plain"] = found["plain"]._replace(text=text.rstrip())
+    found["short"] = Table("Mean cost of planned trials", _short(trials, last))
     found["targets"] = Table("Targets", claims_table("target", {"planned": judged}))
     found["seconds"] = Table("Seconds of a trial", _seconds(trials))
     return found
+
+
+def _short(trials: pd.DataFrame, last: int) -> str:
+    """The main README's table: the first trials as they are, and the later ones of all systems."""
+    systems = [name for name in SYSTEMS if name != "mc-pilco" and (trials["system"] == name).any()]
+    header = ["mean cost (runs)", *(f"trial {i}" for i in (1, 2, 3))]
+    header += [f"2-{last}, {SYSTEMS[name]}" for name in systems]
+    rows = []
+    for learner, label in LEARNERS.items():
+        cells = []
+        for system in systems:
+            own = trials[(trials["scenario"] == learner) & (trials["system"] == system)]
+            if system == "plain":
+                each = [own[own["episode"] == i]["cost"].mean() for i in (1, 2, 3)]
+                cells += [number(value, ".2f") for value in each]
+            late, runs = own[own["episode"] >= 2]["cost"].mean(), own["seed"].nunique()
+            cells.append(f"{number(late, '.2f')} ({runs})" if runs else "")
+        if any(cells):
+            rows.append([label, *cells])
+    return markdown(header, rows)
 
 
 def _of_dyna(experiment: Planning, last: int) -> str:

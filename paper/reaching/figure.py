@@ -44,11 +44,11 @@ def _curves(records: Sequence[Record], experiment: Reaching) -> Path:
             own = trials[(trials["system"] == system) & (trials["scenario"] == name)]
             if len(own):
                 draw_quartiles(ax, own, "all_steps", color=COLORS[name], label=label)
-        ax.axhline(BOUND, color="0.5", lw=1, ls="--", label="1,000 trials of SAC on the true arm")
+        ax.axhline(BOUND, color="0.5", lw=1, ls="--", label="true arm, 1,000 trials of SAC")
         ax.set_ylim(0, 40)
     figure.supxlabel("trial", fontsize="medium")
-    figure.supylabel("hand's RMSE over targets, cm, median and quartiles", fontsize="medium")
-    one_legend(figure, axes, ncols=4)
+    figure.supylabel("hand's error, cm, median and quartiles", fontsize="medium")
+    one_legend(figure, axes)
     return save(figure, experiment.out / "curves.png")
 
 

@@ -44,7 +44,7 @@ def test_a_run_and_its_tables(tmp_path):
         assert len(found["trials"]["cost"]) == 2
         records.append({"system": "sensors", "learner": learner, "seed": 0, **found})
     tables = experiment.tables(records)
-    assert {*tables} == {"sensors", "targets", "seconds"}
+    assert {*tables} == {"sensors", "short", "targets", "seconds"}
     assert "not run" in tables["targets"].text
     assert [path.name for path in experiment.draw(records)] == ["planning.png"]
 
