@@ -9,7 +9,7 @@ import pickle
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import cloudpickle
 import gymnasium as gym
@@ -27,7 +27,6 @@ from gpadjust.rl.mpc_agent import MPCAgent
 from gpadjust.rl.policy_search_agent import PolicySearchAgent
 from gpadjust.rl.random_state import RandomState
 
-Agent = TypeVar("Agent", bound=ModelLearner)
 _FORMAT = "gpadjust episode checkpoint, version 2"
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")
 _BUFFERS = ("replay_buffer", "model_buffer")

@@ -32,7 +32,8 @@ def foresight(
         task: The task, with bounds of the states; its dynamics are scored.
         transitions: States, actions and next states that they have not learnt from.
         recorded: All real episodes.
-        horizons: Numbers of steps; none for the scores of next states alone.
+        horizons: Numbers of steps; none for the scores of next states, and how many of them data
+            override the physics in, alone.
     """
     dynamics = task.dynamics
     score = dynamics.score(*transitions)

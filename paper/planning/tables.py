@@ -65,6 +65,8 @@ def _of_dyna(experiment: Planning, last: int) -> str:
     rows = []
     for name, label in {"cka": "CKA", "phy": "f_p alone", "gp": "GP"}.items():
         costs = np.array([r["episodes"]["cost"] for r in runs if r["scenario"] == name])
+        if not len(costs):
+            continue
         cells = [number(each, ".3f") for each in costs[:, :last].mean(0)]
         worst = number(costs[:, 2:last].max(), ".3f")
         rows.append([f"DynaSAC, {label}", f"{len(costs)}", *cells, worst, ""])
