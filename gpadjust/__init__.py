@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         CKA,
         RRA,
         BiasGP,
+        CalibratedPhysics,
         PhysicsMeanGP,
         ScaleGP,
         StackedGP,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         ODEPhysics,
         Physics,
         PhysicsError,
+        Unknown,
     )
     from gpadjust.validation import Comparison, compare
 
@@ -35,6 +37,7 @@ __all__ = [
     "RRA",
     "BiasGP",
     "BlackBoxPhysics",
+    "CalibratedPhysics",
     "Comparison",
     "FitResult",
     "FunctionPhysics",
@@ -46,6 +49,7 @@ __all__ = [
     "SampleResult",
     "ScaleGP",
     "StackedGP",
+    "Unknown",
     "ZeroMeanGP",
     "compare",
     "fit",

@@ -21,6 +21,8 @@ EXPERIMENTS = {
     "foresight": ("Foresight", "do dynamics foresee the next trial, and know how well?"),
     "planning": ("Planning", "cart-poles that are swung up by planning in several models"),
     "reaching": ("Reaching", "muscle arms that reach after a few trials, by several models"),
+    "parameters": ("Parameters", "intervals of a physics' parameters, by several discrepancies"),
+    "real": ("Real", "learners of real machines, by free runs beside what was measured"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

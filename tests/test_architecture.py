@@ -50,8 +50,9 @@ def first_call():
 
 def test_the_first_call_passes_few_files_and_classes():
     files, classes = passed(first_call)
-    assert len(files) <= 18, sorted(files)
-    assert len(classes) <= 18, sorted(classes)
+    # The 19th are physics/unknown.py and its Unknowns, which say that nothing is unknown.
+    assert len(files) <= 19, sorted(files)
+    assert len(classes) <= 19, sorted(classes)
 
 
 def imports(path):

@@ -1,5 +1,6 @@
 """What the README shows runs, and its commands are those of CI."""
 
+import math
 import re
 from pathlib import Path
 
@@ -45,10 +46,31 @@ def test_measuring(tmp_path, monkeypatch):
     assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8
 
 
+def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    law, log = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[4:6]
+    names = {}
+    exec(law, names)
+    truth = torch.tensor([0.19, 3.65, 0.1], dtype=torch.float64)  # inertia, moment, friction
+    row = torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64)
+    lines = ["time,q,dq,u"]
+    for i in range(160):
+        row[0, 2] = 0.8 * math.sin(0.7 * i)
+        lines.append(",".join(map(str, [round(0.05 * i, 2), *row[0].tolist()])))
+        row[:, :2] = names["physics"](row, truth)
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    exec(log, names)
+    assert "inertia" in capsys.readouterr().out
+    found = names["dynamics"].model.physics_parameters.mean
+    torch.testing.assert_close(found, truth, rtol=1e-3, atol=0)
+    error = names["run"].mean - names["windows"].measured
+    assert error.abs().max() < 1e-2
+
+
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[4:]
+    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[6:]
     assert "=2 * 25" in code
     quick = "Planner(search=CrossEntropy(1), horizon=3, num_random=16)"
     code = code.replace("=2 * 25", "=25").replace(

@@ -2,21 +2,30 @@
 
 from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.free_run import FreeRun
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
+from gpadjust.dynamics.record import Record
+from gpadjust.dynamics.records import Records, Windows
 from gpadjust.dynamics.trajectory_information import TrajectoryInformation
 from gpadjust.dynamics.trajectory_scores import TrajectoryScores
 from gpadjust.dynamics.transition_scores import TransitionScores
+from gpadjust.dynamics.transitions import Transitions
 from gpadjust.states import StateSpec
 
 __all__ = [
     "AngleInput",
     "Dynamics",
+    "FreeRun",
     "LearnedDynamics",
     "PhysicsDynamics",
+    "Record",
+    "Records",
     "StateSpec",
     "TrajectoryInformation",
     "TrajectoryScores",
     "TransitionFunctions",
     "TransitionScores",
+    "Transitions",
+    "Windows",
 ]

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.dynamics.free_run import FreeRun, free_run
 from gpadjust.dynamics.trajectory_scores import TrajectoryScores, score_trajectories
 from gpadjust.dynamics.transition_scores import TransitionScores, score_transitions
 from gpadjust.dynamics.transitions import Transitions
@@ -154,6 +155,62 @@ class Dynamics(ABC):
             num_functions=num_functions,
             max_windows=max_windows,
             units=units,
+            state_bounds=state_bounds,
+            seed=seed,
+        )
+
+    def free_run(
+        self,
+        initial_states: Tensor,
+        actions: Tensor,
+        *,
+        num_functions: int = 39,
+        level: float = 0.95,
+        noise: bool = True,
+        state_bounds: Tensor | None = None,
+        seed: int = 0,
+    ) -> FreeRun:
+        """Follow actions from given states, without looking at what is measured on the way.
+
+        Functions that are drawn from the dynamics follow the actions; see :class:`FreeRun`.
+        :meth:`Records.windows` has both of measured records.
+
+        Args:
+            initial_states: ``w x state_dim``.
+            actions: ``w x T x action_dim``.
+            num_functions: Number of functions, one for each particle: so many that the interval
+                has ends, 39 or more for 95 %.
+            level: The probability of the intervals.
+            noise: Whether intervals and particles are of measured states, with the noise that the
+                dynamics learnt, or of the states themselves.
+            state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
+                would leave them stays where it is. Default: none.
+            seed: Seed of functions and noise; PyTorch's generator is left as it is.
+
+        Raises:
+            RuntimeError: If nothing was learnt yet.
+            TypeError: If states or actions are not float64 tensors.
+            ValueError: If shapes disagree, values are not finite, or an option is out of range.
+            PhysicsError: If the physics fails and does not say where.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
+            >>> spec = StateSpec(["x"], ["v"])
+            >>> dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + 0.1 * X[:, 1:])
+            >>> x, v = torch.zeros(1, 1).double(), torch.ones(1, 3, 1).double()
+            >>> dynamics.free_run(x, v).mean.flatten()
+            tensor([0.1000, 0.2000, 0.3000], dtype=torch.float64)
+        """
+        return free_run(
+            self.spec,
+            self.sample_functions,
+            self.noise_variance,
+            initial_states,
+            actions,
+            num_functions=num_functions,
+            level=level,
+            noise=noise,
             state_bounds=state_bounds,
             seed=seed,
         )

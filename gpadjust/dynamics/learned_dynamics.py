@@ -303,6 +303,8 @@ class LearnedDynamics(Dynamics):
         """What these dynamics are, each setting as a text; of objects, the class."""
         parts = [*self._recipe.parts]
         several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
+        if self.physics is not None and self.physics.unknowns:
+            several["unknowns"] = {name: repr(u) for name, u in self.physics.unknowns.items()}
         kept = {k: v for k, v in self.fit_options.items() if k in KEPT and v is not None}
         return fingerprint(
             self,

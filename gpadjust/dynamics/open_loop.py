@@ -16,6 +16,25 @@ _AT_ONCE = 8  # windows whose particles move together: more leave the cache, at 
 Move = Callable[[Tensor, Tensor], Tensor]
 
 
+def of_states(values: Tensor, name: str, shape: tuple[int, ...]) -> Tensor:
+    """The user's numbers, one or more for each state, in float64.
+
+    Raises:
+        TypeError: If they are no numbers.
+        ValueError: If they are not of that shape.
+    """
+    try:
+        values = torch.as_tensor(values, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"Expected {name} as a tensor of numbers, got {values!r}.") from error
+    if values.shape != shape:
+        raise ValueError(
+            f"Expected {name} of shape {' x '.join(map(str, shape))}, an entry for each state, got "
+            f"shape {tuple(values.shape)}."
+        )
+    return values
+
+
 def steps_ahead(spec: StateSpec, data: Transitions) -> Tensor:
     """How many recorded steps lead on from each row, its own included: ``N`` whole numbers.
 
@@ -46,6 +65,33 @@ def chosen_starts(
     return chosen
 
 
+def move_on(
+    functions: Move, particles: Tensor, lost: Tensor, actions: Tensor, bounds: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Particles a step later, and which are lost by then; a lost one stays where it was.
+
+    Args:
+        functions: Functions of states ``K x n x ...`` and actions to next states.
+        particles: ``K x w x state_dim``.
+        lost: Which of them are lost already, ``K x w`` booleans.
+        actions: ``w x action_dim``.
+        bounds: Lower and upper ones of the states, ``2 x state_dim``.
+    """
+
+    def move(states: Tensor, actions: Tensor) -> Tensor:
+        blocks = (rows.unflatten(0, (len(particles), -1)) for rows in (states, actions))
+        parts = zip(*(block.split(_AT_ONCE, dim=1) for block in blocks), strict=True)
+        return torch.cat([functions(*part) for part in parts], dim=1).flatten(0, 1)
+
+    actions = actions.expand(len(particles), -1, -1)
+    after = step_or_nan(move, particles.flatten(0, 1), actions.flatten(0, 1)).view_as(particles)
+    fails = ~after.isfinite().all(-1)
+    if bounds is not None:
+        fails |= ((after < bounds[0]) | (after > bounds[1])).any(-1)
+    lost = lost | fails
+    return torch.where(lost.unsqueeze(-1), particles, after), lost
+
+
 def follow(
     functions: Move,
     num_functions: int,
@@ -64,12 +110,6 @@ def follow(
         chosen: The rows at which the windows of each horizon start.
         bounds: Lower and upper ones of the states, ``2 x state_dim``.
     """
-
-    def move(states: Tensor, actions: Tensor) -> Tensor:
-        blocks = (rows.unflatten(0, (num_functions, -1)) for rows in (states, actions))
-        parts = zip(*(block.split(_AT_ONCE, dim=1) for block in blocks), strict=True)
-        return torch.cat([functions(*part) for part in parts], dim=1).flatten(0, 1)
-
     # A window is the beginning of a longer one from the same row.
     starts = torch.cat(chosen).unique()
     longest = torch.zeros_like(starts)
@@ -84,14 +124,10 @@ def follow(
     }
     for t in range(int(longest.max()) if len(starts) else 0):
         going = (longest > t).nonzero().flatten()
-        before = particles[:, going]
-        actions = data.actions[starts[going] + t].expand(num_functions, -1, -1)
-        after = step_or_nan(move, before.flatten(0, 1), actions.flatten(0, 1)).view_as(before)
-        fails = ~after.isfinite().all(-1)
-        if bounds is not None:
-            fails |= ((after < bounds[0]) | (after > bounds[1])).any(-1)
-        lost[:, going] |= fails
-        particles[:, going] = torch.where(lost[:, going].unsqueeze(-1), before, after)
+        actions = data.actions[starts[going] + t]
+        particles[:, going], lost[:, going] = move_on(
+            functions, particles[:, going], lost[:, going], actions, bounds
+        )
         if t + 1 in horizons:
             those = torch.searchsorted(starts, chosen[horizons.index(t + 1)])
             found[t + 1] = particles[:, those], lost[:, those]

@@ -8,7 +8,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.open_loop import Move, chosen_starts, follow, steps_ahead
+from gpadjust.dynamics.open_loop import Move, chosen_starts, follow, of_states, steps_ahead
+from gpadjust.dynamics.particles import (
+    about_centre,
+    central_interval,
+    check_enough,
+    measurement_noise,
+)
 from gpadjust.dynamics.step_or_nan import step_or_nan
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models.sampled_functions import check_number
@@ -16,7 +22,6 @@ from gpadjust.states import StateSpec
 from gpadjust.validation import nlpd, rmse
 
 LEVEL = 0.95
-LEAST_FUNCTIONS = 39  # of as many draws, the outermost two are the ends of the central 95 %
 _CERTAIN = 1e-9  # of a typical change: a spread that is one of rounding errors
 
 
@@ -108,21 +113,16 @@ def score_trajectories(
         seed: The seed.
     """
     horizons = checked_horizons(horizons)
-    check_number(num_functions, "num_functions")
-    if num_functions < LEAST_FUNCTIONS:
-        raise ValueError(
-            f"Expected num_functions >= {LEAST_FUNCTIONS}, without which there are no ends of an "
-            f"interval of 95 %, got {num_functions}."
-        )
+    check_enough(num_functions, LEVEL)
     if max_windows is not None:
         check_number(max_windows, "max_windows")
     if units is None:
         units = typical_change(spec, data.states, data.next_states)
-    units = _of_states(units, "units", (spec.state_dim,))
+    units = of_states(units, "units", (spec.state_dim,))
     if not (units.isfinite() & (units > 0)).all():
         raise ValueError(f"Expected units that are finite and positive, got {units.tolist()}.")
     if state_bounds is not None:
-        state_bounds = _of_states(state_bounds, "state_bounds", (2, spec.state_dim))
+        state_bounds = of_states(state_bounds, "state_bounds", (2, spec.state_dim))
     chosen = chosen_starts(steps_ahead(spec, data), horizons, max_windows)
     generator = torch.Generator().manual_seed(seed)
     # Dynamics of a user's may draw from PyTorch's generator all the same.
@@ -142,20 +142,6 @@ def score_trajectories(
     columns = {name: torch.stack([each[name] for each in scores]) for name in scores[0]}
     names = tuple(spec.states[i] for i in spec.moving)
     return TrajectoryScores(horizons=horizons, states=names, **columns)
-
-
-def _of_states(values: Tensor, name: str, shape: tuple[int, ...]) -> Tensor:
-    """The user's numbers, in float64."""
-    try:
-        values = torch.as_tensor(values, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"Expected {name} as a tensor of numbers, got {values!r}.") from error
-    if values.shape != shape:
-        raise ValueError(
-            f"Expected {name} of shape {' x '.join(map(str, shape))}, an entry for each state, got "
-            f"shape {tuple(values.shape)}."
-        )
-    return values
 
 
 def typical_change(spec: StateSpec, states: Tensor, next_states: Tensor) -> Tensor:
@@ -193,23 +179,16 @@ def score_ends(
         none = units.new_full((len(moving),), torch.nan)
         found = dict.fromkeys(("nlpd", "coverage", "rmse"), none)
         return {**found, "energy": none[0], "num_windows": torch.tensor(0), "lost": none[0]}
-    # Where angles went round different ways, their mean is that on the circle.
-    centre = ends.particles.mean(0)
-    for i in spec.angle_columns:
-        angle = ends.particles[..., i]
-        centre[:, i] = torch.atan2(angle.sin().mean(0), angle.cos().mean(0))
-    cloud = spec.change(centre.expand_as(ends.particles), ends.particles)[..., moving]
-    y = spec.change(centre, ends.measured)[:, moving]
+    centre, cloud = about_centre(spec, ends.particles)
+    cloud, y = cloud[..., moving], spec.change(centre, ends.measured)[:, moving]
     scale, noise = units[moving], ends.noise[:, moving]
     mean, variance = cloud.mean(0), cloud.var(0) + noise.square()
     says = (variance.sqrt() > _CERTAIN * scale).all(0)
     silent = torch.full_like(scale, torch.nan)
 
-    z = torch.randn(ends.particles.shape, generator=generator, dtype=torch.float64)
-    for name, velocity in spec.integrated.items():  # its noise is that of its velocity
-        z[..., spec.states.index(name)] = z[..., spec.states.index(velocity)]
-    sample = cloud + noise * z[..., moving]
-    low, high = (_order_statistic(sample, p) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    drawn = measurement_noise(spec, ends.noise, len(cloud), generator)
+    sample = cloud + drawn[..., moving]
+    low, high = central_interval(sample, LEVEL)
     inside = ((y >= low) & (y <= high)).double().masked_fill(y.isnan(), torch.nan).nanmean(0)
     return {
         "nlpd": nlpd(mean, variance, y).where(says, silent),
@@ -231,14 +210,3 @@ def energy_score(sample: Tensor, y: Tensor) -> Tensor:
     mode = "donot_use_mm_for_euclid_dist"
     pairs = [torch.cdist(each, each, compute_mode=mode).sum().item() for each in sample]
     return (error - error.new_tensor(pairs) / (2 * num * (num - 1))).mean()
-
-
-def _order_statistic(sample: Tensor, level: float) -> Tensor:
-    """What a further draw is below with this probability, from ``K x w x m``: ``w x m``.
-
-    The i-th smallest of K draws is so with probability i / (K + 1); between them it is a line.
-    """
-    ordered = sample.sort(0).values
-    place = level * (len(sample) + 1) - 1
-    below = min(max(int(place), 0), len(sample) - 2)
-    return ordered[below].lerp(ordered[below + 1], min(max(place - below, 0.0), 1.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.next_state_physics import check_next_values
-from gpadjust.physics import Physics, PhysicsError
+from gpadjust.physics import ParameterValues, Physics, PhysicsError
 from gpadjust.physics.memo import RowMemo, row_keys
 from gpadjust.states import StateSpec
 
@@ -88,22 +88,28 @@ class TransitionPhysics(Physics):
     """
 
     def __init__(self, physics: Physics, targets: TransitionTargets) -> None:
-        super().__init__(memo=0, name=physics.name)
+        super().__init__(unknowns=physics.unknowns, memo=0, name=physics.name)
         self.physics = physics
         self.targets = targets
         self.num_outputs = len(targets.predicted)
         self._known = RowMemo(2**62)
 
-    def evaluate(self, X: Tensor) -> Tensor:
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The targets that the physics stands for, ``N x m``."""
+        # Not forward: an error's rows are then still those of X.
+        return self._targets_of(self.physics._evaluate_rows, X, *parameters)
+
+    def _targets_of(
+        self, ask: Callable[[Tensor], Tensor], X: Tensor, *parameters: ParameterValues
+    ) -> Tensor:
+        """The targets by what the physics is asked of its rows."""
         targets = self.targets
         num_states = len(targets.spec.moving)
         states = X[:, :num_states]
         read = X[:, : num_states + targets.spec.action_dim]
         try:
-            # Not forward: an error's rows are then still those of X.
             self.physics._check_input(read)
-            following = self.physics._evaluate_rows(self.physics._columns(read))
+            following = ask(self.physics.rows_of(read, *parameters))
         except PhysicsError as error:
             error.partial = None  # next states, which are no targets
             raise
@@ -139,8 +145,11 @@ class TransitionPhysics(Physics):
         self._known = RowMemo(self._known.capacity)
         self.physics.forget()
 
+    def _rows_anew(self, rows: Tensor) -> Tensor:
+        return self._targets_of(self.physics._rows_anew, *self._split(rows))
+
     def _recall(self, rows: Tensor) -> Tensor:
-        if not len(self._known) or self._state():
+        if not len(self._known) or self._state() or self.unknowns:
             return super()._recall(rows)
         slots = self._known.lookup(row_keys(rows))
         new = slots < 0

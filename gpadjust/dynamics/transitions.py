@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.models.sampled_functions import check_number
 from gpadjust.models.training_data import check_finite, check_observed
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import check_columns
@@ -67,3 +68,31 @@ class Transitions(NamedTuple):
     def some(self, rows: Tensor) -> Transitions:
         """The rows of these numbers."""
         return Transitions(*(tensor[rows] for tensor in self))
+
+    def spread(self, number: int, seed: int = 0) -> Transitions:
+        """So many of the rows, drawn evenly: one of each of as many parts of the same length.
+
+        Args:
+            number: How many rows.
+            seed: Seed of the draw; PyTorch's generator is left as it is.
+
+        Raises:
+            ValueError: If there are fewer, or ``number`` is no positive whole number.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import Transitions
+            >>> rows = torch.arange(100, dtype=torch.float64).unsqueeze(-1)
+            >>> Transitions(rows, rows, rows + 1).spread(4).states.flatten() // 25
+            tensor([0., 1., 2., 3.], dtype=torch.float64)
+        """
+        check_number(number, "number")
+        if number > len(self.states):
+            raise ValueError(
+                f"Expected number <= {len(self.states)}, the transitions that there are, got "
+                f"{number}."
+            )
+        edges = torch.arange(number + 1) * len(self.states) // number
+        generator = torch.Generator().manual_seed(seed)
+        share = torch.rand(number, generator=generator, dtype=torch.float64)
+        return self.some(edges[:-1] + (share * edges.diff()).long())

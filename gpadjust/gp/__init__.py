@@ -1,5 +1,6 @@
 """The GPyTorch pieces: terms of a model, and what they are made of."""
 
+from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.physics_columns import AppendedPhysics, PhysicsInput
 from gpadjust.gp.physics_mean import PhysicsMean
 from gpadjust.gp.physics_scaled_kernel import PhysicsScaledKernel
@@ -7,6 +8,7 @@ from gpadjust.gp.term import SumOfTerms, Term, TermsMean
 
 __all__ = [
     "AppendedPhysics",
+    "OrthogonalKernel",
     "PhysicsInput",
     "PhysicsMean",
     "PhysicsScaledKernel",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
+from typing import Any
 
 import gpytorch
 import torch
@@ -22,12 +23,22 @@ class PhysicsInput(InputTransform):
     columns are then the whole prior, so that everything in BoTorch that bypasses a model's
     ``forward`` is right as well.
 
+    Unknown parameters of the physics are at the values that were learnt, the guesses at first.
+
     Args:
         physics: The physics f_p, ``... x n x d`` to ``... x n x k``; of several, side by side.
         num_inputs: Number ``d`` of raw input columns.
         base: The user's input transform, or none.
+
+    Attributes:
+        coordinates: Where the unknown parameters are, ``(S) x p``, in coordinates that are standard
+            normal by their prior; only if there are any.
+        draws: Draws from what is known of them, ``K x p``, in their units; likewise.
     """
 
+    draws: Tensor
+
+    coordinates: Parameter
     transform_on_train = True
     transform_on_eval = True
     transform_on_fantasize = True
@@ -40,11 +51,37 @@ class PhysicsInput(InputTransform):
         self.physics = physics
         self.num_inputs = num_inputs
         self.base = base
+        unknowns = physics.unknowns
+        if unknowns:
+            start = unknowns.coordinates(unknowns.guess)
+            self.register_parameter("coordinates", Parameter(start, requires_grad=False))
+            self.register_buffer("draws", unknowns.guess.unsqueeze(0))
 
     def transform(self, X: Tensor) -> Tensor:
         """Map raw ``X`` (``... x n x d``) to ``... x n x (d' + k)``."""
         self._check(X)
-        return self._append(X if self.base is None else self.base(X), self.physics(X))
+        return self._append(X if self.base is None else self.base(X), self.values(X))
+
+    def values(self, X: Tensor) -> Tensor:
+        """What the physics says, ``... x n x k``, by what was learnt of its parameters."""
+        unknowns = self.physics.unknowns
+        parameters = [unknowns.at(self.coordinates)] if unknowns else []
+        values: Tensor = self.physics(X, *parameters)
+        return values
+
+    def at(self, X: Tensor, coordinates: Tensor) -> Tensor:
+        """Like :meth:`transform`, with unknown parameters at other coordinates, ``... x p``.
+
+        The columns of f_p are NaN in rows at which it fails.
+        """
+        values = self.physics.or_nan(X, self.physics.unknowns.at(coordinates))
+        return self._append(X if self.base is None else self.base(X), values)
+
+    def remember(self, coordinates: Tensor) -> dict[str, Tensor]:
+        """Remember draws of the parameters at coordinates ``K x p``; return them by their names."""
+        self.draws = self.physics.unknowns.at(coordinates)
+        names = self.physics.unknowns.names
+        return {f"physics.{name}": self.draws[:, i] for i, name in enumerate(names)}
 
     def without_physics(self, X: Tensor) -> Tensor:
         """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
@@ -61,7 +98,7 @@ class PhysicsInput(InputTransform):
         """As :meth:`transform`, with the base transform's own preprocessing."""
         self._check(X)
         inputs = X if self.base is None else self.base.preprocess_transform(X)
-        return self._append(inputs, self.physics(X))
+        return self._append(inputs, self.values(X))
 
     def equals(self, other: InputTransform) -> bool:
         """Whether ``other`` appends the same physics after an equal base transform."""
@@ -71,10 +108,18 @@ class PhysicsInput(InputTransform):
             return True
         return self.base is not None and other.base is not None and self.base.equals(other.base)
 
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        """Take draws of the parameters, however many there are."""
+        draws = state_dict.get(f"{prefix}draws")
+        if draws is not None and self.physics.unknowns:
+            self.draws = torch.empty_like(draws)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
     @staticmethod
     def _append(inputs: Tensor, values: Tensor) -> Tensor:
-        """Join columns; the base transform may have added a batch."""
-        return torch.cat([inputs, values.expand(*inputs.shape[:-1], values.shape[-1])], dim=-1)
+        """Join columns; the base transform, or samples of parameters, may have added a batch."""
+        shape = torch.broadcast_shapes(inputs.shape[:-1], values.shape[:-1])
+        return torch.cat([inputs.expand(*shape, -1), values.expand(*shape, -1)], dim=-1)
 
     def _check(self, X: Tensor) -> None:
         if not isinstance(X, Tensor) or X.dtype != torch.float64:

@@ -224,8 +224,8 @@ class SumOfTerms(Kernel):
                 # Dense scaling is faster here than a product of diagonal linear operators.
                 part = part * b1 * b2 if diag else part * b1.unsqueeze(-1) * b2.unsqueeze(-2)
             total = part if total is None else total + part
-        if total is None:
-            raise ValueError("Expected at least one term with a kernel or an unknown mean.")
+        if total is None:  # all is known
+            total = self.terms[0].covariance(x1, x2, diag, known_mean=True)
         return total
 
     def basis_of_means(self, x: Tensor) -> Tensor | None:

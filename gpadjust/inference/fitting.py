@@ -13,6 +13,7 @@ from botorch.utils.transforms import is_fully_bayesian
 
 from gpadjust.gp import AppendedPhysics
 from gpadjust.gp.gaussian import threads_for
+from gpadjust.inference.calibrated_fit import calibrate
 from gpadjust.inference.full_bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
@@ -79,8 +80,14 @@ def fit(
     below, finds the modes; draws around them are weighted by importance sampling. Parameters
     without a prior get that of :func:`~gpadjust.inference.register_priors`, and the size of a
     constant and of a linear trend (of up to three inputs) in the data has no vote on how smooth
-    the functions are. What outputs share, such as the parameters of a physics, is at its most
-    likely value.
+    the functions are. The parameters of a network that is the physics are at their most likely
+    values.
+
+    *Unknown parameters of the physics*, which all outputs share, are learnt with all else, by
+    either method: least squares from several starts, then by turns with the hyper-parameters, from
+    which they are integrated out near their most likely values. ``"bayes"`` then draws them by
+    importance sampling given each of some samples of the hyper-parameters: each sample that the
+    model holds has its own physics. ``model.physics_parameters`` is what is known of them.
 
     ``"map"``: the most likely values. Random starts are screened in one batch beside the model's
     current parameters; L-BFGS then runs from the best of them, for all outputs in lockstep, on a
@@ -107,7 +114,8 @@ def fit(
             points; 32 if the physics learns). ``max_iterations``, the limit of L-BFGS iterations
             from each start (500). ``seed`` of random starts and draws (0); the global random
             state is left alone. Of ``"bayes"`` only: ``num_samples`` that the model is to hold
-            (default: 16, 8 with more than 40 points, 4 with more than 100), and ``num_draws`` that
+            (default: 16, 8 with more than 40 points, 4 with more than 100; 16 if the physics has
+            unknown parameters), and ``num_draws`` that
             they are chosen from (default: 1,024, down to 128 with more than 70 points).
 
     Returns:
@@ -125,6 +133,8 @@ def fit(
     Warns:
         OptimizationWarning: If the optimiser did not converge.
         SamplingWarning: If next to one draw has all the weight.
+        IdentifiabilityWarning: If the observations tell next to nothing of a parameter of the
+            physics, or of a combination of some.
     """
     given: dict[str, Any] = {**options}
     if isinstance(model, ModelListGP):
@@ -145,7 +155,7 @@ def fit(
     with threads_for(model.train_targets.shape[-1], others=True), _without_samples(model):
         try:
             if method == "map":
-                return maximise(model, search)
+                return _most_likely(model, search)
             if not isinstance(model, ExactGPBase):
                 raise TypeError(
                     f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP "
@@ -154,6 +164,12 @@ def fit(
             return sample(model, search, **given)
         finally:
             model.eval()
+
+
+def _most_likely(model: BatchedMultiOutputGPyTorchModel, search: Search) -> FitResult:
+    if isinstance(model, ExactGPBase) and model.has_unknowns:
+        return calibrate(model, search).result
+    return maximise(model, search)
 
 
 def _fit_list(
@@ -184,7 +200,7 @@ def _can_be_sampled(model: BatchedMultiOutputGPyTorchModel) -> bool:
     except ValueError:
         return False
     learnt = [name for name, p in model.named_parameters() if p.requires_grad]
-    return len(learnt) > len(shared_parameters(model))
+    return len(learnt) > len(shared_parameters(model)) or model.has_unknowns
 
 
 @contextmanager

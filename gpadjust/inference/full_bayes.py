@@ -10,6 +10,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from gpadjust.inference.calibrated_fit import (
+    calibrate_roughly,
+    draw_parameters,
+    warn_of_unidentified,
+)
 from gpadjust.inference.importance_sampling import Draws, Mixture
 from gpadjust.inference.importance_sampling import sample as importance_sample
 from gpadjust.inference.log_parameters import shared_parameters
@@ -24,6 +29,7 @@ _WIDEST = 4.0  # standard deviation of Laplace's approximation, in logarithms
 _DRAWS = (128, 1024)  # the least and the most by default
 _COST = 5_120_000  # draws times observations squared
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
+_SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
 _RETURNED = 256  # draws, at least
 LEAST_POWER = 0.05  # of the weights, for draws that show the posterior
 
@@ -62,26 +68,51 @@ def sample(
     model.check_can_be_sampled()
     target = deepcopy(model)
     settled = _settle_shared(target, search)
+    calibrated = calibrate_roughly(target, search) if target.has_unknowns else None
     register_priors(target)
-    objective = Objective(target, marginal=True, of_logs=True, vague_trend=True)
+    shared = None if calibrated is None else calibrated.shared
+    # A trend is what parameters explain, if there are any.
+    is_vague = calibrated is None
+    objective = Objective(target, marginal=True, of_logs=True, vague_trend=is_vague, shared=shared)
     n, parameters = objective.num_points, objective.parameters
     if num_draws is None:
         num_draws = max(_DRAWS[0], min(_DRAWS[1], _COST // n**2))
     if num_samples is None:
         num_samples = default_num_samples(n)
+        if calibrated is not None:
+            num_samples = max(num_samples, _SAMPLES_OF_PARAMETERS)
     generator = torch.Generator().manual_seed(search.seed)
-    draws = _draw(objective, search, num_draws, generator)
-    vectors = draws.resampled(max(_RETURNED, num_samples), generator)
+    number = max(_RETURNED, num_samples)
+    if parameters.names:
+        draws = _draw(objective, search, num_draws, generator)
+        vectors, power = draws.resampled(number, generator), draws.power
+    else:  # all is known but the parameters of the physics
+        vectors = parameters.current().expand(number, -1, -1)
+        power = torch.ones(parameters.num_problems, dtype=torch.float64)
+    if calibrated is not None:
+        vectors, coordinates, least = draw_parameters(
+            calibrated, parameters, vectors, num_samples, generator
+        )
+        power = power.minimum(least)
     rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
     if settled:
         model.train()  # its inputs are then transformed again, with what they are at now
     with torch.no_grad():
         for name, value in settled.items():
             model.get_parameter(name).copy_(value)
-    model.hold_samples(parameters.to_raw(parameters.unflatten(vectors[rows])))
-    result = SampleResult(draws.power.reshape(parameters.batch_shape), _named(objective, vectors))
+    held = parameters.to_raw(parameters.unflatten(vectors[rows]))
+    named = _named(objective, vectors)
+    if calibrated is not None:
+        held["input_transform.coordinates"] = coordinates[rows]
+        named |= model.input_transform.remember(coordinates)
+    model.hold_samples(held)
+    if calibrated is not None:
+        calibrated.calibration.direct(model, coordinates[rows])
+    result = SampleResult(power.reshape(parameters.batch_shape), named)
     if (result.power < LEAST_POWER).any():
         _warn(result)
+    if calibrated is not None:
+        warn_of_unidentified(calibrated, coordinates)
     return result
 
 

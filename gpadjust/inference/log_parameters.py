@@ -66,13 +66,13 @@ class LogParameters:
         is_constrained: Where bounds are those of the user's constraints, ``B x p``.
 
     Raises:
-        ValueError: If no parameter is learnable.
+        ValueError: If no parameter is learnable, nor any of the physics unknown.
     """
 
     def __init__(self, model: BatchedMultiOutputGPyTorchModel) -> None:
         self._model = model
         self._raw = {n: p for n, p in model.named_parameters() if p.requires_grad}
-        if not self._raw:
+        if not self._raw and not getattr(model, "has_unknowns", False):
             raise ValueError(
                 "The model has no learnable parameter: all have `requires_grad=False`."
             )
@@ -123,10 +123,14 @@ class LogParameters:
             values[name].detach().reshape(-1, self.num_problems, shape.numel())
             for name, shape in zip(self.names, self._shapes, strict=True)
         ]
+        if not parts:
+            return torch.zeros(1, self.num_problems, 0, dtype=torch.float64)
         return torch.cat(parts, dim=-1)
 
     def unflatten(self, vectors: Tensor) -> Parameters:
         """The reverse of :meth:`flatten`."""
+        if not self.names:
+            return {}
         parts = vectors.split([shape.numel() for shape in self._shapes], dim=-1)
         return {
             name: part.reshape(-1, *self.batch_shape, *shape)

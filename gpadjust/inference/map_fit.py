@@ -17,6 +17,7 @@ from botorch.optim.batched_lbfgs_b import fmin_l_bfgs_b_batched
 from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics
+from gpadjust.inference.calibration import Shared
 from gpadjust.inference.log_parameters import magnitude
 from gpadjust.inference.objective import Objective
 
@@ -61,14 +62,21 @@ class FitResult:
     converged: Tensor
 
 
-def maximise(model: BatchedMultiOutputGPyTorchModel, search: Search) -> FitResult:
+def maximise(
+    model: BatchedMultiOutputGPyTorchModel, search: Search, shared: Shared | None = None
+) -> FitResult:
     """Bring a model to its most likely hyper-parameters, see :func:`~gpadjust.fit`.
 
-    With many observations the search is made on some of them.
+    With many observations the search is made on some of them. What unknown parameters of a physics
+    add to the targets' distribution is ``shared``.
     """
     with _centers_at_rest(model):
-        objective = Objective(model)
+        objective = Objective(model, shared=shared)
         parameters = objective.parameters
+        if not parameters.names:  # all is known but the parameters of the physics
+            value = objective(parameters.current())[0].reshape(parameters.batch_shape)
+            model.eval()
+            return FitResult(-value, torch.ones_like(value, dtype=torch.bool))
         starts = _starts(objective, search)
         reached, values, converged = _optimise(objective, starts, search.max_iterations)
         best = values.argmin(0), torch.arange(parameters.num_problems)

@@ -13,6 +13,7 @@ from torch import Tensor
 from gpadjust.gp import AppendedPhysics, SumOfTerms, Term
 from gpadjust.gp.gaussian import LikelihoodValue, known_noise, negative_log_likelihood
 from gpadjust.gp.stationary import StationarySum, StationaryTerm, stationary_form
+from gpadjust.inference.calibration import Shared
 from gpadjust.inference.log_parameters import LogParameters
 from gpadjust.inference.log_priors import LogPriors
 from gpadjust.inference.target_distribution import ModuleDistribution, constant_means
@@ -51,6 +52,8 @@ class Objective:
             a trend says nothing of how smooth a function is. A model is else the less likely, the
             larger the functions that its prior allows beside the one that is seen, which speaks
             against all that are nearly polynomial.
+        shared: What unknown parameters of the physics add to mean and covariance; they are then
+            integrated out.
 
     Attributes:
         parameters: The vectors and their bounds.
@@ -65,14 +68,18 @@ class Objective:
         autograd: bool = False,
         rows: Tensor | None = None,
         vague_trend: bool = False,
+        shared: Shared | None = None,
     ) -> None:
         model.train()
         self.model = model
         self._kind = {"marginal": marginal, "of_logs": of_logs, "vague_trend": vague_trend}
         self.parameters = LogParameters(model)
         kept = slice(None) if rows is None else rows
+        self._all_shared, self._shared = shared, None if shared is None else shared.of_rows(kept)
         raw, noise = model.train_inputs[0], known_noise(model.likelihood)
         self.targets = model.train_targets[..., kept]
+        if self._shared is not None:
+            self.targets = self.targets - self._shared.mean
         noise = None if noise is None else noise[..., kept]
         with torch.no_grad():
             inputs = model.transform_inputs(raw)[..., kept, :]
@@ -101,7 +108,7 @@ class Objective:
 
     def of_rows(self, rows: Tensor) -> Objective:
         """The same objective of some of the observations, numbers of rows."""
-        return Objective(self.model, rows=rows, **self._kind)
+        return Objective(self.model, rows=rows, shared=self._all_shared, **self._kind)
 
     @property
     def num_points(self) -> int:
@@ -205,6 +212,8 @@ class Objective:
             mean, covariance, pull_back = self._distribution.with_pull_back(values)
         else:
             mean, covariance = self._distribution(values)
+        if self._shared is not None:
+            covariance = covariance + self._shared.covariance
         residual = (self.targets - mean).expand(covariance.shape[:-1])
         found = negative_log_likelihood(
             residual, covariance, self._basis, least, derivatives, self._trend
@@ -222,6 +231,8 @@ class Objective:
     def _assign_constants(self, vector: Tensor) -> None:
         values = self.parameters.unflatten(vector.unsqueeze(0))
         _, covariance = self._distribution({name: value[0] for name, value in values.items()})
+        if self._shared is not None:
+            covariance = covariance + self._shared.covariance
         inputs, basis = self._inputs, self._basis
         if self.parameters.learns_inputs:
             inputs = self.model.transform_inputs(inputs)
@@ -289,6 +300,8 @@ class Objective:
         parameters = self.parameters
         one_noise = bool((parameters.noise.sum(-1) == 1).all())
         if not parameters.is_batched or self._log_priors is not None or not one_noise:
+            return False
+        if self._shared is not None:
             return False
         vector = parameters.current()
         mean, covariance = self._distribution(parameters.unflatten(vector))

@@ -15,9 +15,10 @@ from gpadjust.models.hyperparameters import constraint_of, is_rho, kernels_of, k
 def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
     """Give a model the hyper-parameters of an earlier one of the same structure.
 
-    They are the same in the user's units: lengthscales, centres, and the variance of a scaling of
-    the physics, stay; the other variances follow the units that the outcome transforms put the
-    targets in, which change with the data. Of a model that holds samples it is their mean.
+    They are the same in the user's units: lengthscales, centres, unknown parameters of the physics,
+    and the variance of a scaling of it, stay; the other variances follow the units that the outcome
+    transforms put the targets in, which change with the data. Of a model that holds samples it is
+    their mean.
 
     Args:
         model: The model to start, changed in place.
@@ -29,6 +30,9 @@ def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
     ratio = 2 * (previous._units()[1] / model._units()[1]).log().squeeze(-1)  # ... x (m)
     source = dict(previous.named_parameters())
     with torch.no_grad():
+        if model.has_unknowns and previous.has_unknowns:
+            model.train()  # its inputs are then transformed again
+            model.input_transform.coordinates.copy_(previous.input_transform.coordinates)
         for name, parameter in model.named_parameters():
             if not parameter.requires_grad:
                 continue
@@ -53,5 +57,5 @@ def _mean_of_samples(model: ExactGPBase) -> ExactGPBase:
     with torch.no_grad():
         for name, parameter in model.named_parameters():
             if held[name].dim() > parameter.dim():
-                parameter.copy_(held[name].mean(0))
+                parameter.copy_(held[name].mean(0).reshape(parameter.shape))
     return model

@@ -3,8 +3,11 @@
 from gpadjust.models.adjusted_gp import AdjustedGP, Adjustment
 from gpadjust.models.ar1 import AR1
 from gpadjust.models.baselines import BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust.models.calibrated_physics import CalibratedPhysics
 from gpadjust.models.cka import CKA
 from gpadjust.models.exact_gp_base import ExactGPBase, Prediction
+from gpadjust.models.hyperparameters import orthogonal_rbf
+from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.rra import RRA, PaperRRA
 from gpadjust.models.sampled_functions import SampledFunctions
 from gpadjust.models.saving import load, save
@@ -17,14 +20,17 @@ __all__ = [
     "AdjustedGP",
     "Adjustment",
     "BiasGP",
+    "CalibratedPhysics",
     "ExactGPBase",
     "PaperRRA",
     "PhysicsMeanGP",
+    "PhysicsParameters",
     "Prediction",
     "SampledFunctions",
     "ScaleGP",
     "StackedGP",
     "ZeroMeanGP",
     "load",
+    "orthogonal_rbf",
     "save",
 ]

@@ -20,6 +20,7 @@ from gpadjust.gp import AppendedPhysics, PhysicsInput, Term
 from gpadjust.gp.gaussian import least_squares
 from gpadjust.models.cholesky_strategy import Weights
 from gpadjust.models.exact_gp_base import ExactGPBase
+from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.training_data import ArrayLike, estimated, residual_scale, training_data
 from gpadjust.physics import Physics, as_physics
 
@@ -159,6 +160,15 @@ class AdjustedGP(ExactGPBase):
         """The physics f_p; of several, all of them side by side."""
         physics: Physics = self.input_transform.physics
         return physics
+
+    @property
+    def physics_parameters(self) -> PhysicsParameters:
+        """What the model knows of the unknown parameters of the physics.
+
+        Raises:
+            ValueError: If the physics has none.
+        """
+        return PhysicsParameters.of(self.input_transform if self.has_unknowns else None)
 
     @property
     def rho_names(self) -> tuple[str, ...]:

@@ -202,8 +202,14 @@ class AR1(ExactGPBase):
                     "AR1 needs a low level: pass `physics` with `bounds` (or with `low_X`), or "
                     "`low_X` with `low_Y`."
                 )
+            sampled = as_physics(physics)
+            if sampled.unknowns:
+                raise ValueError(
+                    f"AR1 samples its low level once, but physics {sampled.name!r} has unknown "
+                    f"parameters: {', '.join(sampled.unknowns)}. CKA learns them."
+                )
             with torch.no_grad():
-                low_Y = as_physics(physics)(low_X)
+                low_Y = sampled(low_X)
         low = training_data(low_X, low_Y, prefix="low")
         if low.X.shape[-1] != high.X.shape[-1] or low.Y.shape[-1] != high.Y.shape[-1]:
             raise ValueError(

@@ -53,7 +53,7 @@ class PreparedTerms(NamedTuple):
 
 def prepare(terms: list[Term], train: Tensor, with_graph: bool = False) -> PreparedTerms:
     """Prepare some terms, at training inputs ``... x n x (d + k)``, by autograd or faster."""
-    origin = train[..., : max(term.num_inputs for term in terms)].mean(-2, keepdim=True)
+    origin = train[..., : max((t.num_inputs for t in terms), default=0)].mean(-2, keepdim=True)
     found = [] if with_graph else terms
     matrices = {term.name: term.log_covariance_with(train, origin) for term in found}
     stacked = {name: matrix for name, matrix in matrices.items() if matrix is not None}

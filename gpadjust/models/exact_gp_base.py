@@ -22,10 +22,16 @@ from linear_operator import to_dense
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import SumOfTerms, Term, TermsMean
+from gpadjust.gp import PhysicsInput, SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import known_noise, noise_variances, threads_for
 from gpadjust.models.cholesky_strategy import CholeskyStrategy, Weights
-from gpadjust.models.hyperparameter_samples import HOLDS_SAMPLES, hold_samples, release_samples
+from gpadjust.models.hyperparameter_samples import (
+    HOLDS_SAMPLES,
+    hold_samples,
+    match_parameters,
+    release_samples,
+    transform_training_inputs,
+)
 from gpadjust.models.hyperparameters import learnt_noise, set_initial_values
 from gpadjust.models.posteriors import (
     HyperparameterMixture,
@@ -44,6 +50,9 @@ from gpadjust.models.training_data import (
     check_observed,
     to_tensor,
 )
+
+# What a state has as many of as there were draws, samples or points.
+_OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions")
 
 
 class Prediction(NamedTuple):
@@ -146,6 +155,12 @@ class ExactGPBase(SingleTaskGP):
         """The terms of the sum."""
         terms: Sequence[Term] = self.covar_module.terms
         return terms
+
+    @property
+    def has_unknowns(self) -> bool:
+        """Whether its physics has unknown parameters."""
+        transform = getattr(self, "input_transform", None)
+        return isinstance(transform, PhysicsInput) and bool(transform.physics.unknowns)
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -370,13 +385,14 @@ class ExactGPBase(SingleTaskGP):
                 f"Expected X with at least 2 dimensions (points x inputs), got {tuple(X.shape)}."
             )
         X = X if self.num_samples is None else X.unsqueeze(MCMC_DIM)
+        X = X.unsqueeze(-3) if self._num_outputs > 1 else X
         inputs = self.transform_inputs(X) if with_basis else self._inputs_without_basis(X)
         if inputs.shape[-1] != self.train_inputs[0].shape[-1]:
             raise ValueError(
                 f"Expected X with the {len(self.input_names)} columns that the model was built on, "
                 f"got shape {tuple(X.shape)}."
             )
-        return inputs.unsqueeze(-3) if self._num_outputs > 1 else inputs
+        return inputs
 
     def _inputs_without_basis(self, X: Tensor) -> Tensor:
         return self.transform_inputs(X)
@@ -402,7 +418,8 @@ class ExactGPBase(SingleTaskGP):
 
     def _joint(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
         """Mean ``... x (m) x q`` and covariance of a weighted sum of terms, in model units."""
-        strategy, prior = self.strategy(), inputs.new_zeros(())
+        q = inputs.shape[-2]
+        strategy, prior = self.strategy(), inputs.new_zeros(q, q)
         for term, weight in weights:
             if not term.is_known:
                 part = term.covariance(inputs, inputs)
@@ -584,6 +601,7 @@ class ExactGPBase(SingleTaskGP):
         }
         own = self.state_dict()
         other = {n for n in own.keys() & state_dict.keys() if own[n].shape != state_dict[n].shape}
+        other = {n for n in other if n.rpartition(".")[-1] not in _OF_ANY_NUMBER}
         if samples:  # of which there are as many of each
             sizes = {len(values) for values in samples.values()}
             other = {n for n in other if not _has_samples(state_dict[n], own[n], sizes)}
@@ -603,10 +621,17 @@ class ExactGPBase(SingleTaskGP):
             # Before samples are held, for which inputs are transformed once and for all.
             prefix = "input_transform."
             own = {n.removeprefix(prefix): v for n, v in state_dict.items() if n.startswith(prefix)}
+            if f"{prefix}coordinates" in samples:
+                own["coordinates"] = samples[f"{prefix}coordinates"][0].flatten()
             if own:
                 self.input_transform.load_state_dict(own, strict)
             self.hold_samples(samples)
-        return super().load_state_dict(state_dict, strict, *args, **kwargs)
+        elif self.has_unknowns and self.num_samples is None:
+            self.train()  # for inputs to be transformed again, with what is loaded
+        keys = super().load_state_dict(state_dict, strict, *args, **kwargs)
+        if self.num_samples is not None:
+            transform_training_inputs(self)
+        return keys
 
     @property
     def _subset_batch_dict(self) -> dict[str, int]:
@@ -634,6 +659,7 @@ class ExactGPBase(SingleTaskGP):
             # BoTorch subsets the transformed inputs only, and a later fit starts from these.
             subset._original_train_inputs = original[..., idcs if len(idcs) > 1 else idcs[0], :, :]
         subset.output_names = tuple(self.output_names[i] for i in idcs)
+        match_parameters(subset)
         return subset
 
     def _new_inputs(self, X: Tensor) -> Tensor:

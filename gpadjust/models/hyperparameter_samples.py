@@ -12,7 +12,7 @@ from gpytorch.likelihoods.noise_models import FixedGaussianNoise
 from torch import Size, Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp import AppendedPhysics
+from gpadjust.gp import AppendedPhysics, OrthogonalKernel
 
 HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
@@ -24,12 +24,36 @@ def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
     """Make a model a batch of itself, one for each sample; see :meth:`ExactGPBase.hold_samples`."""
     (num_samples,) = {len(values) for values in samples.values()}
     _change(model, lambda tensor: tensor.expand(num_samples, *tensor.shape).clone())
+    match_parameters(model)
     named = dict(model.named_parameters())
     with torch.no_grad():
         for name, values in samples.items():
-            named[name].copy_(values)
+            named[name].copy_(values.reshape(named[name].shape))
+    transform_training_inputs(model)
     model.num_samples = num_samples
     model._is_fully_bayesian = model._is_ensemble = True
+
+
+def transform_training_inputs(model: Any) -> None:
+    """Ask the physics about the training inputs again, by its parameters of each sample."""
+    if model.has_unknowns:
+        with torch.no_grad():
+            inputs = model.transform_inputs(model._original_train_inputs)
+        model.train_inputs = (inputs.clone(),)
+
+
+def match_parameters(model: Any) -> None:
+    """Give samples of the physics' parameters a dimension for outputs, if there are several."""
+    if model.has_unknowns:
+        coordinates = model.input_transform.coordinates
+        if coordinates.dim() > 1:
+            shape = (len(coordinates), *[1] * (model.num_outputs > 1), coordinates.shape[-1])
+            _set_coordinates(model, coordinates.reshape(shape))
+
+
+def _set_coordinates(model: Any, coordinates: Tensor) -> None:
+    """Give the parameters of the physics a batch, ``(S) x (1) x p``: the 1 is for the outputs."""
+    model.input_transform.coordinates = Parameter(coordinates.detach(), requires_grad=False)
 
 
 def release_samples(model: Any) -> None:
@@ -44,6 +68,8 @@ def release_samples(model: Any) -> None:
         # The samples share the noise of the training data, but not that of later observations.
         fixed.noise = fixed.noise[0]
     _change(model, lambda tensor: tensor[0])
+    if model.has_unknowns:
+        _set_coordinates(model, model.input_transform.coordinates.flatten())
     model.num_samples = None
     model._is_fully_bayesian = model._is_ensemble = False
 
@@ -80,13 +106,15 @@ def _change(model: Any, change: Callable[[Tensor], Tensor]) -> None:
             continue
         if isinstance(module, Kernel) and module._batch_shape[: len(outputs)] == outputs:
             module._batch_shape = changed(module._batch_shape)
-        if isinstance(module, AppendedPhysics | RFFKernel):
+        if isinstance(module, AppendedPhysics | OrthogonalKernel | RFFKernel):
             for name, buffer in list(module.named_buffers(recurse=False)):
                 setattr(module, name, change(buffer))
         for name, parameter in list(module.named_parameters(recurse=False)):
             if parameter.shape[: len(outputs)] == outputs:
                 learnt = parameter.requires_grad
                 setattr(module, name, Parameter(change(parameter.detach()), requires_grad=learnt))
+    if model.has_unknowns:
+        _set_coordinates(model, change(model.input_transform.coordinates))
     with torch.no_grad():
         model.train_inputs = tuple(change(t) for t in model.train_inputs)
         if model._original_train_inputs is not None:

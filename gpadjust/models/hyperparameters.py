@@ -14,7 +14,7 @@ from gpytorch.likelihoods import GaussianLikelihood, Likelihood
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import AppendedPhysics, PhysicsScaledKernel, SumOfTerms
+from gpadjust.gp import AppendedPhysics, OrthogonalKernel, PhysicsScaledKernel, SumOfTerms
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,7 @@ KINDS = {
 }
 RHO_VARIANCE = Kind(initial=0.5, bounds=(1e-9, 1e9), starts=(1e-2, 1e2), prior=(0.01, 4.0))
 """The outputscale of a rho: its prior is one of rho itself, which has no units."""
+_ROUNDING = 1e-12
 VAGUE_MEAN = 1e2
 """The prior variance of an unknown mean before a fit, in the typical size of an outputscale."""
 
@@ -105,6 +106,11 @@ def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
     constraint = default_constraint()
     base = RBFKernel(num_inputs, batch_shape=batch_shape, lengthscale_constraint=constraint)
     return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=default_constraint())
+
+
+def orthogonal_rbf(num_inputs: int, batch_shape: Size) -> OrthogonalKernel:
+    """The same, orthogonal to what unknown parameters of the physics explain: for a delta."""
+    return OrthogonalKernel(scaled_rbf(num_inputs, batch_shape))
 
 
 def learnt_noise(batch_shape: Size) -> Likelihood:
@@ -192,6 +198,8 @@ def _mean_square_residual(
 ) -> Tensor:
     """The mean square of what the prior mean leaves of the targets, or 1 for 0: ``... x (m)``."""
     unit = (targets - model.mean_module(inputs)).square().nanmean(-1)
+    if getattr(model, "has_unknowns", False):  # a physics that is right leaves rounding errors
+        unit = unit.maximum(_ROUNDING * targets.square().nanmean(-1))
     return unit.where(unit > 0, torch.ones_like(unit))
 
 

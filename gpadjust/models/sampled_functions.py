@@ -14,7 +14,7 @@ from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, RFFKernel, 
 from torch import Size, Tensor
 from torch.nn import Module, ModuleList
 
-from gpadjust.gp import SumOfTerms, Term
+from gpadjust.gp import OrthogonalKernel, SumOfTerms, Term
 from gpadjust.gp.gaussian import noise_variances
 from gpadjust.models.cholesky_strategy import covariances, prepare
 from gpadjust.models.hyperparameter_samples import take_samples
@@ -117,8 +117,9 @@ class SampledFunctions(Module):
         return self._to_user(self._values(self._inputs(X)))
 
     def _inputs(self, X: Tensor) -> Tensor:
-        inputs = X if self.input_transform is None else self.input_transform(X)
-        return inputs.unsqueeze(-3) if self.has_outputs else inputs
+        X = X.unsqueeze(-3) if self.has_outputs else X
+        inputs: Tensor = X if self.input_transform is None else self.input_transform(X)
+        return inputs
 
     def _to_user(self, values: Tensor) -> Tensor:
         values = values * self.scale + self.shift
@@ -209,12 +210,34 @@ class KernelFeatures(Module):
         return features
 
 
+class OrthogonalFeatures(Module):
+    """The features of an ``OrthogonalKernel``: those of its base kernel, less what they are not."""
+
+    def __init__(self, kernel: OrthogonalKernel, maps: Sequence[Module]) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.maps = ModuleList(maps)
+        with torch.no_grad():
+            along = kernel.directions.mT @ self._free(kernel.points)
+            self.taken = torch.linalg.solve_triangular(kernel.factor(), along, upper=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return ``... x n x D``."""
+        return self._free(x) - self.kernel.along(x) @ self.taken
+
+    def _free(self, x: Tensor) -> Tensor:
+        return side_by_side([each(x) for each in self.maps])
+
+
 def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> list[Module]:
     """The feature maps of a kernel, whose features side by side are those of the kernel."""
     if kernel is None:
         return []
     if isinstance(kernel, AdditiveKernel) and kernel.active_dims is None:
         return [m for part in kernel.kernels for m in _feature_maps(part, num_inputs, num_features)]
+    if isinstance(kernel, OrthogonalKernel):
+        free = _feature_maps(kernel.base_kernel, num_inputs, num_features)
+        return [OrthogonalFeatures(kernel, free)] if kernel.directions.shape[-1] else free
     scale = kernel if isinstance(kernel, ScaleKernel) else None
     base = kernel if scale is None else scale.base_kernel
     reads_all = base.active_dims is None and kernel.active_dims is None

@@ -63,8 +63,9 @@ def save(model: ExactGPBase, path: str | Path) -> None:
         physics = {name: import_path(part) for name, part in parts}
         if None in physics.values():
             missing.append("physics")
+        data: Any = model.data()
         with torch.no_grad():
-            f_p = given(model.data()["train_X"])
+            f_p = transform.values(data["train_X"])
         if f_p.shape[-1] != model.num_outputs * len(physics):
             raise ValueError("Expected a model of all outputs of its physics, got a subset.")
     content = {
@@ -127,11 +128,12 @@ def load(path: str | Path, **objects: Any) -> ExactGPBase:
     expected: Any = content["physics_values"]
     if expected is not None:
         with torch.no_grad():
-            found = model.input_transform.physics(content["data"]["train_X"])
+            found = model.input_transform.values(content["data"]["train_X"])
         if found.shape != expected.shape or not torch.allclose(found, expected, rtol=1e-6):
             raise ValueError(
                 f"{path} was saved with another physics: its values at the training inputs differ. "
-                "Give the one that the model was built with (of several, in the same order)."
+                "Give the one that the model was built with (of several, in the same order), with "
+                "the same priors of unknown parameters."
             )
     model.input_names, model.output_names = (tuple(names) for names in content["names"])
     return model.eval()

@@ -5,13 +5,16 @@ from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.function import FunctionPhysics, JoinedPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
+from gpadjust.physics.unknown import ParameterValues, Unknown
 
 __all__ = [
     "BlackBoxPhysics",
     "FunctionPhysics",
     "JoinedPhysics",
     "ODEPhysics",
+    "ParameterValues",
     "Physics",
     "PhysicsError",
+    "Unknown",
     "as_physics",
 ]

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from operator import index
 from typing import Any, ClassVar, Self, SupportsIndex
 
 import torch
-from torch import Tensor
+from torch import Size, Tensor
 
 from gpadjust.physics.carrier import pack, unpack
 from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.finite_difference import central_difference, value_and_central_difference
 from gpadjust.physics.memo import RowMemo
+from gpadjust.physics.unknown import ParameterValues, Unknown, Unknowns
 
 
 class Physics(torch.nn.Module, ABC):
@@ -29,11 +31,16 @@ class Physics(torch.nn.Module, ABC):
       call ``forget()`` after those. A physics must therefore be deterministic. Looking a row up
       costs about a quarter of a microsecond; switch the memo off for a function that is cheaper.
       Threads may share a physics if what it calls allows that.
+    - *Unknown parameters.* ``unknowns`` names them and says what is known of them beforehand; then
+      ``evaluate`` is given their values, one for each row, and a model of the physics learns them
+      by :func:`gpadjust.fit` (other fits leave them at the guesses). Called without parameters the
+      physics takes their guesses.
     - *Gradients.* A result that needs a gradient, in X or in a parameter, is evaluated anew.
     - *Copies.* A deep copy of a physics without parameters and buffers is the physics itself, so
       that a simulator's handle outlives the copies that GP libraries make of their models.
 
     Args:
+        unknowns: The unknown parameters by name, such as ``{"mass": Unknown(1.0, factor=1.5)}``.
         inputs: The columns of X that the physics reads, in its order; negative ones count from
             the end. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
@@ -41,6 +48,7 @@ class Physics(torch.nn.Module, ABC):
 
     Attributes:
         num_outputs: ``m``; None until the first call if it is not known before.
+        unknowns: The unknown parameters, ``p`` of them.
 
     Raises:
         TypeError: If ``inputs`` holds something else than whole numbers, or ``memo`` is none.
@@ -64,11 +72,13 @@ class Physics(torch.nn.Module, ABC):
     def __init__(
         self,
         *,
+        unknowns: Mapping[str, Unknown] | None = None,
         inputs: Sequence[int] | None = None,
         memo: int = 100_000,
         name: str | None = None,
     ) -> None:
         super().__init__()
+        self.unknowns = Unknowns(unknowns)
         if whole_number("memo", memo) < 0:
             raise ValueError(f"memo must be a number of rows, 0 for no memo; found {memo}.")
         self.inputs = None if inputs is None else column_numbers(inputs)
@@ -78,21 +88,25 @@ class Physics(torch.nn.Module, ABC):
         self._warned: set[str] = set()
 
     @abstractmethod
-    def evaluate(self, X: Tensor) -> Tensor:
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The outputs of some rows, without memo and checks.
 
         Args:
             X: ``N x d``, the columns ``inputs`` only, ``N >= 1``.
+            parameters: One argument if there are unknown parameters, their values by name, ``N``
+                each: ``p.mass`` or ``p["mass"]``. None otherwise.
 
         Returns:
             ``N x m`` outputs, or ``N`` if ``m`` is 1.
         """
 
-    def forward(self, X: Tensor) -> Tensor:
+    def forward(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
         """The outputs of the physics.
 
         Args:
             X: ``batch_shape x n x d``, floating point.
+            parameters: Values of the unknown parameters, ``... x p``, which broadcast with the
+                batch shape: one vector for all ``n`` rows. Default: the guesses.
 
         Returns:
             ``batch_shape x n x m``, of X's dtype. Dimensions along which X is expanded (stride 0)
@@ -101,24 +115,56 @@ class Physics(torch.nn.Module, ABC):
 
         Raises:
             TypeError: If X is not a floating-point tensor.
-            ValueError: If X has fewer than two dimensions or lacks a column of ``inputs``.
+            ValueError: If X has fewer than two dimensions or lacks a column of ``inputs``, or
+                parameters are not of that shape.
             PhysicsError: If the physics fails, or returns something else than finite outputs.
         """
         self._check_input(X)
-        once = _without_copies(X)
-        columns = self._columns(once)
+        columns = self._columns(_without_copies(X))
+        shape = X.shape[:-1]
+        if self.unknowns or parameters is not None:
+            values = self._checked_parameters(parameters, X)
+            shape = Size((*torch.broadcast_shapes(X.shape[:-2], values.shape[:-1]), X.shape[-2]))
+            columns = _beside(columns, values)
         rows = columns.reshape(-1, columns.shape[-1])
         try:
             Y = self._evaluate_rows(rows)
         except PhysicsError as error:
             if error.inputs is None:
-                numbers = torch.arange(len(rows)).reshape(once.shape[:-1])
-                origin = numbers.expand(X.shape[:-1]).flatten()
+                numbers = torch.arange(len(rows)).reshape(columns.shape[:-1])
+                origin = numbers.expand(shape).flatten()
                 error.relocate(origin)
                 error.inputs = rows.detach()[origin[list(error.rows)]]
             raise
         m = Y.shape[-1]
-        return Y.reshape(*once.shape[:-1], m).expand(*X.shape[:-1], m)
+        return Y.reshape(*columns.shape[:-1], m).expand(*shape, m)
+
+    def or_nan(self, X: Tensor, parameters: Tensor) -> Tensor:
+        """As calling it, without memo and gradient, NaN in rows at which the physics fails.
+
+        Args:
+            X: As there.
+            parameters: As there.
+
+        Raises:
+            PhysicsError: If it does not say where it fails, or fails everywhere before its number
+                of outputs is known.
+        """
+        self._check_input(X)
+        with torch.no_grad():
+            columns = _beside(self._columns(X), self._checked_parameters(parameters, X))
+            blocks = columns.reshape(1, -1, columns.shape[-1])
+            found = [self._where_it_works(blocks[0])]
+            if isinstance(found[0], PhysicsError):
+                # A function of all rows may raise an error for what some parameters do to it.
+                blocks = columns.reshape(-1, *columns.shape[-2:])
+                found = [self._where_it_works(block) for block in blocks]
+            errors = [Y for Y in found if isinstance(Y, PhysicsError)]
+            if self.num_outputs is None:
+                raise errors[0]
+            failed = columns.new_full((blocks.shape[1], self.num_outputs), torch.nan)
+            values = [failed if isinstance(Y, PhysicsError) else Y for Y in found]
+        return torch.cat(values).reshape(*columns.shape[:-1], self.num_outputs)
 
     def forget(self) -> None:
         """Empties the memo; call it after a change that the physics cannot see."""
@@ -161,6 +207,12 @@ class Physics(torch.nn.Module, ABC):
         """Takes the state of a pickle."""
         super().__setstate__({name: unpack(value) for name, value in state.items()})
 
+    def rows_of(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
+        """What one of several physics reads of rows ``N x d`` and of the parameters of all."""
+        columns = self._columns(X)
+        own = [parameters[0][name].unsqueeze(-1) for name in self.unknowns]
+        return torch.cat([columns, *own], dim=-1) if own else columns
+
     def _state(self) -> list[Tensor]:
         """What the outputs depend on besides X, as far as torch knows."""
         return [*self.parameters(), *self.buffers()]
@@ -188,6 +240,20 @@ class Physics(torch.nn.Module, ABC):
 
     def _columns(self, X: Tensor) -> Tensor:
         return X if self.inputs is None else X[..., list(self.inputs)]
+
+    def _checked_parameters(self, parameters: Tensor | None, X: Tensor) -> Tensor:
+        """Values of the unknown parameters, ``... x p``."""
+        names = self.unknowns.names
+        if parameters is None:
+            return self.unknowns.guess.to(X)
+        if not torch.is_tensor(parameters) or parameters.shape[-1:] != (len(names),) or not names:
+            found = tuple(parameters.shape) if torch.is_tensor(parameters) else repr(parameters)
+            raise ValueError(
+                f"Physics {self.name!r} has {len(names)} unknown parameter(s)"
+                f"{': ' * bool(names)}{', '.join(names)}; expected parameters of shape ... x "
+                f"{len(names)}, found {found}."
+            )
+        return parameters.to(X)
 
     def _evaluate_rows(self, rows: Tensor) -> Tensor:
         if len(rows) == 0:
@@ -221,6 +287,50 @@ class Physics(torch.nn.Module, ABC):
             memo = self._memo = RowMemo(memo.capacity, state)
         return memo
 
+    def _where_it_works(self, rows: Tensor) -> Tensor | PhysicsError:
+        """``N x m`` outputs, NaN where the physics fails; its error if there is nothing else."""
+        working = torch.ones(len(rows), dtype=torch.bool)
+        while True:
+            try:
+                Y = self._rows_anew(rows[working])
+            except PhysicsError as error:
+                if error.partial is None:
+                    if not error.rows:
+                        raise
+                    working[working.nonzero().flatten()[list(error.rows)]] = False
+                    if not working.any():
+                        return error
+                    continue
+                Y = error.partial
+            values = Y.new_full((len(rows), Y.shape[-1]), torch.nan)
+            values[working] = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)
+            return values
+
+    def _rows_anew(self, rows: Tensor) -> Tensor:
+        """``N x m`` outputs, whatever is remembered."""
+        return self._call(rows)
+
+    def _slope(self, rows: Tensor, step: Tensor | None = None) -> Tensor:
+        """The Jacobian ``N x m x (d + p)`` by central differences in X, zero for the parameters."""
+        d = rows.shape[1] - len(self.unknowns)
+        slope = central_difference(self._along_columns(rows), rows[:, :d], step)
+        return torch.nn.functional.pad(slope, (0, len(self.unknowns)))
+
+    def _value_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """The outputs and, as by :meth:`_slope`, the Jacobian, in one call."""
+        d = rows.shape[1] - len(self.unknowns)
+        values, slope = value_and_central_difference(self._along_columns(rows), rows[:, :d])
+        return values, torch.nn.functional.pad(slope, (0, len(self.unknowns)))
+
+    def _along_columns(self, rows: Tensor) -> Callable[[Tensor], Tensor]:
+        """The outputs at rows of X moved as finite differences do it, each with its parameters."""
+        if not self.unknowns:
+            return self._call
+        d = rows.shape[1] - len(self.unknowns)
+        values = rows[:, d:]
+        every = torch.cat([values, values.repeat_interleave(d, dim=0).repeat(2, 1)])
+        return lambda moved: self._call(torch.cat([moved, every[-len(moved) :]], dim=-1))
+
     def _call_without_graph(self, rows: Tensor) -> Tensor:
         Y = self._call(rows)
         if Y.requires_grad:
@@ -234,7 +344,7 @@ class Physics(torch.nn.Module, ABC):
     def _call(self, rows: Tensor) -> Tensor:
         """Evaluates all rows and checks the result: ``N x m``, finite, of the rows' dtype."""
         try:
-            Y = self.evaluate(rows)
+            Y = self.evaluate(*self._split(rows))
         except PhysicsError as error:
             if error.partial is not None:
                 error.partial = self._check_shape(error.partial, len(rows)).to(rows)
@@ -257,6 +367,13 @@ class Physics(torch.nn.Module, ABC):
                 partial=Y.detach(),
             )
         return Y
+
+    def _split(self, rows: Tensor) -> tuple[Any, ...]:
+        """Rows ``N x (d + p)`` as the arguments of ``evaluate``."""
+        if not self.unknowns:
+            return (rows,)
+        d = rows.shape[-1] - len(self.unknowns)
+        return rows[:, :d], self.unknowns.named(rows[:, d:])
 
     def _check_shape(self, Y: Tensor, n: int) -> Tensor:
         expected = f"a real tensor of shape ({n}, m) or ({n},), one row per row of X"
@@ -292,6 +409,14 @@ def _without_copies(X: Tensor) -> Tensor:
         if X.shape[dim] > 1 and X.stride(dim) == 0:
             X = X.narrow(dim, 0, 1)
     return X
+
+
+def _beside(columns: Tensor, values: Tensor) -> Tensor:
+    """Rows ``... x n x d`` and, at the end of each, values ``... x p``."""
+    batch = torch.broadcast_shapes(columns.shape[:-2], values.shape[:-1])
+    rows = columns.expand(*batch, *columns.shape[-2:])
+    values = values.unsqueeze(-2).expand(*rows.shape[:-1], values.shape[-1])
+    return torch.cat([rows, values], dim=-1)
 
 
 def _same(a: Tensor, b: Tensor) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -13,10 +13,10 @@ from torch import Tensor
 from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.external_call import ExternalCall
-from gpadjust.physics.finite_difference import central_difference
 from gpadjust.physics.row_calls import call_rows, real_array
+from gpadjust.physics.unknown import ParameterValues, Unknown
 
-NumpyFunction = Callable[[NDArray[np.float64]], ArrayLike]
+NumpyFunction = Callable[..., ArrayLike]
 
 
 class BlackBoxPhysics(Physics):
@@ -37,11 +37,14 @@ class BlackBoxPhysics(Physics):
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
             ``batched=False``, one row ``(d,)`` to ``(m,)`` or a scalar.
+        unknowns: Unknown parameters by name; their values are then the function's second argument,
+            ``p.mass`` or ``p["mass"]``, ``N`` each, or with ``batched=False`` a number. They are
+            learnt by finite differences.
         batched: Whether the function takes all rows at once.
         gradient: Where the gradient in X comes from. ``"finite-difference"``: central differences,
             ``2 d`` evaluations per row in the backward pass, which the memo does not keep. A
-            callable: the Jacobian, from rows ``N x d`` to ``N x m x d``. None: no gradient, the
-            outputs are constants to autograd. Second derivatives are not available.
+            callable: the Jacobian, from rows ``N x d`` (and parameters) to ``N x m x d``. None: no
+            gradient, the outputs are constants to autograd. Second derivatives are not available.
         fd_step: The step of the finite differences in the units of X, one for all columns or one
             for each. Default: ``eps^(1/3) max(1, |x|)``.
         inputs: The columns of X that the function reads. Default: all.
@@ -68,6 +71,7 @@ class BlackBoxPhysics(Physics):
         self,
         function: NumpyFunction,
         *,
+        unknowns: Mapping[str, Unknown] | None = None,
         batched: bool = True,
         gradient: Literal["finite-difference"] | NumpyFunction | None = "finite-difference",
         fd_step: float | Sequence[float] | None = None,
@@ -86,17 +90,18 @@ class BlackBoxPhysics(Physics):
         if steps.size == 0 or not (np.isfinite(steps) & (steps > 0)).all():
             raise ValueError(f"fd_step must be positive, in the units of X; found {fd_step}.")
         name = name or getattr(function, "__name__", type(function).__name__)
-        super().__init__(inputs=inputs, memo=memo, name=name)
+        super().__init__(unknowns=unknowns, inputs=inputs, memo=memo, name=name)
         self.function = function
         self.batched = batched
         self.gradient = gradient
         self.fd_step = fd_step
 
-    def evaluate(self, X: Tensor) -> Tensor:
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The function's outputs.
 
         Args:
             X: ``N x d``.
+            parameters: Those that are unknown, if there are any.
 
         Returns:
             ``N x m``, or ``N`` if the function returns such.
@@ -104,12 +109,16 @@ class BlackBoxPhysics(Physics):
         Raises:
             PhysicsError: If single rows fail. It carries the outputs of the others.
         """
-        rows = _to_numpy(X)
-        Y = real_array(self.function(rows)) if self.batched else self._stack(rows)
+        rows, more = _to_numpy(X), [p.numpy() for p in parameters]
+        Y = real_array(self.function(rows, *more)) if self.batched else self._stack(rows, *more)
         return torch.from_numpy(Y).to(X.device)
 
-    def _stack(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        results = call_rows(self.function, rows)
+    def _stack(
+        self, rows: NDArray[np.float64], *parameters: ParameterValues
+    ) -> NDArray[np.float64]:
+        results = call_rows(
+            self.function, rows, *([p.row(i) for i in range(len(rows))] for p in parameters)
+        )
         errors = {i: y for i, y in enumerate(results) if isinstance(y, Exception)}
         outputs = {i: y for i, y in enumerate(results) if not isinstance(y, Exception)}
         lengths = {len(y) for y in outputs.values()}
@@ -145,7 +154,7 @@ class BlackBoxPhysics(Physics):
                 "gradient='finite-difference'."
             )
             return self._recall(rows)
-        d = rows.shape[1]
+        d = rows.shape[1] - len(self.unknowns)
         if self.fd_step is not None and np.size(self.fd_step) not in (1, d):
             raise ValueError(
                 f"fd_step of physics {self.name!r} has {np.size(self.fd_step)} entries, expected "
@@ -156,10 +165,10 @@ class BlackBoxPhysics(Physics):
     def _jacobian(self, rows: Tensor) -> Tensor:
         if callable(self.gradient):
             return self._user_jacobian(self.gradient, rows)
-        n, d = rows.shape
+        n, d = len(rows), rows.shape[1] - len(self.unknowns)
         step = None if self.fd_step is None else torch.tensor(self.fd_step, dtype=torch.float64)
         try:
-            return central_difference(self._call, rows.double().cpu(), step).to(rows)
+            return self._slope(rows.double().cpu(), step).to(rows)
         except PhysicsError as error:
             if error.inputs is None:
                 error.rows = tuple(sorted({i // d % n for i in error.rows}))
@@ -172,19 +181,21 @@ class BlackBoxPhysics(Physics):
 
     def _user_jacobian(self, gradient: NumpyFunction, rows: Tensor) -> Tensor:
         try:
-            J = real_array(gradient(_to_numpy(rows)))
+            X, *parameters = self._split(rows)
+            J = real_array(gradient(_to_numpy(X), *(p.numpy() for p in parameters)))
         except PhysicsError:
             raise
         except Exception as error:
             raise PhysicsError(
                 f"The gradient of physics {self.name!r} raised {type(error).__name__}: {error}."
             ) from error
-        expected = (len(rows), self.num_outputs, rows.shape[1])
+        expected = (len(rows), self.num_outputs, X.shape[1])
         if J.shape != expected or not np.isfinite(J).all():
             raise PhysicsError(
                 f"The gradient of physics {self.name!r} returned a Jacobian of shape {J.shape}, "
                 f"expected shape N x m x d = {expected} and finite numbers."
             )
+        J = np.pad(J, ((0, 0), (0, 0), (0, len(self.unknowns))))
         return torch.from_numpy(J).to(rows)
 
 

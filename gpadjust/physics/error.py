@@ -22,7 +22,8 @@ class PhysicsError(RuntimeError):
     Attributes:
         rows: Indices of the failing rows, counted over the flattened leading dimensions of X;
             empty if unknown.
-        inputs: ``len(rows) x d`` inputs of those rows, or None if unknown.
+        inputs: ``len(rows) x d`` inputs of those rows, and then unknown parameters, if the physics
+            has any; or None if unknown.
 
     Example:
         >>> error = PhysicsError("physics 'pendulum' returned NaN.", rows=[7])

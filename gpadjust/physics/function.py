@@ -11,6 +11,8 @@ from torch import Tensor
 
 from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.module_parameters import call_with, check_module
+from gpadjust.physics.unknown import ParameterValues, Unknown
 
 AnyPhysics = Physics | Callable[[Tensor], Tensor]
 Parts = Sequence[AnyPhysics] | Mapping[str, AnyPhysics]
@@ -21,14 +23,18 @@ class FunctionPhysics(Physics):
 
     Args:
         function: Maps rows ``N x d`` to outputs ``N x m``, or ``N`` if ``m`` is 1. The parameters
-            of a ``torch.nn.Module`` become parameters of the physics: they are learnt with the
-            GP's hyper-parameters by the marginal likelihood.
+            of a ``torch.nn.Module`` that require gradients, as those of a network, are brought to
+            their most likely values with the GP's hyper-parameters.
+        unknowns: Unknown parameters by name; their values are then the function's second argument,
+            ``N`` each: ``lambda X, p: p.mass * X[:, 0]``. Or names of parameters of the module that
+            the function is, a number each.
         inputs: The columns of X that the function reads. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: the function's.
 
     Raises:
         TypeError: If ``function`` is not callable.
+        ValueError: If ``function`` is a module that has only some of the unknown parameters.
 
     Example:
         >>> import torch
@@ -42,8 +48,9 @@ class FunctionPhysics(Physics):
 
     def __init__(
         self,
-        function: Callable[[Tensor], Tensor],
+        function: Callable[..., Tensor],
         *,
+        unknowns: Mapping[str, Unknown] | None = None,
         inputs: Sequence[int] | None = None,
         memo: int = 100_000,
         name: str | None = None,
@@ -51,14 +58,17 @@ class FunctionPhysics(Physics):
         if not callable(function):
             raise TypeError(f"function must be callable; found {type(function).__name__}.")
         name = name or getattr(function, "__name__", type(function).__name__)
-        super().__init__(inputs=inputs, memo=memo, name=name)
+        super().__init__(unknowns=unknowns, inputs=inputs, memo=memo, name=name)
+        if self.unknowns:
+            check_module(function, self.unknowns)
         self.function = function
 
-    def evaluate(self, X: Tensor) -> Tensor:
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The function's outputs.
 
         Args:
             X: ``N x d``.
+            parameters: Those that are unknown, if there are any.
 
         Returns:
             ``N x m`` or ``N``, as the function gives them.
@@ -71,7 +81,7 @@ class FunctionPhysics(Physics):
             "BlackBoxPhysics(function)."
         )
         try:
-            Y = self.function(X)
+            Y = call_with(self.function, X, *parameters) if parameters else self.function(X)
         except RuntimeError as error:
             if "Can't call numpy() on Tensor that requires grad" in str(error):
                 raise PhysicsError(use_black_box) from error
@@ -128,20 +138,21 @@ class JoinedPhysics(Physics):
             )
         if not physics:
             raise ValueError("There is no physics to join; give at least one.")
-        super().__init__(memo=0, name=name)
         given = [*physics.values()] if isinstance(physics, Mapping) else [*physics]
         parts = [as_physics(part) for part in given]
+        super().__init__(unknowns=_in_common(parts), memo=0, name=name)
         self.names = _names([*physics] if isinstance(physics, Mapping) else None, parts)
         for part, origin, own in zip(parts, given, self.names, strict=True):
             if part is not origin:  # a wrapper of ours
                 part.name = own
         self.parts = torch.nn.ModuleList(parts)
 
-    def evaluate(self, X: Tensor) -> Tensor:
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The outputs of the parts, each by its own memo.
 
         Args:
             X: ``N x d``.
+            parameters: Those that are unknown to some part, if there are any.
 
         Returns:
             ``N x (k m)``, those of the first part first.
@@ -149,13 +160,20 @@ class JoinedPhysics(Physics):
         Raises:
             PhysicsError: If a part fails, or the parts differ in their number of outputs.
         """
+        # Not forward: an error's rows are then still those of X.
+        return self._of_parts(lambda part, rows: part._evaluate_rows(rows), X, *parameters)
+
+    def _of_parts(
+        self, ask: Callable[[Physics, Tensor], Tensor], X: Tensor, *parameters: ParameterValues
+    ) -> Tensor:
+        """What each part is asked of its rows, side by side."""
         outputs = []
         for name, part in zip(self.names, cast(Iterable[Physics], self.parts), strict=True):
             part._check_input(X)
             try:
-                # Not forward: an error's rows are then still those of X.
-                outputs.append(part._evaluate_rows(part._columns(X)))
+                outputs.append(ask(part, part.rows_of(X, *parameters)))
             except PhysicsError as error:
+                error.partial = None  # outputs of this part alone
                 if name != part.name:
                     error.add_note(f"This physics is {name!r} of {self.names}.")
                 raise
@@ -181,7 +199,10 @@ class JoinedPhysics(Physics):
 
     def _evaluate_rows(self, rows: Tensor) -> Tensor:
         # Checks, memo and gradients are the parts'.
-        return self.evaluate(rows)
+        return self.evaluate(*self._split(rows))
+
+    def _rows_anew(self, rows: Tensor) -> Tensor:
+        return self._of_parts(lambda part, own: part._rows_anew(own), *self._split(rows))
 
 
 def as_physics(physics: AnyPhysics | Parts) -> Physics:
@@ -217,6 +238,20 @@ def as_physics(physics: AnyPhysics | Parts) -> Physics:
             "motion, or BlackBoxPhysics(function) for NumPy code and simulators."
         )
     return FunctionPhysics(physics)
+
+
+def _in_common(parts: Sequence[Physics]) -> dict[str, Unknown]:
+    """The unknown parameters of some physics; what has the same name is one."""
+    found: dict[str, Unknown] = {}
+    for part in parts:
+        for name, unknown in part.unknowns.items():
+            if found.setdefault(name, unknown) != unknown:
+                raise ValueError(
+                    f"Several physics have an unknown parameter {name!r}, which is then one and "
+                    f"the same, but say different things of it: {found[name]} and {unknown}. Say "
+                    "the same, or give it another name."
+                )
+    return found
 
 
 def _names(keys: list[str] | None, parts: list[Physics]) -> tuple[str, ...]:

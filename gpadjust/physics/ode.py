@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -13,7 +13,8 @@ from torchdiffeq import odeint
 from gpadjust.physics.base import Physics, whole_number
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.external_call import ExternalCall
-from gpadjust.physics.finite_difference import central_difference, value_and_central_difference
+from gpadjust.physics.module_parameters import call_with, check_module
+from gpadjust.physics.unknown import ParameterValues, Unknown
 
 FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
 ADAPTIVE_STEP = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
@@ -30,8 +31,8 @@ class ODEPhysics(Physics):
 
     Args:
         rhs: The time derivative :math:`g`, from the state ``N x state_dim`` and the action
-            ``N x a`` (``a`` may be 0) to ``N x state_dim``. The parameters of a
-            ``torch.nn.Module`` become parameters of the physics.
+            ``N x a`` (``a`` may be 0) to ``N x state_dim``; with ``unknowns`` also from their
+            values, ``N`` each.
         step: The duration of the step, in the time unit of ``rhs``.
         state_dim: The number of leading columns that hold the state; the others hold the action.
         substeps: Integration steps within the step, for the fixed-step methods.
@@ -42,9 +43,12 @@ class ODEPhysics(Physics):
         atol: Absolute tolerance of the adaptive methods, in the unit of the state.
         max_steps: The most steps that an adaptive method tries within ``step``.
         difference: Whether the output is the change of the state instead of the new state.
+        unknowns: Unknown parameters of the equation by name, its third argument:
+            ``lambda state, action, p: ... p.mass ...``. Or names of parameters of the module that
+            ``rhs`` is, a number each.
         gradient: Where the gradient in X comes from: ``"autograd"``, or ``"finite-difference"``,
             central differences in a single call, which is several times faster if there are many
-            substeps, with first derivatives only. (Parameters are learnt by autograd.)
+            substeps, with first derivatives only.
         inputs: The columns of X that hold state and action, in this order. Default: all.
         memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: that of ``rhs``.
@@ -66,7 +70,7 @@ class ODEPhysics(Physics):
 
     def __init__(
         self,
-        rhs: Callable[[Tensor, Tensor], Tensor],
+        rhs: Callable[..., Tensor],
         step: float,
         state_dim: int,
         *,
@@ -76,6 +80,7 @@ class ODEPhysics(Physics):
         atol: float = 1e-9,
         max_steps: int = 10_000,
         difference: bool = False,
+        unknowns: Mapping[str, Unknown] | None = None,
         gradient: Literal["autograd", "finite-difference"] = "autograd",
         inputs: Sequence[int] | None = None,
         memo: int = 100_000,
@@ -102,7 +107,8 @@ class ODEPhysics(Physics):
                 f"Unknown gradient {gradient!r}; use 'autograd' or 'finite-difference'."
             )
         name = name or getattr(rhs, "__name__", type(rhs).__name__)
-        super().__init__(inputs=inputs, memo=memo, name=name)
+        super().__init__(unknowns=unknowns, inputs=inputs, memo=memo, name=name)
+        check_module(rhs, self.unknowns)
         self.rhs = rhs
         self.step = float(step)
         self.state_dim = state_dim
@@ -115,11 +121,12 @@ class ODEPhysics(Physics):
         self.gradient = gradient
         self.num_outputs = state_dim
 
-    def evaluate(self, X: Tensor) -> Tensor:
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The state after the step, or its change.
 
         Args:
             X: ``N x (state_dim + a)``, states and actions.
+            parameters: Those that are unknown, if there are any.
 
         Returns:
             ``N x state_dim``.
@@ -136,7 +143,7 @@ class ODEPhysics(Physics):
         state, action = X[:, : self.state_dim], X[:, self.state_dim :]
 
         def derivative(t: Tensor, state: Tensor) -> Tensor:
-            rate = self.rhs(state, action)
+            rate = call_with(self.rhs, state, action, *parameters)
             if not torch.is_tensor(rate) or rate.shape != state.shape or rate.is_complex():
                 found: object = type(rate).__name__
                 if torch.is_tensor(rate):
@@ -181,13 +188,13 @@ class ODEPhysics(Physics):
         with torch.no_grad():
             try:
                 # In one call, as what it costs grows slowly with the rows.
-                values, slope = value_and_central_difference(self._call, rows.detach())
+                values, slope = self._value_and_slope(rows.detach())
             except PhysicsError:
                 values, slope = self._recall(rows.detach()), None  # which rows they are
 
         def jacobian(rows: Tensor) -> Tensor:
             with torch.no_grad():
-                return central_difference(self._call, rows) if slope is None else slope
+                return self._slope(rows) if slope is None else slope
 
         return ExternalCall.apply(rows, lambda _: values, jacobian)
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
 
-RowFunction = Callable[[NDArray[np.float64]], ArrayLike]
+RowFunction = Callable[..., ArrayLike]
 
 
 def call_rows(
-    function: RowFunction, X: NDArray[np.float64]
+    function: RowFunction, X: NDArray[np.float64], *more: Sequence[Any]
 ) -> list[NDArray[np.float64] | Exception]:
     """Calls a function on each row; a row that fails does not stop the others.
 
@@ -23,6 +24,7 @@ def call_rows(
     Args:
         function: Maps a row ``(d,)`` to a scalar or ``(m,)``.
         X: ``N x d``.
+        more: Further arguments of the function, one for each row.
 
     Returns:
         For each row its outputs ``(m,)``, or the exception it raised.
@@ -32,7 +34,7 @@ def call_rows(
         [array([0.5]), ZeroDivisionError('division by zero')]
     """
     results: list[NDArray[np.float64] | Exception] = Parallel(n_jobs=None)(
-        delayed(_call_row)(function, x) for x in X
+        delayed(_call_row)(function, *row) for row in zip(X, *more, strict=True)
     )
     return results
 
@@ -61,9 +63,9 @@ def real_array(values: ArrayLike) -> NDArray[np.float64]:
     return array.astype(np.float64, copy=False)
 
 
-def _call_row(function: RowFunction, x: NDArray[np.float64]) -> NDArray[np.float64] | Exception:
+def _call_row(function: RowFunction, *row: Any) -> NDArray[np.float64] | Exception:
     try:
-        y = np.atleast_1d(real_array(function(x)))
+        y = np.atleast_1d(real_array(function(*row)))
         if y.ndim > 1:
             raise ValueError(f"expected a scalar or outputs of shape (m,), found {y.shape}")
         return y

@@ -128,7 +128,13 @@ def compare(
     structure with too many unknown constants for the points is left out of models and tables,
     unless there is no other.
 
-    The parameters of a physics that learns are not fitted again, so that left-out observations have
+    A physics with unknown parameters is calibrated by each structure that uses it: then
+    ``"physics mean"`` is the calibrated physics and a delta (Kennedy and O'Hagan 2001), ``"CKA"``
+    that with rho and delta, and ``"calibrated physics"`` is one more structure without either,
+    :class:`~gpadjust.CalibratedPhysics`. Left-out observations are then predicted by weights,
+    however few there are.
+
+    The parameters of a network that learns are not fitted again, so that left-out observations have
     had their say in them. The advice says so.
 
     Args:
@@ -193,7 +199,8 @@ def compare(
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
                 result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
-                again = not shared_parameters(model) and _can_be_left_out(data)
+                apart = not shared_parameters(model) and not model.has_unknowns
+                again = apart and _can_be_left_out(data)
                 left_out[structure.name] = (
                     refitted(structure, data, part, input_transform, **{**_REFIT, **given})
                     if again

@@ -29,7 +29,7 @@ def refitted(
     """Predict each observation by full Bayes of all others.
 
     The ``n`` fits run in lockstep, as ``n m`` outputs of one model: the i-th copy of an output
-    lacks its i-th observation.
+    lacks its i-th observation. So the physics may have no unknown parameters, which outputs share.
 
     Args:
         structure: What to fit.

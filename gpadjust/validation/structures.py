@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
-from gpadjust.models import CKA, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.models import CKA, CalibratedPhysics, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.physics import JoinedPhysics, Physics
 
@@ -24,6 +24,7 @@ class Structure(NamedTuple):
         uses_physics: Whether it reads the physics at all.
         adjusts: Whether it does more than to take the physics as a mean.
         joins: Whether it takes several physics at once.
+        calibrates: Whether it is of a physics with unknown parameters only.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Structure(NamedTuple):
     uses_physics: bool = True
     adjusts: bool = True
     joins: bool = True
+    calibrates: bool = False
 
 
 def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> ExactGPBase:
@@ -39,6 +41,7 @@ def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> ExactGPBase:
 
 
 STRUCTURES = (
+    Structure("calibrated physics", CalibratedPhysics, adjusts=False, joins=False, calibrates=True),
     Structure("zero mean", _zero_mean, uses_physics=False, adjusts=False, joins=False),
     Structure("physics mean", PhysicsMeanGP, adjusts=False),
     Structure(
@@ -77,6 +80,14 @@ def candidates(
     Those with too many unknown constants for the points are left out, if there are others.
     """
     found: list[tuple[Structure, Physics]] = []
+    if not physics.unknowns:
+        plain = [structure for structure in structures if not structure.calibrates]
+        if not plain:
+            raise ValueError(
+                f"Physics {physics.name!r} has no unknown parameter for 'calibrated physics' to "
+                "learn; say which it has with unknowns={'mass': Unknown(1.0, factor=1.5)}."
+            )
+        structures = plain
     for structure in structures:
         if not isinstance(physics, JoinedPhysics) or not structure.uses_physics:
             found.append((structure, physics))

@@ -94,8 +94,10 @@ def test_terms_without_kernels(uniform):
     assert not unknown.is_known
     expected = torch.full((5, 5), 2.0, dtype=torch.float64)
     torch.testing.assert_close(SumOfTerms([known, unknown])(X).to_dense(), expected)
-    with pytest.raises(ValueError, match="at least one term with a kernel or an unknown mean"):
-        SumOfTerms([known]).covariance(X)
+    kernel, zero = SumOfTerms([known]), torch.zeros(5, 5, dtype=torch.float64)
+    torch.testing.assert_close(kernel(X).to_dense(), zero)  # nothing is unknown
+    torch.testing.assert_close(kernel(X, diag=True), zero[0])
+    torch.testing.assert_close(kernel(X, uniform(3, 2)).to_dense(), zero[:, :3])
 
 
 def test_terms_that_are_not_their_own():

@@ -15,7 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpadjust.physics import BlackBoxPhysics, PhysicsError
+from gpadjust.physics import BlackBoxPhysics, PhysicsError, Unknown
 
 
 def waves(X):
@@ -339,3 +339,45 @@ class TestCopies:
         Y = loaded(points(3, 2).requires_grad_())
         with pytest.raises(PhysicsError, match=r"set physics.gradient = ... again"):
             Y.sum().backward()
+
+
+UNKNOWNS = {"gain": Unknown(1.0, sd=1.0), "rate": Unknown(2.0, factor=1.5)}
+
+
+class TestUnknownParameters:
+    @staticmethod
+    def decay(x, p):
+        return p.gain * np.exp(-p.rate * x[..., 0]) * x[..., 1]
+
+    @staticmethod
+    def jacobian(X, p):
+        size = p.gain * np.exp(-p.rate * X[:, 0])
+        return np.stack([-p.rate * size * X[:, 1], size], -1)[:, None, :]
+
+    @pytest.mark.parametrize("batched", [True, False])
+    @pytest.mark.parametrize("how", [{"gradient": jacobian}, {"fd_step": [1e-5, 1e-4]}])
+    def test_gradient(self, batched, how, points):
+        options = {"unknowns": UNKNOWNS, "batched": batched, **how}
+        X, values = points(2, 3, 2).requires_grad_(), points(2, 2, seed=1)
+        found = BlackBoxPhysics(self.decay, **options)(X, values)
+        gain, rate = values.unsqueeze(-2).unbind(-1)
+        expected = (gain * (-rate * X[..., 0]).exp() * X[..., 1]).unsqueeze(-1)
+        torch.testing.assert_close(found, expected)
+        slopes = [torch.autograd.grad(Y.square().sum(), X)[0] for Y in (found, expected)]
+        torch.testing.assert_close(*slopes, rtol=1e-6, atol=1e-6)
+
+    def test_failure_in_finite_differences_names_the_row(self):
+        physics = BlackBoxPhysics(lambda x, p: np.sqrt(x[:, 0] - p.gain), unknowns=UNKNOWNS)
+        X = torch.tensor([[4.0], [1.0]], dtype=torch.float64).requires_grad_()
+        Y = physics(X, torch.tensor([[0.0, 2.0], [1.0, 2.0]], dtype=torch.float64))
+        with np.errstate(invalid="ignore"), pytest.raises(PhysicsError) as caught:
+            Y.sum().backward()
+        assert caught.value.rows == (3,)
+        assert caught.value.inputs.tolist() == [[1.0, 1.0, 2.0]]
+
+    def test_in_threads(self, points):
+        X, values = points(3, 2), points(2, 2, seed=1)
+        physics = BlackBoxPhysics(self.decay, unknowns=UNKNOWNS, batched=False, memo=0)
+        expected = physics(X, values)
+        with joblib.parallel_config(backend="threading", n_jobs=2):
+            torch.testing.assert_close(physics(X, values), expected)

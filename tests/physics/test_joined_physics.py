@@ -14,6 +14,7 @@ from gpadjust.physics import (
     JoinedPhysics,
     ODEPhysics,
     PhysicsError,
+    Unknown,
 )
 
 
@@ -158,3 +159,64 @@ class TestCopies:
             pickle.dumps(JoinedPhysics([total, lambda X: X]))
         scaled = JoinedPhysics([total, lambda X: 2 * X[:, 0]])
         assert torch.equal(pickle.loads(cloudpickle.dumps(scaled))(X), scaled(X))
+
+
+MASS, DRAG = Unknown(1.0, factor=1.5), Unknown(0.1, bounds=(0.0, 1.0))
+
+
+def push(X, p):
+    return X[:, 0] / p.mass
+
+
+def fall(X, p):
+    return (p.mass * X[:, 0] - p.drag).sqrt()
+
+
+class TestUnknownParameters:
+    @staticmethod
+    def parts(memo=1000):
+        """Their own columns and parameters, of which the mass is one and the same."""
+        first = FunctionPhysics(push, unknowns={"mass": MASS}, inputs=[1], memo=memo)
+        unknowns = {"drag": DRAG, "mass": MASS}
+        return [first, FunctionPhysics(fall, unknowns=unknowns, memo=memo), total]
+
+    @pytest.mark.parametrize("memo", [0, 1000])
+    def test_of_the_same_name_are_one(self, memo, points):
+        X = points(4, 2).square() + 1
+        values = torch.tensor([[1.0, 0.5], [2.0, 0.1], [3.0, 0.9]], dtype=torch.float64)
+        joined = JoinedPhysics(self.parts(memo))
+        assert {**joined.unknowns} == {"mass": MASS, "drag": DRAG}
+        mass, drag = values.unsqueeze(-2).unbind(-1)
+        x, y = X.unbind(-1)
+        expected = torch.stack([y / mass, (mass * x - drag).sqrt(), (x + y).expand(3, 4)], -1)
+        nested = JoinedPhysics([JoinedPhysics(self.parts(memo)), lambda X: X[:, [0, 0, 0]]])
+        for found in (joined(X, values), joined.or_nan(X, values), nested(X, values)[..., :3]):
+            torch.testing.assert_close(found, expected)
+
+    def test_that_contradict_each_other(self):
+        parts = self.parts()
+        parts[2] = FunctionPhysics(push, unknowns={"mass": Unknown(1.0, sd=0.1)})
+        message = "parameter 'mass', which is then one.*factor=1.5.*sd=0.1.*or give it another name"
+        with pytest.raises(ValueError, match=message):
+            JoinedPhysics(parts)
+
+    @pytest.mark.parametrize("memo", [0, 1000])
+    def test_at_which_a_part_fails(self, memo):
+        X = torch.tensor([[1.0, 3.0], [2.0, 4.0]], dtype=torch.float64)
+        values = torch.tensor([[1.0, 0.5], [1.0, 1.5], [1.0, 9.0]], dtype=torch.float64)
+        joined = JoinedPhysics(self.parts(memo))
+        found = joined.or_nan(X, values)
+        assert found.isnan().all(-1).tolist() == [[False, False], [True, False], [True, True]]
+        assert found.isnan().any(-1).tolist() == found.isnan().all(-1).tolist()
+        with pytest.raises(PhysicsError, match="'fall' returned NaN") as caught:
+            joined(X, values)
+        assert caught.value.rows == (2, 4, 5)
+        assert caught.value.inputs[0].tolist() == [1.0, 3.0, 1.0, 1.5]
+
+    def test_or_nan_leaves_the_memos_alone(self, numpy_counter, points):
+        counted = BlackBoxPhysics(lambda X, p: numpy_counter(X), unknowns={"mass": MASS})
+        joined = JoinedPhysics([counted, torch.sin])
+        for _ in range(2):
+            joined.or_nan(points(3, 2), torch.ones(1))
+        assert len(numpy_counter.rows) == 6
+        assert not len(counted._memo)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from gpadjust.physics import ODEPhysics, PhysicsError
+from gpadjust.physics import ODEPhysics, PhysicsError, Unknown
 from gpadjust.physics.ode import ADAPTIVE_STEP, FIXED_STEP
 
 
@@ -231,3 +231,48 @@ def test_gradients_by_finite_differences_are_those_of_autograd():
     assert learnt.rhs.stiffness.grad.abs() > 0
     with pytest.raises(ValueError, match="Unknown gradient 'none'; use 'autograd' or 'finite"):
         ODEPhysics(decay, **options, gradient="none")
+
+
+class TestUnknownParameters:
+    def test_of_a_decay(self, points):
+        X, rate = points(4, 1), torch.tensor([[0.5], [1.0], [2.0]], dtype=torch.float64)
+        unknowns = {"rate": Unknown(1.0, sd=1.0)}
+        decaying = ODEPhysics(lambda s, a, p: -p.rate[:, None] * s, 0.3, 1, unknowns=unknowns)
+        expected = X * (-0.3 * rate.unsqueeze(-1)).exp()
+        torch.testing.assert_close(decaying(X, rate), expected, rtol=1e-7, atol=0)
+
+    @pytest.mark.parametrize("gradient", ["autograd", "finite-difference"])
+    def test_of_a_module_are_those_of_a_function(self, gradient, points):
+        def rhs(state, action, p):
+            rate = -p.stiffness * state[:, 0] + action[:, 0]
+            return torch.stack([state[:, 1], rate], -1)
+
+        unknowns = {"stiffness": Unknown(4.0, factor=1.5)}
+        X, values = points(5, 3), torch.tensor([[3.0], [4.0], [9.0]], dtype=torch.float64)
+        slopes = []
+        for made, how in ((Spring(), gradient), (rhs, gradient), (rhs, "autograd")):
+            physics = ODEPhysics(made, 0.2, 2, unknowns=unknowns, gradient=how)
+            leaf = X.clone().requires_grad_()
+            found = physics(leaf, values)
+            for i, row in enumerate(values):
+                spring = ODEPhysics(Spring(row.item()), 0.2, 2)
+                torch.testing.assert_close(found[i], spring(X))
+            slopes.append(torch.autograd.grad(found.square().sum(), leaf)[0])
+        torch.testing.assert_close(slopes[0], slopes[2], rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(slopes[1], slopes[2], rtol=1e-8, atol=1e-8)
+
+    def test_that_an_adaptive_method_cannot_do(self):
+        unknowns = {"rate": Unknown(1.0, sd=1.0)}
+        physics = ODEPhysics(
+            lambda s, a, p: p.rate[:, None] * s**2,
+            *(1.0, 1),
+            unknowns=unknowns,
+            method="dopri5",
+            max_steps=50,
+        )
+        x = torch.tensor([[0.5], [0.8]], dtype=torch.float64)
+        rates = torch.tensor([[1.0], [3.0], [-1.0]], dtype=torch.float64)
+        expected = x / (1 - rates.unsqueeze(-1) * x)
+        expected[1] = torch.nan  # it blows up before 1, for which the method stops for all
+        found = physics.or_nan(x, rates)
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=0, equal_nan=True)

@@ -158,13 +158,18 @@ def plot_leave_one_out(
 
 
 def _physics(model: Any) -> list[tuple[str, Any]]:
-    """The physics of a model with their names."""
+    """The physics of a model with their names, unknown parameters at their means."""
     physics: Any = getattr(model, "physics", None)
+    known = model.physics_parameters if getattr(model, "has_unknowns", False) else {}
+
+    def at_means(part: Any) -> Any:
+        values = [known[name].mean() for name in getattr(part, "unknowns", ())]
+        return (lambda X: part(X, torch.stack(values))) if values else part
+
     if isinstance(physics, JoinedPhysics):
-        return [
-            (f"physics {n}", part) for n, part in zip(physics.names, physics.parts, strict=True)
-        ]
-    return [("physics", physics)] if callable(physics) else []
+        parts = zip(physics.names, physics.parts, strict=True)
+        return [(f"physics {name}", at_means(part)) for name, part in parts]
+    return [("physics", at_means(physics))] if callable(physics) else []
 
 
 def _check_inputs(X: Tensor, Y: Tensor | None) -> None:

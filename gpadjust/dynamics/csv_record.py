@@ -1,0 +1,70 @@
+"""A record from a CSV file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import torch
+
+from gpadjust.dynamics.control_steps import checked_step
+from gpadjust.dynamics.csv_columns import CsvColumns
+from gpadjust.dynamics.record import Record
+from gpadjust.states import StateSpec
+
+
+def read_record(
+    file: str | Path,
+    spec: StateSpec,
+    states: Mapping[str, str],
+    actions: Mapping[str, str],
+    time: str | float,
+    segment: str | None,
+    delimiter: str,
+) -> Record:
+    """The record in a file; see :meth:`~gpadjust.dynamics.Records.read_csv`.
+
+    Args:
+        file: The file.
+        spec: What the entries of states and actions are.
+        states: The column of each state.
+        actions: The column of each action.
+        time: The column of times, or the time from one row to the next.
+        segment: The column of labels, if there is one.
+        delimiter: What is between two fields.
+    """
+    table = CsvColumns(file, delimiter)
+    if isinstance(time, str):
+        times = table.numbers(time)
+    else:
+        times = checked_step(time, "time") * torch.arange(len(table), dtype=torch.float64)
+    measured = [
+        torch.full_like(times, math.nan)
+        if name in spec.previous and name == column and name not in table.names
+        else table.numbers(column, may_miss=True)
+        for name, column in states.items()
+    ]
+    taken = [table.numbers(column) for column in actions.values()]
+    labels = None if segment is None else table.texts(segment)
+    return Record(times, torch.stack(measured, -1), torch.stack(taken, -1), labels, str(file))
+
+
+def checked_columns(
+    given: Mapping[str, str] | None, names: Iterable[str], argument: str
+) -> dict[str, str]:
+    """The column of each name: the one given, or else that of the same name.
+
+    Raises:
+        TypeError: If it is no mapping.
+        ValueError: If it has another name.
+    """
+    given, names = {} if given is None else given, tuple(names)
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            f"Expected {argument} as a dictionary from names of the spec to columns, such as "
+            f"{{{names[0]!r}: 'q'}}, found {given!r}."
+        )
+    if unknown := [name for name in given if name not in names]:
+        raise ValueError(f"There is no {unknown[0]!r} among the {argument} of the spec, {names}.")
+    return {name: given.get(name, name) for name in names}

@@ -1,0 +1,145 @@
+"""Free runs: where given actions lead from given states, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from numbers import Real
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics.open_loop import Move, move_on, of_states
+from gpadjust.dynamics.particles import (
+    about_centre,
+    central_interval,
+    check_enough,
+    measurement_noise,
+)
+from gpadjust.dynamics.step_or_nan import step_or_nan
+from gpadjust.models.training_data import check_finite
+from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import check_columns
+
+_ROWS = 1024  # whose noise is asked for at once
+
+
+class FreeRun(NamedTuple):
+    r"""Where dynamics say that ``w`` sequences of ``T`` actions lead, each from its own state.
+
+    Step t is the state after t + 1 actions. Each of the ``K`` particles follows one function drawn
+    from the dynamics, and nothing that was measured on the way. The noise that the dynamics learnt
+    is added to what is reported of each step, as to a measurement of it, and moves nothing on; see
+    :class:`TrajectoryScores`. A particle that is lost, because it would leave the bounds or the
+    finite numbers or meet a failure of the physics, stays where it was before.
+
+    The mean of an angle is that on the circle. It goes on from the initial state without jumps of
+    :math:`2 \pi`, and interval and particles of each step are about it: compare with what was
+    measured by ``spec.change(run.mean, measured)``.
+
+    Args:
+        mean: ``w x T x state_dim``.
+        lower: What a state, measured if the noise was asked for, is above with probability
+            ``(1 + level) / 2``, ``w x T x state_dim``: an order statistic of the particles, which
+            holds for any distribution. NaN where the physics fails at the mean before, for the
+            noise's sake.
+        upper: What it is below with that probability.
+        particles: ``K x w x T x state_dim``, with the noise if that was asked for. An angle is
+            within half a turn of the mean, but for the noise.
+        lost: Share of the particles that are lost by then, ``w x T``.
+    """
+
+    mean: Tensor
+    lower: Tensor
+    upper: Tensor
+    particles: Tensor
+    lost: Tensor
+
+
+def free_run(
+    spec: StateSpec,
+    sample_functions: Callable[[int, int], Move],
+    noise_variance: Move,
+    initial_states: Tensor,
+    actions: Tensor,
+    *,
+    num_functions: int,
+    level: float,
+    noise: bool,
+    state_bounds: Tensor | None,
+    seed: int,
+) -> FreeRun:
+    """Free runs of dynamics; see :meth:`~gpadjust.dynamics.Dynamics.free_run`.
+
+    Args:
+        spec: What the entries of states and actions are.
+        sample_functions: Draws so many functions of states and actions by a seed.
+        noise_variance: Variances of measured next states about a function.
+        initial_states: As there, like all that follows.
+        actions: The actions.
+        num_functions: The number of functions.
+        level: The probability of the intervals.
+        noise: Whether particles and intervals have the noise.
+        state_bounds: Beyond which a particle is lost.
+        seed: The seed.
+    """
+    _check_start(spec, initial_states, actions)
+    if not isinstance(level, Real) or not 0 < level < 1:
+        raise ValueError(f"Expected level as a probability between 0 and 1, got {level!r}.")
+    check_enough(num_functions, level)
+    if state_bounds is not None:
+        state_bounds = of_states(state_bounds, "state_bounds", (2, spec.state_dim))
+    generator = torch.Generator().manual_seed(seed)
+    # Dynamics of a user's may draw from PyTorch's generator all the same.
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        functions = sample_functions(num_functions, seed)
+        particles = initial_states.expand(num_functions, -1, -1)
+        lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
+        path, lost_by_then = [], []
+        for each in actions.unbind(1):
+            particles, lost = move_on(functions, particles, lost, each, state_bounds)
+            path.append(particles)
+            lost_by_then.append(lost.double().mean(0))
+        centre, cloud = about_centre(spec, torch.stack(path, dim=2))
+        centre = _without_jumps(spec, initial_states, centre)
+        mean = centre + cloud.mean(0)
+        if noise:
+            before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
+            rows = before.flatten(0, 1).split(_ROWS), actions.flatten(0, 1).split(_ROWS)
+            variances = [step_or_nan(noise_variance, *part) for part in zip(*rows, strict=True)]
+            scatter = torch.cat(variances).sqrt().view_as(centre)
+            cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
+    low, high = central_interval(cloud, level)
+    return FreeRun(mean, centre + low, centre + high, centre + cloud, torch.stack(lost_by_then, 1))
+
+
+def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:
+    """A path ``w x T x state_dim`` whose angles go on from those of the initial states."""
+    path, angles = path.clone(), spec.angle_columns
+    before = torch.cat([initial_states.unsqueeze(1), path[:, :-1]], dim=1)
+    change = spec.change(before, path)[..., angles]
+    path[..., angles] = before[:, :1, angles] + change.cumsum(1)
+    return path
+
+
+def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> None:
+    """Raise an error unless each state has a sequence of actions, all of them finite."""
+    check_columns(initial_states, spec.state_dim, "initial_states")
+    check_columns(actions, spec.action_dim, "actions")
+    for name, tensor in (("initial_states", initial_states), ("actions", actions)):
+        if tensor.dtype != torch.float64:
+            raise TypeError(
+                f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`."
+            )
+    shapes = tuple(initial_states.shape), tuple(actions.shape)
+    fits = initial_states.dim() == 2 and actions.dim() == 3 and len(initial_states) == len(actions)
+    if not fits or not actions.numel():
+        raise ValueError(
+            f"Expected initial_states of shape w x {spec.state_dim} and actions of shape w x T x "
+            f"{spec.action_dim}, one sequence of one or more actions for each state, got "
+            f"{shapes[0]} and {shapes[1]}; of a single run, use `initial_state.unsqueeze(0)` and "
+            "`actions.unsqueeze(0)`."
+        )
+    check_finite(initial_states, "initial_states")
+    check_finite(actions, "actions")

@@ -1,0 +1,149 @@
+"""Fitting a model together with the unknown parameters of its physics."""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import torch
+from botorch.exceptions.warnings import OptimizationWarning
+from torch import Tensor
+
+from gpadjust.inference.calibration import Around, Calibration, Shared
+from gpadjust.inference.log_parameters import LogParameters
+from gpadjust.inference.map_fit import FitResult, Search, maximise
+from gpadjust.models import ExactGPBase
+
+_ROUNDS = 4  # of hyper-parameters and parameters by turns
+_ARRIVED = 0.05  # standard deviations that the parameters moved
+_GIVEN = 16  # vectors of hyper-parameters that parameters are drawn for, at least
+_UNTOLD = 0.15  # of the prior's precision: what else is known of a direction is next to nothing
+_TAKES_PART = 0.3  # cosine of a parameter and such a direction
+
+
+class IdentifiabilityWarning(UserWarning):
+    """The observations say next to nothing of some parameters of the physics."""
+
+
+class Calibrated(NamedTuple):
+    """A model at its most likely parameters, about which they are integrated out.
+
+    Attributes:
+        calibration: Its parameters.
+        near: The prior mean near them.
+        shared: What they add to the distribution of the targets.
+        result: What the fit of the hyper-parameters reached.
+    """
+
+    calibration: Calibration
+    near: Around
+    shared: Shared
+    result: FitResult
+
+
+def calibrate(model: ExactGPBase, search: Search) -> Calibrated:
+    """Bring a model to its most likely hyper-parameters, and then parameters of the physics.
+
+    The first are those most likely with the parameters integrated out, near their most likely
+    values; the search for these begins with least squares. The two go by turns until the parameters
+    stay. The model is left in train mode.
+    """
+    model.train()
+    calibration = Calibration(model)
+    start = calibration.point
+    try:
+        return _calibrate(calibration, search)
+    except BaseException:
+        calibration.move_to(start)
+        raise
+
+
+def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
+    model, generator = calibration.model, torch.Generator().manual_seed(search.seed)
+    point, variances = calibration.least_squares(generator)
+    near = calibration.around(point)
+    if not near.slope.any():
+        raise ValueError(
+            f"The unknown parameters {', '.join(calibration.unknowns)} of the physics change "
+            "nothing at the training inputs that the prior mean of the model takes from it; "
+            "correct the physics, or give rho a mean that is not 0 (rho_mean=1.0)."
+        )
+    information = calibration.independent(near, variances)
+    for _ in range(_ROUNDS):
+        calibration.move_to(point)
+        shared = calibration.shared(near, information)
+        result = maximise(model, search, shared)
+        search = search._replace(num_screened=0)
+        model.train()
+        parameters = LogParameters(model)
+        current = parameters.current()
+        _, covariance = calibration.covariance(parameters, current, point.unsqueeze(0))
+        target = calibration.newton(near, covariance[0])
+        _, chol = calibration.information(near, covariance[0]).posterior()
+        moved = (chol.mT @ (target - point)).norm()
+        point, near = target, calibration.around(target)
+        information = calibration.information(near, covariance[0])
+        if moved < _ARRIVED * len(point) ** 0.5:
+            break
+    calibration.move_to(point)
+    model.input_transform.remember(point.unsqueeze(0))
+    return Calibrated(calibration, near, calibration.shared(near, information), result)
+
+
+def calibrate_roughly(model: ExactGPBase, search: Search) -> Calibrated:
+    """As :func:`calibrate`, of a model whose hyper-parameters are sampled afterwards."""
+    search = search._replace(
+        num_starts=search.num_starts or 4,
+        num_screened=64 if search.num_screened is None else search.num_screened,
+        max_iterations=min(search.max_iterations, 60),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OptimizationWarning)
+        return calibrate(model, search)
+
+
+def draw_parameters(
+    calibrated: Calibrated,
+    parameters: LogParameters,
+    vectors: Tensor,
+    num_samples: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw parameters of the physics given draws of the hyper-parameters, ``K x B x q``.
+
+    Returns:
+        ``K`` or more vectors, the coordinates of parameters that go with each, ``x p``, and the
+        least power of importance weights.
+    """
+    count = max(num_samples, min(_GIVEN, len(vectors)))
+    rows = torch.linspace(0, len(vectors) - 1, count).round().long()
+    each = -(-len(vectors) // count)
+    draws = calibrated.calibration.draw(calibrated.near, parameters, vectors[rows], generator)
+    found = draws.resampled(each, generator)  # each x count x p
+    order = torch.rand(each, count, generator=generator).argsort(0)  # they come as they were drawn
+    found = found.gather(0, order.unsqueeze(-1).expand_as(found))
+    coordinates = found.transpose(0, 1).flatten(0, 1)
+    return vectors[rows].repeat_interleave(each, 0), coordinates, draws.power.min()
+
+
+def warn_of_unidentified(calibrated: Calibrated, coordinates: Tensor) -> None:
+    """Warn of parameters that the posterior knows no better than the prior.
+
+    Args:
+        calibrated: The model.
+        coordinates: Draws of the parameters, ``K x p``, standard normal by the prior.
+    """
+    names = calibrated.calibration.unknowns.names
+    values, vectors = torch.linalg.eigh(torch.cov(coordinates.mT).reshape(len(names), -1))
+    untold = vectors[:, values > 1 / (1 + _UNTOLD)]
+    part = untold.norm(dim=-1) > _TAKES_PART
+    if not part.any():
+        return
+    found = ", ".join(name for name, yes in zip(names, part.tolist(), strict=True) if yes)
+    warnings.warn(
+        f"The observations say next to nothing of {found} of the physics, or only of a combination "
+        "of them: their posterior is their prior there. Observe where they matter, give narrower "
+        "priors, or take one of them as known.",
+        IdentifiabilityWarning,
+        stacklevel=4,
+    )

@@ -1,0 +1,105 @@
+"""What a model knows of the unknown parameters of its physics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from gpadjust.gp import PhysicsInput
+from gpadjust.physics import Unknown
+
+
+class PhysicsParameters(Mapping[str, Tensor]):
+    """The posterior of the unknown parameters of a physics, as draws.
+
+    It maps names to their draws, ``K`` each. After a point fit (``"map"``), and in a model that was
+    not fitted, there is one, the value itself. What is learnt by conditioning on further
+    observations leaves them as they are, like hyper-parameters.
+
+    Args:
+        unknowns: The parameters.
+        draws: Draws from their posterior, ``K x p``, in their units.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import CalibratedPhysics, fit
+        >>> from gpadjust.physics import FunctionPhysics, Unknown
+        >>> law = FunctionPhysics(
+        ...     lambda t, p: 0.5 * p.g * t[:, 0] ** 2,
+        ...     unknowns={"g": Unknown(9.0, sd=1.0, unit="m/s²")},
+        ... )
+        >>> t = torch.linspace(0.1, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        >>> model = CalibratedPhysics(t, 0.5 * 9.81 * t**2, physics=law)
+        >>> result = fit(model)
+        >>> len(model.physics_parameters["g"])
+        256
+    """
+
+    def __init__(self, unknowns: Mapping[str, Unknown], draws: Tensor) -> None:
+        self.unknowns = unknowns
+        self.draws = draws
+
+    @classmethod
+    def of(cls, transform: PhysicsInput | None) -> PhysicsParameters:
+        """Those of a model's input transform."""
+        if transform is None:
+            raise ValueError(
+                "The physics has no unknown parameters; a physics names them as "
+                "unknowns={'mass': Unknown(1.0, factor=1.5)}."
+            )
+        return cls(transform.physics.unknowns, transform.draws)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """The draws of a parameter, ``K``."""
+        if name not in self.unknowns:
+            raise KeyError(f"There is no parameter {name!r}; there are {', '.join(self.unknowns)}.")
+        return self.draws[:, [*self.unknowns].index(name)]
+
+    def __iter__(self) -> Iterator[str]:
+        """The names."""
+        return iter(self.unknowns)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.unknowns)
+
+    @property
+    def mean(self) -> Tensor:
+        """Means, ``p``, in the parameters' units."""
+        return self.draws.mean(0)
+
+    @property
+    def sd(self) -> Tensor:
+        """Standard deviations, ``p``; zero of a single draw."""
+        return self.draws.std(0, correction=0)
+
+    def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
+        """Lower and upper ends of the central intervals, ``p`` each.
+
+        Args:
+            level: The probability that one holds, between 0 and 1.
+
+        Raises:
+            ValueError: If ``level`` is not between 0 and 1.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"Expected level between 0 and 1, got {level}.")
+        ends = torch.tensor([(1 - level) / 2, (1 + level) / 2]).to(self.draws)
+        low, high = self.draws.quantile(ends, dim=0)
+        return low, high
+
+    def __repr__(self) -> str:
+        """A table of means, intervals and priors."""
+        low, high = self.interval()
+        rows = [("", "mean", "95 % interval", "prior", "unit")]
+        for i, (name, unknown) in enumerate(self.unknowns.items()):
+            interval = f"{low[i]:.4g} to {high[i]:.4g}"
+            rows.append((name, f"{self.mean[i]:.4g}", interval, unknown.prior_text, unknown.unit))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = (
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        )
+        return "\n".join(lines)

@@ -1,0 +1,93 @@
+"""Learn from some transitions of a machine; compare free runs with what was measured."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics import Dynamics, FreeRun, Windows
+from gpadjust.inference import SamplingWarning
+from gpadjust.validation import nlpd, rmse
+from paper.common.experiment import Record
+from paper.real import HORIZONS, UNTAUGHT, Real, Settings
+from paper.real.learners import learnt
+from paper.real.systems import System, system
+
+_SHOWN = 2  # free runs that are kept for a figure
+_CERTAIN = 1e-9  # a standard deviation that is one of rounding errors
+
+
+def run(
+    experiment: Real, name: str, learner: str, n: int, seed: int, *, unfinished: Path
+) -> Record:
+    """Learn, and return the scores of each test: by steps ahead, of each state."""
+    warnings.simplefilter("ignore", SamplingWarning)
+    settings, known = experiment.settings, system(name)
+    data = known.drawn(n, seed)
+    begin = time.perf_counter()
+    dynamics = learnt(learner, known.machine, data, seed)
+    fitted = time.perf_counter()
+    tests = {test: _scores(dynamics, known, test, settings) for test in known.tests}
+    found: Record = {
+        "fit_seconds": fitted - begin,
+        "score_seconds": time.perf_counter() - fitted,
+        "tests": {test: scores for test, (scores, _) in tests.items()},
+    }
+    if learner in UNTAUGHT or (n == settings.drawn and seed == 0):
+        found["paths"] = {test: _paths(known, free) for test, (_, free) in tests.items()}
+    return found
+
+
+def _scores(
+    dynamics: Dynamics, known: System, test: str, settings: Settings
+) -> tuple[dict[str, Any], FreeRun]:
+    """Scores by name and steps ahead, and the free runs of which they are.
+
+    Those of one step are of all steps of the test.
+    """
+    single = dynamics.score(*known.steps(test))
+    windows = windows_of(known, test, settings)
+    free = dynamics.free_run(
+        windows.initial_states, windows.actions, num_functions=settings.num_functions
+    )
+    by_steps = {"1": {name: getattr(single, name) for name in ("rmse", "coverage", "nlpd")}}
+    by_steps |= {str(h): _of_free_runs(known, free, windows, h) for h in HORIZONS}
+    scores: dict[str, Any] = {
+        name: {steps: each[name].tolist() for steps, each in by_steps.items()}
+        for name in ("rmse", "coverage", "nlpd")
+    }
+    return {**scores, "lost": free.lost[:, -1].mean().item()}, free
+
+
+def windows_of(known: System, test: str, settings: Settings) -> Windows:
+    """The windows of a test, the same for all learners."""
+    return known.windows(test, HORIZONS[-1], settings.windows)
+
+
+def _of_free_runs(known: System, free: FreeRun, windows: Windows, steps: int) -> dict[str, Tensor]:
+    """The scores of each state after so many steps."""
+    mean, low, high = (part[:, steps - 1] for part in (free.mean, free.lower, free.upper))
+    measured = mean + known.machine.spec.change(mean, windows.measured[:, steps - 1])
+    variance = free.particles[:, :, steps - 1].var(0)
+    says = (variance.sqrt() > _CERTAIN).all(0)
+    silent = torch.full_like(says, torch.nan, dtype=mean.dtype)
+    inside = ((low <= measured) & (measured <= high)).double().mean(0)
+    return {
+        "rmse": rmse(mean, measured),
+        "coverage": inside.where(says, silent),
+        "nlpd": nlpd(mean, variance, measured).where(says, silent),
+    }
+
+
+def _paths(known: System, free: FreeRun) -> dict[str, Any]:
+    """A few free runs of the last angle: which windows they are, means and ends of intervals."""
+    rows = torch.linspace(0, len(free.mean) - 1, _SHOWN + 2).round().long()[1:-1].unique()
+    angle = known.machine.spec.angle_columns[-1]
+    parts = {"mean": free.mean, "lower": free.lower, "upper": free.upper}
+    paths = {name: part[rows, :, angle].tolist() for name, part in parts.items()}
+    return {"windows": rows.tolist(), **paths}

@@ -1,0 +1,125 @@
+"""The machines' records, cut into what is learnt from and what is tested at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics import Records, Transitions, Windows
+from paper.real.machines import DOUBLE_PENDULUM, PENDULUM, STEP, SUBSTEPS, Machine
+
+DATA = Path(__file__).parent / "data"
+
+
+@dataclass(frozen=True)
+class System:
+    """Records of a machine, of which some are learnt from and others are tested at.
+
+    Args:
+        machine: The machine.
+        folder: Where the files are in ``DATA``.
+        train: Files that are learnt from, without their endings.
+        tests: Those of each test, by its name.
+        actions: Columns of the actions that are called otherwise there.
+        segment: The column of segments.
+        moves: A rate in rad/s: of the tests only what is measured to be faster somewhere counts.
+    """
+
+    machine: Machine
+    folder: str
+    train: tuple[str, ...]
+    tests: Mapping[str, tuple[str, ...]]
+    actions: Mapping[str, str] = field(default_factory=dict)
+    segment: str | None = None
+    moves: float = 0.0
+
+    def describe(self) -> dict[str, Any]:
+        """All that decides what is learnt, in plain values."""
+        return {
+            "step": STEP,
+            "substeps": SUBSTEPS,
+            "train": list(self.train),
+            "tests": {name: list(files) for name, files in self.tests.items()},
+            "actions": dict(self.actions),
+            "moves": self.moves,
+            **{name: dict(parameters) for name, parameters in self.machine.known.items()},
+        }
+
+    def drawn(self, n: int, seed: int) -> Transitions:
+        """Transitions to learn from, spread over the records; ``n`` of them, or none.
+
+        Raises:
+            ValueError: If the records have fewer.
+        """
+        known = self._records(self.train).transitions(STEP)
+        return known.spread(n, seed) if n else known.rows(0, 0)
+
+    def steps(self, test: str) -> Transitions:
+        """The single steps of a test, that start where the machine moves."""
+        data = self._records(self.tests[test]).transitions(STEP)
+        return data.some(self._fast(data.states).nonzero().flatten())
+
+    def windows(self, test: str, length: int, number: int) -> Windows:
+        """So many windows of a test in which the machine moves, evenly spread."""
+        found = self._records(self.tests[test]).windows(length, STEP, stride=1)
+        moving = self._fast(found.initial_states) | self._fast(found.measured).any(1)
+        rows = moving.nonzero().flatten()
+        places = torch.linspace(0, len(rows) - 1, min(number, len(rows))).round().long()
+        return Windows(*(part[rows[places]] for part in found))
+
+    def _fast(self, states: Tensor) -> Tensor:
+        """Where a rate is above the threshold: the rates are the second half of the states."""
+        rates = states[..., states.shape[-1] // 2 :]
+        return (rates.abs() >= self.moves).any(-1)
+
+    def _records(self, files: tuple[str, ...]) -> Records:
+        return Records.read_csv(
+            [DATA / self.folder / f"{file}.csv" for file in files],
+            self.machine.spec,
+            actions=self.actions,
+            segment=self.segment,
+        )
+
+
+def _double_pendulum(*numbers: str) -> tuple[str, ...]:
+    return tuple(f"A0_20220815_{number}" for number in numbers)
+
+
+@cache
+def system(name: str) -> System:
+    """A system, by its name.
+
+    Raises:
+        KeyError: If there is none.
+    """
+    double: dict[str, Any] = {"machine": DOUBLE_PENDULUM, "folder": "double_pendulum"}
+    single: dict[str, Any] = {
+        "machine": PENDULUM,
+        "folder": "pendulum",
+        "train": ("energy_shaping",),
+        "segment": "segment",
+        "moves": 0.3,
+    }
+    return {
+        "double-pendulum": System(
+            **double,
+            train=_double_pendulum("00", "02", "03"),
+            tests={
+                "near": _double_pendulum("01", "12", "13"),
+                "far": _double_pendulum("04", "05"),
+            },
+        ),
+        "double-pendulum-harder": System(
+            **double,
+            train=_double_pendulum("01", "02", "03"),
+            tests={"harder": _double_pendulum("00", "12", "13")},
+        ),
+        "pendulum": System(**single, tests={"sac": ("sac",)}),
+        "pendulum-measured": System(**single, tests={"ddp": ("ddp",)}, actions={"u": "tau_meas"}),
+    }[name]

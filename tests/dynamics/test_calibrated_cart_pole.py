@@ -1,0 +1,85 @@
+"""A cart-pole whose masses, length and friction are unknown, after one trial."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust import CKA, CalibratedPhysics, ODEPhysics, PhysicsMeanGP, Unknown
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.envs import CART_POLE_SPEC, CartPoleSwingUpEnv
+from gpadjust.envs.cart_pole.system import CartPoleEquation
+from paper.planning.systems import FittedPhysics
+
+UNKNOWNS = {
+    "cart_mass": Unknown(0.6, factor=1.5, unit="kg"),
+    "pole_mass": Unknown(0.6, factor=1.5, unit="kg"),
+    "pole_length": Unknown(0.7, factor=1.5, unit="m"),
+    "damping": Unknown(0.05, bounds=(0.0, 1.0), unit="N s/m"),
+}
+GUESS = CartPoleEquation(0.6, 0.6, 0.7, 0.05)
+NOISE = 0.01  # m, rad, m/s, rad/s
+
+
+def equation(state, action, p):
+    known = object.__new__(CartPoleEquation)
+    for name in p:
+        object.__setattr__(known, name, p[name])  # a value for each row, which its checks refuse
+    object.__setattr__(known, "gravity", 9.82)
+    return known(state, action)
+
+
+def physics():
+    return ODEPhysics(equation, 0.1, 4, unknowns=UNKNOWNS)
+
+
+def trial(seed, noise=0.0):
+    """Transitions under random forces."""
+    env, draw = CartPoleSwingUpEnv(), np.random.default_rng(seed)
+    env.reset(seed=seed)
+    states, actions = [env.unwrapped.state], []
+    for _ in range(25):
+        actions.append(draw.uniform(-1, 1, 1).astype(np.float32) * env.action_space.high)
+        env.step(actions[-1])
+        states.append(env.unwrapped.state)
+    states = torch.tensor(np.stack(states), dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    states = states + noise * torch.randn(states.shape, generator=generator, dtype=torch.float64)
+    return states[:-1], torch.tensor(np.stack(actions), dtype=torch.float64), states[1:]
+
+
+def error(dynamics):
+    """Of single steps that were not seen, relative to the change of each state."""
+    trials = [trial(100 + i) for i in range(4)]
+    states, actions, after = (torch.cat(part) for part in zip(*trials, strict=True))
+    missed = CART_POLE_SPEC.change(after, dynamics.predict(states, actions).mean)
+    return (missed.square().mean(0) / (after - states).square().mean(0)).sqrt().mean().item()
+
+
+@pytest.mark.parametrize("model", [CalibratedPhysics, PhysicsMeanGP, CKA])
+def test_one_trial_without_noise_tells_the_parameters(model):
+    dynamics = LearnedDynamics(CART_POLE_SPEC, physics(), model=model)
+    dynamics.update(*trial(0))
+    assert error(dynamics) < 1e-4
+    truth = torch.tensor([0.5, 0.5, 0.6, 0.1], dtype=torch.float64)
+    found = dynamics.model.physics_parameters.mean
+    torch.testing.assert_close(found, truth, rtol=1e-3, atol=0)
+
+
+@pytest.mark.slow
+def test_with_noise_it_is_as_good_as_least_squares():
+    errors = {name: [] for name in ("least squares", "calibrated", "delta", "rho and delta")}
+    for seed in range(5):
+        data = trial(seed, NOISE)
+        fitted = FittedPhysics(GUESS, 0.1)
+        fitted.update(*data)
+        errors["least squares"].append(error(fitted))
+        models = (CalibratedPhysics, PhysicsMeanGP, CKA)
+        for name, model in zip([*errors][1:], models, strict=True):
+            dynamics = LearnedDynamics(CART_POLE_SPEC, physics(), model=model)
+            dynamics.update(*data)
+            errors[name].append(error(dynamics))
+    means = {name: np.mean(values) for name, values in errors.items()}
+    print(means)
+    assert means["calibrated"] < 1.5 * means["least squares"]
+    assert means["delta"] < 1.5 * means["least squares"]
+    assert means["rho and delta"] < 1.5 * means["least squares"]

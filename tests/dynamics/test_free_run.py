@@ -1,0 +1,252 @@
+"""Free runs: particles that follow actions from given states, and their intervals."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, Record, Records, StateSpec
+from gpadjust.models import Prediction, ZeroMeanGP
+from gpadjust.physics import PhysicsError
+
+SPEC = StateSpec(["x"], ["v"])
+TURN = StateSpec(["theta"], ["omega"], angles=["theta"])
+
+
+class Drift(Dynamics):
+    """States that move by the action and a rate, N(0, sd^2), that is each function's own."""
+
+    is_fitted = True
+
+    def __init__(self, sd=0.0, noise=0.0, spec=SPEC, wraps=False):
+        super().__init__(spec)
+        self.sd, self.noise, self.wraps = sd, noise, wraps
+
+    def predict(self, states, actions):
+        return Prediction(states + actions, torch.full_like(states, self.sd**2 + self.noise**2))
+
+    def sample(self, states, actions):
+        raise NotImplementedError
+
+    def sample_functions(self, num_functions, seed=None):
+        generator = torch.Generator().manual_seed(seed)
+        rate = self.sd * torch.randn(num_functions, 1, 1, generator=generator, dtype=torch.float64)
+
+        def step(states, actions):
+            following = states + actions + rate
+            return torch.atan2(following.sin(), following.cos()) if self.wraps else following
+
+        return step
+
+    def noise_variance(self, states, actions):
+        return torch.full_like(states, self.noise**2)
+
+    def update(self, states, actions, next_states):
+        raise NotImplementedError
+
+    describe = state_dict = load_state_dict = update
+
+
+def start(num_windows=2, num_steps=6):
+    """Windows from 0, 1, ... with actions 0.1, 0.2, ..."""
+    states = torch.arange(num_windows, dtype=torch.float64).unsqueeze(-1)
+    actions = 0.1 * (1 + torch.arange(num_steps, dtype=torch.float64)).expand(num_windows, -1)
+    return states, actions.unsqueeze(-1)
+
+
+STATES, ACTIONS = start()
+
+
+def test_a_perfect_model_is_where_the_system_was(cart_pole_system):
+    system = cart_pole_system
+    states, actions, following = system.trial(0)
+    path = torch.cat([states, following[-1:]])
+    times = 0.1 * torch.arange(26, dtype=torch.float64)
+    record = Record(times, path, torch.cat([actions, actions[-1:]]))
+    windows = Records(record, system.spec).windows(8)
+    run = PhysicsDynamics(system.spec, system.truth).free_run(*windows[:2])
+    assert run.mean.shape == run.lower.shape == run.upper.shape == (3, 8, 4)
+    assert run.particles.shape == (39, 3, 8, 4)
+    for found in (run.mean, run.lower, run.upper, run.particles[7]):
+        torch.testing.assert_close(found, windows.measured)
+    assert run.lost.shape == (3, 8)
+    assert not run.lost.any()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_each_particle_keeps_its_function_and_noise_comes_once(noise):
+    """After k steps a rate of its own has moved a particle by k rates: sd^2 k^2, plus noise."""
+    states, actions = start()
+    dynamics, k = Drift(0.2, noise), torch.arange(1, 7)
+    run = dynamics.free_run(states, actions, num_functions=3999)
+    torch.testing.assert_close(
+        run.mean[..., 0], states + actions[0, :, 0].cumsum(0), rtol=0, atol=0.03
+    )
+    width = 1.96 * ((0.2 * k) ** 2 + noise**2).sqrt().double().expand(2, -1)
+    torch.testing.assert_close((run.upper - run.mean)[..., 0], width, rtol=0.08, atol=0)
+    torch.testing.assert_close((run.mean - run.lower)[..., 0], width, rtol=0.08, atol=0)
+    quiet = dynamics.free_run(states, actions, num_functions=3999, noise=False)
+    assert torch.equal(quiet.mean, run.mean)
+    steps = (quiet.particles - run.mean)[..., 0]
+    torch.testing.assert_close(steps[..., 5], 6 * steps[..., 0])
+
+
+def test_the_ends_of_the_interval_are_draws_at_any_level():
+    states, actions = start()
+    for level, number in ((0.95, 39), (0.8, 9), (0.5, 3)):
+        run = Drift(1.0).free_run(states, actions, level=level, num_functions=number)
+        torch.testing.assert_close(run.lower, run.particles.amin(0))
+        torch.testing.assert_close(run.upper, run.particles.amax(0))
+        with pytest.raises(ValueError, match=f"num_functions >= {number}, .* of {100 * level:g} %"):
+            Drift(1.0).free_run(states, actions, level=level, num_functions=number - 1)
+    inner = Drift(1.0).free_run(states, actions, level=0.5, num_functions=39)
+    ordered = inner.particles.sort(0).values
+    torch.testing.assert_close(inner.lower, ordered[9])
+    torch.testing.assert_close(inner.upper, ordered[29])
+
+
+def test_it_says_what_the_scores_of_trajectories_say(cart_pole_system, make, monkeypatch):
+    system = cart_pole_system
+    dynamics = make("CKA", system.spec, system.crude)
+    dynamics.update(*system.trial(0))
+    states, actions, following = system.trial(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(dynamics, "noise_variance", lambda states, actions: 0 * states)
+        options = {"horizons": (1, 9), "max_windows": 5}
+        scores = dynamics.score_trajectories(states, actions, following, **options)
+    rows = torch.arange(0, 17, 4)
+    ahead = actions[rows.unsqueeze(-1) + torch.arange(9)]
+    run = dynamics.free_run(states[rows], ahead, noise=False)
+    measured = following[rows + 8]
+    error = system.spec.change(run.mean[:, -1], measured)
+    torch.testing.assert_close(error.square().mean(0).sqrt(), scores.rmse[1])
+    at = run.mean[:, -1] + error
+    inside = (at >= run.lower[:, -1]) & (at <= run.upper[:, -1])
+    torch.testing.assert_close(inside.double().mean(0), scores.coverage[1])
+    noisy = dynamics.free_run(states[rows], ahead)
+    assert torch.equal(noisy.mean, run.mean)
+    scatter = (noisy.particles - run.particles).std(dim=(0, 1, 2))
+    learnt = dynamics.noise_variance(states, actions).mean(0).sqrt()
+    torch.testing.assert_close(scatter, learnt, rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_angles_go_on_without_jumps(wraps):
+    """Three turns and more, from an angle that is itself beyond one."""
+    states = torch.tensor([[7.0], [-0.2]]).double()
+    actions = torch.full((2, 30, 1), 0.7).double()
+    actions[1] *= -1
+    run = Drift(0.02, 0.05, TURN, wraps).free_run(states, actions, num_functions=199)
+    expected = states + actions[..., 0].cumsum(1)
+    torch.testing.assert_close(run.mean[..., 0], expected, rtol=0, atol=0.2)
+    for path in (run.mean, run.lower, run.upper):
+        assert path.diff(dim=1).abs().max() < 1.2
+    assert (run.lower < run.mean).all()
+    assert (run.mean < run.upper).all()
+    assert (run.upper - run.lower).max() < 5
+
+
+def test_particles_that_went_round_different_ways_have_their_mean_on_the_circle():
+    states, actions = torch.tensor([[3.1]]).double(), torch.zeros(1, 1, 1).double()
+    run = Drift(0.2, 0.0, TURN, wraps=True).free_run(states, actions, num_functions=399)
+    assert run.mean.item() == pytest.approx(3.1, abs=0.05)
+    assert run.lower.item() == pytest.approx(3.1 - 0.4, abs=0.1)
+    assert run.upper.item() == pytest.approx(3.1 + 0.4, abs=0.1)
+    assert (run.particles - run.mean).abs().max() < math.pi
+
+
+def test_an_integrated_state_has_the_noise_of_its_velocity(uniform):
+    spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.5)
+    dynamics = LearnedDynamics(spec, fit_options={"method": "map"}, model=ZeroMeanGP)
+    v, u = uniform(30, 1), uniform(30, 1, seed=1)
+    following = v + 0.5 * u + 0.05 * uniform(30, 1, low=-1, seed=2)
+    x = torch.zeros_like(v)
+    next_x = x + 0.25 * (v + following)
+    dynamics.update(torch.cat([x, v], -1), u, torch.cat([next_x, following], -1))
+    options = {"num_functions": 39, "seed": 2}
+    at = torch.tensor([[0.0, 0.5]]).double(), torch.full((1, 3, 1), 0.2).double()
+    with_noise = dynamics.free_run(*at, **options).particles
+    added = with_noise - dynamics.free_run(*at, noise=False, **options).particles
+    assert added[..., 1].std() > 0.01
+    torch.testing.assert_close(added[..., 0], 0.25 * added[..., 1])
+
+
+def test_lost_particles_stay_where_they_were():
+    run = Drift().free_run(*start(3), state_bounds=torch.tensor([[-1.0], [2.4]]))
+    assert run.lost.tolist() == [[0] * 6, [0, 0, 0, 0, 1, 1], [0, 0, 1, 1, 1, 1]]
+    np.testing.assert_allclose(run.mean[2, :, 0], [2.1, 2.3, 2.3, 2.3, 2.3, 2.3])
+    there_and_back = torch.tensor([2.0, 1.0, -1.0]).double().reshape(1, 3, 1)
+    run = Drift().free_run(STATES[:1], there_and_back, state_bounds=torch.tensor([[-1.0], [2.4]]))
+    assert run.mean.flatten().tolist() == [2, 2, 2]
+
+    def runs(X):
+        return torch.where(X[:, :1] > 1.5, torch.nan, X[:, :1] + X[:, 1:])
+
+    run = PhysicsDynamics(SPEC, runs).free_run(*start(3))
+    assert run.lost.mean(1).tolist() == pytest.approx([0, 1 / 2, 1])
+    assert run.mean.isfinite().all()
+
+
+def test_without_the_noise_there_is_no_interval():
+    class Fails(Drift):
+        def noise_variance(self, states, actions):
+            rows = (states[:, 0] > 1.25).nonzero().flatten().tolist()
+            if rows:
+                raise PhysicsError("It fails.", rows=rows)
+            return super().noise_variance(states, actions)
+
+    states, actions = start()
+    run = Fails(0.01, 0.1).free_run(states, actions)
+    assert run.mean.isfinite().all()
+    assert run.lower.isfinite()[..., 0].tolist() == [
+        [True] * 5 + [False],
+        [True, True, False, False, False, False],
+    ]
+    assert torch.equal(run.lower.isnan(), run.upper.isnan())
+
+
+def test_runs_are_the_same_again_and_draw_from_no_generator():
+    class Careless(Drift):
+        def sample_functions(self, num_functions, seed=None):
+            return super().sample_functions(num_functions, int(torch.randint(99, ())))
+
+    before = torch.get_rng_state()
+    one, other = (Careless(0.1, 0.1).free_run(*start()) for _ in range(2))
+    assert torch.equal(before, torch.get_rng_state())
+    for value, again in zip(one, other, strict=True):
+        assert torch.equal(value, again)
+    assert not torch.equal(Careless(0.1, 0.1).free_run(*start(), seed=1).lower, one.lower)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "error", "says"),
+    [
+        ((STATES[0], ACTIONS[0]), {}, ValueError, r"\(1,\) and \(6, 1\); of a single run, use `in"),
+        ((STATES, ACTIONS[:1]), {}, ValueError, r"got \(2, 1\) and \(1, 6, 1\)"),
+        ((STATES, ACTIONS[:, :0]), {}, ValueError, "one or more actions for each state"),
+        ((STATES[:0], ACTIONS[:0]), {}, ValueError, r"got \(0, 1\) and \(0, 6, 1\)"),
+        ((STATES.repeat(1, 2), ACTIONS), {}, ValueError, r"initial_states of shape \.\.\. x 1"),
+        ((STATES.float(), ACTIONS), {}, TypeError, "initial_states in float64, got torch.float32"),
+        ((STATES, ACTIONS.float()), {}, TypeError, "actions in float64"),
+        ((STATES / 0, ACTIONS), {}, ValueError, "initial_states to be finite"),
+        ((STATES, ACTIONS * torch.nan), {}, ValueError, "actions to be finite"),
+        ((STATES, ACTIONS), {"level": 95}, ValueError, "probability between 0 and 1, got 95"),
+        ((STATES, ACTIONS), {"level": "95 %"}, ValueError, "probability between 0 and 1"),
+        ((STATES, ACTIONS), {"num_functions": 39.0}, ValueError, "num_functions to be a whole"),
+        (
+            (STATES, ACTIONS),
+            {"state_bounds": torch.ones(2)},
+            ValueError,
+            "state_bounds of shape 2 x 1",
+        ),
+    ],
+)
+def test_arguments_out_of_range(arguments, options, error, says):
+    with pytest.raises(error, match=says):
+        Drift(0.1).free_run(*arguments, **options)
+
+
+def test_it_must_have_learnt():
+    with pytest.raises(RuntimeError, match="call `update`"):
+        LearnedDynamics(SPEC, lambda X: X[:, :1]).free_run(STATES, ACTIONS)

@@ -1,0 +1,110 @@
+"""Dynamics that learn unknown parameters of their physics."""
+
+import pytest
+import torch
+
+from gpadjust import CKA, CalibratedPhysics, ODEPhysics, Unknown
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
+from gpadjust.physics import FunctionPhysics
+
+SPEC = StateSpec(["q", "dq"], ["u"], angles=["q"])
+UNKNOWNS = {"k": Unknown(1.0, factor=2.0), "c": Unknown(0.2, bounds=(0.0, 1.0))}
+FEW = {"num_samples": 3, "num_draws": 32, "num_starts": 1, "num_screened": 8}
+
+
+def pendulum(state, action, p):
+    rate = -p.k * state[:, 0].sin() - p.c * state[:, 1] + action[:, 0]
+    return torch.stack([state[:, 1], rate], -1)
+
+
+def make_physics(**changes):
+    options = {"substeps": 2, "gradient": "finite-difference"}
+    return ODEPhysics(pendulum, 0.1, 2, unknowns={**UNKNOWNS, **changes}, **options)
+
+
+def make(model=CalibratedPhysics, **changes):
+    return LearnedDynamics(SPEC, make_physics(**changes), model=model, fit_options=FEW)
+
+
+@pytest.fixture
+def transitions(uniform):
+    """Makes transitions of a pendulum with k = 1.7 and c = 0.5."""
+
+    def transitions(n, seed=0):
+        rows = uniform(n, 3, low=-2.0, high=2.0, seed=seed)
+        truth = make_physics()(rows, torch.tensor([1.7, 0.5], dtype=torch.float64))
+        return rows[:, :2], rows[:, 2:], truth + 1e-4 * uniform(n, 2, low=-1.0, seed=seed + 1)
+
+    return transitions
+
+
+@pytest.mark.parametrize("model", [CalibratedPhysics, CKA])
+def test_are_learnt_kept_and_used(model, transitions, uniform):
+    dynamics, (states, actions, after) = make(model), transitions(8, seed=5)
+    first = transitions(12)
+    dynamics.update(*first)
+    parameters = dynamics.model.physics_parameters
+    assert abs(parameters["k"].mean() - 1.7) < 0.1
+    assert abs(parameters["c"].mean() - 0.5) < 0.1
+    mean, variance = dynamics.predict(states, actions)
+    assert (mean - after).abs().max() < 0.01
+    assert (variance > 0).any()
+
+    dynamics.condition(states, actions, after)
+    again = make(model)
+    again.load_state_dict(dynamics.state_dict())
+    for found, expected in zip(
+        again.predict(states, actions), dynamics.predict(states, actions), strict=True
+    ):
+        torch.testing.assert_close(found, expected)
+    assert torch.equal(again.model.physics_parameters.draws, parameters.draws)
+
+    blocks = [t.expand(4, *t.shape) for t in (states, actions)]
+    step = dynamics.sample_functions(4, seed=0)
+    leaf = blocks[0].clone().requires_grad_()
+    found = step(leaf, blocks[1])
+    assert (found - after).abs().max() < 0.01
+    (slope,) = torch.autograd.grad(found[..., 0].sum(), leaf)
+    torch.testing.assert_close(slope[..., 1], torch.full_like(slope[..., 1], 0.1), rtol=0.2, atol=0)
+    dynamics.update(*transitions(4, seed=9))
+    assert dynamics.num_transitions == 24
+
+
+def test_a_state_of_other_priors_is_refused(transitions):
+    dynamics = make()
+    dynamics.update(*transitions(6))
+    other = make(k=Unknown(1.0, factor=1.9))  # the same guess
+    with pytest.raises(RuntimeError, match=r"unknowns is \{'c': .*factor=2.0.*factor=1.9.* here"):
+        other.load_state_dict(dynamics.state_dict())
+    assert "unknowns" not in LearnedDynamics(SPEC, lambda X: X[:, :2]).describe()
+
+
+def test_without_learning_they_are_the_guesses(transitions):
+    states, actions, _ = transitions(5)
+    mean, _ = PhysicsDynamics(SPEC, make_physics()).predict(states, actions)
+    guess = torch.tensor([1.0, 0.2], dtype=torch.float64)
+    expected = make_physics()(torch.cat([states, actions], -1), guess)
+    torch.testing.assert_close(mean, expected)
+
+
+def test_targets_of_a_physics_at_parameters(uniform):
+    def turn(X, p):
+        """NaN where it turns too far."""
+        moved = X[:, :2] + p.speed[:, None]
+        return moved.where(p.speed[:, None] < 5.0, torch.nan)
+
+    physics = FunctionPhysics(turn, unknowns={"speed": Unknown(1.0, sd=1.0)})
+    targets = TransitionPhysics(physics, TransitionTargets(SPEC, "difference"))
+    X = uniform(4, 3, low=-3.0, high=3.0)
+    speed = torch.tensor([[0.5], [4.0], [-4.0]], dtype=torch.float64)
+    pi = torch.pi
+    rows = [[0.5, 0.5], [4 - 2 * pi, 4.0], [2 * pi - 4, -4.0]]
+    expected = torch.tensor(rows, dtype=torch.float64)
+    for found in (targets(X, speed), targets.or_nan(X, speed)):
+        torch.testing.assert_close(found, expected.unsqueeze(-2).expand(3, 4, 2))
+    targets.know(X, torch.zeros(4, 2, dtype=torch.float64))  # of the guesses, which say nothing
+    torch.testing.assert_close(targets(X, speed[0]), expected[0].expand(4, 2))
+    found = targets.or_nan(X, torch.tensor([[0.5], [9.0]], dtype=torch.float64))
+    assert found.isnan().all(-1).all(-1).tolist() == [False, True]
+    torch.testing.assert_close(found[0], expected[0].expand(4, 2))

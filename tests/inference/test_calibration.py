@@ -1,0 +1,227 @@
+"""Unknown parameters of a physics, learnt with all else."""
+
+import math
+
+import pytest
+import torch
+
+from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, PhysicsMeanGP, Unknown, fit
+from gpadjust.gp import OrthogonalKernel
+from gpadjust.inference import IdentifiabilityWarning
+from gpadjust.inference.calibration import Calibration
+from gpadjust.models import orthogonal_rbf
+from gpadjust.physics import BlackBoxPhysics, PhysicsError
+from gpadjust.validation.plots import plot_prediction
+
+A, B = 1.3, 0.4
+PRIORS = {"a": Unknown(1.0, sd=0.5), "b": Unknown(-1.0, sd=2.0)}
+NOISE = 0.3
+
+
+def lines(X, p):
+    """Two outputs that are linear in two parameters."""
+    return torch.stack([p.a * X[:, 0] + p.b * X[:, 1], p.a - p.b * X[:, 0]], dim=-1)
+
+
+def growth(X, p):
+    """Saturating growth."""
+    return p.a * (1 - (-p.b * X[:, 0]).exp())
+
+
+def data(n=12, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    X = torch.rand(n, 2, generator=generator, dtype=torch.float64)
+    p = FunctionPhysics(lines, unknowns=PRIORS)
+    Y = p(X, torch.tensor([A, B], dtype=torch.float64))
+    return X, Y + NOISE * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+
+
+def linear_regression(X, Y, covariance):
+    """Mean and covariance of the parameters of ``lines``, in plain linear algebra."""
+    one = torch.ones(len(X), dtype=torch.float64)
+    G = torch.cat([X, torch.stack([one, -X[:, 0]], dim=-1)])
+    K = torch.block_diag(covariance, covariance)
+    prior, guess = (
+        torch.diag(torch.tensor([0.25, 4.0]).double()),
+        torch.tensor([1.0, -1.0]).double(),
+    )
+    precision = prior.inverse() + G.T @ torch.linalg.solve(K, G)
+    pull = prior.inverse() @ guess + G.T @ torch.linalg.solve(K, Y.T.reshape(-1))
+    return torch.linalg.solve(precision, pull), precision.inverse()
+
+
+def test_a_linear_physics_with_known_noise_is_bayesian_linear_regression():
+    X, Y = data()
+    mean, covariance = linear_regression(X, Y, NOISE**2 * torch.eye(len(X)).double())
+    model = CalibratedPhysics(X, Y, NOISE**2, physics=FunctionPhysics(lines, unknowns=PRIORS))
+    fit(model, "map")
+    torch.testing.assert_close(model.physics_parameters.mean, mean, rtol=1e-5, atol=1e-6)
+    assert fit(model).power.min() == 1
+    found, sd = model.physics_parameters, covariance.diagonal().sqrt()
+    assert ((found.mean - mean).abs() < 0.25 * sd).all()
+    torch.testing.assert_close(found.sd, sd, rtol=0.2, atol=0)
+    correlation = torch.corrcoef(found.draws.T)[0, 1]
+    expected = covariance[0, 1] / sd.prod()
+    assert abs(correlation - expected) < 0.2
+
+
+def test_draws_given_a_discrepancy_are_those_of_generalised_least_squares():
+    X, Y = data()
+    model = PhysicsMeanGP(
+        X, Y, NOISE**2, physics=FunctionPhysics(lines, unknowns=PRIORS), outcome_transform=None
+    )
+    model.covar_module.requires_grad_(False)
+    model.covar_module.terms[1].kernel.outputscale = 0.2
+    model.covar_module.terms[1].kernel.base_kernel.lengthscale = 0.7
+    distance = torch.cdist(X / 0.7, X / 0.7)
+    K = 0.2 * (-0.5 * distance.square()).exp() + NOISE**2 * torch.eye(len(X)).double()
+    mean, covariance = linear_regression(X, Y, K)
+    fit(model)
+    found, sd = model.physics_parameters, covariance.diagonal().sqrt()
+    assert ((found.mean - mean).abs() < 0.25 * sd).all()
+    torch.testing.assert_close(found.sd, sd, rtol=0.2, atol=0)
+
+
+def test_outputs_share_what_they_say():
+    X, Y = data(40)
+    both = CalibratedPhysics(X, Y, NOISE**2, physics=FunctionPhysics(lines, unknowns=PRIORS))
+    fit(both)
+    for i in range(2):
+        law = FunctionPhysics(lambda X, p, i=i: lines(X, p)[:, i], unknowns=PRIORS)
+        one = CalibratedPhysics(X, Y[:, i : i + 1], NOISE**2, physics=law)
+        fit(one)
+        assert (both.physics_parameters.sd < one.physics_parameters.sd).all()
+
+
+@pytest.mark.parametrize("model_class", [CalibratedPhysics, PhysicsMeanGP, CKA])
+def test_a_nonlinear_physics_is_found_from_far(model_class):
+    X = torch.linspace(0.1, 3, 15, dtype=torch.float64).unsqueeze(-1)
+    unknowns = {"a": Unknown(1.0, factor=4.0), "b": Unknown(8.0, factor=4.0)}
+    law = FunctionPhysics(growth, unknowns=unknowns)
+    Y = law(X, torch.tensor([5.0, 1.0], dtype=torch.float64))
+    model = model_class(X, Y, physics=law)
+    fit(model)
+    truth = torch.tensor([5.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(model.physics_parameters.mean, truth, rtol=1e-2, atol=0)
+    torch.testing.assert_close(model.predict(X).mean, Y, rtol=1e-3, atol=1e-3)
+
+
+def test_a_black_box_is_calibrated_by_differences():
+    X = torch.linspace(0.1, 3, 12, dtype=torch.float64).unsqueeze(-1)
+    law = BlackBoxPhysics(
+        lambda x, p: p.a * (1 - math.exp(-p.b * x[0])),
+        batched=False,
+        unknowns={"a": Unknown(4.0, factor=2.0), "b": Unknown(1.5, factor=2.0)},
+    )
+    model = CalibratedPhysics(X, 5 * (1 - (-X).exp()), physics=law)
+    fit(model, "map")
+    truth = torch.tensor([5.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(model.physics_parameters.mean, truth, rtol=1e-4, atol=0)
+
+
+def test_missing_observations_do_not_count():
+    X, Y = data(14)
+    law = FunctionPhysics(lines, unknowns=PRIORS)
+    Y[3:6, 0] = torch.nan
+    Y[9, 1] = torch.nan
+    model = CalibratedPhysics(X, Y, NOISE**2, physics=law)
+    fit(model, "map")
+    observed = ~Y.isnan()
+    one = torch.ones(len(X), dtype=torch.float64)
+    G = torch.cat([X[observed[:, 0]], torch.stack([one, -X[:, 0]], dim=-1)[observed[:, 1]]])
+    y = torch.cat([Y[observed[:, 0], 0], Y[observed[:, 1], 1]])
+    prior, guess = (
+        torch.diag(torch.tensor([4.0, 0.25]).double()),
+        torch.tensor([1.0, -1.0]).double(),
+    )
+    mean = torch.linalg.solve(prior + G.T @ G / NOISE**2, prior @ guess + G.T @ y / NOISE**2)
+    torch.testing.assert_close(model.physics_parameters.mean, mean, rtol=1e-5, atol=1e-6)
+
+
+def test_parameters_at_which_the_physics_fails_are_avoided():
+    def root(X, p):
+        if (p.a < 0.5).any():
+            raise PhysicsError("the root is not real", (p.a < 0.5).nonzero().flatten().tolist())
+        return (p.a - 0.5).sqrt() * X[:, 0]
+
+    X = torch.linspace(0.1, 1, 9, dtype=torch.float64).unsqueeze(-1)
+    law = FunctionPhysics(root, unknowns={"a": Unknown(1.5, sd=1.0)})
+    generator = torch.Generator().manual_seed(0)
+    Y = 0.3 * X + 0.1 * torch.randn(9, 1, generator=generator, dtype=torch.float64)
+    model = CalibratedPhysics(X, Y, physics=law)
+    fit(model)
+    assert (model.physics_parameters["a"] >= 0.5).all()
+    assert model.physics_parameters["a"].std() > 0
+
+
+def test_parameters_that_nothing_tells_apart_are_named():
+    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    unknowns = {"a": Unknown(1.0, sd=1.0), "b": Unknown(1.0, sd=1.0), "c": Unknown(1.0, sd=1.0)}
+    law = FunctionPhysics(lambda X, p: (p.a + p.b) * X[:, 0] + p.c, unknowns=unknowns)
+    with pytest.warns(IdentifiabilityWarning, match="next to nothing of a, b of the physics"):
+        fit(CalibratedPhysics(X, 2 * X + 1, 0.01, physics=law))
+
+
+def test_a_discrepancy_that_is_orthogonal_leaves_the_best_fit_to_the_parameters():
+    X = torch.linspace(0.02, 1, 17, dtype=torch.float64).unsqueeze(-1)
+    truth = 4 * X + X * (5 * X).sin()  # Plumlee (2017)
+    Y = truth + 0.02 * torch.randn(17, 1, generator=torch.Generator().manual_seed(0)).double()
+    law = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(3.0, sd=2.0)})
+    best = (X * truth).sum() / X.square().sum()
+    free = PhysicsMeanGP(X, Y, physics=law)
+    orthogonal = PhysicsMeanGP(X, Y, physics=law, covar_module=orthogonal_rbf)
+    widths = []
+    for model in (free, orthogonal):
+        fit(model)
+        low, high = model.physics_parameters.interval()
+        assert low < best < high
+        widths.append(high - low)
+    assert widths[1] < 0.1 * widths[0]
+    kernel = orthogonal.covar_module.terms[1].kernel
+    assert isinstance(kernel, OrthogonalKernel)
+    functions = orthogonal.sample_functions(32, seed=0)(X).squeeze(-1)
+    parameter = (functions @ X.squeeze(-1)) / X.square().sum()
+    assert abs(parameter.mean() - best) < 0.02
+    assert (orthogonal.predict(X).mean - truth).abs().max() < 0.05
+
+
+def test_the_linearisation_is_that_of_autograd():
+    X = torch.linspace(0.1, 3, 6, dtype=torch.float64).unsqueeze(-1)
+    unknowns = {"a": Unknown(4.0, sd=2.0), "b": Unknown(1.5, bounds=(0.0, 4.0))}
+    law = FunctionPhysics(growth, unknowns=unknowns)
+    model = PhysicsMeanGP(X, law(X, torch.tensor([5.0, 1.0]).double()), physics=law)
+    calibration = Calibration(model.train())
+    z = torch.tensor([0.3, -0.7], dtype=torch.float64)
+    near = calibration.around(z)
+    scale = model.outcome_transform.stdvs.item()
+
+    def mean(z):
+        return law(X, law.unknowns.at(z)).squeeze(-1) / scale
+
+    slope = torch.autograd.functional.jacobian(mean, z)
+    torch.testing.assert_close(near.slope[0], slope, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(near.residual[0], model.train_targets - mean(z))
+
+
+def test_what_cannot_be_calibrated_is_told():
+    X, Y = data()
+    law = FunctionPhysics(lines, unknowns=PRIORS)
+    silent = CKA(X, Y, physics=law, rho_mean=0.0)
+    with pytest.raises(ValueError, match=r"change nothing at the training inputs.*rho_mean=1\.0"):
+        fit(silent, "map")
+    batch = CKA(X.expand(2, -1, -1), Y.expand(2, -1, -1), physics=law)
+    with pytest.raises(ValueError, match="of one data set to learn unknown parameters"):
+        fit(batch, "map")
+    with pytest.raises(ValueError, match=r"AR1 samples its low level once.*a, b\. CKA learns"):
+        AR1(X, Y, physics=law, bounds=[[0.0, 0.0], [1.0, 1.0]])
+
+
+def test_the_figure_shows_the_physics_with_what_was_learnt():
+    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    law = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1.0, sd=2.0)})
+    model = PhysicsMeanGP(X, 3 * X, physics=law)
+    fit(model, "map")
+    (line,) = [each for each in plot_prediction(model, X).lines if each.get_label() == "physics"]
+    torch.testing.assert_close(
+        torch.as_tensor(line.get_ydata()), 3 * X.squeeze(-1), rtol=1e-4, atol=0
+    )

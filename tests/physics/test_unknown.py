@@ -1,0 +1,371 @@
+"""Unknown parameters: priors, values by name, and physics that are called with them."""
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from gpadjust.physics import (
+    BlackBoxPhysics,
+    FunctionPhysics,
+    ParameterValues,
+    Physics,
+    PhysicsError,
+    Unknown,
+)
+
+A, B = Unknown(1.0, sd=0.5), Unknown(2.0, factor=1.5)
+
+
+def numbers(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def wave(X, p):
+    """`[a x_0 + sin(b x_1), a b]` by columns or by single numbers."""
+    left = p.a * X[..., 0] + (p["b"] * X[..., 1]).sin()
+    return torch.stack([left, p.a * p.b + 0 * left], -1)
+
+
+def wave_at(X, values):
+    """The same at vectors of parameters, `... x 2`, by broadcasting."""
+    a, b = values.unsqueeze(-2).unbind(-1)
+    left = a * X[..., 0] + (b * X[..., 1]).sin()
+    return torch.stack(torch.broadcast_tensors(left, a * b), -1)
+
+
+class Wave(Physics):
+    """The same as a class of the user's."""
+
+    def evaluate(self, X, p):
+        assert p.a.shape == p.b.shape == X.shape[:1]
+        return wave(X, p)
+
+
+class WaveModule(torch.nn.Module):
+    """The same as a module that has the parameters."""
+
+    def __init__(self):
+        super().__init__()
+        self.a = torch.nn.Parameter(numbers(1.0).squeeze())
+        self.b = torch.nn.Parameter(numbers(2.0).reshape(1, 1))
+
+    def forward(self, X):
+        left = self.a * X[:, 0] + (self.b.squeeze() * X[:, 1]).sin()
+        return torch.stack([left, (self.a * self.b.squeeze()).expand(len(X))], -1)
+
+
+def numpy_wave(x, p):
+    left = p.a * x[..., 0] + np.sin(p["b"] * x[..., 1])
+    return np.stack([left, p.a * p.b + 0 * left], -1)
+
+
+MAKE = {
+    "function": lambda **o: FunctionPhysics(wave, unknowns={"a": A, "b": B}, **o),
+    "module": lambda **o: FunctionPhysics(WaveModule(), unknowns={"a": A, "b": B}, **o),
+    "class": lambda **o: Wave(unknowns={"a": A, "b": B}, **o),
+    "black box": lambda **o: BlackBoxPhysics(numpy_wave, unknowns={"a": A, "b": B}, **o),
+    "rows": lambda **o: BlackBoxPhysics(numpy_wave, unknowns={"a": A, "b": B}, batched=False, **o),
+}
+
+
+@pytest.fixture(params=list(MAKE))
+def make(request):
+    """Makes a physics of `wave`, of each kind."""
+    return MAKE[request.param]
+
+
+def cut(prior, low, high):
+    """The quantiles of a prior between bounds, by its own."""
+    below, above = prior.cdf(low), prior.cdf(high)
+    return lambda q: prior.ppf(below + (above - below) * q)
+
+
+LOG = stats.lognorm(math.log(1.5), scale=2.0)
+INF = math.inf
+PRIORS = {
+    "normal": (Unknown(9.8, sd=0.2), stats.norm(9.8, 0.2).ppf),
+    "log-normal": (Unknown(2.0, factor=1.5), LOG.ppf),
+    "uniform": (Unknown(0.2, bounds=(-1.0, 3.0)), stats.uniform(-1.0, 4.0).ppf),
+    "cut normal": (
+        Unknown(1.0, sd=2.0, bounds=(0.0, 1.5)),
+        stats.truncnorm(-0.5, 0.25, 1.0, 2.0).ppf,
+    ),
+    "positive": (Unknown(1, sd=2, bounds=(0, INF)), stats.truncnorm(-0.5, INF, 1.0, 2.0).ppf),
+    "below": (Unknown(1, sd=2, bounds=(-INF, 2)), stats.truncnorm(-INF, 0.5, 1.0, 2.0).ppf),
+    "cut log-normal": (Unknown(2.0, factor=1.5, bounds=(1.0, 2.5)), cut(LOG, 1.0, 2.5)),
+    "not cut": (Unknown(2.0, factor=1.5, bounds=(-1.0, INF)), LOG.ppf),
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_values_are_quantiles_of_the_prior(name):
+    unknown, quantile = PRIORS[name]
+    q = np.array([1e-6, 0.01, 0.3, 0.5, 0.9, 0.999])
+    z = torch.from_numpy(stats.norm.ppf(q))
+    torch.testing.assert_close(unknown.value(z), torch.from_numpy(quantile(q)))
+
+
+@st.composite
+def unknowns(draw):
+    """Unknown parameters of any prior, with and without bounds."""
+    guess = draw(st.floats(-1e3, 1e3))
+    size = draw(st.floats(0.01, 1e3)) * max(abs(guess), 1)
+    kind = draw(st.sampled_from(["sd", "factor", None]))
+    guess = abs(guess) + 1e-3 if kind == "factor" else guess
+    ends = [guess - size * draw(st.floats(0.01, 5)), guess + size * draw(st.floats(0.01, 5))]
+    if kind is not None:
+        ends = [draw(st.sampled_from([ends[0], -INF])), draw(st.sampled_from([ends[1], INF]))]
+    spread = {"sd": size, "factor": 1 + draw(st.floats(0.01, 9))}
+    return Unknown(guess, bounds=tuple(ends), **({kind: spread[kind]} if kind else {}))
+
+
+@given(unknown=unknowns(), z=st.floats(-3, 3), far=st.floats(-100, 100))
+def test_coordinates_reverse_values_which_are_within_bounds(unknown, z, far):
+    low, high = unknown.bounds
+    values = unknown.value(numbers(z, far))
+    assert low <= values.min() <= values.max() <= high
+    assert unknown.coordinate(values)[0] == pytest.approx(z, abs=1e-5)
+    guess = unknown.value(unknown.coordinate(numbers(unknown.guess)))
+    assert guess.item() == pytest.approx(unknown.guess, abs=1e-6)
+
+
+BAD = {
+    "text": (("one",), {"sd": 1.0}, TypeError, "guess must be a number; found 'one'"),
+    "no number": ((1.0,), {"sd": True}, TypeError, "sd must be a number; found True"),
+    "tensor": ((1.0,), {"factor": torch.ones(())}, TypeError, "factor must be a number"),
+    "one bound": ((1.0,), {"bounds": 3.0}, TypeError, "bounds must be two numbers; found 3.0"),
+    "three": ((1.0,), {"bounds": (0, 1, 2)}, TypeError, "bounds must be two numbers"),
+    "outside": ((3.0,), {"bounds": (0, 2)}, ValueError, r"inside of the bounds; found 3.0 and \(0"),
+    "at a bound": ((0.0,), {"sd": 1, "bounds": (0, 2)}, ValueError, "inside of the bounds"),
+    "not finite": ((math.nan,), {"sd": 1.0}, ValueError, "guess must be finite"),
+    "sd": ((1.0,), {"sd": 0.0}, ValueError, "sd must be positive and finite; found 0.0"),
+    "factor": ((1.0,), {"factor": 1.0}, ValueError, "factor must be above 1 and finite; found 1.0"),
+    "negative": ((-1.0,), {"factor": 1.5}, ValueError, "positive guess; found -1.0. Give sd"),
+    "both": ((1.0,), {"factor": 1.5, "sd": 1.0}, ValueError, "sd and factor; give one of them"),
+    "neither": ((1.0,), {"bounds": (0.0, INF)}, ValueError, "no prior; give sd.*two finite bounds"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_prior(name):
+    given, options, error, message = BAD[name]
+    with pytest.raises(error, match=message):
+        Unknown(*given, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"sd": 0.5}, "2 ± 0.5"),
+        ({"factor": 1.5}, "2, factor 1.5"),
+        ({"bounds": (0, 3)}, "0 to 3"),
+        ({"sd": 0.5, "bounds": (0, INF)}, "2 ± 0.5, above 0"),
+        ({"factor": 1.5, "bounds": (-INF, 3)}, "2, factor 1.5, below 3"),
+    ],
+)
+def test_a_prior_as_text(options, text):
+    assert Unknown(2.0, **options).prior_text == text
+
+
+class TestNames:
+    @pytest.mark.parametrize(
+        "name", ["two words", "1st", "_hidden", "lambda", "rows", "numpy", "keys", 3]
+    )
+    def test_that_can_be_no_attribute(self, name):
+        with pytest.raises(ValueError, match=f"names such as 'mass'.*found {name!r}"):
+            FunctionPhysics(wave, unknowns={name: A})
+
+    @pytest.mark.parametrize("given", [{"mass": 1.0}, ["mass"], A])
+    def test_without_priors(self, given):
+        with pytest.raises(TypeError, match=r"names to Unknown\(guess, sd=.*'mass': Unknown\(1.0"):
+            FunctionPhysics(wave, unknowns=given)
+
+
+class TestParameterValues:
+    def test_are_a_mapping_with_attributes(self):
+        rows = numbers(1.0, 2.0, 3.0, 4.0).reshape(2, 2)
+        values = ParameterValues(("mass", "length"), rows)
+        assert [*values] == ["mass", "length"]
+        assert len(values) == 2
+        assert torch.equal(values.mass, rows[:, 0])
+        assert torch.equal(values["length"], rows[:, 1])
+        assert "drag" not in values
+        assert values.numpy().length.tolist() == [2.0, 4.0]
+        assert values.numpy().row(1).mass == 3.0
+        assert values.numpy().row(1)["length"].shape == ()
+
+    def test_of_another_name(self):
+        values = ParameterValues(("mass", "length"), torch.ones(3, 2))
+        with pytest.raises(KeyError, match="no parameter 'drag'; there are mass, length"):
+            values["drag"]
+        with pytest.raises(AttributeError, match="no parameter 'drag'"):
+            _ = values.drag
+
+    def test_copies(self):
+        values = ParameterValues(("mass",), torch.ones(3, 1)).numpy()
+        for again in (copy.deepcopy(values), pickle.loads(pickle.dumps(values))):
+            assert again.mass.tolist() == [1.0, 1.0, 1.0]
+
+
+class TestCalls:
+    def test_without_parameters_at_the_guesses(self, make, points):
+        X = points(3, 2)
+        torch.testing.assert_close(make()(X), wave_at(X, numbers(1.0, 2.0)))
+
+    @pytest.mark.parametrize("lead", [(), (3,), (1,)], ids=str)
+    @pytest.mark.parametrize("batch", [(), (3,), (3, 1), (4, 3)], ids=str)
+    def test_shapes(self, make, points, lead, batch):
+        X, values = points(*batch, 5, 2), points(*lead, 2, seed=1)
+        expected = wave_at(X, values)
+        physics = make()
+        for _ in range(2):  # the second time it remembers them
+            found = physics(X, values)
+            assert found.shape == expected.shape
+            torch.testing.assert_close(found, expected)
+        torch.testing.assert_close(physics.or_nan(X, values), expected)
+
+    def test_expanded_inputs_and_equal_parameters_are_evaluated_once(self, points):
+        asked = []
+
+        def record(X, p):
+            asked.append(len(X))
+            return wave(X, p)
+
+        physics = FunctionPhysics(record, unknowns={"a": A, "b": B})
+        X, values = points(5, 2), points(3, 2, seed=1)
+        found = physics(X.expand(4, 3, 5, 2), values)
+        torch.testing.assert_close(found, wave_at(X, values).expand(4, 3, 5, 2))
+        physics(X, values[1])
+        physics(X[2:], values.flip(0))
+        assert asked == [15]
+        physics(X, values[0] + 1.0)
+        assert asked == [15, 5]
+
+    def test_inputs_of_some_columns(self, make, points):
+        X, values = points(4, 3), points(2, 2, seed=1)
+        found = make(inputs=[2, 0])(X, values)
+        torch.testing.assert_close(found, wave_at(X[:, [2, 0]], values))
+
+    def test_single_precision(self, make, points):
+        X, values = points(4, 2).float(), points(2, 2, seed=1)
+        found = make()(X, values)
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, wave_at(X, values.float()))
+
+    @pytest.mark.parametrize("values", [torch.ones(3), torch.ones(()), 1.0])
+    def test_of_another_shape(self, values, points):
+        message = r"has 2 unknown parameter\(s\): a, b; expected parameters of shape ... x 2, found"
+        with pytest.raises(ValueError, match=message):
+            MAKE["function"]()(points(3, 2), values)
+
+    def test_of_a_physics_that_has_none(self, points):
+        with pytest.raises(ValueError, match=r"'sin' has 0 unknown parameter\(s\); expected"):
+            FunctionPhysics(torch.sin)(points(3, 2), torch.ones(2))
+
+
+class TestGradients:
+    def test_in_X(self, make, points):
+        X, values = points(3, 4, 2), points(3, 2, seed=1)
+        weights, leaf = points(3, 4, 2, seed=2), X.clone().requires_grad_()
+        physics = make()
+        torch.testing.assert_close(physics(leaf, values), wave_at(X, values))
+        (found,) = torch.autograd.grad((weights * physics(leaf, values)).sum(), leaf)
+        (expected,) = torch.autograd.grad((weights * wave_at(leaf, values)).sum(), leaf)
+        torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
+
+    @pytest.mark.parametrize("name", ["function", "module", "class"])
+    def test_in_parameters(self, name, points):
+        X, values = points(4, 2), points(3, 2, seed=1).requires_grad_()
+        assert torch.autograd.gradcheck(lambda values: MAKE[name]()(X, values), values)
+
+
+def root(x, p):
+    """NaN, or of single rows an error, below zero."""
+    if x.ndim == 1 and x[0] < p.low:
+        raise ArithmeticError("below zero")
+    return (x[..., 0] - p.low) ** 0.5
+
+
+def fragile(X, p):
+    """An error for all rows if one of them is below zero."""
+    if (X[:, 0] < p.low).any():
+        raise ArithmeticError("below zero")
+    return root(X, p)
+
+
+LOW = {"low": Unknown(0.0, sd=1.0)}
+ROOTS = {
+    "NaN": lambda: FunctionPhysics(root, unknowns=LOW),
+    "error": lambda: FunctionPhysics(fragile, unknowns=LOW),
+    "rows": lambda: BlackBoxPhysics(root, unknowns=LOW, batched=False),
+}
+
+
+class TestFailures:
+    @pytest.mark.parametrize("name", ["NaN", "rows"])
+    @pytest.mark.parametrize("grad", [False, True])
+    def test_name_rows_with_their_parameters(self, name, grad):
+        physics = ROOTS[name]()
+        X = numbers(1.0, 2.0).unsqueeze(-1).requires_grad_(grad)
+        with pytest.raises(PhysicsError) as caught:
+            physics(X, numbers(0.0, 1.5, 1.0).unsqueeze(-1))
+        assert caught.value.rows == (2,)
+        assert caught.value.inputs.tolist() == [[1.0, 1.5]]
+        with pytest.raises(PhysicsError) as caught:  # of X that is expanded, too
+            physics(X.expand(2, 2, 1), numbers(1.5))
+        assert caught.value.rows == (0, 2)
+
+    @pytest.mark.parametrize("name", ROOTS)
+    def test_or_nan(self, name):
+        physics, X = ROOTS[name](), numbers(1.0, 2.0, 3.0).unsqueeze(-1)
+        physics(X)
+        low = numbers(0.0, 1.5, 4.0, -1.0)
+        found = physics.or_nan(X, low.unsqueeze(-1)).squeeze(-1)
+        expected = (X.squeeze(-1) - low.unsqueeze(-1)).sqrt()
+        if name == "error":  # it does not say in which rows
+            expected[1] = torch.nan
+        torch.testing.assert_close(found, expected, equal_nan=True)
+        assert physics.or_nan(X, numbers(5.0)).isnan().all()
+        assert not physics.or_nan(X, numbers(0.5).expand(2, 1)).isnan().any()
+
+    @pytest.mark.parametrize("name", ROOTS)
+    def test_or_nan_of_nothing_else(self, name):
+        physics, X = ROOTS[name](), numbers(1.0).unsqueeze(-1)
+        if name == "NaN":  # whose shape says what it returns
+            assert physics.or_nan(X, numbers(2.0)).isnan().all()
+        else:
+            with pytest.raises(PhysicsError, match="below zero"):
+                physics.or_nan(X, numbers(2.0, 3.0).unsqueeze(-1))
+
+    def test_or_nan_of_an_error_without_rows(self):
+        physics = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
+        with pytest.raises(PhysicsError, match="returned list, expected a real tensor"):
+            physics.or_nan(torch.ones(2, 1), torch.zeros(1))
+
+    def test_or_nan_runs_a_simulation_once(self):
+        asked = []
+
+        def simulate(x, p):
+            asked.append((x[0], float(p.low)))
+            return root(x, p)
+
+        physics = BlackBoxPhysics(simulate, unknowns=LOW, batched=False)
+        physics.or_nan(numbers(1.0, 2.0).unsqueeze(-1), numbers(0.0, 1.5).unsqueeze(-1))
+        assert asked == [(1.0, 0.0), (2.0, 0.0), (1.0, 1.5), (2.0, 1.5)]
+
+
+@pytest.mark.parametrize("name", ["function", "module", "class"])
+def test_pickles_and_copies(name, points):
+    physics, X, values = MAKE[name](), points(3, 2), points(2, 2, seed=1)
+    expected = physics(X, values)
+    for again in (copy.deepcopy(physics), pickle.loads(pickle.dumps(physics)), copy.copy(physics)):
+        assert {**again.unknowns} == {"a": A, "b": B}
+        torch.testing.assert_close(again(X, values), expected)
+    assert (copy.deepcopy(physics) is physics) == (name != "module")
