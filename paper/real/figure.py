@@ -30,14 +30,14 @@ COLORS = {
     "cka-identified": "tab:cyan",
     "rra": "tab:green",
     "rra-identified": "yellowgreen",
-    "calibrated": "peru",
-    "calibrated-delta": "darkorange",
+    "calibrated": "tab:olive",
+    "calibrated-delta": "deepskyblue",
     "calibrated-orthogonal": "teal",
-    "calibrated-cka": "crimson",
+    "calibrated-cka": "blue",
     "network": "0.55",
     "residual": "tab:pink",
 }
-_SHOWN = ("phy", "fitted", "gp", "phymean-fitted", "cka", "cka-identified")
+_SHOWN = ("phy", "fitted", "gp", "calibrated-delta", "calibrated-cka")
 _Paths = dict[str, list[Any]]
 
 
