@@ -99,7 +99,7 @@ class LearnedDynamics(Dynamics):
         if not isinstance(encode_angles, bool):
             raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
         self.targets = TransitionTargets(spec, target)
-        self.physics = None if physics is None else check_physics(physics)
+        self.physics = None if physics is None else check_physics(physics, spec)
         self.encode_angles = encode_angles
         self.fit_result: FitResult | SampleResult | None = None
         self._recipe = ModelRecipe(self.targets, self.physics, model, model_options, encode_angles)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import cast
 
@@ -14,7 +15,7 @@ from gpadjust.physics import JoinedPhysics, ODEPhysics, Physics, as_physics
 from gpadjust.states import StateSpec
 
 
-def check_physics(physics: PhysicsLike) -> Physics:
+def check_physics(physics: PhysicsLike, spec: StateSpec) -> Physics:
     """A physics of next states, or several of them joined, from what the user gave."""
     whole = as_physics(physics)
     for part in parts_of(whole).values():
@@ -22,6 +23,12 @@ def check_physics(physics: PhysicsLike) -> Physics:
             raise ValueError(
                 f"Physics {part.name!r} returns the change of the state (difference=True), but "
                 "dynamics take the next state from it; build it with difference=False."
+            )
+        step = part.step if isinstance(part, ODEPhysics) else spec.step
+        if spec.step is not None and not math.isclose(step or 0.0, spec.step, rel_tol=1e-6):
+            raise ValueError(
+                f"Physics {part.name!r} makes steps of {step:g}, but the spec says {spec.step:g}; "
+                f"build it with step={spec.step:g}, or correct the spec."
             )
     return whole
 

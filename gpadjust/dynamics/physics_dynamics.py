@@ -49,7 +49,7 @@ class PhysicsDynamics(Dynamics):
 
     def __init__(self, spec: StateSpec, physics: Physics | Callable[[Tensor], Tensor]) -> None:
         super().__init__(spec)
-        self.physics = check_physics(physics)
+        self.physics = check_physics(physics, spec)
         if len(parts_of(self.physics)) > 1:
             raise ValueError(
                 "Expected one physics to follow, got "
