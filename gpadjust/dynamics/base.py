@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -167,6 +167,7 @@ class Dynamics(ABC):
         num_functions: int = 39,
         level: float = 0.95,
         noise: bool = True,
+        start_noise: Tensor | Literal["learnt"] | None = None,
         state_bounds: Tensor | None = None,
         seed: int = 0,
     ) -> FreeRun:
@@ -183,6 +184,10 @@ class Dynamics(ABC):
             level: The probability of the intervals.
             noise: Whether intervals and particles are of measured states, with the noise that the
                 dynamics learnt, or of the states themselves.
+            start_noise: Standard deviations ``state_dim`` by which the initial states, as measured,
+                err; each particle then starts elsewhere. ``"learnt"``: half of the variance of the
+                learnt noise, which is right if that comes of measuring both ends of a transition.
+                Default: they are exact.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
                 would leave them stays where it is. Default: none.
             seed: Seed of functions and noise; PyTorch's generator is left as it is.
@@ -211,6 +216,7 @@ class Dynamics(ABC):
             num_functions=num_functions,
             level=level,
             noise=noise,
+            start_noise=start_noise,
             state_bounds=state_bounds,
             seed=seed,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from numbers import Real
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -66,6 +66,7 @@ def free_run(
     num_functions: int,
     level: float,
     noise: bool,
+    start_noise: Tensor | Literal["learnt"] | None,
     state_bounds: Tensor | None,
     seed: int,
 ) -> FreeRun:
@@ -80,6 +81,7 @@ def free_run(
         num_functions: The number of functions.
         level: The probability of the intervals.
         noise: Whether particles and intervals have the noise.
+        start_noise: By how much the initial states err.
         state_bounds: Beyond which a particle is lost.
         seed: The seed.
     """
@@ -95,6 +97,10 @@ def free_run(
         torch.manual_seed(seed)
         functions = sample_functions(num_functions, seed)
         particles = initial_states.expand(num_functions, -1, -1)
+        if start_noise is not None:
+            first = (noise_variance, initial_states, actions[:, 0])
+            error = _start_noise(spec, start_noise, first)
+            particles = particles + measurement_noise(spec, error, num_functions, generator)
         lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
         path, lost_by_then = [], []
         for each in actions.unbind(1):
@@ -112,6 +118,27 @@ def free_run(
             cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
     low, high = central_interval(cloud, level)
     return FreeRun(mean, centre + low, centre + high, centre + cloud, torch.stack(lost_by_then, 1))
+
+
+def _start_noise(
+    spec: StateSpec, given: Tensor | Literal["learnt"], first: tuple[Move, Tensor, Tensor]
+) -> Tensor:
+    """Standard deviations of the errors of initial states, ``w x state_dim``.
+
+    Args:
+        spec: What the entries of states are.
+        given: What the user said of them.
+        first: The variances of measured next states, the initial states, the first actions.
+    """
+    variance, states, actions = first
+    if isinstance(given, str):
+        if given != "learnt":
+            raise ValueError(f"Expected start_noise as 'learnt' or a tensor, got {given!r}.")
+        return (step_or_nan(variance, states, actions).nan_to_num(nan=0.0) / 2).sqrt()
+    sd = of_states(given, "start_noise", (spec.state_dim,))
+    if not (sd.isfinite() & (sd >= 0)).all():
+        raise ValueError(f"Expected start_noise of 0 or more, got {sd.tolist()}.")
+    return sd.expand_as(states)
 
 
 def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:

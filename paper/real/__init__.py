@@ -121,4 +121,5 @@ class Real(Experiment):
         from paper.real.systems import system
 
         settings = {k: v for k, v in asdict(self.settings).items() if k != "sizes"}
-        return {**settings, "horizons": list(HORIZONS), **system(kind[0]).describe()}
+        scored = {"horizons": list(HORIZONS), "start_noise": "learnt"}
+        return {**settings, **scored, **system(kind[0]).describe()}

@@ -92,6 +92,19 @@ def test_each_particle_keeps_its_function_and_noise_comes_once(noise):
     torch.testing.assert_close(steps[..., 5], 6 * steps[..., 0])
 
 
+@pytest.mark.parametrize("start_noise", ["learnt", torch.tensor([0.3])])
+def test_a_start_that_was_measured_with_noise_moves_all_that_follows(start_noise):
+    noise = 0.3 * math.sqrt(2)  # of both ends of a transition
+    run = Drift(noise=noise).free_run(
+        STATES, ACTIONS, num_functions=3999, noise=False, start_noise=start_noise
+    )
+    torch.testing.assert_close(run.mean, STATES.unsqueeze(1) + ACTIONS.cumsum(1), rtol=0, atol=0.02)
+    spread = run.particles.std(0)
+    torch.testing.assert_close(spread, torch.full_like(spread, 0.3), rtol=0.05, atol=0)
+    steps = run.particles.diff(dim=2)  # each goes on from where it started
+    torch.testing.assert_close(steps, ACTIONS[:, 1:].expand_as(steps))
+
+
 def test_the_ends_of_the_interval_are_draws_at_any_level():
     states, actions = start()
     for level, number in ((0.95, 39), (0.8, 9), (0.5, 3)):
@@ -233,6 +246,18 @@ def test_runs_are_the_same_again_and_draw_from_no_generator():
         ((STATES, ACTIONS * torch.nan), {}, ValueError, "actions to be finite"),
         ((STATES, ACTIONS), {"level": 95}, ValueError, "probability between 0 and 1, got 95"),
         ((STATES, ACTIONS), {"level": "95 %"}, ValueError, "probability between 0 and 1"),
+        (
+            (STATES, ACTIONS),
+            {"start_noise": "known"},
+            ValueError,
+            "as .learnt. or a tensor",
+        ),
+        (
+            (STATES, ACTIONS),
+            {"start_noise": -torch.ones(1)},
+            ValueError,
+            "start_noise of 0 or",
+        ),
         ((STATES, ACTIONS), {"num_functions": 39.0}, ValueError, "num_functions to be a whole"),
         (
             (STATES, ACTIONS),
