@@ -72,7 +72,8 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         X_pending: Points that are being measured, ``k x d``.
 
     Raises:
-        TypeError: If the model has no such adjustment, or is no adjustment of a physics.
+        TypeError: If the model has no such adjustment, or is no adjustment of a physics. What is
+            told of unknown parameters of the physics does not count.
         ValueError: If ``about`` is unknown, or ``"delta"`` of a model with a centre, as by default,
             whose delta is not independent of rho a priori; with ``center=0.0`` it is.
 
@@ -143,6 +144,11 @@ def _check(model: Any, about: str) -> None:
     if about not in get_args(About):
         raise ValueError(f"Unknown {about=}; expected 'rho', 'delta' or 'both'.")
     name = type(model).__name__
+    if isinstance(model, AdjustedGP) and not model.term_names:
+        raise TypeError(
+            f"{type(model).__name__} has neither rho nor delta to learn about; what observations "
+            "tell of parameters of the physics is not computed. CKA has both."
+        )
     if not isinstance(model, AdjustedGP) or "f" in model.term_names:
         raise TypeError(
             f"Expected a model with rho or delta (CKA, RRA, ScaleGP, PhysicsMeanGP, BiasGP), got "

@@ -1,6 +1,6 @@
 """Fitting the models, by maximum likelihood or full Bayes."""
 
-from gpadjust.inference.calibrated_fit import IdentifiabilityWarning
+from gpadjust.inference.calibrated_fit import ParameterWarning
 from gpadjust.inference.fitting import FitOptions, fit
 from gpadjust.inference.full_bayes import SampleResult, SamplingWarning
 from gpadjust.inference.map_fit import FitResult
@@ -9,7 +9,7 @@ from gpadjust.inference.priors import register_priors
 __all__ = [
     "FitOptions",
     "FitResult",
-    "IdentifiabilityWarning",
+    "ParameterWarning",
     "SampleResult",
     "SamplingWarning",
     "fit",

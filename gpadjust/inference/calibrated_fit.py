@@ -9,20 +9,21 @@ import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 
-from gpadjust.inference.calibration import Around, Calibration, Shared
+from gpadjust.inference.calibration import Around, Calibration, Information, Shared
 from gpadjust.inference.log_parameters import LogParameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.models import ExactGPBase
 
 _ROUNDS = 4  # of hyper-parameters and parameters by turns
 _ARRIVED = 0.05  # standard deviations that the parameters moved
-_GIVEN = 16  # vectors of hyper-parameters that parameters are drawn for, at least
+_GIVEN = 16  # vectors of hyper-parameters that parameters are drawn for
 _UNTOLD = 0.15  # of the prior's precision: what else is known of a direction is next to nothing
+_FAR = 3.0  # standard deviations of the prior
 _TAKES_PART = 0.3  # cosine of a parameter and such a direction
 
 
-class IdentifiabilityWarning(UserWarning):
-    """The observations say next to nothing of some parameters of the physics."""
+class ParameterWarning(UserWarning):
+    """The observations say next to nothing of parameters of the physics, or contradict a prior."""
 
 
 class Calibrated(NamedTuple):
@@ -31,12 +32,14 @@ class Calibrated(NamedTuple):
     Attributes:
         calibration: Its parameters.
         near: The prior mean near them.
+        information: What the targets of each output say of them.
         shared: What they add to the distribution of the targets.
         result: What the fit of the hyper-parameters reached.
     """
 
     calibration: Calibration
     near: Around
+    information: Information
     shared: Shared
     result: FitResult
 
@@ -87,7 +90,8 @@ def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
             break
     calibration.move_to(point)
     model.input_transform.remember(point.unsqueeze(0))
-    return Calibrated(calibration, near, calibration.shared(near, information), result)
+    shared = calibration.shared(near, information)
+    return Calibrated(calibration, near, information, shared, result)
 
 
 def calibrate_roughly(model: ExactGPBase, search: Search) -> Calibrated:
@@ -106,7 +110,6 @@ def draw_parameters(
     calibrated: Calibrated,
     parameters: LogParameters,
     vectors: Tensor,
-    num_samples: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Draw parameters of the physics given draws of the hyper-parameters, ``K x B x q``.
@@ -115,7 +118,7 @@ def draw_parameters(
         ``K`` or more vectors, the coordinates of parameters that go with each, ``x p``, and the
         least power of importance weights.
     """
-    count = max(num_samples, min(_GIVEN, len(vectors)))
+    count = min(_GIVEN, len(vectors))
     rows = torch.linspace(0, len(vectors) - 1, count).round().long()
     each = -(-len(vectors) // count)
     draws = calibrated.calibration.draw(calibrated.near, parameters, vectors[rows], generator)
@@ -126,24 +129,33 @@ def draw_parameters(
     return vectors[rows].repeat_interleave(each, 0), coordinates, draws.power.min()
 
 
-def warn_of_unidentified(calibrated: Calibrated, coordinates: Tensor) -> None:
-    """Warn of parameters that the posterior knows no better than the prior.
+def warn_of_parameters(calibrated: Calibrated) -> None:
+    """Warn of parameters that the observations tell nothing of, or against what was known.
 
-    Args:
-        calibrated: The model.
-        coordinates: Draws of the parameters, ``K x p``, standard normal by the prior.
+    The first are directions in which the observations have next to none of the prior's precision;
+    the second are likely more standard deviations of the prior away from its middle than it allows.
     """
     names = calibrated.calibration.unknowns.names
-    values, vectors = torch.linalg.eigh(torch.cov(coordinates.mT).reshape(len(names), -1))
-    untold = vectors[:, values > 1 / (1 + _UNTOLD)]
-    part = untold.norm(dim=-1) > _TAKES_PART
-    if not part.any():
-        return
-    found = ", ".join(name for name, yes in zip(names, part.tolist(), strict=True) if yes)
-    warnings.warn(
-        f"The observations say next to nothing of {found} of the physics, or only of a combination "
-        "of them: their posterior is their prior there. Observe where they matter, give narrower "
-        "priors, or take one of them as known.",
-        IdentifiabilityWarning,
-        stacklevel=4,
-    )
+
+    def of(which: Tensor) -> str:
+        return ", ".join(name for name, yes in zip(names, which.tolist(), strict=True) if yes)
+
+    values, vectors = torch.linalg.eigh(calibrated.information.precision.sum(-3))
+    silent = of(vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART)
+    if silent:
+        warnings.warn(
+            f"The observations say next to nothing of {silent} of the physics, or only of a "
+            "combination of them: their posterior is their prior there. Observe where they matter, "
+            "give narrower priors, or take one of them as known.",
+            ParameterWarning,
+            stacklevel=4,
+        )
+    against = of(calibrated.near.point.abs() > _FAR)
+    if against:
+        warnings.warn(
+            f"Observations and prior disagree about {against} of the physics: most likely are "
+            f"values more than {_FAR:g} standard deviations of the prior away. Look at guess, sd, "
+            "factor and bounds, or at the physics.",
+            ParameterWarning,
+            stacklevel=4,
+        )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.gp import OrthogonalKernel, PhysicsInput
+from gpadjust.gp import AppendedPhysics, OrthogonalKernel, PhysicsInput
 from gpadjust.gp.gaussian import cholesky, known_noise, negative_log_likelihood
 from gpadjust.inference.importance_sampling import Draws, Mixture
 from gpadjust.inference.importance_sampling import sample as importance_sample
@@ -18,16 +19,19 @@ from gpadjust.models import ExactGPBase
 from gpadjust.models.hyperparameters import kernels_of
 
 _STEP = 1e-4  # of differences, in standard deviations of the prior
-_GUESSES = 64  # of the parameters, of which the best are started from
-_STARTS = 8
+_GUESSES = 255  # of the parameters, of which the best are started from
+_STARTS = 16
 _ITERATIONS = 60  # of least squares
 _ARRIVED = 1e-4  # decrease of a negative log density at which they stop
 _TRIED = 8  # of them, after which the best go on
-_KEPT = 3  # of these
+_KEPT = 6  # of these
 _SILENT = 1e-14  # the mean square of residuals, relative to that of the targets, that is none
 _AT_ONCE = 2**22  # numbers in the covariances of a batch
 _STUCK = 1e8  # damping of a search that finds nothing better
 _NEARER = 2  # times that the mean is linearised anew for a sample of the hyper-parameters
+_POOR = 0.5  # power of the weights of such draws, below which there are more
+_MOST_DRAWS = 2048
+_ROWS = 1_000_000  # that the physics is asked about for them
 _DRAWS = 48  # of the parameters, for each sample of the hyper-parameters
 
 
@@ -123,6 +127,8 @@ class Calibration:
         self.unknowns = transform.physics.unknowns
         kernels = (kernel for _, kernel, _, _ in kernels_of(model))
         self._is_orthogonal = any(isinstance(kernel, OrthogonalKernel) for kernel in kernels)
+        scaled = (t for t in model.terms if isinstance(t.basis, AppendedPhysics))
+        self._moves_covariance = self._is_orthogonal or not all(t.is_known for t in scaled)
 
     @property
     def point(self) -> Tensor:
@@ -173,8 +179,10 @@ class Calibration:
             Their coordinates, ``p``, and the mean squares of the residuals, ``B``.
         """
         current = self.point.unsqueeze(0)  # where it works, as the model was built there
-        drawn = torch.randn(_GUESSES, current.shape[-1], generator=generator, dtype=torch.float64)
-        guesses = torch.cat([current, drawn.to(current)])
+        seed = int(torch.randint(2**31, (1,), generator=generator))
+        engine = torch.quasirandom.SobolEngine(current.shape[-1], scramble=True, seed=seed)
+        shares = engine.draw(_GUESSES, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
+        guesses = torch.cat([current, torch.special.ndtri(shares).to(current)])
         values = self._misfit(guesses, self._residuals(guesses))[0]
         best = values[1:].argsort()[: _STARTS - 1] + 1
         z = torch.cat([guesses[:1], guesses[best]])
@@ -256,7 +264,7 @@ class Calibration:
         residual = self._residuals(points).movedim(0, -1)
         white = torch.linalg.solve_triangular(self._factor(covariance), residual, upper=False)
         value = white.square().sum((0, 1)) + points.square().sum(-1)
-        return points[value.nan_to_num(nan=math.inf).argmin()]
+        return points[value.nan_to_num(nan=math.inf, posinf=math.inf).argmin()]
 
     @torch.no_grad()
     def draw(
@@ -279,13 +287,37 @@ class Calibration:
         def coordinates(away: Tensor) -> Tensor:
             return mean + (root @ away.unsqueeze(-1)).squeeze(-1)
 
-        draws = importance_sample(
-            lambda away: self._potential(coordinates(away), parameters, vectors),
-            proposal,
-            _DRAWS,
-            generator,
-        )
+        def drawn(number: int) -> Draws:
+            return importance_sample(
+                lambda away: potential(coordinates(away)), proposal, number, generator
+            )
+
+        potential = self._potential_given(parameters, vectors, covariance)
+        draws = drawn(_DRAWS)
+        more = min(_MOST_DRAWS, _ROWS // (len(vectors) * len(self._raw)))
+        if (draws.power < _POOR).any() and more > _DRAWS:  # far from linear: adapt, in rounds
+            draws = drawn(more)
         return draws._replace(positions=coordinates(draws.positions))
+
+    def _potential_given(
+        self, parameters: LogParameters, vectors: Tensor, covariance: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Negative log densities ``k x H`` of parameters ``k x H x p`` given hyper-parameters.
+
+        They are up to a constant for each of the ``H`` vectors, of which ``covariance`` is that of
+        the targets.
+        """
+        if self._moves_covariance:
+            return lambda z: self._potential(z, parameters, vectors)
+        chol = self._factor(covariance)
+
+        def potential(z: Tensor) -> Tensor:
+            residual = self._residuals(z).movedim(0, -1)  # H x B x n x k
+            white = torch.linalg.solve_triangular(chol, residual, upper=False)
+            value = 0.5 * white.square().sum((1, 2)).mT + 0.5 * z.square().sum(-1)
+            return value.nan_to_num(nan=math.inf, posinf=math.inf)
+
+        return potential
 
     def _potential(self, z: Tensor, parameters: LogParameters, vectors: Tensor) -> Tensor:
         """Negative log densities ``k x H`` of parameters ``k x H x p`` given hyper-parameters."""
@@ -301,7 +333,7 @@ class Calibration:
             residual = self._targets - mean.nan_to_num(nan=0.0)
             value = negative_log_likelihood(residual, covariance).value.sum(-1)
             found.append(value.masked_fill(failed, math.inf) + 0.5 * part.square().sum(-1))
-        return torch.cat(found).nan_to_num(nan=math.inf).view(z.shape[:2])
+        return torch.cat(found).nan_to_num(nan=math.inf, posinf=math.inf).view(z.shape[:2])
 
     def _inputs(self, points: Tensor) -> Tensor:
         """What the terms read at points ``... x p``, ``... x (1) x n x d``; NaN if f_p fails."""
@@ -312,7 +344,7 @@ class Calibration:
         """The targets less their prior mean at points ``... x p``, as in :class:`Around`."""
         mean = self.model.mean_module(self._inputs(points))
         mean = mean.reshape(*points.shape[:-1], *self._targets.shape)
-        residual = self._targets - mean.nan_to_num(nan=math.inf)
+        residual = self._targets - mean.nan_to_num(nan=math.inf, posinf=math.inf)
         return residual.where(self._observed, torch.zeros_like(residual))
 
     def _misfit(self, z: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -321,7 +353,7 @@ class Calibration:
         least = _SILENT * self._targets.square().nanmean(-1) + torch.finfo(z.dtype).tiny
         variances = (residual.square().sum(-1) / count).maximum(least)
         value = (0.5 * count * variances.log()).sum(-1) + 0.5 * z.square().sum(-1)
-        return value.nan_to_num(nan=math.inf), variances
+        return value.nan_to_num(nan=math.inf, posinf=math.inf), variances
 
     def _factor(self, covariance: Tensor) -> Tensor:
         return cholesky(covariance.clone(), None if self._all else self._observed)[0]

@@ -115,8 +115,8 @@ def fit(
             from each start (500). ``seed`` of random starts and draws (0); the global random
             state is left alone. Of ``"bayes"`` only: ``num_samples`` that the model is to hold
             (default: 16, 8 with more than 40 points, 4 with more than 100; 16 if the physics has
-            unknown parameters), and ``num_draws`` that
-            they are chosen from (default: 1,024, down to 128 with more than 70 points).
+            unknown parameters, and up to 256 of a model that has nothing else), and ``num_draws``
+            that they are chosen from (default: 1,024, down to 128 with more than 70 points).
 
     Returns:
         For ``"map"`` the likelihood reached and whether the optimiser converged, otherwise the
@@ -133,8 +133,8 @@ def fit(
     Warns:
         OptimizationWarning: If the optimiser did not converge.
         SamplingWarning: If next to one draw has all the weight.
-        IdentifiabilityWarning: If the observations tell next to nothing of a parameter of the
-            physics, or of a combination of some.
+        ParameterWarning: If the observations tell next to nothing of a parameter of the physics, or
+            of a combination of some, or contradict its prior.
     """
     given: dict[str, Any] = {**options}
     if isinstance(model, ModelListGP):

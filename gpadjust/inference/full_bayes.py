@@ -13,7 +13,7 @@ from torch import Tensor
 from gpadjust.inference.calibrated_fit import (
     calibrate_roughly,
     draw_parameters,
-    warn_of_unidentified,
+    warn_of_parameters,
 )
 from gpadjust.inference.importance_sampling import Draws, Mixture
 from gpadjust.inference.importance_sampling import sample as importance_sample
@@ -29,6 +29,7 @@ _WIDEST = 4.0  # standard deviation of Laplace's approximation, in logarithms
 _DRAWS = (128, 1024)  # the least and the most by default
 _COST = 5_120_000  # draws times observations squared
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
+_SAMPLED_ALONE = 2_000_000  # samples times observations squared, of a physics without a GP
 _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
 _RETURNED = 256  # draws, at least
 LEAST_POWER = 0.05  # of the weights, for draws that show the posterior
@@ -80,7 +81,9 @@ def sample(
     if num_samples is None:
         num_samples = default_num_samples(n)
         if calibrated is not None:
-            num_samples = max(num_samples, _SAMPLES_OF_PARAMETERS)
+            alone = all(term.is_known for term in model.terms)
+            least = min(_RETURNED, _SAMPLED_ALONE // n**2) if alone else 0
+            num_samples = max(num_samples, _SAMPLES_OF_PARAMETERS, least)
     generator = torch.Generator().manual_seed(search.seed)
     number = max(_RETURNED, num_samples)
     if parameters.names:
@@ -90,10 +93,8 @@ def sample(
         vectors = parameters.current().expand(number, -1, -1)
         power = torch.ones(parameters.num_problems, dtype=torch.float64)
     if calibrated is not None:
-        vectors, coordinates, least = draw_parameters(
-            calibrated, parameters, vectors, num_samples, generator
-        )
-        power = power.minimum(least)
+        vectors, coordinates, lowest = draw_parameters(calibrated, parameters, vectors, generator)
+        power = power.minimum(lowest)
     rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
     if settled:
         model.train()  # its inputs are then transformed again, with what they are at now
@@ -112,7 +113,7 @@ def sample(
     if (result.power < LEAST_POWER).any():
         _warn(result)
     if calibrated is not None:
-        warn_of_unidentified(calibrated, coordinates)
+        warn_of_parameters(calibrated)
     return result
 
 

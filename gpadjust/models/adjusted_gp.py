@@ -106,6 +106,8 @@ class AdjustedGP(ExactGPBase):
         start = _start(data.Y, f, rho_means)
         if isinstance(outcome_transform, _DefaultType):
             mean = sum((w * v for w, v in zip(start, f, strict=True)), torch.zeros_like(data.Y))
+            if f and transform.physics.unknowns:
+                mean = _closer(data.Y, mean)
             units: Standardize | None = residual_scale(data.Y, mean)
         else:
             units = estimated(outcome_transform, data.Y, X)
@@ -287,6 +289,13 @@ def _values(transform: Any, X: Tensor, m: int) -> list[Tensor]:
             f"{m}, one for each column of train_Y."
         )
     return list(X[..., -total:].split(m, dim=-1))
+
+
+def _closer(Y: Tensor, mean: Tensor) -> Tensor:
+    """The prior mean or, where guesses of the physics' parameters are farther off, that of Y."""
+    own = Y.nanmean(-2, keepdim=True).expand_as(mean)
+    square, least = ((Y - each).square().nanmean(-2, keepdim=True) for each in (mean, own))
+    return own.where((least > 0) & (least < square), mean)
 
 
 def _means(rho: Adjustment | None, number: int) -> list[float | Literal["learn"]]:

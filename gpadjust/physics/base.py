@@ -351,8 +351,8 @@ class Physics(torch.nn.Module, ABC):
             raise
         except Exception as error:
             raise PhysicsError(
-                f"Physics {self.name!r} raised {type(error).__name__}: {error}. The call was for "
-                f"{len(rows)} row(s):",
+                f"Physics {self.name!r} raised {type(error).__name__}: {str(error).rstrip('.')}."
+                f"{self._arguments_hint(error)} The call was for {len(rows)} row(s):",
                 range(len(rows)),
             ) from error
         Y = self._check_shape(Y, len(rows)).to(rows)
@@ -367,6 +367,17 @@ class Physics(torch.nn.Module, ABC):
                 partial=Y.detach(),
             )
         return Y
+
+    def _arguments_hint(self, error: Exception) -> str:
+        """What to do where a function was called with the wrong number of arguments."""
+        if not isinstance(error, TypeError) or "positional argument" not in str(error):
+            return ""
+        if self.unknowns:
+            return (
+                " The values of its unknown parameters, p, are its last argument: p."
+                f"{self.unknowns.names[0]} is one for each row."
+            )
+        return " Parameters that are to be learnt are named as unknowns={'mass': Unknown(...)}."
 
     def _split(self, rows: Tensor) -> tuple[Any, ...]:
         """Rows ``N x (d + p)`` as the arguments of ``evaluate``."""

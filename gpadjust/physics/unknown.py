@@ -168,8 +168,11 @@ class ParameterValues(Mapping[str, Any]):
 
     def __getattr__(self, name: str) -> Any:
         """The values of a parameter, ``N``."""
-        if name.startswith("_") or name not in self._names:
-            raise AttributeError(f"There is no parameter {name!r}.")
+        if name.startswith("_"):  # also of a copy that has nothing yet
+            raise AttributeError(name)
+        if name not in self._names:
+            known = ", ".join(self._names)
+            raise AttributeError(f"there is no parameter {name!r}; there are {known}")
         return self[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -15,7 +15,7 @@ from torch import Size, Tensor
 
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.gp import PhysicsScaledKernel
-from gpadjust.inference import IdentifiabilityWarning, SamplingWarning
+from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.models import ExactGPBase, orthogonal_rbf
 from gpadjust.models.hyperparameters import scaled_rbf
 from gpadjust.validation import rmse
@@ -41,7 +41,7 @@ _BUILD: Mapping[str, Callable[..., ExactGPBase]] = {
 def run(experiment: Parameters, problem: str, model: str, seed: int, *, unfinished: Path) -> Record:
     """Fit a model to a case; return ends of intervals, beside what they are to hold."""
     warnings.simplefilter("ignore", SamplingWarning)
-    warnings.simplefilter("ignore", IdentifiabilityWarning)
+    warnings.simplefilter("ignore", ParameterWarning)
     known = case(problem, seed)
     fitted: Any = _BUILD[model](known.X, known.observations, physics=known.physics)
     begin = time.perf_counter()

@@ -45,11 +45,11 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
         for known in ("phy", "phy-identified")
     )
     smaller = [((*cell[:3], most), [(*cell[:3], 100)]) for cell, most in found.largest(ours)]
-    fitted = found.beside(["phymean-fitted", CALIBRATED[0]], ["fitted"])
+    fitted = found.beside(["phymean-fitted", *CALIBRATED], ["fitted"])
     contained = [
         pair
         for name in ours
-        for pair in found.beside([name], [OURS.get(name, "phy"), "gp"])
+        for pair in found.beside([name], [OURS.get(name, "calibrated"), "gp"])
         if pair[0][3] >= _LEAST
     ]
     pendulum = [
@@ -147,7 +147,7 @@ class _Means:
         held = sum(ratio <= most for ratio in ratios.values())
         worst = max(ratios, key=lambda cell: ratios[cell])
         at = f"{' '.join(worst[:3])}, n = {worst[3]}, {worst[4]}"
-        text = f"in {held} of {len(ratios)} cells; the worst, {ratios[worst]:.2f} times: {at}"
+        text = f"held in {held} of {len(ratios)} cells; the worst, {ratios[worst]:.2f} times: {at}"
         return Judged(name, claim, met(held == len(ratios)), text)
 
     def within(
@@ -172,7 +172,9 @@ class _Means:
             return Judged(name, claim, "not run", "no results of these learners")
         held = sum(low <= value <= high for value in found.values())
         ends = f"from {min(found.values()):.2f} to {max(found.values()):.2f}"
-        return Judged(name, claim, met(held == len(found)), f"in {held} of {len(found)}, {ends}")
+        return Judged(
+            name, claim, met(held == len(found)), f"held in {held} of {len(found)}, {ends}"
+        )
 
     def _cells(self, learners: Sequence[str]) -> Iterator[_Cell]:
         for system, test, learner, n in self.table.index:

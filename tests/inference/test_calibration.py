@@ -7,7 +7,7 @@ import torch
 
 from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, PhysicsMeanGP, Unknown, fit
 from gpadjust.gp import OrthogonalKernel
-from gpadjust.inference import IdentifiabilityWarning
+from gpadjust.inference import ParameterWarning
 from gpadjust.inference.calibration import Calibration
 from gpadjust.models import orthogonal_rbf
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
@@ -158,7 +158,7 @@ def test_parameters_that_nothing_tells_apart_are_named():
     X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
     unknowns = {"a": Unknown(1.0, sd=1.0), "b": Unknown(1.0, sd=1.0), "c": Unknown(1.0, sd=1.0)}
     law = FunctionPhysics(lambda X, p: (p.a + p.b) * X[:, 0] + p.c, unknowns=unknowns)
-    with pytest.warns(IdentifiabilityWarning, match="next to nothing of a, b of the physics"):
+    with pytest.warns(ParameterWarning, match="next to nothing of a, b of the physics"):
         fit(CalibratedPhysics(X, 2 * X + 1, 0.01, physics=law))
 
 
@@ -225,3 +225,34 @@ def test_the_figure_shows_the_physics_with_what_was_learnt():
     torch.testing.assert_close(
         torch.as_tensor(line.get_ydata()), 3 * X.squeeze(-1), rtol=1e-4, atol=0
     )
+
+
+@pytest.mark.filterwarnings("ignore::gpadjust.inference.ParameterWarning")
+def test_a_curved_ridge_is_followed():
+    X = torch.linspace(0, 3, 20, dtype=torch.float64).unsqueeze(-1)
+    unknowns = {"a": Unknown(1.5, sd=0.7), "k": Unknown(1.5, sd=0.7)}
+    law = FunctionPhysics(lambda X, p: p.a * p.k * (-0.8 * X[:, 0]).exp(), unknowns=unknowns)
+    generator = torch.Generator().manual_seed(0)
+    Y = 2 * (-0.8 * X).exp() + 0.03 * torch.randn(20, 1, generator=generator, dtype=torch.float64)
+    model = CalibratedPhysics(X, Y, 0.03**2, physics=law)
+    result = fit(model)
+    assert result.power.min() > 0.5
+    grid = torch.linspace(0.02, 4, 400, dtype=torch.float64)
+    a, k = torch.meshgrid(grid, grid, indexing="ij")
+    basis = (-0.8 * X.squeeze(-1)).exp()
+    size, cross = basis @ basis, basis @ Y.squeeze(-1)
+    product = a * k
+    log_density = -(0.5 * product.square() * size - product * cross) / 0.03**2
+    log_density -= 0.5 * (((a - 1.5) / 0.7) ** 2 + ((k - 1.5) / 0.7) ** 2)
+    marginal = (log_density - log_density.max()).exp().sum(1)
+    below = marginal.cumsum(0) / marginal.sum()
+    low, high = (grid[(below < q).sum()] for q in (0.025, 0.975))
+    found = model.physics_parameters.interval()
+    assert found[1][0] - found[0][0] > 0.5 * (high - low)
+
+
+def test_a_prior_that_the_observations_contradict_is_named():
+    X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+    law = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1000.0, sd=1.0)})
+    with pytest.warns(ParameterWarning, match="prior disagree about a of the physics"):
+        fit(CalibratedPhysics(X, 2 * X, 0.01, physics=law))

@@ -369,3 +369,15 @@ def test_pickles_and_copies(name, points):
         assert {**again.unknowns} == {"a": A, "b": B}
         torch.testing.assert_close(again(X, values), expected)
     assert (copy.deepcopy(physics) is physics) == (name != "module")
+
+
+def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():
+    X = torch.ones(2, 1, dtype=torch.float64)
+    without = FunctionPhysics(lambda X: X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
+    with pytest.raises(PhysicsError, match=r"unknown parameters, p, are its last argument: p\.a"):
+        without(X)
+    with pytest.raises(PhysicsError, match="are named as unknowns="):
+        FunctionPhysics(lambda X, p: p.a * X[:, 0])(X)
+    misspelt = FunctionPhysics(lambda X, p: p.b * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
+    with pytest.raises(PhysicsError, match=r"there is no parameter 'b'; there are a\. The call"):
+        misspelt(X)
