@@ -144,9 +144,10 @@ class ExactGPBase(SingleTaskGP):
     def summary(self) -> str:
         """What the model has learnt, as a text in the user's units.
 
-        The structure; the log marginal likelihood; means, standard deviations and lengthscales of
-        the terms; the noise as a standard deviation; and what is at a bound of the search. Of a
-        model that holds samples, their medians and the ranges of 95 % of them.
+        The structure; unknown parameters of the physics; the log marginal likelihood; means,
+        standard deviations and lengthscales of the terms; the noise as a standard deviation; and
+        what is at a bound. Of a model that holds samples, their medians and the ranges of 95 % of
+        them.
         """
         return summary(self)
 

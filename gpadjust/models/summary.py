@@ -14,6 +14,8 @@ from gpadjust.models.hyperparameters import KINDS, is_rho, kind_of, typical_size
 
 _ROUNDING = 1e-12  # of a term's unit
 _NEAR = 1.01  # times a bound is at the bound
+_NEAR_BOUND = 0.1  # of the range of draws of a parameter is at its bound
+_MANY = 0.25  # share of the draws, with which the parameter is
 
 
 def title(model: Any) -> str:
@@ -32,6 +34,8 @@ def summary(model: Any) -> str:
     """The text of :meth:`~gpadjust.CKA.summary`."""
     model.eval()
     lines = [title(model)]
+    if model.has_unknowns:
+        lines += ["parameters of the physics:", *_of_physics(model)]
     for i, name in enumerate(model.output_names):
         lines += [f"{name}:", *_lines(model.subset_output([i]))]
     return "\n".join(lines)
@@ -61,6 +65,20 @@ def _lines(model: Any) -> list[str]:
     noise = noise_variances(model.likelihood, model.train_inputs[0]).mean(-1)
     sd = _text(noise.sqrt() * scale)
     return [*lines, f"  noise: sd {sd}{_at_bound(noise, 'noise', sizes.get(name))}"]
+
+
+def _of_physics(model: Any) -> list[str]:
+    """A line for each unknown parameter of the physics."""
+    lines = []
+    for name, unknown in model.physics_parameters.unknowns.items():
+        draws = model.physics_parameters[name]
+        reach = _NEAR_BOUND * (draws.amax() - draws.amin())
+        shares = [float(((draws - end).abs() < reach).double().mean()) for end in unknown.bounds]
+        near = [end for end, share in zip(unknown.bounds, shares, strict=True) if share > _MANY]
+        at = f", at the bound {near[0]:.4g}" if near else ""
+        unit = f" {unknown.unit}" if unknown.unit else ""
+        lines.append(f"  {name}: {_text(draws)}{unit}{at}")
+    return lines
 
 
 def _of_term(

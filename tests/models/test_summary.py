@@ -7,7 +7,18 @@ import torch
 from botorch.models.transforms import Normalize
 from torch.distributions import MultivariateNormal, Normal
 
-from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from gpadjust import (
+    AR1,
+    CKA,
+    RRA,
+    CalibratedPhysics,
+    FunctionPhysics,
+    PhysicsMeanGP,
+    ScaleGP,
+    Unknown,
+    ZeroMeanGP,
+    fit,
+)
 
 
 def crude(X):
@@ -93,3 +104,19 @@ def test_intervals_of_a_mixture(uniform):
     for end, level in zip(model.interval(Z), (0.025, 0.975), strict=True):
         share = Normal(posterior.mean, posterior.variance.sqrt()).cdf(end.unsqueeze(-3)).mean(-3)
         torch.testing.assert_close(share, torch.full_like(share, level))
+
+
+def test_parameters_of_the_physics():
+    X = torch.linspace(0, 1, 12, dtype=torch.float64).unsqueeze(-1)
+    unknowns = {
+        "slope": Unknown(1.0, sd=1.0, unit="m/s"),
+        "rest": Unknown(1.5, bounds=(1.0, 2.0)),
+    }
+    law = FunctionPhysics(lambda X, p: p.slope * X[:, 0] + p.rest, unknowns=unknowns)
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.05 * torch.randn(12, 1, generator=generator, dtype=torch.float64)
+    model = CalibratedPhysics(X, 2 * X + 0.9 + noise, 0.05**2, physics=law)
+    fit(model)
+    text = model.summary()
+    assert re.search(r"slope: 1\.\d+ \(1\.\d+ to \d\.\d+\) m/s\n", text)
+    assert re.search(r"rest: 1\.0\d* \(1.* to 1\.\d+\), at the bound 1\n", text)
