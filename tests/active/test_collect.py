@@ -4,6 +4,7 @@ import json
 import math
 import os
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -450,7 +451,9 @@ print("end", result.X.flatten().tolist(), flush=True)
             process = start("log")
             lines.append(process.stdout.readline().strip())
             if kills == 0:
+                process.send_signal(signal.SIGSTOP)  # it may be done before the other has started
                 refused = start("log").communicate()[1]
+                process.send_signal(signal.SIGCONT)
                 assert f"log is held by process {process.pid} on" in refused
             if kills < 3:
                 time.sleep(draw.uniform(0, 0.2))

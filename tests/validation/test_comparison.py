@@ -7,7 +7,7 @@ import pytest
 import torch
 from botorch.models.transforms import Normalize
 
-from gpadjust import CKA, StackedGP, ZeroMeanGP, compare, fit
+from gpadjust import CKA, FunctionPhysics, StackedGP, Unknown, ZeroMeanGP, compare, fit
 from gpadjust.validation import STRUCTURES, Structure, leave_one_out, stacking_weights
 from gpadjust.validation.ranking import Candidate, is_clear, ranking
 
@@ -260,7 +260,8 @@ def test_several_physics_each_alone_and_all(X, noise):
 @pytest.mark.slow
 def test_all_structures_by_default(scaled):
     comparison = compare(*scaled, crude)
-    assert set(comparison.models) == {structure.name for structure in STRUCTURES}
+    known = {structure.name for structure in STRUCTURES if not structure.calibrates}
+    assert set(comparison.models) == known
     assert says(comparison, "The physics helps")
 
 
@@ -310,3 +311,19 @@ def test_bad_input(scaled):
     ):
         with pytest.raises(ValueError, match=says):
             compare(*data, crude, **{"structures": ["CKA"], **options})
+
+
+def test_a_physics_with_unknown_parameters_is_calibrated_by_each_structure():
+    X = torch.linspace(0.1, 3, 12, dtype=torch.float64).unsqueeze(-1)
+    unknowns = {"size": Unknown(4.0, factor=1.5), "rate": Unknown(1.5, factor=1.5)}
+    law = FunctionPhysics(lambda X, p: p.size * (1 - (-p.rate * X[:, 0]).exp()), unknowns=unknowns)
+    noise = 0.05 * torch.randn(12, 1, generator=torch.Generator().manual_seed(0)).double()
+    Y = 5 * (1 - (-X).exp()) + noise
+    comparison = compare(X, Y, law, structures=["calibrated physics", "physics mean"])
+    for model in comparison.models.values():
+        low, high = model.physics_parameters.interval()
+        assert ((low < torch.tensor([5.0, 1.0])) & (torch.tensor([5.0, 1.0]) < high)).all()
+    (rows,) = comparison.table.values()
+    assert {row.structure for row in rows} == {"calibrated physics", "physics mean"}
+    with pytest.raises(ValueError, match="has no unknown parameter for 'calibrated physics'"):
+        compare(X, Y, torch.sin, structures="calibrated physics")
