@@ -9,7 +9,8 @@ import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 
-from gpadjust.inference.calibration import Around, Calibration, Information, Shared
+from gpadjust.inference.calibration import Calibration
+from gpadjust.inference.linearisation import Around, Information, Shared
 from gpadjust.inference.log_parameters import LogParameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.models import ExactGPBase
@@ -53,11 +54,13 @@ def calibrate(model: ExactGPBase, search: Search) -> Calibrated:
     """
     model.train()
     calibration = Calibration(model)
-    start = calibration.point
+    start = [(parameter, parameter.detach().clone()) for parameter in model.parameters()]
     try:
         return _calibrate(calibration, search)
-    except BaseException:
-        calibration.move_to(start)
+    except BaseException:  # the model is then as it was
+        with torch.no_grad():
+            for parameter, before in start:
+                parameter.copy_(before)
         raise
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from gpadjust.gp import AppendedPhysics, OrthogonalKernel, PhysicsInput
 from gpadjust.gp.gaussian import cholesky, known_noise, negative_log_likelihood
 from gpadjust.inference.importance_sampling import Draws, Mixture
 from gpadjust.inference.importance_sampling import sample as importance_sample
+from gpadjust.inference.linearisation import Around, Information, Shared
 from gpadjust.inference.log_parameters import LogParameters
 from gpadjust.inference.target_distribution import ModuleDistribution
 from gpadjust.models import ExactGPBase
@@ -33,67 +33,6 @@ _POOR = 0.3  # power of the weights of such draws, below which there are more
 _MOST_DRAWS = 2048
 _ROWS = 1_000_000  # that the physics is asked about for them
 _DRAWS = 48  # of the parameters, for each sample of the hyper-parameters
-
-
-class Around(NamedTuple):
-    """The prior mean at the training inputs, near points of the unknown parameters.
-
-    Attributes:
-        point: Their coordinates z, ``... x p``.
-        residual: The targets less the mean there, ``... x B x n``; 0 where there is no target, and
-            infinite where the physics fails.
-        slope: Derivatives of the mean, ``... x B x n x p``; 0 likewise.
-    """
-
-    point: Tensor
-    residual: Tensor
-    slope: Tensor
-
-    @property
-    def target(self) -> Tensor:
-        """What the slopes times the parameters are to make, :math:`r + J z`, ``... x B x n``."""
-        return self.residual + (self.slope @ self.point[..., None, :, None]).squeeze(-1)
-
-
-class Information(NamedTuple):
-    """What the targets of each output say of the parameters, if the mean is linear in them.
-
-    Attributes:
-        precision: :math:`J^T K^{-1} J`, ``... x B x p x p``.
-        pull: :math:`J^T K^{-1} (r + J z)`, ``... x B x p``.
-    """
-
-    precision: Tensor
-    pull: Tensor
-
-    def posterior(self, outputs: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Mean ``... x p`` and Cholesky factor of the precision, by the prior and all outputs.
-
-        With a matrix of ones and zeros, ``b x B``, for each of its rows by some of them.
-        """
-        if outputs is None:
-            precision, pull = self.precision.sum(-3), self.pull.sum(-2)
-        else:
-            precision = torch.einsum("bc,...cpq->...bpq", outputs, self.precision)
-            pull = outputs @ self.pull
-        chol = torch.linalg.cholesky(precision + torch.eye(pull.shape[-1]).to(pull))
-        return torch.cholesky_solve(pull.unsqueeze(-1), chol).squeeze(-1), chol
-
-
-class Shared(NamedTuple):
-    """What unknown parameters add to the distribution of the targets.
-
-    Attributes:
-        mean: Added to their mean, ``(m) x n``.
-        covariance: Added to their covariance, ``(m) x n x n``.
-    """
-
-    mean: Tensor
-    covariance: Tensor
-
-    def of_rows(self, rows: Any) -> Shared:
-        """That of some of the targets."""
-        return Shared(self.mean[..., rows], self.covariance[..., rows, :][..., rows])
 
 
 class Calibration:

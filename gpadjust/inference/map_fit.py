@@ -17,7 +17,7 @@ from botorch.optim.batched_lbfgs_b import fmin_l_bfgs_b_batched
 from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics
-from gpadjust.inference.calibration import Shared
+from gpadjust.inference.linearisation import Shared
 from gpadjust.inference.log_parameters import magnitude
 from gpadjust.inference.objective import Objective
 

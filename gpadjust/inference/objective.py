@@ -13,7 +13,7 @@ from torch import Tensor
 from gpadjust.gp import AppendedPhysics, SumOfTerms, Term
 from gpadjust.gp.gaussian import LikelihoodValue, known_noise, negative_log_likelihood
 from gpadjust.gp.stationary import StationarySum, StationaryTerm, stationary_form
-from gpadjust.inference.calibration import Shared
+from gpadjust.inference.linearisation import Shared
 from gpadjust.inference.log_parameters import LogParameters
 from gpadjust.inference.log_priors import LogPriors
 from gpadjust.inference.target_distribution import ModuleDistribution, constant_means

@@ -256,3 +256,18 @@ def test_a_prior_that_the_observations_contradict_is_named():
     law = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1000.0, sd=1.0)})
     with pytest.warns(ParameterWarning, match="prior disagree about a of the physics"):
         fit(CalibratedPhysics(X, 2 * X, 0.01, physics=law))
+
+
+def test_a_fit_that_fails_leaves_the_model_as_it_was(monkeypatch):
+    X, Y = data()
+    model = PhysicsMeanGP(X, Y, physics=FunctionPhysics(lines, unknowns=PRIORS))
+    before = {name: value.clone() for name, value in model.named_parameters()}
+
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Calibration, "newton", stopped)  # when hyper-parameters have been found
+    with pytest.raises(KeyboardInterrupt):
+        fit(model, "map")
+    for name, value in model.named_parameters():
+        assert torch.equal(value, before[name]), name
