@@ -36,6 +36,8 @@ nitpick_ignore = [  # what signatures name, but users do not call by name
     ("py:class", "gpadjust.envs.viewed_env.ViewedEnv"),
     ("py:class", "gpadjust.inference.fitting.FitOptions"),
     ("py:class", "gpadjust.dynamics.incremental_fit.DynamicsFitOptions"),
+    ("py:class", "gpadjust.dynamics.control_steps.Stretch"),
+    ("py:class", "gpadjust.dynamics.smoothing.Estimate"),
     ("py:class", "gpadjust.models.stacked.Part"),
     ("py:class", "gpadjust.models.cholesky_strategy.CholeskyStrategy"),
     ("py:class", "gpadjust.models.sampled_functions.TermFeatures"),

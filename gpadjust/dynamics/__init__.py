@@ -3,10 +3,13 @@
 from gpadjust.dynamics.angle_input import AngleInput
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.free_run import FreeRun
+from gpadjust.dynamics.free_run_scores import FreeRunScores
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.record import Record
 from gpadjust.dynamics.records import Records, Windows
+from gpadjust.dynamics.smoothed_records import SmoothedRecords, smooth
+from gpadjust.dynamics.smoothing import SmoothingWarning
 from gpadjust.dynamics.trajectory_information import TrajectoryInformation
 from gpadjust.dynamics.trajectory_scores import TrajectoryScores
 from gpadjust.dynamics.transition_scores import TransitionScores
@@ -17,10 +20,13 @@ __all__ = [
     "AngleInput",
     "Dynamics",
     "FreeRun",
+    "FreeRunScores",
     "LearnedDynamics",
     "PhysicsDynamics",
     "Record",
     "Records",
+    "SmoothedRecords",
+    "SmoothingWarning",
     "StateSpec",
     "TrajectoryInformation",
     "TrajectoryScores",
@@ -28,4 +34,5 @@ __all__ = [
     "TransitionScores",
     "Transitions",
     "Windows",
+    "smooth",
 ]

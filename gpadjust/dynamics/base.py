@@ -166,15 +166,17 @@ class Dynamics(ABC):
         *,
         num_functions: int = 39,
         level: float = 0.95,
-        noise: bool = True,
+        noise: Tensor | bool = True,
         start_noise: Tensor | Literal["learnt"] | None = None,
+        process_noise: Tensor | Literal["learnt"] | None = None,
         state_bounds: Tensor | None = None,
         seed: int = 0,
     ) -> FreeRun:
         """Follow actions from given states, without looking at what is measured on the way.
 
         Functions that are drawn from the dynamics follow the actions; see :class:`FreeRun`.
-        :meth:`Records.windows` has both of measured records.
+        :meth:`Records.windows` has both of measured records, and what ``score`` of the runs is to
+        know.
 
         Args:
             initial_states: ``w x state_dim``.
@@ -183,11 +185,16 @@ class Dynamics(ABC):
                 has ends, 39 or more for 95 %.
             level: The probability of the intervals.
             noise: Whether intervals and particles are of measured states, with the noise that the
-                dynamics learnt, or of the states themselves.
+                dynamics learnt, or of the states themselves. Or the standard deviations
+                ``state_dim`` of the measurements' errors.
             start_noise: Standard deviations ``state_dim`` by which the initial states, as measured,
                 err; each particle then starts elsewhere. ``"learnt"``: half of the variance of the
                 learnt noise, which is right if that comes of measuring both ends of a transition.
                 Default: they are exact.
+            process_noise: Standard deviations ``state_dim`` of what each step adds to the state
+                itself, so that it is carried on. ``"learnt"``: the noise that the dynamics learnt,
+                which is that if they learnt from states without noise, such as those that
+                :func:`smooth` draws. Default: nothing.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
                 would leave them stays where it is. Default: none.
             seed: Seed of functions and noise; PyTorch's generator is left as it is.
@@ -217,6 +224,7 @@ class Dynamics(ABC):
             level=level,
             noise=noise,
             start_noise=start_noise,
+            process_noise=process_noise,
             state_bounds=state_bounds,
             seed=seed,
         )

@@ -21,10 +21,14 @@ class Stretch(NamedTuple):
     Args:
         states: Before the first step and after each, ``n + 1 x state_dim``.
         actions: ``n x action_dim``.
+        times: Of the states, ``n + 1``.
+        record: The number of the record.
     """
 
     states: Tensor
     actions: Tensor
+    times: Tensor
+    record: int
 
 
 def in_control_steps(
@@ -42,14 +46,16 @@ def in_control_steps(
             step is no multiple of them or not that of the spec.
     """
     every, stretches = _rows_a_step(records, spec, step), []
-    for record in records:
+    for number, record in enumerate(records):
         for rows in record.stretches():
             num_steps = (rows.stop - rows.start - 1) // every
-            states = record.states[rows][: num_steps * every + 1 : every].clone()
+            kept = slice(rows.start, rows.start + num_steps * every + 1, every)
+            states = record.states[kept].clone()
             actions = record.actions[rows][: num_steps * every]
             actions = actions.unflatten(0, (num_steps, every)).mean(1)
-            spec.remember(states[1:], actions)
-            stretches.append(Stretch(states, actions))
+            for _ in spec.previous:  # as often as the longest chain of them needs
+                spec.remember(states[1:], states[:-1].clone(), actions)
+            stretches.append(Stretch(states, actions, record.times[kept], number))
     if not any(len(stretch.actions) for stretch in stretches):
         raise ValueError(
             f"Expected a stretch of {every + 1} rows or more, which are a control step, found none "

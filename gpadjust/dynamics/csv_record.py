@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -13,11 +14,13 @@ from gpadjust.dynamics.csv_columns import CsvColumns
 from gpadjust.dynamics.record import Record
 from gpadjust.states import StateSpec
 
+Column = TypeVar("Column", bound=str | None)
+
 
 def read_record(
     file: str | Path,
     spec: StateSpec,
-    states: Mapping[str, str],
+    states: Mapping[str, str | None],
     actions: Mapping[str, str],
     time: str | float,
     segment: str | None,
@@ -28,7 +31,7 @@ def read_record(
     Args:
         file: The file.
         spec: What the entries of states and actions are.
-        states: The column of each state.
+        states: The column of each state; None if there is none.
         actions: The column of each action.
         time: The column of times, or the time from one row to the next.
         segment: The column of labels, if there is one.
@@ -39,20 +42,21 @@ def read_record(
         times = table.numbers(time)
     else:
         times = checked_step(time, "time") * torch.arange(len(table), dtype=torch.float64)
-    measured = [
-        torch.full_like(times, math.nan)
-        if name in spec.previous and name == column and name not in table.names
-        else table.numbers(column, may_miss=True)
-        for name, column in states.items()
-    ]
+    measured = []
+    for name, column in states.items():
+        filled_in = name in spec.previous and name == column and name not in table.names
+        if column is None or filled_in:
+            measured.append(torch.full_like(times, math.nan))
+        else:
+            measured.append(table.numbers(column, may_miss=True))
     taken = [table.numbers(column) for column in actions.values()]
     labels = None if segment is None else table.texts(segment)
     return Record(times, torch.stack(measured, -1), torch.stack(taken, -1), labels, str(file))
 
 
 def checked_columns(
-    given: Mapping[str, str] | None, names: Iterable[str], argument: str
-) -> dict[str, str]:
+    given: Mapping[str, Column] | None, names: Iterable[str], argument: str
+) -> dict[str, Column | str]:
     """The column of each name: the one given, or else that of the same name.
 
     Raises:

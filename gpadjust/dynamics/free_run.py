@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.dynamics.free_run_scores import FreeRunScores, score_free_runs
 from gpadjust.dynamics.open_loop import Move, move_on, of_states
 from gpadjust.dynamics.particles import (
     about_centre,
@@ -28,10 +29,10 @@ class FreeRun(NamedTuple):
     r"""Where dynamics say that ``w`` sequences of ``T`` actions lead, each from its own state.
 
     Step t is the state after t + 1 actions. Each of the ``K`` particles follows one function drawn
-    from the dynamics, and nothing that was measured on the way. The noise that the dynamics learnt
-    is added to what is reported of each step, as to a measurement of it, and moves nothing on; see
-    :class:`TrajectoryScores`. A particle that is lost, because it would leave the bounds or the
-    finite numbers or meet a failure of the physics, stays where it was before.
+    from the dynamics, and nothing that was measured on the way. Noise is added to what is reported
+    of each step, as to a measurement of it, and moves nothing on (see :class:`TrajectoryScores`);
+    process noise moves the particles themselves. A particle that is lost, because it would leave
+    the bounds or the finite numbers or meet a failure of the physics, stays where it was before.
 
     The mean of an angle is that on the circle. It goes on from the initial state without jumps of
     :math:`2 \pi`, and interval and particles of each step are about it: compare with what was
@@ -47,6 +48,8 @@ class FreeRun(NamedTuple):
         particles: ``K x w x T x state_dim``, with the noise if that was asked for. An angle is
             within half a turn of the mean, but for the noise.
         lost: Share of the particles that are lost by then, ``w x T``.
+        spec: What the entries of states are.
+        level: The probability of the intervals.
     """
 
     mean: Tensor
@@ -54,6 +57,51 @@ class FreeRun(NamedTuple):
     upper: Tensor
     particles: Tensor
     lost: Tensor
+    spec: StateSpec
+    level: float
+
+    def score(self, measured: Tensor) -> FreeRunScores:
+        """Judge all steps by what was measured of states that were not learnt from.
+
+        Angles are compared the shortest way round. What was measured has noise: so should the
+        runs, as they do by default.
+
+        Args:
+            measured: ``w x T x state_dim``, as ``measured`` of :meth:`Records.windows`; NaN where
+                an entry was not measured.
+
+        Raises:
+            TypeError: If it is no float64 tensor.
+            ValueError: If its shape is not that of the means, or an entry is infinite.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
+            >>> dynamics = PhysicsDynamics(StateSpec(["x"], ["v"]), lambda X: X[:, :1] + X[:, 1:])
+            >>> x, v = torch.zeros(2, 1).double(), torch.ones(2, 3, 1).double()
+            >>> measured = torch.tensor([[1.0, 2, 4], [1, 3, 2]]).double().unsqueeze(-1)
+            >>> dynamics.free_run(x, v).score(measured).rmse.flatten()
+            tensor([0.0000, 0.7071, 1.0000], dtype=torch.float64)
+        """
+        check_columns(measured, self.spec.state_dim, "measured")
+        if measured.dtype != torch.float64:
+            raise TypeError(
+                f"Expected measured in float64, got {measured.dtype}; use `measured.double()`."
+            )
+        if measured.shape != self.mean.shape:
+            raise ValueError(
+                f"Expected measured of shape w x T x state_dim {tuple(self.mean.shape)}, that of "
+                f"the runs' means, got {tuple(measured.shape)}; of `windows` that the runs start "
+                "from it is `windows.measured`."
+            )
+        if measured.isinf().any():
+            raise ValueError(
+                "Expected measured to be finite, found infinity; put NaN where an entry was not "
+                "measured."
+            )
+        found = self.mean + self.spec.change(self.mean, measured)
+        interval = self.lower, self.upper
+        return score_free_runs(self.mean, interval, self.particles.var(0), found)
 
 
 def free_run(
@@ -65,8 +113,9 @@ def free_run(
     *,
     num_functions: int,
     level: float,
-    noise: bool,
+    noise: Tensor | bool,
     start_noise: Tensor | Literal["learnt"] | None,
+    process_noise: Tensor | Literal["learnt"] | None,
     state_bounds: Tensor | None,
     seed: int,
 ) -> FreeRun:
@@ -82,6 +131,7 @@ def free_run(
         level: The probability of the intervals.
         noise: Whether particles and intervals have the noise.
         start_noise: By how much the initial states err.
+        process_noise: What each step adds to a particle.
         state_bounds: Beyond which a particle is lost.
         seed: The seed.
     """
@@ -91,54 +141,85 @@ def free_run(
     check_enough(num_functions, level)
     if state_bounds is not None:
         state_bounds = of_states(state_bounds, "state_bounds", (2, spec.state_dim))
+    start_noise, process_noise = (
+        _checked_noise(spec, given, name)
+        for given, name in ((start_noise, "start_noise"), (process_noise, "process_noise"))
+    )
+    sensors = None if isinstance(noise, bool) else _checked_noise(spec, noise, "noise")
+    if noise is True and isinstance(process_noise, str):
+        raise ValueError(
+            "The learnt noise moves particles on (process_noise='learnt'), so that it is not that "
+            "of measurements as well; say the noise of these, such as noise=smoothed.noise of "
+            "smooth(records, physics), or noise=False."
+        )
     generator = torch.Generator().manual_seed(seed)
     # Dynamics of a user's may draw from PyTorch's generator all the same.
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         functions = sample_functions(num_functions, seed)
         particles = initial_states.expand(num_functions, -1, -1)
+        if isinstance(start_noise, str):
+            variance = step_or_nan(noise_variance, initial_states, actions[:, 0])
+            start_noise = (variance.nan_to_num(nan=0.0) / 2).sqrt()
         if start_noise is not None:
-            first = (noise_variance, initial_states, actions[:, 0])
-            error = _start_noise(spec, start_noise, first)
+            error = start_noise.expand_as(initial_states)
             particles = particles + measurement_noise(spec, error, num_functions, generator)
         lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
         path, lost_by_then = [], []
         for each in actions.unbind(1):
+            added = process_noise
+            if isinstance(process_noise, str):
+                middle = about_centre(spec, particles)[0]
+                added = step_or_nan(noise_variance, middle, each).nan_to_num(nan=0.0).sqrt()
             particles, lost = move_on(functions, particles, lost, each, state_bounds)
+            if added is not None:
+                error = added.expand_as(initial_states)
+                moved = measurement_noise(spec, error, num_functions, generator)
+                particles = particles + moved.masked_fill(lost.unsqueeze(-1), 0.0)
             path.append(particles)
             lost_by_then.append(lost.double().mean(0))
         centre, cloud = about_centre(spec, torch.stack(path, dim=2))
         centre = _without_jumps(spec, initial_states, centre)
         mean = centre + cloud.mean(0)
-        if noise:
+        if sensors is not None:
+            error = sensors.expand_as(centre)
+            cloud = cloud + measurement_noise(spec, error, num_functions, generator)
+        elif noise:
             before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
             rows = before.flatten(0, 1).split(_ROWS), actions.flatten(0, 1).split(_ROWS)
             variances = [step_or_nan(noise_variance, *part) for part in zip(*rows, strict=True)]
             scatter = torch.cat(variances).sqrt().view_as(centre)
             cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
     low, high = central_interval(cloud, level)
-    return FreeRun(mean, centre + low, centre + high, centre + cloud, torch.stack(lost_by_then, 1))
+    return FreeRun(
+        mean=mean,
+        lower=centre + low,
+        upper=centre + high,
+        particles=centre + cloud,
+        lost=torch.stack(lost_by_then, 1),
+        spec=spec,
+        level=level,
+    )
 
 
-def _start_noise(
-    spec: StateSpec, given: Tensor | Literal["learnt"], first: tuple[Move, Tensor, Tensor]
-) -> Tensor:
-    """Standard deviations of the errors of initial states, ``w x state_dim``.
-
-    Args:
-        spec: What the entries of states are.
-        given: What the user said of them.
-        first: The variances of measured next states, the initial states, the first actions.
-    """
-    variance, states, actions = first
+def _checked_noise(
+    spec: StateSpec, given: Tensor | str | None, name: str
+) -> Tensor | Literal["learnt"] | None:
+    """Standard deviations ``state_dim`` as the user said them, or what else was said."""
+    if given is None:
+        return None
     if isinstance(given, str):
-        if given != "learnt":
-            raise ValueError(f"Expected start_noise as 'learnt' or a tensor, got {given!r}.")
-        return (step_or_nan(variance, states, actions).nan_to_num(nan=0.0) / 2).sqrt()
-    sd = of_states(given, "start_noise", (spec.state_dim,))
+        if given != "learnt" or name == "noise":
+            learnt = "True or False" if name == "noise" else "'learnt'"
+            raise ValueError(f"Expected {name} as {learnt} or a tensor, got {given!r}.")
+        return "learnt"
+    sd = of_states(given, name, (spec.state_dim,))
     if not (sd.isfinite() & (sd >= 0)).all():
-        raise ValueError(f"Expected start_noise of 0 or more, got {sd.tolist()}.")
-    return sd.expand_as(states)
+        raise ValueError(
+            f"Expected {name} of 0 or more, got {sd.tolist()}; of states that are never measured "
+            "`.nan_to_num()` makes it 0."
+        )
+    return sd
 
 
 def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:

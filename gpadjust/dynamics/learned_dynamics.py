@@ -37,12 +37,13 @@ class LearnedDynamics(Dynamics):
 
     Each state's change (or next value) is an independent output of one model, of the states that
     move and the action, such as :math:`f_a = \rho f_p + \delta` of :class:`~gpadjust.CKA`.
-    Integrated states follow from their velocities, exogenous ones stay, and previous actions are
-    the action taken.
+    Integrated states follow from their velocities, exogenous ones stay, and previous ones are what
+    they name: with earlier outputs and actions among the states that is an autoregressive model
+    (NARX), which :meth:`free_run` feeds with its own predictions.
 
     Args:
         spec: What the entries of states and actions are.
-        physics: The next values of the states that are neither exogenous nor previous actions,
+        physics: The next values of the states that are neither exogenous nor previous values,
             from these and the actions: columns ``[states, actions]`` in the order of the spec,
             angles in rad. Several: a list, or a dictionary with their names, as of
             :class:`~gpadjust.CKA`. None for a model without physics.

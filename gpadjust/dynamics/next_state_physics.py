@@ -52,7 +52,7 @@ def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
     if Y.shape[-1] != num_states:
         raise ValueError(
             f"Expected physics {physics.name!r} to return the next values of the {num_states} "
-            f"states that are neither exogenous nor previous actions, got {Y.shape[-1]} columns."
+            f"states that are neither exogenous nor previous values, got {Y.shape[-1]} columns."
         )
 
 

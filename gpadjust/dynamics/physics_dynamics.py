@@ -30,7 +30,7 @@ class PhysicsDynamics(Dynamics):
 
     Args:
         spec: What the entries of states and actions are.
-        physics: The next values of the states that are neither exogenous nor previous actions,
+        physics: The next values of the states that are neither exogenous nor previous values,
             from these and the actions: columns ``[states, actions]`` in the order of the spec.
 
     Raises:
@@ -154,4 +154,4 @@ class PhysicsDynamics(Dynamics):
         following[..., moving] = next_values(
             self.physics, torch.cat([states[..., moving], actions], dim=-1), len(moving)
         )
-        return self.spec.remember(following, actions)
+        return self.spec.remember(following, states, actions)

@@ -34,14 +34,36 @@ class Windows(NamedTuple):
     actions: Tensor
     measured: Tensor
 
+    @property
+    def states(self) -> Tensor:
+        """The initial states, then what was measured: ``w x (T + 1) x state_dim``."""
+        return torch.cat([self.initial_states.unsqueeze(1), self.measured], dim=1)
+
+    def some(self, rows: Tensor | list[int]) -> Windows:
+        """The windows of these numbers, or those where a tensor of ``w`` booleans is true.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import Record, Records, StateSpec
+            >>> x = torch.arange(9, dtype=torch.float64).unsqueeze(-1)
+            >>> windows = Records(Record(x[:, 0], x, x), StateSpec(["x"], ["u"])).windows(2)
+            >>> fast = (windows.states.abs() > 3).any(1).any(-1)
+            >>> windows.some(fast).states[..., 0]
+            tensor([[2., 3., 4.],
+                    [4., 5., 6.],
+                    [6., 7., 8.]], dtype=torch.float64)
+        """
+        return Windows(*(part[rows] for part in self))
+
 
 class Records:
     """Measured trajectories of one system.
 
     The control step is a whole multiple of the sampling step: of its states each k-th row of a
     stretch is one, and its action the mean of the k actions. No step leads from one segment, record
-    or side of a gap to another. States that hold previous actions are filled in: the action of the
-    step before, and at the first row of a stretch what was recorded there.
+    or side of a gap to another. States that hold previous values (lagged actions and outputs) are
+    filled in: what was there a step before, and at the first row of a stretch what was recorded
+    there. Where nothing was, steps begin later by as many as the spec looks back.
 
     Args:
         records: The records, a :class:`Record` each.
@@ -100,7 +122,7 @@ class Records:
         files: str | Path | Iterable[str | Path],
         spec: StateSpec,
         *,
-        states: Mapping[str, str] | None = None,
+        states: Mapping[str, str | None] | None = None,
         actions: Mapping[str, str] | None = None,
         time: str | float = "time",
         segment: str | None = None,
@@ -109,14 +131,15 @@ class Records:
         r"""Read records from CSV files, one from each.
 
         The first line of a file names its columns; those that are not asked for are left alone. A
-        field of a state is empty or NaN where it was not measured. States that hold previous
-        actions need no column.
+        field of a state is empty or NaN where it was not measured. States that hold previous values
+        need no column.
 
         Args:
             files: The file, or several.
             spec: What the entries of states and actions are.
-            states: Which columns have the states, such as ``{"theta": "q"}``. Default, also for
-                states that are not said: the columns of their names.
+            states: Which columns have the states, such as ``{"theta": "q"}``; None for a state that
+                is hidden, which :func:`smooth` estimates. Default, also for states that are not
+                said: the columns of their names.
             actions: The same for the actions.
             time: The column of times, or where there is none the time from one row to the next.
             segment: The column of the labels of segments. Default: a file is one segment.
@@ -174,7 +197,7 @@ class Records:
                 above; or stretches, because they are shorter than a step.
         """
         stretches = in_control_steps(self.records, self.spec, step)
-        parts = [(states[:-1], actions, states[1:]) for states, actions in stretches]
+        parts = [(each.states[:-1], each.actions, each.states[1:]) for each in stretches]
         data = Transitions(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
         complete = ~data.states.isnan().any(-1)
         says = ~data.next_states[:, self.spec.predicted].isnan().all(-1)
@@ -217,7 +240,7 @@ class Records:
         stride = length if stride is None else stride
         check_number(stride, "stride")
         stretches, found = in_control_steps(self.records, self.spec, step), []
-        for states, actions in stretches:
+        for states, actions, *_ in stretches:
             complete, start = (~states.isnan().any(-1)).tolist(), 0
             while start + length <= len(actions):
                 end = start + length
@@ -227,7 +250,7 @@ class Records:
         if not found:
             raise ValueError(
                 f"Expected stretches of {length} steps from a state measured in full, found none; "
-                f"the longest stretch has {max(len(actions) for _, actions in stretches)}. Take a "
+                f"the longest stretch has {max(len(each.actions) for each in stretches)}. Take a "
                 "smaller length."
             )
         return Windows(*(torch.stack(parts) for parts in zip(*found, strict=True)))

@@ -39,7 +39,8 @@ class TransitionTargets:
         self.target = target
         moving = spec.moving
         self.predicted = [moving.index(i) for i in spec.predicted]
-        self.angles = [moving.index(i) for i in spec.angle_columns if i in moving]
+        read = [*moving, *[None] * spec.action_dim, *spec.previous_columns]
+        self.angles = [place for place, i in enumerate(read) if i in spec.angle_columns]
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -57,7 +58,7 @@ class TransitionTargets:
         return tuple(f"change of {n}" if self.target == "difference" else n for n in names)
 
     def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The raw inputs of a model, ``... x d``: states that move, actions, previous actions.
+        """The raw inputs of a model, ``... x d``: states that move, actions, previous values.
 
         The physics reads the first two only.
         """

@@ -17,7 +17,7 @@ class TransitionScores(NamedTuple):
     r"""How well transitions were predicted, for each state that moves: ``len(spec.moving)``.
 
     These are the states that a model predicts and those integrated from them, in the spec's order;
-    exogenous ones and previous actions are left out. The variance of an integrated state is what
+    exogenous ones and previous values are left out. The variance of an integrated state is what
     the dynamics say, :math:`(h / 2)^2` times that of its velocity: the more certain the velocity,
     the more the trapezoid's own error counts in its ``nlpd`` and ``coverage``. Both are NaN where
     a variance is zero, which says nothing of errors.

@@ -16,7 +16,9 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
 
     Where a system follows its actions with a delay that the observation does not show, such as the
     activation of muscles, the next observation depends on earlier actions. The last one says much
-    of what is hidden. A :class:`~gpadjust.states.StateSpec` declares it in ``previous``.
+    of what is hidden. A :class:`~gpadjust.states.StateSpec` declares it in ``previous``. It is that
+    action alone: a spec that holds earlier ones, or earlier states, is of an environment that
+    observes them itself.
 
     What is appended is the action clipped to its space, as the environments of this library take
     it. Observations keep their data type, if that is floating-point.

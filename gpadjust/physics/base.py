@@ -139,7 +139,7 @@ class Physics(torch.nn.Module, ABC):
         m = Y.shape[-1]
         return Y.reshape(*columns.shape[:-1], m).expand(*shape, m)
 
-    def or_nan(self, X: Tensor, parameters: Tensor) -> Tensor:
+    def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
         """As calling it, without memo and gradient, NaN in rows at which the physics fails.
 
         Args:

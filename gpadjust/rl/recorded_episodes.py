@@ -85,7 +85,7 @@ class RecordedEpisodes:
     def bounds(self) -> Tensor | None:
         """Bounds ``2 x state_dim`` far beyond what was seen in episodes that have ended.
 
-        There are none of angles, constants and actions; None if no episode has ended.
+        There are none of angles, constants and previous values; None if no episode has ended.
         """
         if not self._whole.any():
             return None

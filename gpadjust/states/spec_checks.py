@@ -20,15 +20,56 @@ def check_exogenous(name: str, change: Tensor, rounding: Tensor) -> None:
         )
 
 
-def check_previous(name: str, action: str, found: Tensor, taken: Tensor, tolerance: Tensor) -> None:
-    """Raise an error if a state is not the action that was taken, to a tolerance."""
-    wrong = ((found - taken).abs() > tolerance).nonzero()
+def check_lags(
+    previous: Mapping[str, str],
+    states: Sequence[str],
+    actions: Sequence[str],
+    angles: Sequence[str],
+) -> None:
+    """Raise an error unless what each state holds is another state's or an action's earlier value.
+
+    A state is an angle if what it holds is one, and only then.
+    """
+    for name, other in previous.items():
+        if (other in states) == (other in actions):
+            raise ValueError(
+                f"previous must name a state or an action that {name!r} holds the earlier value "
+                f"of; found {other!r}, which is {'both' if other in states else 'neither'}: the "
+                f"states are {tuple(states)}, the actions are {tuple(actions)}."
+            )
+        if (name in angles) != (other in angles and other in states):
+            which = (name, other) if name in angles else (other, name)
+            raise ValueError(
+                f"State {name!r} holds the earlier value of {other!r}, but {which[0]!r} is one of "
+                f"the angles and {which[1]!r} is not; put both into `angles`, or neither."
+            )
+        chain = [name]
+        while (held := previous.get(chain[-1])) is not None:
+            if held in chain:
+                raise ValueError(
+                    f"previous goes round in a circle, {' -> '.join((*chain, held))}; let it end "
+                    "at an action, or at a state that is not in `previous`."
+                )
+            chain.append(held)
+
+
+def check_previous(name: str, held: str, found: Tensor, before: Tensor, off: Tensor) -> None:
+    """Raise an error for the first row in which a state is off what it is said to hold.
+
+    Args:
+        name: The state's name.
+        held: What it holds, in words.
+        found: Its values after a step, ``N``.
+        before: What they should be, ``N``.
+        off: Where they are not, ``N`` booleans.
+    """
+    wrong = off.nonzero()
     if len(wrong):
         row = int(wrong[0])
         raise ValueError(
-            f"State {name!r} is said to hold the previous action {action!r}, but is "
-            f"{float(found[row]):.3g} after the action {float(taken[row]):.3g} in row {row}. Mend "
-            f"`previous`, or take {name!r} out of it, so that the model predicts it."
+            f"State {name!r} is said to hold the previous {held}, but is {float(found[row]):.3g} "
+            f"where that was {float(before[row]):.3g} in row {row}. Mend `previous`, or take "
+            f"{name!r} out of it, so that the model predicts it."
         )
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from gpadjust.states.spec_checks import (
     check_exogenous,
     check_integrated,
+    check_lags,
     check_previous,
     checked_mapping,
     checked_names,
@@ -38,16 +39,19 @@ class StateSpec:
         integrated: For states that a model need not predict, the states that are their
             velocities: :math:`q' = q + h (v + v') / 2`.
         step: The time step :math:`h`, in the time unit of the velocities; needed by ``integrated``.
-        previous: For states that hold the previous action, the entries of the action that they
-            will hold next. What a system does may depend on them, as where it follows its actions
-            with a delay: policy and models see them, models need not predict them, and the physics
-            knows nothing of them.
+        previous: For states that hold what another entry was a step before, the name of that
+            action or state: ``{"last_force": "force"}``, or ``{"x_1": "x", "x_2": "x_1"}`` for two
+            steps back. These are the lagged outputs and inputs of an autoregressive model (NARX).
+            What a system does may depend on them, as where it follows its actions with a delay, or
+            where not all of its state is measured: policy and models see them, models need not
+            predict them, and the physics knows nothing of them. What holds an angle is an angle.
 
     Raises:
         TypeError: If names are not strings, ``integrated`` or ``previous`` is no mapping or
             ``step`` no number.
         ValueError: If a name is unknown, repeated, or stands for two things that exclude each
-            other, no state is left to predict, or ``step`` is missing or not positive.
+            other, ``previous`` goes round in a circle, no state is left to predict, or ``step`` is
+            missing or not positive.
 
     Example:
         >>> import torch
@@ -55,6 +59,14 @@ class StateSpec:
         >>> spec = StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"])
         >>> spec.observe(torch.tensor([[0.0, 2.0]]))
         tensor([[0., 1., 2.]])
+
+        A tank of which the level alone is measured, with two earlier levels and a pump's action:
+
+        >>> previous = {"level_1": "level", "level_2": "level_1", "pump_1": "pump"}
+        >>> spec = StateSpec(["level", *previous], ["pump"], previous=previous)
+        >>> state, action = torch.tensor([3.0, 2.0, 1.0, 0.5]), torch.tensor([0.7])
+        >>> spec.complete(state, action, predicted=torch.tensor([4.0]))
+        tensor([4.0000, 3.0000, 2.0000, 0.7000])
     """
 
     states: Sequence[str]
@@ -71,7 +83,7 @@ class StateSpec:
             object.__setattr__(self, name, checked_names(getattr(self, name), name))
         for name, other, example in (
             ("integrated", "its velocity", {"x": "x_dot"}),
-            ("previous", "an action", {"last_force": "force"}),
+            ("previous", "an action or another state", {"last_force": "force"}),
         ):
             mapping = checked_mapping(getattr(self, name), name, other, example)
             object.__setattr__(self, name, mapping)
@@ -85,24 +97,18 @@ class StateSpec:
         unknown = [name for name in named if name not in self.states]
         if unknown:
             raise ValueError(f"There is no state {unknown[0]!r}; the states are {self.states}.")
-        unknown = [name for name in self.previous.values() if name not in self.actions]
-        if unknown:
-            raise ValueError(
-                f"previous names an action {unknown[0]!r}; the actions are {self.actions}."
-            )
+        check_lags(self.previous, self.states, self.actions, self.angles)
         fixed = (*self.exogenous, *self.integrated, *self.previous)
         twice = [name for name in fixed if fixed.count(name) > 1]
         twice += [name for name in self.integrated.values() if name in fixed]
-        twice += [name for name in self.angles if name in self.previous]
         if twice:
             raise ValueError(
-                f"State {twice[0]!r} is said to be two things: exogenous, integrated, a "
-                "velocity and a previous action exclude each other, as do an angle and a previous "
-                "action."
+                f"State {twice[0]!r} is said to be two things: exogenous, integrated, a velocity "
+                "and a previous value exclude each other."
             )
         if set(fixed) == set(self.states):
             raise ValueError(
-                "No state is left to predict; all are exogenous, integrated or previous actions."
+                "No state is left to predict; all are exogenous, integrated or previous values."
             )
         if self.integrated and self.step is None:
             raise ValueError("step must be the duration of a step, as some states are integrated.")
@@ -129,7 +135,7 @@ class StateSpec:
     def moving(self) -> list[int]:
         """The states that the physics reads, before the action, and says the next values of.
 
-        They are those neither exogenous nor previous actions.
+        They are those neither exogenous nor previous values.
         """
         still = (*self.exogenous, *self.previous)
         return [i for i, name in enumerate(self.states) if name not in still]
@@ -141,7 +147,7 @@ class StateSpec:
 
     @property
     def previous_columns(self) -> list[int]:
-        """The states that hold previous actions, read by models beside moving ones and action."""
+        """The states that hold previous values, read by models beside moving ones and action."""
         return [i for i, name in enumerate(self.states) if name in self.previous]
 
     @property
@@ -223,7 +229,8 @@ class StateSpec:
         than a tenth if it is sampled six times a period or more. Discrepancies in angles are taken
         the shortest way round.
 
-        A previous action must be the action to a thousandth of the largest of that action.
+        A previous action must be the action to a thousandth of the largest of that action; a
+        previous state must be that state to the rounding of single precision.
 
         Args:
             states: ``N x state_dim``.
@@ -253,7 +260,7 @@ class StateSpec:
             i = self.states.index(name)
             check_exogenous(name, change[..., i], rounding[..., i])
         if self.previous:
-            self._check_previous(next_states, actions)
+            self._check_previous(states, next_states, actions, rounding)
         for name, velocity in self.integrated.items():
             i, v = self.states.index(name), self.states.index(velocity)
             assert self.step is not None, "checked at the start"
@@ -265,31 +272,48 @@ class StateSpec:
             found, unavoidable = discrepancy[known], rounding[..., i][known]
             check_integrated(name, velocity, self.step, velocities, found, unavoidable)
 
-    def _check_previous(self, next_states: Tensor, actions: Tensor | None) -> None:
-        if actions is None:
+    def _check_previous(
+        self, states: Tensor, next_states: Tensor, actions: Tensor | None, rounding: Tensor
+    ) -> None:
+        taken = [name for name, other in self.previous.items() if other in self.actions]
+        if taken and actions is None:
             raise ValueError(
-                f"States {tuple(self.previous)} are said to be previous actions, which cannot be "
-                "checked without actions; pass `actions`."
+                f"States {tuple(taken)} are said to be previous actions, which cannot be checked "
+                "without actions; pass `actions`."
             )
+        if actions is None:
+            actions = states.new_zeros(*states.shape[:-1], self.action_dim)
         check_columns(actions, self.action_dim, "actions")
-        for name, action in self.previous.items():
-            found, taken = next_states[..., self.states.index(name)], self._taken(actions, action)
-            check_previous(name, action, found, taken, 1e-3 * taken.abs().amax())
+        expected = self.remember(next_states.clone(), states, actions)
+        gap = self.change(expected, next_states).abs()
+        for name, other in self.previous.items():
+            i = self.states.index(name)
+            found, before, tolerance = next_states[..., i], expected[..., i], rounding[..., i]
+            held = f"state {other!r}"
+            if name in taken:
+                held, tolerance = f"action {other!r}", 1e-3 * before.abs().amax()
+            check_previous(name, held, found, before, gap[..., i] > tolerance)
 
-    def _taken(self, actions: Tensor, name: str) -> Tensor:
-        return actions[..., self.actions.index(name)]
+    def remember(self, next_states: Tensor, states: Tensor, actions: Tensor) -> Tensor:
+        """Let next states hold what these states and actions are as the previous ones, in place.
 
-    def remember(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Let states ``... x state_dim`` hold these actions as the previous ones, in place."""
-        for name, action in self.previous.items():
-            states[..., self.states.index(name)] = self._taken(actions, action)
-        return states
+        Args:
+            next_states: ``... x state_dim``, in memory of their own.
+            states: ``... x state_dim``.
+            actions: ``... x action_dim``.
+        """
+        for name, other in self.previous.items():
+            names, values = (
+                (self.states, states) if other in self.states else (self.actions, actions)
+            )
+            next_states[..., self.states.index(name)] = values[..., names.index(other)]
+        return next_states
 
     def complete(self, states: Tensor, actions: Tensor, predicted: Tensor) -> Tensor:
         """The next states, of which a model knows ``predicted``, ``... x len(spec.predicted)``."""
         following = states.expand(*predicted.shape[:-1], self.state_dim).clone()
         following[..., self.predicted] = predicted
-        self.remember(following, actions)
+        self.remember(following, states, actions)
         for name, velocity in self.integrated.items():
             i, v = self.states.index(name), self.states.index(velocity)
             assert self.step is not None, "checked at the start"

@@ -8,18 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from gpadjust.dynamics import Dynamics, FreeRun, Windows
 from gpadjust.inference import SamplingWarning
-from gpadjust.validation import nlpd, rmse
 from paper.common.experiment import Record
 from paper.real import HORIZONS, UNTAUGHT, Real, Settings
 from paper.real.learners import learnt
 from paper.real.systems import System, system
 
 _SHOWN = 2  # free runs that are kept for a figure
-_CERTAIN = 1e-9  # a standard deviation that is one of rounding errors
 
 
 def run(
@@ -58,33 +55,17 @@ def _scores(
         num_functions=settings.num_functions,
         start_noise="learnt",  # the windows start at measured states
     )
-    by_steps = {"1": {name: getattr(single, name) for name in ("rmse", "coverage", "nlpd")}}
-    by_steps |= {str(h): _of_free_runs(known, free, windows, h) for h in HORIZONS}
-    scores: dict[str, Any] = {
-        name: {steps: each[name].tolist() for steps, each in by_steps.items()}
-        for name in ("rmse", "coverage", "nlpd")
-    }
+    after = free.score(windows.measured)
+    scores: dict[str, Any] = {}
+    for name in ("rmse", "coverage", "nlpd"):
+        found, ahead = getattr(single, name).tolist(), getattr(after, name).tolist()
+        scores[name] = {"1": found, **{str(steps): ahead[steps - 1] for steps in HORIZONS}}
     return {**scores, "lost": free.lost[:, -1].mean().item()}, free
 
 
 def windows_of(known: System, test: str, settings: Settings) -> Windows:
     """The windows of a test, the same for all learners."""
     return known.windows(test, HORIZONS[-1], settings.windows)
-
-
-def _of_free_runs(known: System, free: FreeRun, windows: Windows, steps: int) -> dict[str, Tensor]:
-    """The scores of each state after so many steps."""
-    mean, low, high = (part[:, steps - 1] for part in (free.mean, free.lower, free.upper))
-    measured = mean + known.machine.spec.change(mean, windows.measured[:, steps - 1])
-    variance = free.particles[:, :, steps - 1].var(0)
-    says = (variance.sqrt() > _CERTAIN).all(0)
-    silent = torch.full_like(says, torch.nan, dtype=mean.dtype)
-    inside = ((low <= measured) & (measured <= high)).double().mean(0)
-    return {
-        "rmse": rmse(mean, measured),
-        "coverage": inside.where(says, silent),
-        "nlpd": nlpd(mean, variance, measured).where(says, silent),
-    }
 
 
 def _paths(known: System, free: FreeRun) -> dict[str, Any]:

@@ -68,10 +68,9 @@ class System:
     def windows(self, test: str, length: int, number: int) -> Windows:
         """So many windows of a test in which the machine moves, evenly spread."""
         found = self._records(self.tests[test]).windows(length, STEP, stride=1)
-        moving = self._fast(found.initial_states) | self._fast(found.measured).any(1)
-        rows = moving.nonzero().flatten()
+        rows = self._fast(found.states).any(1).nonzero().flatten()
         places = torch.linspace(0, len(rows) - 1, min(number, len(rows))).round().long()
-        return Windows(*(part[rows[places]] for part in found))
+        return found.some(rows[places])
 
     def _fast(self, states: Tensor) -> Tensor:
         """Where a rate is above the threshold: the rates are the second half of the states."""

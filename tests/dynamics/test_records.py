@@ -155,6 +155,36 @@ def test_previous_actions_are_those_of_the_step_before(step):
     torch.testing.assert_close(later.states, data.states[1:])
 
 
+@pytest.mark.parametrize("names", [("x_1", "x_2", "u_1"), ("u_1", "x_2", "x_1")])
+@pytest.mark.parametrize("step", [0.01, 0.02])
+def test_previous_states_are_those_of_the_steps_before(names, step):
+    k = round(100 * step)
+    lags = {"x_1": "x", "x_2": "x_1", "u_1": "u"}
+    spec = StateSpec([*names, "x"], ["u"], previous={name: lags[name] for name in names})
+    record = counted(24, segments=["a"] * 13 + ["b"] * 11)
+    never = torch.full((24, 3), math.nan, dtype=torch.float64)
+    states = torch.cat([never, record.states], -1)
+    records = Records([Record(record.times, states, record.actions, record.segments)], spec)
+    with pytest.warns(UserWarning, match="4 of which start at a state not measured in full"):
+        data = records.transitions(step)
+    starts = [*range(2 * k, 13 - k, k), *range(13 + 2 * k, 24 - k, k)]
+    assert data.states[:, 3].tolist() == starts
+    now, after = ({n: t[:, i] for i, n in enumerate(spec.states)} for t in (data[0], data[2]))
+    assert (now["x"] - now["x_1"]).unique().tolist() == [k]
+    assert (now["x"] - now["x_2"]).unique().tolist() == [2 * k]
+    before = [sum((row - j) ** 2 for j in range(1, k + 1)) / k for row in starts]
+    assert now["u_1"].tolist() == pytest.approx(before)
+    assert torch.equal(after["x_2"], now["x_1"])
+    assert torch.equal(after["u_1"], data.actions[:, 0])
+    PhysicsDynamics(spec, lambda X: X[:, :1] + k).update(*data)  # as the spec says
+    assert records.windows(3, step).initial_states[0, 3] == 2 * k
+    states[0, :3] = torch.tensor([-1.0, -2.0, -3.0])  # of the first row it is known
+    records = Records([Record(record.times, states, record.actions, record.segments)], spec)
+    with pytest.warns(UserWarning, match="2 of which start"):
+        data = records.transitions(step)
+    assert data.states[:2, 3].tolist() == [0, k]
+
+
 def test_the_step_of_the_spec_is_the_default():
     spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.02)
     record = counted(9)
@@ -460,8 +490,15 @@ def test_columns_of_the_same_names_need_no_words(csv):
     assert record.states.tolist() == [[pytest.approx(math.nan, nan_ok=True), v] for v in (1, 4)]
 
 
-def test_previous_actions_need_no_column(csv):
-    spec = StateSpec(["x", "last"], ["u"], previous={"last": "u"})
+def test_a_hidden_state_has_no_column(csv):
+    (record,) = Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), POINT, states={"v": None})
+    assert record.states[:, 0].tolist() == [1, 4]
+    assert record.states[:, 1].isnan().all()
+
+
+@pytest.mark.parametrize("held", ["u", "x"])
+def test_previous_values_need_no_column(csv, held):
+    spec = StateSpec(["x", "last"], ["u"], previous={"last": held})
     (record,) = Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), spec)
     assert record.states[:, 1].isnan().all()
     with pytest.raises(ValueError, match="expected a column 'before'"):

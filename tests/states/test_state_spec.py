@@ -91,9 +91,14 @@ def test_equal_specs_are_equal_and_hashable():
         ({"integrated": {"x": 2}, "step": 0.1}, TypeError, "as strings; found 2"),
         ({"previous": ["x"]}, TypeError, r"such as {'last_force': 'force'}; found \['x'\]"),
         ({"previous": {"y": "a"}}, ValueError, "There is no state 'y'"),
-        ({"previous": {"x": "b"}}, ValueError, r"an action 'b'; the actions are \('a',\)"),
+        ({"previous": {"x": "b"}}, ValueError, r"'b', which is neither: .* actions are \('a',\)"),
+        ({"previous": {"x": "v"}, "actions": ["a", "v"]}, ValueError, "'v', which is both"),
+        ({"previous": {"x": "x"}}, ValueError, "round in a circle, x -> x; let it end"),
+        ({"previous": {"x": "v", "v": "x"}}, ValueError, "circle, x -> v -> x"),
+        ({"previous": {"x": "v"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'v' is not"),
+        ({"previous": {"x": "v"}, "angles": ["v"]}, ValueError, "'v' is one .* and 'x' is not"),
         ({"previous": {"x": "a"}, "exogenous": ["x"]}, ValueError, "'x' is said to be two things"),
-        ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is said to be two things"),
+        ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'a' is not"),
         ({"previous": {"x": "a", "v": "a"}}, ValueError, "No state is left to predict"),
         ({"step": "fast"}, TypeError, "step must be a number or None; found 'fast'"),
         ({"step": 0}, ValueError, "step must be positive and finite; found 0"),
@@ -182,3 +187,53 @@ def test_what_is_no_previous_action_is_named():
         MEMORY.check_transitions(states, following, scales * actions)
     with pytest.raises(ValueError, match="without actions; pass `actions`"):
         MEMORY.check_transitions(states, following)
+
+
+# Previous states
+
+
+LAGS = {"y_2": "y_1", "y_1": "y", "u_2": "u_1", "u_1": "u", "q_1": "q"}
+ANGLES = ["q", "q_1"]
+
+
+@pytest.mark.parametrize("names", [[*LAGS], [*LAGS][::-1], sorted(LAGS)])
+def test_previous_values_are_those_before_the_step_in_any_order(names):
+    previous = {name: LAGS[name] for name in names}
+    states = [*names[:2], "y", *names[2:], "q"]
+    spec = StateSpec(states, ["u"], angles=ANGLES, previous=previous)
+    before = {"y": 1.0, "y_1": 2.0, "y_2": 3.0, "u_1": 4.0, "u_2": 5.0, "q": 6.0, "q_1": 7.0}
+    row = torch.tensor([before[name] for name in states], requires_grad=True)
+    action = torch.tensor([8.0], requires_grad=True)
+    following = spec.complete(row, action, torch.tensor([[[-1.0, -2.0]], [[-3.0, -4.0]]]))
+    expected = {"y_1": 1.0, "y_2": 2.0, "u_1": 8.0, "u_2": 4.0, "q_1": 6.0}
+    for block, own in zip(following, ({"y": -1.0, "q": -2.0}, {"y": -3.0, "q": -4.0}), strict=True):
+        assert block[0].tolist() == [{**expected, **own}[name] for name in states]
+    assert [states[i] for i in spec.moving] == [states[i] for i in spec.predicted] == ["y", "q"]
+    assert {states[i] for i in spec.previous_columns} == {*LAGS}
+    variance = spec.complete_variance(torch.tensor([0.5, 0.7]))
+    assert dict(zip(states, variance.tolist(), strict=True)) == pytest.approx(
+        {**dict.fromkeys(LAGS, 0.0), "y": 0.5, "q": 0.7}
+    )
+    gradients = torch.autograd.grad(following.sum(), (row, action))
+    read = dict(zip(states, (gradients[0] / 2).tolist(), strict=True))
+    assert read == {"y": 1, "y_1": 1, "y_2": 0, "u_1": 1, "u_2": 0, "q": 1, "q_1": 0}
+    assert gradients[1].item() == 2
+
+
+def test_what_is_no_previous_state_is_named():
+    spec = StateSpec(
+        ["y", "y_1", "q", "q_1"], ["u"], angles=ANGLES, previous={"y_1": "y", "q_1": "q"}
+    )
+    generator = torch.Generator().manual_seed(0)
+    states = 300 + torch.rand(5, 4, generator=generator, dtype=torch.float64)
+    following = spec.complete(states, torch.zeros(1), states[:, [0, 2]] + 0.1)
+    following[:, 3] += 2 * math.pi  # the same angle
+    following[1, 1] = math.nan  # which was not measured
+    spec.check_transitions(states, following)
+    spec.check_transitions(states, following.float().double())
+    for column, name, other in ((1, "y_1", "y"), (3, "q_1", "q")):
+        wrong = following.clone()
+        wrong[3, column] += 0.01  # little beside the state, much beside its changes
+        message = f"'{name}' is said to hold the previous state '{other}', but is .* in row 3"
+        with pytest.raises(ValueError, match=message):
+            spec.check_transitions(states, wrong)

@@ -1,4 +1,4 @@
-"""Figures of how well dynamics predict; they need matplotlib, ``pip install gpadjust[plot]``."""
+"""Figures of the scores of trajectories."""
 
 from __future__ import annotations
 

@@ -1,0 +1,186 @@
+"""States of a linear chain under Gaussian errors, by all that was measured of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Link(NamedTuple):
+    """Steps of a stretch of the chain, ``T`` of them: ``x[t + 1] = matrices[t] x[t] + offsets[t]``.
+
+    Args:
+        matrices: ``T x D x D``.
+        offsets: ``T x D``.
+        measured: Of the first entries of the states, ``T + 1 x d``; NaN where there is nothing.
+    """
+
+    matrices: Array
+    offsets: Array
+    measured: Array
+
+
+class Moments(NamedTuple):
+    """Means and covariances of the states of a stretch.
+
+    Args:
+        means: ``T + 1 x D``.
+        covariances: ``T + 1 x D x D``.
+    """
+
+    means: Array
+    covariances: Array
+
+
+class Filtered(NamedTuple):
+    """What is known of the states of a stretch by what was measured before, and up to then.
+
+    Args:
+        ahead: Before the measurement.
+        known: After it.
+    """
+
+    ahead: Moments
+    known: Moments
+
+
+class Smoothed(NamedTuple):
+    """What is known of the states of a stretch by all that was measured.
+
+    Args:
+        states: Their moments.
+        crossed: Covariances of each state but the first with the one before, ``T x D x D``.
+    """
+
+    states: Moments
+    crossed: Array
+
+
+def smooth(
+    links: Sequence[Link], starts: Sequence[tuple[Array, Array]], noise: Array, scatter: Array
+) -> tuple[list[Smoothed], float]:
+    """All stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
+
+    The last entries of a state, beyond those that a stretch starts anew with, are constants that
+    all stretches share.
+
+    Args:
+        links: The stretches.
+        starts: Means ``d`` and variances ``d`` of the first state of each; of the first stretch
+            of all ``D`` entries.
+        noise: Variances ``d`` of the errors of what is measured.
+        scatter: Variances ``d`` of what a step adds to the first entries.
+
+    Returns:
+        What is known of each stretch, and the log density of what was measured.
+    """
+    (mean, variance), log_density, filtered = starts[0], 0.0, []
+    covariance, d = np.diag(variance), len(noise)
+    for link, (first, spread) in zip(links, starts, strict=True):
+        mean = np.concatenate([first[:d], mean[d:]])
+        shared, covariance = covariance[d:, d:], np.zeros_like(covariance)
+        covariance[:d, :d], covariance[d:, d:] = np.diag(spread[:d]), shared
+        found, gained = _filter(link, mean, covariance, noise, scatter)
+        filtered.append(found)
+        log_density += gained
+        mean, covariance = found.known.means[-1], found.known.covariances[-1]
+    smoothed = []
+    for link, found in zip(reversed(links), reversed(filtered), strict=True):
+        last, spread = found.known.means[-1], found.known.covariances[-1]
+        # What later stretches say of the constants reaches the end of this one through them.
+        gain = _gain(spread[d:, d:], spread[d:])
+        end = last + gain @ (mean[d:] - last[d:])
+        end_spread = spread + gain @ (covariance[d:, d:] - spread[d:, d:]) @ gain.T
+        smoothed.append(_backwards(link, found, end, end_spread))
+        mean, covariance = (part[0] for part in smoothed[-1].states)
+    return smoothed[::-1], log_density
+
+
+def draw(found: Sequence[Smoothed], num_constants: int, rng: np.random.Generator) -> list[Array]:
+    """Draw the states of all stretches, ``T + 1 x D`` each, with the same constants in all.
+
+    Args:
+        found: What is known of the stretches.
+        num_constants: How many of the last entries are constants.
+        rng: Source of random numbers.
+    """
+    paths, constants = [], None
+    for (means, covariances), crossed in found:
+        path, mean, covariance = np.empty_like(means), means[-1], covariances[-1]
+        d = means.shape[1] - num_constants
+        if constants is None:
+            constants = _normal(mean[d:], covariance[d:, d:], rng)
+        path[-1, d:] = constants
+        gain = _gain(covariance[d:, d:], covariance[d:, :d])
+        own = covariance[:d, :d] - gain @ covariance[d:, :d]
+        path[-1, :d] = _normal(mean[:d] + gain @ (constants - mean[d:]), own, rng)
+        for t in range(len(crossed) - 1, -1, -1):
+            gain = _gain(covariances[t + 1], crossed[t])
+            mean = means[t] + gain @ (path[t + 1] - means[t + 1])
+            path[t] = _normal(mean, covariances[t] - gain @ crossed[t], rng)
+            path[t, d:] = constants
+        paths.append(path)
+    return paths
+
+
+def _filter(
+    link: Link, mean: Array, covariance: Array, noise: Array, scatter: Array
+) -> tuple[Filtered, float]:
+    """Kalman's filter of a stretch, and the log density of what was measured in it."""
+    D, d, log_density = len(mean), len(noise), 0.0
+    shape = len(link.measured), D
+    ahead, known = (Moments(np.empty(shape), np.empty((*shape, D))) for _ in range(2))
+    added = np.zeros((D, D))
+    added[:d, :d] = np.diag(scatter)
+    for t, measured in enumerate(link.measured):
+        if t:
+            matrix = link.matrices[t - 1]
+            mean = matrix @ mean + link.offsets[t - 1]
+            covariance = matrix @ covariance @ matrix.T + added
+        ahead.means[t], ahead.covariances[t] = mean, covariance
+        rows = np.flatnonzero(~np.isnan(measured))
+        if len(rows):
+            error = measured[rows] - mean[rows]
+            spread = covariance[np.ix_(rows, rows)] + np.diag(noise[rows])
+            chol = np.linalg.cholesky(spread)
+            scaled = np.linalg.solve(chol, np.column_stack([error, covariance[rows]]))
+            mean = mean + scaled[:, 1:].T @ scaled[:, 0]
+            covariance = covariance - scaled[:, 1:].T @ scaled[:, 1:]
+            log_density -= 0.5 * scaled[:, 0] @ scaled[:, 0] + np.log(np.diag(chol)).sum()
+            log_density -= 0.5 * len(rows) * np.log(2 * np.pi)
+        known.means[t], known.covariances[t] = mean, covariance
+    return Filtered(ahead, known), float(log_density)
+
+
+def _backwards(link: Link, filtered: Filtered, end: Array, spread: Array) -> Smoothed:
+    """The smoother of a stretch whose last state is known by all that was measured."""
+    means, covariances = filtered.known.means.copy(), filtered.known.covariances.copy()
+    means[-1], covariances[-1] = end, spread
+    crossed = np.empty_like(link.matrices)
+    for t in range(len(link.matrices) - 1, -1, -1):
+        ahead = filtered.ahead.covariances[t + 1]
+        gain = _gain(ahead, link.matrices[t] @ covariances[t])
+        crossed[t] = covariances[t + 1] @ gain.T
+        means[t] += gain @ (means[t + 1] - filtered.ahead.means[t + 1])
+        covariances[t] += gain @ (covariances[t + 1] - ahead) @ gain.T
+    return Smoothed(Moments(means, covariances), crossed)
+
+
+def _gain(covariance: Array, crossed: Array) -> Array:
+    """``crossed' covariance^-1``, also of constants that are known, which have no variance."""
+    scale = np.sqrt(np.diag(covariance).clip(np.finfo(float).tiny))
+    scaled = covariance / np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
+    gain: Array = np.linalg.solve(scaled, crossed / scale[:, None]).T / scale
+    return gain
+
+
+def _normal(mean: Array, covariance: Array, rng: np.random.Generator) -> Array:
+    """A draw, also where there is no variance in some directions."""
+    values, vectors = np.linalg.eigh(covariance)
+    found: Array = mean + vectors @ (np.sqrt(values.clip(0)) * rng.standard_normal(len(mean)))
+    return found

@@ -1,0 +1,116 @@
+"""Scores of free runs: each step against its own formula, angles, and what was not measured."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from gpadjust.dynamics import FreeRun, PhysicsDynamics, Record, Records, StateSpec
+from gpadjust.dynamics.particles import central_interval
+
+SPEC = StateSpec(["x", "theta"], ["u"], angles=["theta"])
+
+
+def run_of(particles, level=0.8):
+    """Free runs of given particles."""
+    ends = central_interval(particles, level)
+    lost = torch.zeros(particles.shape[1:3], dtype=torch.float64)
+    return FreeRun(particles.mean(0), *ends, particles, lost, SPEC, level)
+
+
+@pytest.fixture
+def run(uniform):
+    """Of 9 particles, 4 windows and 3 steps, the angle by the edge of a turn."""
+    return run_of(uniform(9, 4, 3, 2) + torch.tensor([5.0, math.pi - 0.4]))
+
+
+@pytest.fixture
+def measured(run, uniform):
+    """What the particles are about, with angles from -pi to pi, not all of it measured."""
+    found = run.mean + 0.8 * uniform(4, 3, 2, low=-1, seed=7)
+    found[..., 1] = torch.atan2(found[..., 1].sin(), found[..., 1].cos())
+    found[1, 0, 0] = found[2, 1] = found[:, 2, 1] = torch.nan
+    return found
+
+
+def test_each_step_is_scored_by_its_formula(run, measured):
+    scores = run.score(measured)
+    assert all(score.shape == (3, 2) for score in scores)
+    assert (run.mean - measured)[..., 1].nan_to_num().max() > math.pi
+    for t in range(3):
+        for i in range(2):
+            rows = [w for w in range(4) if not measured[w, t, i].isnan()]
+            if not rows:
+                assert all(score[t, i].isnan() for score in scores)
+                continue
+            mean, low, high = (x[rows, t, i].numpy() for x in (run.mean, run.lower, run.upper))
+            sd, y = run.particles[:, rows, t, i].numpy().std(0, ddof=1), measured[rows, t, i]
+            error = y.numpy() - mean
+            error -= 2 * math.pi * np.round(error / (2 * math.pi)) if i == 1 else 0
+            inside = (low <= mean + error) & (mean + error <= high)
+            expected = [
+                np.sqrt(np.mean(error**2)),
+                inside.mean(),
+                -norm.logpdf(error, 0, sd).mean(),
+            ]
+            found = [scores.rmse[t, i], scores.coverage[t, i], scores.nlpd[t, i]]
+            np.testing.assert_allclose(found, expected)
+            # Of an even number torch takes the lower one of the two in the middle.
+            assert scores.median[t, i] == pytest.approx(sorted(abs(error))[(len(rows) - 1) // 2])
+    assert 0 < scores.coverage.nan_to_num().mean() < 1
+
+
+def test_particles_without_spread_say_nothing_of_errors(run, measured):
+    particles = run.particles.clone()
+    particles[:, 3, 1] = particles[:1, 3, 1] * (1 + 1e-13 * torch.rand(9, 1))  # rounding errors
+    scores, before = run_of(particles).score(measured), run.score(measured)
+    for name in ("coverage", "nlpd"):
+        assert getattr(scores, name)[1].isnan().all()
+        torch.testing.assert_close(
+            getattr(scores, name)[::2], getattr(before, name)[::2], equal_nan=True
+        )
+    assert scores.rmse[1].isfinite().all()
+    exact = run_of(run.particles[:1, :1, :1].expand(9, -1, -1, -1)).score(measured[:1, :1])
+    assert exact.coverage.isnan().all()
+
+
+def test_windows_without_an_interval_are_left_out_of_what_judges_it(run, measured):
+    """As where the physics fails at the mean before, so that the noise is not known."""
+    particles = run.particles.clone()
+    particles[:, 0] = torch.nan
+    some = run_of(particles)._replace(mean=run.mean).score(measured)
+    rest = run_of(run.particles[:, 1:]).score(measured[1:])
+    torch.testing.assert_close(some.rmse, run.score(measured).rmse, equal_nan=True)
+    torch.testing.assert_close(some.coverage, rest.coverage, equal_nan=True)
+    torch.testing.assert_close(some.nlpd, rest.nlpd, equal_nan=True)
+
+
+def test_windows_of_records_are_chosen_and_scored():
+    spec, x = StateSpec(["x"], ["u"]), torch.arange(13, dtype=torch.float64).unsqueeze(-1)
+    windows = Records(Record(x[:, 0], x, torch.ones_like(x)), spec).windows(3)
+    assert windows.states[..., 0].tolist() == [[3.0 * w + t for t in range(4)] for w in range(4)]
+    late = windows.some(windows.states[:, 0, 0] > 4)
+    assert late.initial_states.flatten().tolist() == [6, 9]
+    assert torch.equal(windows.some(torch.tensor([3, 2])).measured, late.measured.flip(0))
+    slow = PhysicsDynamics(spec, lambda X: X[:, :1] + 0.9 * X[:, 1:])
+    scores = slow.free_run(late.initial_states, late.actions).score(late.measured)
+    np.testing.assert_allclose(scores.rmse[:, 0], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(scores.median[:, 0], [0.1, 0.2, 0.3])
+    assert scores.nlpd.isnan().all()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "says"),
+    [
+        (lambda m: m[:, :1], ValueError, r"\(4, 3, 2\), .* got \(4, 1, 2\); of `windows`"),
+        (lambda m: m[..., :1], ValueError, r"measured of shape \.\.\. x 2"),
+        (lambda m: m.float(), TypeError, r"float64, got torch\.float32; use `measured\.double"),
+        (lambda m: m.numpy(), TypeError, "measured as a floating-point tensor"),
+        (lambda m: m / 0, ValueError, "infinity; put NaN where"),
+    ],
+)
+def test_what_was_measured_is_checked(run, measured, spoil, error, says):
+    with pytest.raises(error, match=says):
+        run.score(spoil(measured))

@@ -1,0 +1,115 @@
+"""Earlier outputs and actions among the states: autoregressive dynamics (NARX)."""
+
+import math
+
+import pytest
+import torch
+
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, Record, Records, StateSpec
+from gpadjust.models import ZeroMeanGP
+
+QUICK = {"method": "map", "num_starts": 2, "num_screened": 16}
+LAGS = {"y_1": "y", "u_1": "u"}
+FIRST_ORDER = StateSpec(["y"], ["u"])
+NARX = StateSpec(["y", *LAGS], ["u"], previous=LAGS)
+
+
+def oscillation(num_rows, seed):
+    """Times, outputs and inputs of an oscillator, of which the output alone is measured."""
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.randn(num_rows, generator=generator, dtype=torch.float64)
+    y = [torch.zeros((), dtype=torch.float64)] * 2
+    for k in range(1, num_rows - 1):
+        y.append(1.6 * y[k] - 0.8 * y[k - 1] + 0.2 * (u[k] + u[k - 1]))
+    return torch.arange(num_rows).double(), torch.stack(y), u
+
+
+def records_of(spec, num_rows, seed):
+    times, y, u = oscillation(num_rows, seed)
+    states = torch.full((num_rows, spec.state_dim), math.nan, dtype=torch.float64)
+    states[:, spec.states.index("y")] = y
+    return Records(Record(times, states, u.unsqueeze(-1)), spec)
+
+
+def learnt(spec, physics=None, **options):
+    dynamics = LearnedDynamics(spec, physics, fit_options=QUICK, **options)
+    states, actions, following = records_of(NARX, 45, 0).windows(1)
+    columns = [NARX.states.index(name) for name in spec.states]
+    dynamics.update(states[:, columns], actions[:, 0], following[:, 0, columns])
+    return dynamics
+
+
+def test_a_free_run_follows_a_second_order_system_of_one_measured_output():
+    errors = []
+    for spec in (FIRST_ORDER, NARX):
+        windows = records_of(spec, 45, 1).windows(20)
+        dynamics = learnt(spec, model=ZeroMeanGP)
+        run = dynamics.free_run(windows.initial_states, windows.actions, noise=False)
+        errors.append((run.mean - windows.measured)[..., 0].square().mean().sqrt())
+    size = oscillation(45, 1)[1].square().mean().sqrt()
+    assert errors[0] > 0.5 * size, "the state of a first-order model is not the system's"
+    assert errors[1] < 0.02 * size
+    y, y_1, u_1 = run.particles.unbind(-1)
+    torch.testing.assert_close(y_1[:, :, 1:], y[:, :, :-1])
+    torch.testing.assert_close(u_1, windows.actions[..., 0].expand(39, -1, -1))
+
+
+def test_physics_knows_the_present_only_and_a_model_both():
+    widths = set()
+
+    def physics(X):
+        widths.add(X.shape[-1])
+        return 1.6 * X[:, :1] + 0.2 * X[:, 1:]
+
+    dynamics = learnt(NARX, physics)
+    states, actions, following = records_of(NARX, 45, 1).windows(1)
+    scores = dynamics.score(states, actions[:, 0], following[:, 0])
+    assert scores.rmse.shape == (1,)
+    assert scores.rmse < 0.02
+    alone = PhysicsDynamics(NARX, physics)
+    alone.update(states, actions[:, 0], following[:, 0])
+    assert widths == {2}
+    assert dynamics.model.input_names == ("y", "u", "y_1", "u_1")
+    for each in (alone, dynamics):
+        moved = each.sample(states, actions[:, 0])
+        assert torch.equal(moved[:, 1:], torch.cat([states[:, :1], actions[:, 0]], -1))
+    assert (dynamics.predict(states, actions[:, 0]).variance[:, 1:] == 0).all()
+    assert (dynamics.noise_variance(states, actions[:, 0])[:, 1:] == 0).all()
+    with pytest.raises(ValueError, match="'y_1' is said to hold the previous state 'y'"):
+        dynamics.update(states, actions[:, 0], following[:, 0].flip(0))
+
+
+def test_what_was_learnt_is_of_the_same_previous_values():
+    dynamics = learnt(NARX, model=ZeroMeanGP)
+    states, actions, _ = records_of(NARX, 45, 1).windows(1)
+    turned = dict([*LAGS.items()][::-1])
+    again = LearnedDynamics(
+        StateSpec(NARX.states, ["u"], previous=turned), model=ZeroMeanGP, fit_options=QUICK
+    )
+    again.load_state_dict(dynamics.state_dict())
+    for own, other in zip(
+        again.predict(states, actions[:, 0]), dynamics.predict(states, actions[:, 0]), strict=True
+    ):
+        assert torch.equal(own, other)
+    further = StateSpec(NARX.states, ["u"], previous={"y_1": "y", "u_1": "y_1"})
+    other = LearnedDynamics(further, model=ZeroMeanGP, fit_options=QUICK)
+    with pytest.raises(RuntimeError, match=r"previous is {'u_1': 'u', .* in the state"):
+        other.load_state_dict(dynamics.state_dict())
+
+
+def test_a_model_reads_the_point_of_the_circle_of_an_earlier_angle(uniform):
+    """A rotor turns on as in the step before, and by the action; its rate is not measured."""
+    spec = StateSpec(["q_1", "q"], ["u"], angles=["q", "q_1"], previous={"q_1": "q"})
+    q_1, rate, u = uniform(60, 3, low=-1).split(1, -1)
+    q_1, q = 9 * q_1, 9 * q_1 + rate
+    following = torch.cat([q, q + rate + 0.1 * u], -1)
+    states = torch.cat([q_1, q], -1)
+    dynamics = LearnedDynamics(spec, model=ZeroMeanGP, fit_options=QUICK)
+    dynamics.update(states, u, following)
+    for name in ("sin(q_1)", "cos(q_1)", "sin(q)", "cos(q)"):
+        assert f"lengthscale of {name}:" in dynamics.model.summary()
+    turned = states + 2 * math.pi * torch.tensor([3, -2]).double()
+    mean = dynamics.predict(turned, u).mean
+    error = spec.change(mean, following)
+    assert error[:, 0].abs().max() < 1e-12
+    assert error[:, 1].abs().max() < 0.1

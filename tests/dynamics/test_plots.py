@@ -1,0 +1,142 @@
+"""Figures over time: what was recorded, and free runs beside it."""
+
+import math
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.dynamics import PhysicsDynamics, Record, StateSpec, Windows
+from gpadjust.dynamics.plots import plot_free_run, plot_record
+
+mpl.use("Agg")
+SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
+
+
+@pytest.fixture(autouse=True)
+def close():
+    yield
+    plt.close("all")
+
+
+def turning(num_rows=31, first=7.0, **options):
+    """A record of an angle that turns at a rate of 7, from -pi to pi, and v of which none is."""
+    times = 0.1 * torch.arange(num_rows, dtype=torch.float64)
+    angle = first + 7 * times
+    states = torch.stack([torch.atan2(angle.sin(), angle.cos()), torch.full_like(times, torch.nan)])
+    return Record(times, states.T, torch.ones(num_rows, 1).double(), **options)
+
+
+def test_a_record_shows_its_gaps_and_segments():
+    record = turning(segments=["a"] * 12 + ["b"] * 19)
+    record.states[::3, 1] = 2.0
+    rows = torch.tensor([i for i in range(31) if i not in (20, 21)])
+    labels = [record.segments[i] for i in rows]
+    record = Record(record.times[rows], record.states[rows], record.actions[rows], labels)
+    axes = plot_record(record, SPEC, units={"u": "N m", "time": "min"})
+    assert [ax.get_ylabel() for ax in axes] == ["theta in rad", "v", "u in N m"]
+    assert axes[-1].get_xlabel() == "time in min"
+    spans = [(p.get_x(), p.get_x() + p.get_width()) for p in axes[0].patches]
+    np.testing.assert_allclose(spans, [(1.1, 1.2), (1.9, 2.2)])
+    lines = [line for line in axes[0].lines if line.get_linestyle() != ":"]
+    (edge,) = [line for line in axes[0].lines if line.get_linestyle() == ":"]
+    assert list(edge.get_xdata()) == pytest.approx([1.2, 1.2])
+    starts = [0, 1.2, 2.2]
+    for line, start in zip(lines, starts, strict=True):
+        path, times = line.get_ydata(), line.get_xdata()
+        assert times[0] == pytest.approx(start)
+        assert abs(path[0]) <= math.pi
+        np.testing.assert_allclose(np.diff(path), 0.7)
+    dots = [line for line in axes[1].lines if line.get_marker() == "."]
+    assert sum(len(line.get_xdata()) for line in dots) == int((~record.states[:, 1].isnan()).sum())
+    assert axes[2].lines[0].get_drawstyle() == "steps-post"
+
+
+def turns(num_windows=4, num_steps=20):
+    """Windows of an angle that turns at a rate of 7 v, from -pi to pi, and its dynamics."""
+    v = torch.linspace(0.5, 1, num_windows, dtype=torch.float64)
+    angle = 3 + 0.7 * torch.arange(num_steps + 1).double() * v.unsqueeze(-1)
+    angle = torch.atan2(angle.sin(), angle.cos())
+    states = torch.stack([angle, v.unsqueeze(-1).expand_as(angle)], -1)
+    actions = torch.zeros(num_windows, num_steps, 1, dtype=torch.float64)
+    windows = Windows(
+        states[:, 0] + torch.tensor([4 * math.pi, 0.0], dtype=torch.float64), actions, states[:, 1:]
+    )
+
+    def physics(X):
+        return torch.stack([X[:, 0] + 0.7 * X[:, 1], X[:, 1]], -1)
+
+    run = PhysicsDynamics(SPEC, physics).free_run(windows.initial_states, actions)
+    return windows, run._replace(lower=run.mean - 0.3, upper=run.mean + 0.3)
+
+
+def test_free_runs_lie_on_what_was_measured():
+    windows, run = turns()
+    windows.measured[3, 5:8, 0] = torch.nan
+    axes = plot_free_run(run, windows, others={"slow": run._replace(mean=run.mean - 0.1)}, step=0.1)
+    assert axes.shape == (2, 3)  # windows 0, 2 (of 1.5) and 3
+    for ax, row in zip(axes[0], (0, 2, 3), strict=True):
+        lines = {line.get_label(): line for line in ax.lines}
+        times, measured = lines["measured"].get_data()
+        np.testing.assert_allclose(times, 0.1 * np.arange(21))
+        assert measured[0] == pytest.approx(3.0)
+        known = ~np.isnan(measured)
+        assert (~known).sum() == (3 if row == 3 else 0)
+        mean = lines["free run"].get_ydata()
+        np.testing.assert_allclose(mean[known], measured[known])
+        np.testing.assert_allclose(lines["slow"].get_ydata()[1:], mean[1:] - 0.1)
+        (band,) = ax.collections
+        ends = band.get_paths()[0].vertices
+        assert ends[:, 0].min() == pytest.approx(0.1)
+        assert ends[:, 1].max() == pytest.approx(mean[-1] + 0.3)
+        assert ax.get_ylim()[1] > mean[-1] + 0.3
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["theta in rad", "v"]
+    assert axes[1, 0].get_xlabel() == "time in s"
+    (legend,) = axes[0, 0].figure.legends
+    assert [t.get_text() for t in legend.texts] == ["95 %", "free run", "slow", "measured"]
+
+
+def test_windows_states_and_axes_are_chosen():
+    windows, run = turns()
+    given = plt.figure().subplots(1, 2)
+    axes = plot_free_run(run, windows, rows=[2, 0], states=["v"], axes=given)
+    assert list(axes[0]) == list(given)
+    assert axes[0, 0].get_xlabel() == "steps"
+    shown = [ax.lines[0].get_ydata()[-1] for ax in axes[0]]
+    np.testing.assert_allclose(shown, run.mean[[2, 0], -1, 1])
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "says"),
+    [
+        ({"run": None}, TypeError, "run as a FreeRun, got NoneType; pass `dynamics"),
+        ({"windows": ()}, TypeError, "windows as Windows, got tuple; pass `records"),
+        ({"windows": turns(3)[0]}, ValueError, r"\(3, 20, 2\), got .*\(4, 20, 2\); .* by `rows`"),
+        ({"others": {"old": turns(4, 9)[1]}}, ValueError, r"old of these windows, .* \(4, 9, 2\)"),
+        ({"rows": [4]}, ValueError, r"windows from 0 to 3, got \[4\]"),
+        ({"rows": []}, ValueError, "windows from 0 to 3"),
+        ({"states": ["omega"]}, ValueError, "states of theta, v, found 'omega'"),
+        ({"states": []}, ValueError, "states of theta, v, found none"),
+        ({"units": {"w": "m"}}, ValueError, "units of theta, v, u, time, found 'w'"),
+        ({"axes": []}, ValueError, "Expected 2 x 3 axes, got 0"),
+    ],
+)
+def test_what_is_no_free_run_of_these_windows(options, error, says):
+    windows, run = turns()
+    with pytest.raises(error, match=says):
+        plot_free_run(**{"run": run, "windows": windows, **options})
+
+
+@pytest.mark.parametrize(
+    ("record", "spec", "error", "says"),
+    [
+        ([turning()], SPEC, TypeError, "record as a Record, got list; of `records` draw each"),
+        (turning(), "theta", TypeError, "spec as a StateSpec, got str"),
+        (turning(), StateSpec(["x"], ["u"]), ValueError, "states, x, and .* found 2 and 1 columns"),
+    ],
+)
+def test_what_is_no_record_of_this_machine(record, spec, error, says):
+    with pytest.raises(error, match=says):
+        plot_record(record, spec)
