@@ -15,7 +15,7 @@ from gpadjust.dynamics.csv_record import checked_columns, read_record
 from gpadjust.dynamics.open_loop import steps_ahead
 from gpadjust.dynamics.record import Record
 from gpadjust.dynamics.resampling import resampled
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics.transitions import Transitions, spread_rows
 from gpadjust.models.sampled_functions import check_number
 from gpadjust.states import StateSpec
 
@@ -54,6 +54,22 @@ class Windows(NamedTuple):
                     [6., 7., 8.]], dtype=torch.float64)
         """
         return Windows(*(part[rows] for part in self))
+
+    def spread(self, number: int, seed: int = 0) -> Windows:
+        """So many of the windows, drawn evenly, as by :meth:`Transitions.spread`."""
+        return self.some(spread_rows(len(self.states), number, seed, "windows"))
+
+    def as_records(self, spec: StateSpec, step: float) -> Records:
+        """A record of each window, such as to :func:`smooth` them.
+
+        Args:
+            spec: What the entries of states and actions are.
+            step: The control step.
+        """
+        times = checked_step(step) * torch.arange(self.states.shape[1], dtype=torch.float64)
+        actions = torch.cat([self.actions, self.actions[:, -1:]], dim=1)  # the last one is not read
+        parts = enumerate(zip(self.states, actions, strict=True))
+        return Records([Record(times, *part, name=f"window {i}") for i, part in parts], spec)
 
 
 class Records:

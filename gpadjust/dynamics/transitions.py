@@ -86,13 +86,19 @@ class Transitions(NamedTuple):
             >>> Transitions(rows, rows, rows + 1).spread(4).states.flatten() // 25
             tensor([0., 1., 2., 3.], dtype=torch.float64)
         """
-        check_number(number, "number")
-        if number > len(self.states):
-            raise ValueError(
-                f"Expected number <= {len(self.states)}, the transitions that there are, got "
-                f"{number}."
-            )
-        edges = torch.arange(number + 1) * len(self.states) // number
-        generator = torch.Generator().manual_seed(seed)
-        share = torch.rand(number, generator=generator, dtype=torch.float64)
-        return self.some(edges[:-1] + (share * edges.diff()).long())
+        return self.some(spread_rows(len(self.states), number, seed, "transitions"))
+
+
+def spread_rows(total: int, number: int, seed: int, what: str) -> Tensor:
+    """So many of the numbers below ``total``, one of each of as many parts of the same length.
+
+    Raises:
+        ValueError: If there are fewer, or ``number`` is no positive whole number.
+    """
+    check_number(number, "number")
+    if number > total:
+        raise ValueError(f"Expected number <= {total}, the {what} that there are, got {number}.")
+    edges = torch.arange(number + 1) * total // number
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(number, generator=generator, dtype=torch.float64)
+    return edges[:-1] + (share * edges.diff()).long()

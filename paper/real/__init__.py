@@ -36,6 +36,10 @@ LEARNERS = {
     "calibrated-delta": "calibrated f_p + delta",
     "calibrated-orthogonal": "calibrated f_p + orthogonal delta",
     "calibrated-cka": "calibrated CKA",
+    "stretches-delta": "calibrated f_p + delta, of stretches",
+    "smoothed": "calibrated f_p, smoothed",
+    "smoothed-delta": "calibrated f_p + delta, smoothed",
+    "smoothed-cka": "calibrated CKA, smoothed",
     "network": "network",
     "residual": "f_p and a network",
 }
@@ -43,6 +47,12 @@ LEARNERS = {
 
 HORIZONS = (10, 20, 40)
 """Steps of 0.05 s after which free runs are scored, beside the single steps of all rows."""
+
+SMOOTHED = ("smoothed", "smoothed-delta", "smoothed-cka")
+"""Learners of states that are estimated along stretches of ten transitions."""
+
+OF_STRETCHES = ("stretches-delta", *SMOOTHED)
+"""Learners whose transitions come in stretches, not one by one."""
 
 UNTAUGHT = ("phy", "phy-identified")
 """Learners that learn nothing: one run each, of 0 transitions."""

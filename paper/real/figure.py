@@ -34,6 +34,10 @@ COLORS = {
     "calibrated-delta": "deepskyblue",
     "calibrated-orthogonal": "teal",
     "calibrated-cka": "blue",
+    "stretches-delta": "slategray",
+    "smoothed": "darkkhaki",
+    "smoothed-delta": "crimson",
+    "smoothed-cka": "darkviolet",
     "network": "0.55",
     "residual": "tab:pink",
 }

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, Transitions
+from torch import Tensor
+
+from gpadjust.dynamics import (
+    Dynamics,
+    LearnedDynamics,
+    PhysicsDynamics,
+    Records,
+    Transitions,
+    smooth,
+)
 from gpadjust.models import (
     CKA,
     RRA,
@@ -15,6 +24,7 @@ from gpadjust.models import (
     orthogonal_rbf,
 )
 from gpadjust.physics import Physics
+from paper.real import SMOOTHED
 from paper.real.least_squares import LeastSquares
 from paper.real.machines import Machine
 from paper.real.networks import NetworkDynamics
@@ -23,9 +33,30 @@ Known = Literal["crude", "identified"]
 Maker = Callable[[Machine, Transitions, int], Dynamics]
 
 
+class Learnt(NamedTuple):
+    """What a learner made.
+
+    Args:
+        dynamics: The dynamics.
+        noise: Standard deviations of what is measured, ``state_dim``, if they learnt from states
+            that were estimated: the noise that they learnt is then process noise.
+    """
+
+    dynamics: Dynamics
+    noise: Tensor | None = None
+
+
 def learnt(learner: str, machine: Machine, data: Transitions, seed: int) -> Dynamics:
     """What a learner makes of transitions of a machine; networks are drawn by the seed."""
     return MAKERS[learner](machine, data, seed)
+
+
+def learnt_of_stretches(learner: str, machine: Machine, records: Records, seed: int) -> Learnt:
+    """The same of stretches: of all their transitions, or those of a draw of the states."""
+    if learner not in SMOOTHED:
+        return Learnt(learnt(learner, machine, records.transitions(), seed))
+    found = smooth(records, machine.calibrated())
+    return Learnt(learnt(learner, machine, found.draw(seed).transitions(), seed), found.noise)
 
 
 def _alone(known: Known) -> Maker:
@@ -98,6 +129,10 @@ MAKERS: dict[str, Maker] = {
     "calibrated-delta": _calibrated(PhysicsMeanGP),
     "calibrated-orthogonal": _calibrated(PhysicsMeanGP, covar_module=orthogonal_rbf),
     "calibrated-cka": _calibrated(CKA),
+    "stretches-delta": _calibrated(PhysicsMeanGP),
+    "smoothed": _calibrated(CalibratedPhysics),
+    "smoothed-delta": _calibrated(PhysicsMeanGP),
+    "smoothed-cka": _calibrated(CKA),
     "network": _networks(None),
     "residual": _networks("crude"),
 }

@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
-from gpadjust.dynamics import Dynamics, FreeRun, Windows
+from gpadjust.dynamics import Dynamics, FreeRun, FreeRunScores, TransitionScores, Windows
 from gpadjust.inference import SamplingWarning
 from paper.common.experiment import Record
-from paper.real import HORIZONS, UNTAUGHT, Real, Settings
-from paper.real.learners import learnt
+from paper.real import HORIZONS, OF_STRETCHES, UNTAUGHT, Real, Settings
+from paper.real.learners import Learnt, learnt, learnt_of_stretches
 from paper.real.systems import System, system
 
 _SHOWN = 2  # free runs that are kept for a figure
@@ -25,11 +25,16 @@ def run(
     """Learn, and return the scores of each test: by steps ahead, of each state."""
     warnings.simplefilter("ignore", SamplingWarning)
     settings, known = experiment.settings, system(name)
-    data = known.drawn(n, seed)
-    begin = time.perf_counter()
-    dynamics = learnt(learner, known.machine, data, seed)
+    if learner in OF_STRETCHES:
+        records = known.stretches(n, seed)
+        begin = time.perf_counter()
+        made = learnt_of_stretches(learner, known.machine, records, seed)
+    else:
+        data = known.drawn(n, seed)
+        begin = time.perf_counter()
+        made = Learnt(learnt(learner, known.machine, data, seed))
     fitted = time.perf_counter()
-    tests = {test: _scores(dynamics, known, test, settings) for test in known.tests}
+    tests = {test: _scores(made, known, test, settings) for test in known.tests}
     found: Record = {
         "fit_seconds": fitted - begin,
         "score_seconds": time.perf_counter() - fitted,
@@ -41,26 +46,37 @@ def run(
 
 
 def _scores(
-    dynamics: Dynamics, known: System, test: str, settings: Settings
+    made: Learnt, known: System, test: str, settings: Settings
 ) -> tuple[dict[str, Any], FreeRun]:
     """Scores by name and steps ahead, and the free runs of which they are.
 
-    Those of one step are of all steps of the test.
+    Those of one step are of all steps of the test. If the noise of what is measured is known, the
+    dynamics learnt process noise; else half of what they learnt is that of a state (the windows
+    start at measured ones), and there is no process noise.
     """
-    single = dynamics.score(*known.steps(test))
-    windows = windows_of(known, test, settings)
-    free = dynamics.free_run(
-        windows.initial_states,
-        windows.actions,
-        num_functions=settings.num_functions,
-        start_noise="learnt",  # the windows start at measured states
-    )
+    (dynamics, noise), windows = made, windows_of(known, test, settings)
+    single: TransitionScores | FreeRunScores
+    if noise is None:
+        single = dynamics.score(*known.steps(test))
+        free = _follow(dynamics, windows, settings, start_noise="learnt")
+    else:
+        given: dict[str, Any] = {"start_noise": noise, "noise": noise, "process_noise": "learnt"}
+        states, actions, following = known.steps(test)
+        steps = Windows(states, actions.unsqueeze(1), following.unsqueeze(1))
+        score = _follow(dynamics, steps, settings, **given).score(steps.measured)
+        single = FreeRunScores(*(part[0] for part in score))
+        free = _follow(dynamics, windows, settings, **given)
     after = free.score(windows.measured)
     scores: dict[str, Any] = {}
     for name in ("rmse", "coverage", "nlpd"):
         found, ahead = getattr(single, name).tolist(), getattr(after, name).tolist()
         scores[name] = {"1": found, **{str(steps): ahead[steps - 1] for steps in HORIZONS}}
     return {**scores, "lost": free.lost[:, -1].mean().item()}, free
+
+
+def _follow(dynamics: Dynamics, windows: Windows, settings: Settings, **given: Any) -> FreeRun:
+    states, actions, _ = windows
+    return dynamics.free_run(states, actions, num_functions=settings.num_functions, **given)
 
 
 def windows_of(known: System, test: str, settings: Settings) -> Windows:

@@ -14,6 +14,8 @@ from torch import Tensor
 from gpadjust.dynamics import Records, Transitions, Windows
 from paper.real.machines import DOUBLE_PENDULUM, PENDULUM, STEP, SUBSTEPS, Machine
 
+_LENGTH = 10  # transitions of a stretch
+
 DATA = Path(__file__).parent / "data"
 
 
@@ -59,6 +61,16 @@ class System:
         """
         known = self._records(self.train).transitions(STEP)
         return known.spread(n, seed) if n else known.rows(0, 0)
+
+    def stretches(self, n: int, seed: int) -> Records:
+        """``n`` transitions in stretches of ten, or as many as divide ``n``, spread alike.
+
+        Raises:
+            ValueError: If the records have fewer.
+        """
+        length = max(k for k in range(1, _LENGTH + 1) if n % k == 0)
+        found = self._records(self.train).windows(length, STEP).spread(n // length, seed)
+        return found.as_records(self.machine.spec, STEP)
 
     def steps(self, test: str) -> Transitions:
         """The single steps of a test, that start where the machine moves."""

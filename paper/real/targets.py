@@ -20,7 +20,10 @@ OURS = {
 }
 """Learners of f_p and a GP, and the f_p alone that they adjust."""
 
-CALIBRATED = ("calibrated-delta", "calibrated-cka", "calibrated-orthogonal")
+CALIBRATED = (
+    *("calibrated-delta", "calibrated-cka", "calibrated-orthogonal"),
+    *("smoothed-delta", "smoothed-cka"),
+)
 """Learners of a GP and of f_p's parameters at once; they are judged as soon as they are run."""
 
 _NEAR, _FAR = ("double-pendulum", "near"), ("double-pendulum", "far")
