@@ -20,6 +20,7 @@ from gpadjust.models import (
     RRA,
     CalibratedPhysics,
     PhysicsMeanGP,
+    PhysicsParameters,
     ZeroMeanGP,
     orthogonal_rbf,
 )
@@ -40,23 +41,29 @@ class Learnt(NamedTuple):
         dynamics: The dynamics.
         noise: Standard deviations of what is measured, ``state_dim``, if they learnt from states
             that were estimated: the noise that they learnt is then process noise.
+        parameters: The posterior of f_p's parameters, if they were learnt.
     """
 
     dynamics: Dynamics
     noise: Tensor | None = None
+    parameters: PhysicsParameters | None = None
 
 
-def learnt(learner: str, machine: Machine, data: Transitions, seed: int) -> Dynamics:
+def learnt(learner: str, machine: Machine, data: Transitions, seed: int) -> Learnt:
     """What a learner makes of transitions of a machine; networks are drawn by the seed."""
-    return MAKERS[learner](machine, data, seed)
+    dynamics = MAKERS[learner](machine, data, seed)
+    if not isinstance(dynamics, LearnedDynamics) or not dynamics.model.has_unknowns:
+        return Learnt(dynamics)
+    return Learnt(dynamics, parameters=dynamics.model.physics_parameters)
 
 
 def learnt_of_stretches(learner: str, machine: Machine, records: Records, seed: int) -> Learnt:
     """The same of stretches: of all their transitions, or those of a draw of the states."""
     if learner not in SMOOTHED:
-        return Learnt(learnt(learner, machine, records.transitions(), seed))
+        return learnt(learner, machine, records.transitions(), seed)
     found = smooth(records, machine.calibrated())
-    return Learnt(learnt(learner, machine, found.draw(seed).transitions(), seed), found.noise)
+    dynamics = learnt(learner, machine, found.draw(seed).transitions(), seed).dynamics
+    return Learnt(dynamics, found.noise, found.physics_parameters)
 
 
 def _alone(known: Known) -> Maker:

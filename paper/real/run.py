@@ -32,7 +32,7 @@ def run(
     else:
         data = known.drawn(n, seed)
         begin = time.perf_counter()
-        made = Learnt(learnt(learner, known.machine, data, seed))
+        made = learnt(learner, known.machine, data, seed)
     fitted = time.perf_counter()
     tests = {test: _scores(made, known, test, settings) for test in known.tests}
     found: Record = {
@@ -40,6 +40,12 @@ def run(
         "score_seconds": time.perf_counter() - fitted,
         "tests": {test: scores for test, (scores, _) in tests.items()},
     }
+    if made.parameters is not None:
+        ends = zip(*made.parameters.interval(), strict=True)
+        found["parameters"] = {
+            name: [low.item(), high.item()]
+            for name, (low, high) in zip(made.parameters, ends, strict=True)
+        }
     if learner in UNTAUGHT or (n == settings.drawn and seed == 0):
         found["paths"] = {test: _paths(known, free) for test, (_, free) in tests.items()}
     return found
@@ -54,7 +60,7 @@ def _scores(
     dynamics learnt process noise; else half of what they learnt is that of a state (the windows
     start at measured ones), and there is no process noise.
     """
-    (dynamics, noise), windows = made, windows_of(known, test, settings)
+    (dynamics, noise, _), windows = made, windows_of(known, test, settings)
     single: TransitionScores | FreeRunScores
     if noise is None:
         single = dynamics.score(*known.steps(test))
