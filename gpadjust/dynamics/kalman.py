@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -143,16 +144,13 @@ def _filter(
             mean = matrix @ mean + link.offsets[t - 1]
             covariance = matrix @ covariance @ matrix.T + added
         ahead.means[t], ahead.covariances[t] = mean, covariance
-        rows = np.flatnonzero(~np.isnan(measured))
-        if len(rows):
-            error = measured[rows] - mean[rows]
-            spread = covariance[np.ix_(rows, rows)] + np.diag(noise[rows])
-            chol = np.linalg.cholesky(spread)
-            scaled = np.linalg.solve(chol, np.column_stack([error, covariance[rows]]))
-            mean = mean + scaled[:, 1:].T @ scaled[:, 0]
-            covariance = covariance - scaled[:, 1:].T @ scaled[:, 1:]
-            log_density -= 0.5 * scaled[:, 0] @ scaled[:, 0] + np.log(np.diag(chol)).sum()
-            log_density -= 0.5 * len(rows) * np.log(2 * np.pi)
+        for i in np.flatnonzero(~np.isnan(measured)):  # one by one, as their errors are independent
+            variance, error = covariance[i, i] + noise[i], measured[i] - mean[i]
+            if not 0 < variance < math.inf:
+                raise np.linalg.LinAlgError("a variance is no positive number")
+            gain = covariance[i] / variance
+            mean, covariance = mean + gain * error, covariance - np.outer(gain, covariance[i])
+            log_density -= 0.5 * (error**2 / variance + math.log(2 * math.pi * variance))
         known.means[t], known.covariances[t] = mean, covariance
     return Filtered(ahead, known), float(log_density)
 

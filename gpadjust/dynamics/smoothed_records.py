@@ -94,6 +94,7 @@ def smooth(
     start: Mapping[str, tuple[float, float]] | None = None,
     noise: Tensor | None = None,
     process_noise: Tensor | None = None,
+    num_starts: int | None = None,
     max_rounds: int = 200,
 ) -> SmoothedRecords:
     r"""Estimate the states of a machine, measured with noise or not at all, along its records.
@@ -120,7 +121,9 @@ def smooth(
         noise: Standard deviations ``state_dim`` of the errors of what was measured; NaN for those
             to be learnt. Default: all.
         process_noise: The same of what a step adds to f_p.
-        max_rounds: The most rounds of smoothing.
+        num_starts: How many starts to take the best end of, if there is something to learn of
+            the physics. Default: 4 with hidden states, else 1.
+        max_rounds: The most rounds of smoothing of each.
 
     Returns:
         The states, their uncertainty, and what decided them.
@@ -130,6 +133,7 @@ def smooth(
         ValueError: If a hidden state has no start, names or numbers are wrong, or as
             :meth:`Records.transitions`.
         PhysicsError: If the physics fails at measured states.
+        RuntimeError: If the states diverge from all starts.
 
     Warns:
         SmoothingWarning: If the states did not settle.
@@ -165,7 +169,11 @@ def smooth(
         _starts(start, records),
     )
     _check_hidden(stretches, known, records)
-    found = estimate(whole, spec, stretches, known, max_rounds)
+    if num_starts is None:
+        measured = torch.cat([stretch.states[:, spec.moving] for stretch in stretches])
+        num_starts = 4 if measured.isnan().all(0).any() and whole.unknowns else 1
+    check_number(num_starts, "num_starts")
+    found = estimate(whole, spec, stretches, known, max_rounds, num_starts)
     variances = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
     still = [each._replace(states=torch.zeros_like(each.states)) for each in stretches]
     sd = _by_record(spec.moving, still, [np.sqrt(v.clip(0)) for v in variances])

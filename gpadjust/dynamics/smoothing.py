@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ _SHARE = 0.25  # of the variance of f_p's errors in single steps: that of the no
 _HIDDEN = 0.1  # of the change in a step: what it adds to a state that is never measured, at first
 _LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by rounding
 _LONGER = 1.6  # than a step of expectation maximisation, in logarithms
+_NEARER = math.log(4)  # the most that a logarithm of a variance changes in a round
 _HALVINGS = 6
 _ARRIVED = 0.01  # nats of the log density
 _STILL = 0.1  # nats, a change that is not settled
@@ -62,7 +64,12 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    physics: Physics, spec: StateSpec, stretches: Sequence[Stretch], known: Known, max_rounds: int
+    physics: Physics,
+    spec: StateSpec,
+    stretches: Sequence[Stretch],
+    known: Known,
+    max_rounds: int,
+    num_starts: int,
 ) -> Estimate:
     """States, parameters of the physics and sizes of errors that explain stretches best.
 
@@ -71,41 +78,76 @@ def estimate(
     takes the variances that are most likely given these (expectation maximisation, Shumway and
     Stoffer 1982). A new trajectory that explains less is taken part of the way only.
 
+    Of several starts the best end counts. They are at the guesses of the parameters, and then at
+    draws from their priors. By turns variances that are known are so from the beginning, or come
+    down to this from the sizes of f_p's errors in single steps: a trajectory that may hardly leave
+    the physics is often found by way of those that may.
+
     Raises:
-        PhysicsError: If the physics fails where a round begins.
+        PhysicsError: If the physics fails at the measured states.
+        RuntimeError: If no start leads anywhere.
 
     Warns:
         SmoothingWarning: If there are no rounds left.
     """
     chain = _Chain(physics, spec, stretches, known)
-    path = chain.first_path()
+    p, found = chain.num_parameters, []
+    engine = torch.quasirandom.SobolEngine(max(p, 1), scramble=True, seed=0)
+    shares = engine.draw(num_starts, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
+    draws = torch.special.ndtri(shares)[:, :p].numpy()
+    for i, coordinates in enumerate(draws):
+        try:
+            path = chain.first_path(coordinates if i > 1 else np.zeros(p))
+        except PhysicsError:
+            if i < 2:
+                raise
+            continue
+        with contextlib.suppress(np.linalg.LinAlgError):  # far off, where numbers end
+            found.append(_from(chain, path, known_at_once=i % 2 == 1, max_rounds=max_rounds))
+    if not found:
+        raise RuntimeError(
+            f"The states diverged from each of {num_starts} starts. Give narrower priors of the "
+            "parameters, a start of hidden states, more of the noise, or a larger num_starts."
+        )
+    # By what was measured, but only where the variances that are known are so by then.
+    best, gained = max(found, key=lambda end: (abs(end[1]) <= _STILL, end[0].log_density))
+    if abs(gained) > _STILL:
+        warnings.warn(
+            f"The states did not settle in {max_rounds} rounds: the log density of what was "
+            f"measured still changed by {gained:.2g}. Raise max_rounds, say more of what is known "
+            "(noise, process_noise, start), or look at the physics.",
+            SmoothingWarning,
+            stacklevel=4,
+        )
+    return best
+
+
+def _from(
+    chain: _Chain, path: _Path, *, known_at_once: bool, max_rounds: int
+) -> tuple[Estimate, float]:
+    """What is found from a path, and by how much the log density changed in the last round."""
     noise, scatter = chain.first_variances(path)
-    value, faster = -math.inf, _LONGER
+    if known_at_once:
+        noise, scatter = chain.checked(noise, scatter)
+    value = -math.inf
     for _ in range(max_rounds):
         links = chain.linearised(path)
         found, density = smooth(links, chain.starts, noise, scatter)
-        arrived = abs(density - value) < _ARRIVED
-        faster = _LONGER if density >= value else 1.0
-        gained, value = density - value, density
+        if not math.isfinite(density):
+            raise np.linalg.LinAlgError
+        faster, gained, value = _LONGER if density >= value else 1.0, density - value, density
+        estimate = Estimate(found, noise, scatter, density)
         path, whole = chain.towards(path, found, noise, scatter)
-        if arrived and whole:
-            break
-        if whole:
-            likely = chain.likely_variances(links, found)
-            noise, scatter = (
-                np.exp(np.log(old) + faster * (np.log(new) - np.log(old)))
-                for old, new in zip((noise, scatter), chain.checked(*likely), strict=True)
-            )
-    else:
-        if abs(gained) > _STILL:
-            warnings.warn(
-                f"The states did not settle in {max_rounds} rounds: the log density of what was "
-                f"measured still changed by {gained:.2g}. Raise max_rounds, say more of what is "
-                "known (noise, process_noise, start), or look at the physics.",
-                SmoothingWarning,
-                stacklevel=4,
-            )
-    return Estimate(found, noise, scatter, value)
+        likely = chain.checked(*chain.likely_variances(links, found))
+        if not whole:
+            continue
+        if abs(gained) < _ARRIVED:
+            return estimate, 0.0
+        noise, scatter = (
+            old * np.exp((faster * np.log(new / old)).clip(-_NEARER, _NEARER))
+            for old, new in zip((noise, scatter), likely, strict=True)
+        )
+    return estimate, gained
 
 
 class _Path(NamedTuple):
@@ -141,12 +183,15 @@ class _Chain:
         self.spread = spread.clip(np.finfo(float).tiny ** 0.25)
         self.starts = [self._start(measured) for measured in self.measured]
 
-    def first_path(self) -> _Path:
-        """Measured states, and between them and in hidden ones where f_p leads."""
+    def first_path(self, parameters: Array) -> _Path:
+        """Measured states, and between them and in hidden ones where f_p leads.
+
+        Args:
+            parameters: Its parameters' coordinates, ``p``.
+        """
         measured, lengths = self.measured, [len(m) for m in self.measured]
         states = [np.empty_like(m) for m in measured]
         bounds = np.cumsum([0, *(n - 1 for n in lengths)])
-        parameters = np.zeros(self.num_parameters)
         now = np.stack([start[: len(self.spread)] for start, _ in self.starts])
         complete = not np.isnan(np.concatenate(measured)).any()
         for t in range(max(lengths)):
@@ -163,7 +208,7 @@ class _Chain:
         return _Path(states, parameters, self._following(everything, self.actions, parameters))
 
     def first_variances(self, path: _Path) -> tuple[Array, Array]:
-        """Of noise and scatter, by f_p's errors in single steps."""
+        """Of noise and scatter, by f_p's errors in single steps, whatever is known of them."""
         ends = np.concatenate([m[1:] for m in self.measured])
         begins = np.concatenate([x[:-1] for x in path.states])
         change = ((path.following - begins) ** 2).mean(0)
@@ -173,7 +218,8 @@ class _Chain:
                 for i, (c, ok) in enumerate(self._columns(ends))
             ]
         )
-        return self.checked(_SHARE * errors, 2 * _SHARE * errors)
+        least = (_LEAST * self.spread) ** 2
+        return (_SHARE * errors).clip(least), (2 * _SHARE * errors).clip(least)
 
     def checked(self, noise: Array, scatter: Array) -> tuple[Array, Array]:
         """Variances with what is known of them, and none too small to reckon with."""
