@@ -120,7 +120,9 @@ def smooth(
             needed of hidden ones. Default: about the first that was measured.
         noise: Standard deviations ``state_dim`` of the errors of what was measured; NaN for those
             to be learnt. Default: all.
-        process_noise: The same of what a step adds to f_p.
+        process_noise: The same of what a step adds to f_p. Learnt, it makes the best predictions of
+            the next measurement; said to be small, it fits f_p to long free runs, to which errors
+            that persist, as of a wrong f_p, would otherwise be noise.
         num_starts: How many starts to take the best end of, if there is something to learn of
             the physics. Default: 4 with hidden states, else 1.
         max_rounds: The most rounds of smoothing of each.

@@ -79,9 +79,9 @@ def estimate(
     Stoffer 1982). A new trajectory that explains less is taken part of the way only.
 
     Of several starts the best end counts. They are at the guesses of the parameters, and then at
-    draws from their priors. By turns variances that are known are so from the beginning, or come
-    down to this from the sizes of f_p's errors in single steps: a trajectory that may hardly leave
-    the physics is often found by way of those that may.
+    draws from their priors. Variances that are known come down to this from the sizes of f_p's
+    errors in single steps, as a trajectory that may hardly leave the physics is often found by way
+    of those that may; of every other start they are so from the beginning.
 
     Raises:
         PhysicsError: If the physics fails at the measured states.
@@ -94,15 +94,22 @@ def estimate(
     p, found = chain.num_parameters, []
     engine = torch.quasirandom.SobolEngine(max(p, 1), scramble=True, seed=0)
     shares = engine.draw(num_starts, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
-    draws = torch.special.ndtri(shares)[:, :p].numpy()
-    for i, coordinates in enumerate(draws):
+    places = torch.special.ndtri(shares)[:, :p].numpy()
+    something_known = not np.isnan(np.concatenate([known.noise, known.scatter])).all()
+    at_guesses = 2 if something_known else 1
+    places[:at_guesses] = 0.0
+    for i, coordinates in enumerate(places):
         try:
-            path = chain.first_path(coordinates if i > 1 else np.zeros(p))
+            path = chain.first_path(coordinates)
         except PhysicsError:
-            if i < 2:
+            if i < at_guesses:
                 raise
             continue
-        with contextlib.suppress(np.linalg.LinAlgError):  # far off, where numbers end
+        # Far off numbers end; then another start may lead somewhere.
+        with (
+            contextlib.suppress(np.linalg.LinAlgError),
+            np.errstate(over="ignore", invalid="ignore"),
+        ):
             found.append(_from(chain, path, known_at_once=i % 2 == 1, max_rounds=max_rounds))
     if not found:
         raise RuntimeError(

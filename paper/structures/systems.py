@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics import Records, Transitions
 from gpadjust.envs import (
     ARM_SPEC,
     CART_POLE_SPEC,
@@ -24,10 +22,10 @@ from gpadjust.envs import (
 )
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.states import StateSpec
+from paper.real.systems import DATA
 from paper.structures import ARM, SIMULATED
 
-RECORDS = Path(__file__).parents[1] / "records"
-CONTROL_STEP = 4  # rows of a record, of 10 ms each
+CONTROL_STEP = 0.04  # s
 _GRAVITY = 9.81
 _TEST_SEED = 20_000  # no run has it
 _EPISODE = {"arm": 15, "cart-pole": 25}  # steps, as the environments' ids have them
@@ -107,21 +105,11 @@ def recorded(name: str, numbers: tuple[str, ...]) -> Transitions:
 
     The actions are means over the 40 ms.
     """
-    spec, parts = _SPECS[name], []
-    for number in numbers:
-        table = pd.read_csv(RECORDS / f"{name.replace('-', '_')}_{number}.csv")
-        segment = table["segment"] if "segment" in table else pd.Series(0, index=table.index)
-        for _, rows in table.groupby(segment):
-            parts.append(_transitions(rows, spec))
-    return Transitions(*(torch.cat(part) for part in zip(*parts, strict=True)))
-
-
-def _transitions(rows: pd.DataFrame, spec: StateSpec) -> Transitions:
-    """Those of a stretch of a record without gaps."""
-    states = torch.tensor(rows[list(spec.states)].to_numpy(dtype=float))[::CONTROL_STEP]
-    actions = torch.tensor(rows[list(spec.actions)].to_numpy(dtype=float))
-    held = actions.unfold(0, CONTROL_STEP, CONTROL_STEP).mean(-1)[: len(states) - 1]
-    return Transitions(states[:-1], held, states[1:])
+    pendulum = name == "pendulum"
+    file = "{}.csv" if pendulum else "A0_20220815_{}.csv"
+    files = [DATA / name.replace("-", "_") / file.format(number) for number in numbers]
+    records = Records.read_csv(files, _SPECS[name], segment="segment" if pendulum else None)
+    return records.transitions(CONTROL_STEP)
 
 
 def pendulum_physics() -> ODEPhysics:
@@ -164,4 +152,4 @@ def double_pendulum_physics() -> ODEPhysics:
 
 
 def _step(rates: Callable[[Tensor, Tensor], Tensor], state_dim: int, name: str) -> ODEPhysics:
-    return ODEPhysics(rates, step=0.01 * CONTROL_STEP, state_dim=state_dim, substeps=4, name=name)
+    return ODEPhysics(rates, step=CONTROL_STEP, state_dim=state_dim, substeps=4, name=name)

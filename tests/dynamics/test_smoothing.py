@@ -166,7 +166,7 @@ def test_a_hidden_state_and_rows_that_were_not_measured():
     states[:, 1] = math.nan
     states[20:30, 0] = math.nan
     record = Record(STEP * torch.arange(LENGTH).double(), states, actions)
-    found = smooth(Records(record, SPEC), spring(), start={"v": (0.0, 1.0)})
+    found = smooth(Records(record, SPEC), spring(), start={"v": (0.0, 1.0)}, num_starts=1)
     velocities = found.records.records[0].states[:, 1]
     assert (velocities - truth[:, 1]).square().mean().sqrt() < 0.1 * truth[:, 1].std()
     assert found.noise.isnan().tolist() == [False, True]
@@ -250,6 +250,31 @@ def test_states_that_do_not_settle_are_told():
         smooth(Records(measured(truth, actions), SPEC), spring(), max_rounds=2)
 
 
+def test_small_process_noise_fits_free_runs_from_several_starts():
+    """Of a spring that is too stiff by a priori factors, and only seen every fifth time."""
+    truth, actions = simulated(3, scatter=torch.zeros(2))
+    states = measured(truth, actions).states
+    states[:, 1] = math.nan
+    states[torch.arange(LENGTH) % 5 > 0, 0] = math.nan
+    record = Record(STEP * torch.arange(LENGTH).double(), states, actions)
+    unknowns = {"stiffness": Unknown(12.0, factor=3.0), "damping": Unknown(0.5, factor=2.0)}
+    physics = ODEPhysics(rates, step=STEP, state_dim=2, unknowns=unknowns)
+    small, start = torch.tensor([1e-3, 1e-3]), {"v": (0.0, 1.0)}
+    given = {"start": start, "process_noise": small}
+    one, several = (smooth(Records(record, SPEC), physics, num_starts=k, **given) for k in (1, 4))
+    assert several.log_density >= one.log_density - 0.1
+    found = several.physics_parameters.mean
+    torch.testing.assert_close(found, torch.tensor([STIFFNESS, DAMPING]).double(), rtol=0.1, atol=0)
+    torch.testing.assert_close(several.process_noise, small.double())
+
+
+def test_states_that_diverge_from_all_starts_are_told():
+    truth, actions = simulated(0, length=60)
+    physics = FunctionPhysics(lambda X: 1e200 * X[:, :2])
+    with pytest.raises(RuntimeError, match="diverged from each of 1 starts"):
+        smooth(Records(measured(truth, actions), SPEC), physics)
+
+
 @pytest.mark.parametrize(
     ("given", "error", "message"),
     [
@@ -260,6 +285,7 @@ def test_states_that_do_not_settle_are_told():
         ({"noise": [0.1]}, ValueError, "noise of shape 2"),
         ({"process_noise": [0.1, 0.0]}, ValueError, "process_noise as standard deviations above 0"),
         ({"max_rounds": 0}, ValueError, "max_rounds"),
+        ({"num_starts": 1.5}, ValueError, "num_starts"),
         ({"step": 0.15}, ValueError, "whole multiple of the sampling step"),
     ],
 )
