@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator
 
 from paper.common.experiment import Record
 from paper.common.figures import draw_quartiles, one_legend, panels, save
-from paper.real import LEARNERS, SYSTEMS, Real
+from paper.real import LEARNERS, SMOOTHED, SYSTEMS, Real
 from paper.real.machines import STEP
 from paper.real.run import windows_of
 from paper.real.systems import system
@@ -36,12 +36,12 @@ COLORS = {
     "calibrated-cka": "blue",
     "stretches-delta": "slategray",
     "smoothed": "darkkhaki",
-    "smoothed-delta": "crimson",
+    "smoothed-delta": "limegreen",
     "smoothed-cka": "darkviolet",
     "network": "0.55",
     "residual": "tab:pink",
 }
-_SHOWN = ("phy", "fitted", "gp", "calibrated-delta", "calibrated-cka")
+_SHOWN = ("phy", "fitted", "gp", "calibrated-delta", "smoothed-cka")
 _Paths = dict[str, list[Any]]
 
 
@@ -52,7 +52,10 @@ def draw(records: Sequence[Record], experiment: Real) -> list[Path]:
         kept = {r["learner"]: r["paths"] for r in records if r["system"] == name and "paths" in r}
         if {*kept} & {*_SHOWN}:
             found.append(_free_runs(name, kept, experiment))
-    return found
+    of_most = [r for r in records if "parameters" in r and r["n"] == experiment.settings.drawn]
+    of_systems = {name: [r for r in of_most if r["system"] == name] for name in SYSTEMS}
+    drawn = {name: own for name, own in of_systems.items() if own}
+    return [*found, *(_parameters(name, own, experiment) for name, own in drawn.items())]
 
 
 def _errors(records: Sequence[Record], experiment: Real) -> Path:
@@ -60,7 +63,7 @@ def _errors(records: Sequence[Record], experiment: Real) -> Path:
     runs = load(records)
     tests = [*runs[["system", "test"]].drop_duplicates().itertuples(index=False)]
     titles = [f"{SYSTEMS[name]}, {test}" for name, test in tests]
-    figure, axes = panels(titles, 3, (4.2, 3.4), share=False, width=12)
+    figure, axes = panels(titles, 3, (4.2, 3.4), share=False, width=13)
     for ax, (name, test) in zip(axes, tests, strict=True):
         own = runs[(runs["system"] == name) & (runs["test"] == test)]
         for learner, label in LEARNERS.items():
@@ -76,7 +79,7 @@ def _errors(records: Sequence[Record], experiment: Real) -> Path:
         ax.yaxis.set_major_formatter("{x:g}")
     figure.supxlabel("transitions", fontsize="medium")
     figure.supylabel("median RMSE of the last angle after 1 s, rad", fontsize="medium")
-    one_legend(figure, axes, ncols=5)
+    one_legend(figure, axes, ncols=4)
     return save(figure, experiment.out / "errors.png")
 
 
@@ -101,6 +104,31 @@ def _free_runs(name: str, kept: dict[str, dict[str, _Paths]], experiment: Real) 
     figure.supylabel("last angle, rad", fontsize="medium")
     one_legend(figure, axes)
     return save(figure, experiment.out / f"{name}.png")
+
+
+def _parameters(name: str, records: Sequence[Record], experiment: Real) -> Path:
+    """Intervals of each parameter, of each learner by its first draw, and the prior's."""
+    first: dict[str, Record] = {}
+    for record in sorted(records, key=lambda r: int(r["seed"])):
+        if record["learner"] not in SMOOTHED[1:]:  # which have the parameters of the first
+            first.setdefault(record["learner"], record)
+    machine = system(name).machine
+    unknowns, identified = machine.unknowns, machine.known["identified"]
+    figure, axes = panels([*unknowns], 3, (4.0, 2.0), share=False, width=11)
+    for ax, (parameter, unknown) in zip(axes, unknowns.items(), strict=True):
+        ends = [float(unknown.value(torch.tensor(z).double())) for z in (-1.96, 1.96)]
+        bars = {"prior": (ends, "0.7")}
+        for learner, record in first.items():
+            bars[LEARNERS[learner]] = (record["parameters"][parameter], COLORS[learner])
+        for place, (label, (bar, color)) in enumerate(bars.items()):
+            ax.plot(bar, [-place, -place], color=color, lw=4, label=label, solid_capstyle="butt")
+        ax.axvline(identified[parameter], color="black", lw=0.8, ls="--", label="identified")
+        learnt = [end for label, (bar, _) in bars.items() if label != "prior" for end in bar]
+        room = 0.4 * (max(learnt) - min(learnt))
+        ax.locator_params(axis="x", nbins=5)
+        ax.set(yticks=[], xlim=(min(learnt) - room, max(learnt) + room))
+    one_legend(figure, axes, ncols=4)
+    return save(figure, experiment.out / f"{name}-parameters.png")
 
 
 def _free_run(ax: Axes, measured: list[float], path: list[list[float]]) -> None:

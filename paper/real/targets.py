@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from paper.common.claims import Judged, met
+from paper.real import SMOOTHED
 
 OURS = {
     "phymean": "phy",
@@ -52,7 +53,7 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
     contained = [
         pair
         for name in ours
-        for pair in found.beside([name], [OURS.get(name, "calibrated"), "gp"])
+        for pair in found.beside([name], [_alone(name), "gp"])
         if pair[0][3] >= _LEAST
     ]
     pendulum = [
@@ -89,6 +90,11 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
             "fit_seconds",
         ),
     ]
+
+
+def _alone(name: str) -> str:
+    """The learner of f_p alone that a learner of ours adjusts."""
+    return OURS.get(name, "smoothed" if name in SMOOTHED else "calibrated")
 
 
 @dataclass(frozen=True)
