@@ -108,8 +108,8 @@ def smooth(
     States x, unknown parameters :math:`\theta` of the physics, R and Q are estimated together, by
     an iterated extended Kalman smoother and expectation maximisation. Where Q turns out small this
     fits f_p to free runs, as shooting methods do; where it is large, to single steps, but not
-    from noisy states (errors in variables). Look at the noise that is found: a physics that is wrong
-    beyond its parameters takes for noise what it does not follow, and pulls the states to itself.
+    from noisy states (errors in variables). Look at the noise that is found: a physics that is
+    wrong beyond its parameters takes for noise what it does not follow, and pulls states to itself.
 
     Args:
         records: The records. A state that is NaN throughout is hidden.
