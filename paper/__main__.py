@@ -23,10 +23,7 @@ EXPERIMENTS = {
     "reaching": ("Reaching", "muscle arms that reach after a few trials, by several models"),
     "parameters": ("Parameters", "intervals of a physics' parameters, by several discrepancies"),
     "real": ("Real", "learners of real machines, by free runs beside what was measured"),
-    "tanks": (
-        "Tanks",
-        "cascaded tanks: structures, parameters and GPs, by a free run of 68 minutes",
-    ),
+    "tanks": ("Tanks", "cascaded tanks: structures of f_p and GPs, by a free run"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

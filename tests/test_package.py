@@ -32,6 +32,7 @@ def test_what_is_not_needed_is_not_imported():
 
 def test_every_name_is_there_and_brings_nothing_optional():
     optional = ["gymnasium", "stable_baselines3", "pygame", "opensim", "matplotlib", "pandas"]
+    optional.append("sklearn")
     code = (
         "import sys, gpadjust.active\n"
         f"assert not {set(optional)} & {{*sys.modules}}, 'needless imports'\n"

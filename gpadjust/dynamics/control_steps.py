@@ -53,6 +53,8 @@ def in_control_steps(
             states = record.states[kept].clone()
             actions = record.actions[rows][: num_steps * every]
             actions = actions.unflatten(0, (num_steps, every)).mean(1)
+            if every > 1:  # recorded ones are of a row before, not of a step
+                states[:1, spec.previous_columns] = math.nan
             for _ in spec.previous:  # as often as the longest chain of them needs
                 spec.remember(states[1:], states[:-1].clone(), actions)
             stretches.append(Stretch(states, actions, record.times[kept], number))

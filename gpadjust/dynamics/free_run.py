@@ -160,22 +160,27 @@ def free_run(
         particles = initial_states.expand(num_functions, -1, -1)
         if isinstance(start_noise, str):
             variance = step_or_nan(noise_variance, initial_states, actions[:, 0])
-            start_noise = (variance.nan_to_num(nan=0.0) / 2).sqrt()
+            start_noise = _with_lags(spec, (variance.nan_to_num(nan=0.0) / 2).sqrt())
         if start_noise is not None:
             error = start_noise.expand_as(initial_states)
             particles = particles + measurement_noise(spec, error, num_functions, generator)
         lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
         path, lost_by_then = [], []
         for each in actions.unbind(1):
-            added = process_noise
+            added, before = process_noise, particles
             if isinstance(process_noise, str):
                 middle = about_centre(spec, particles)[0]
                 added = step_or_nan(noise_variance, middle, each).nan_to_num(nan=0.0).sqrt()
             particles, lost = move_on(functions, particles, lost, each, state_bounds)
             if added is not None:
-                error = added.expand_as(initial_states)
+                error = torch.zeros_like(initial_states)
+                error[:, spec.moving] = added.expand_as(initial_states)[:, spec.moving]
                 moved = measurement_noise(spec, error, num_functions, generator)
                 particles = particles + moved.masked_fill(lost.unsqueeze(-1), 0.0)
+                if state_bounds is not None:
+                    low, high = state_bounds
+                    lost = lost | ((particles < low) | (particles > high)).any(-1)
+                    particles = torch.where(lost.unsqueeze(-1), before, particles)
             path.append(particles)
             lost_by_then.append(lost.double().mean(0))
         centre, cloud = about_centre(spec, torch.stack(path, dim=2))
@@ -188,7 +193,7 @@ def free_run(
             before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
             rows = before.flatten(0, 1).split(_ROWS), actions.flatten(0, 1).split(_ROWS)
             variances = [step_or_nan(noise_variance, *part) for part in zip(*rows, strict=True)]
-            scatter = torch.cat(variances).sqrt().view_as(centre)
+            scatter = _with_lags(spec, torch.cat(variances).sqrt().view_as(centre))
             cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
     low, high = central_interval(cloud, level)
     return FreeRun(
@@ -220,6 +225,18 @@ def _checked_noise(
             "`.nan_to_num()` makes it 0."
         )
     return sd
+
+
+def _with_lags(spec: StateSpec, noise: Tensor) -> Tensor:
+    """Noise ``... x state_dim`` of measured states, whose lags were measured alike."""
+    noise = noise.clone()
+    for name in spec.previous:
+        held = name
+        while held in spec.previous:
+            held = spec.previous[held]
+        if held in spec.states:
+            noise[..., spec.states.index(name)] = noise[..., spec.states.index(held)]
+    return noise
 
 
 def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:

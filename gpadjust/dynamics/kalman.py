@@ -62,8 +62,8 @@ class Smoothed(NamedTuple):
     crossed: Array
 
 
-def smooth(
-    links: Sequence[Link], starts: Sequence[tuple[Array, Array]], noise: Array, scatter: Array
+def smooth_chain(
+    links: Sequence[Link], starts: Sequence[tuple[Array, Array]], noise: Array, process_noise: Array
 ) -> tuple[list[Smoothed], float]:
     """All stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
 
@@ -75,7 +75,7 @@ def smooth(
         starts: Means ``d`` and variances ``d`` of the first state of each; of the first stretch
             of all ``D`` entries.
         noise: Variances ``d`` of the errors of what is measured.
-        scatter: Variances ``d`` of what a step adds to the first entries.
+        process_noise: Variances ``d`` of what a step adds to the first entries.
 
     Returns:
         What is known of each stretch, and the log density of what was measured.
@@ -86,7 +86,7 @@ def smooth(
         mean = np.concatenate([first[:d], mean[d:]])
         shared, covariance = covariance[d:, d:], np.zeros_like(covariance)
         covariance[:d, :d], covariance[d:, d:] = np.diag(spread[:d]), shared
-        found, gained = _filter(link, mean, covariance, noise, scatter)
+        found, gained = _filter(link, mean, covariance, noise, process_noise)
         filtered.append(found)
         log_density += gained
         mean, covariance = found.known.means[-1], found.known.covariances[-1]
@@ -102,7 +102,9 @@ def smooth(
     return smoothed[::-1], log_density
 
 
-def draw(found: Sequence[Smoothed], num_constants: int, rng: np.random.Generator) -> list[Array]:
+def draw_paths(
+    found: Sequence[Smoothed], num_constants: int, rng: np.random.Generator
+) -> list[Array]:
     """Draw the states of all stretches, ``T + 1 x D`` each, with the same constants in all.
 
     Args:
@@ -130,14 +132,14 @@ def draw(found: Sequence[Smoothed], num_constants: int, rng: np.random.Generator
 
 
 def _filter(
-    link: Link, mean: Array, covariance: Array, noise: Array, scatter: Array
+    link: Link, mean: Array, covariance: Array, noise: Array, process_noise: Array
 ) -> tuple[Filtered, float]:
     """Kalman's filter of a stretch, and the log density of what was measured in it."""
     D, d, log_density = len(mean), len(noise), 0.0
     shape = len(link.measured), D
     ahead, known = (Moments(np.empty(shape), np.empty((*shape, D))) for _ in range(2))
     added = np.zeros((D, D))
-    added[:d, :d] = np.diag(scatter)
+    added[:d, :d] = np.diag(process_noise)
     for t, measured in enumerate(link.measured):
         if t:
             matrix = link.matrices[t - 1]
@@ -151,6 +153,7 @@ def _filter(
             gain = covariance[i] / variance
             mean, covariance = mean + gain * error, covariance - np.outer(gain, covariance[i])
             log_density -= 0.5 * (error**2 / variance + math.log(2 * math.pi * variance))
+        covariance = (covariance + covariance.T) / 2
         known.means[t], known.covariances[t] = mean, covariance
     return Filtered(ahead, known), float(log_density)
 
@@ -166,6 +169,7 @@ def _backwards(link: Link, filtered: Filtered, end: Array, spread: Array) -> Smo
         crossed[t] = covariances[t + 1] @ gain.T
         means[t] += gain @ (means[t + 1] - filtered.ahead.means[t + 1])
         covariances[t] += gain @ (covariances[t + 1] - ahead) @ gain.T
+        covariances[t] = (covariances[t] + covariances[t].T) / 2
     return Smoothed(Moments(means, covariances), crossed)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
@@ -11,27 +12,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpadjust.dynamics.chain import Known
 from gpadjust.dynamics.control_steps import Stretch, in_control_steps
-from gpadjust.dynamics.kalman import Array, draw
-from gpadjust.dynamics.next_state_physics import check_physics
+from gpadjust.dynamics.kalman import Array, draw_paths
+from gpadjust.dynamics.next_state_physics import check_physics, parts_of
 from gpadjust.dynamics.open_loop import of_states
 from gpadjust.dynamics.record import Record
 from gpadjust.dynamics.records import Records
-from gpadjust.dynamics.smoothing import Estimate, Known, estimate
+from gpadjust.dynamics.smoothing import Estimate, estimate
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.sampled_functions import check_number
-from gpadjust.physics import Physics
+from gpadjust.physics import ODEPhysics, Physics
 
 _DRAWS = 256  # of the parameters
+_SAME = 0.01  # of a step, by which another one may differ from it
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class SmoothedRecords:
     r"""The states of a machine while it was recorded, as :func:`smooth` finds them.
 
     Attributes:
         records: The most likely states, at the control steps.
-        sd: Their standard deviations, ``N x state_dim`` of each record.
+        sd: Their standard deviations, ``N x state_dim`` of each record; 0 of states that the
+            physics does not move.
         noise: Standard deviations of the errors of what was measured, ``state_dim``; NaN of a state
             that never was, 0 of those that the physics does not move.
         process_noise: Standard deviations of what a step adds to the physics, ``state_dim``.
@@ -73,9 +77,14 @@ class SmoothedRecords:
 
         Args:
             seed: Seed of the draw.
+
+        Raises:
+            ValueError: If it is no whole number of 0 or more.
         """
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise ValueError(f"Expected seed as a whole number of 0 or more, got {seed!r}.")
         rng = np.random.default_rng(seed)
-        paths = draw(self._found.stretches, len(self._physics.unknowns), rng)
+        paths = draw_paths(self._found.stretches, len(self._physics.unknowns), rng)
         return _records(self.records, self._stretches, paths)
 
     def __repr__(self) -> str:
@@ -95,7 +104,7 @@ def smooth(
     noise: Tensor | None = None,
     process_noise: Tensor | None = None,
     num_starts: int | None = None,
-    max_rounds: int = 200,
+    max_rounds: int = 100,
 ) -> SmoothedRecords:
     r"""Estimate the states of a machine, measured with noise or not at all, along its records.
 
@@ -163,25 +172,34 @@ def smooth(
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
     spec = records.spec
-    whole = check_physics(physics, spec)
+    whole = _checked_physics(physics, records, step)
     check_number(max_rounds, "max_rounds")
-    stretches = [s for s in in_control_steps(records.records, spec, step) if len(s.actions)]
+    stretches = in_control_steps(records.records, spec, step)
+    if short := sum(not len(stretch.actions) for stretch in stretches):
+        warnings.warn(
+            f"Left out: {short} of {len(stretches)} stretches, shorter than a step.",
+            UserWarning,
+            stacklevel=2,
+        )
+        stretches = [stretch for stretch in stretches if len(stretch.actions)]
     known = Known(
         _variances(noise, "noise", records),
         _variances(process_noise, "process_noise", records),
         _starts(start, records),
     )
     _check_hidden(stretches, known, records)
+    measured = torch.cat([stretch.states for stretch in stretches])
+    hidden = [i for i in spec.moving if measured[:, i].isnan().all()]
     if num_starts is None:
-        measured = torch.cat([stretch.states[:, spec.moving] for stretch in stretches])
-        num_starts = 4 if measured.isnan().all(0).any() and whole.unknowns else 1
+        num_starts = 4 if hidden and whole.unknowns else 1
     check_number(num_starts, "num_starts")
     found = estimate(whole, spec, stretches, known, max_rounds, num_starts)
     variances = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
     still = [each._replace(states=torch.zeros_like(each.states)) for each in stretches]
-    sd = _by_record(spec.moving, still, [np.sqrt(v.clip(0)) for v in variances])
+    sd = _by_record(records, still, [np.sqrt(v.clip(0)) for v in variances], remember=False)
     sizes = torch.zeros(2, spec.state_dim, dtype=torch.float64)
-    sizes[:, spec.moving] = torch.from_numpy(np.sqrt([found.noise, found.scatter]))
+    sizes[:, spec.moving] = torch.from_numpy(np.sqrt([found.noise, found.process_noise]))
+    sizes[0, hidden] = torch.nan
     return SmoothedRecords(
         _records(records, stretches, [s.means for s, _ in found.stretches]),
         tuple(sd.values()),
@@ -196,7 +214,7 @@ def smooth(
 
 def _records(records: Records, stretches: Sequence[Stretch], paths: Sequence[Array]) -> Records:
     """Records whose states that move are those of the paths, ``T + 1 x (d + p)``."""
-    states, found = _by_record(records.spec.moving, stretches, paths), []
+    states, found = _by_record(records, stretches, paths, remember=True), []
     for number, own in states.items():
         mine = [stretch for stretch in stretches if stretch.record == number]
         # The action of the last row of a stretch counts for nothing.
@@ -208,15 +226,38 @@ def _records(records: Records, stretches: Sequence[Stretch], paths: Sequence[Arr
 
 
 def _by_record(
-    moving: Sequence[int], stretches: Sequence[Stretch], paths: Sequence[Array]
+    records: Records, stretches: Sequence[Stretch], paths: Sequence[Array], *, remember: bool
 ) -> dict[int, Tensor]:
-    """States by the number of the record, those that move from the paths."""
-    found: dict[int, list[Tensor]] = {}
+    """States by the number of the record, those that move from the paths, lags filled in."""
+    spec, found = records.spec, dict[int, list[Tensor]]()
     for stretch, path in zip(stretches, paths, strict=True):
         states = stretch.states.clone()
-        states[:, moving] = torch.from_numpy(path[:, : len(moving)].copy())
+        states[:, spec.moving] = torch.from_numpy(path[:, : len(spec.moving)].copy())
+        for _ in spec.previous if remember else ():  # as often as the longest chain of them needs
+            spec.remember(states[1:], states[:-1].clone(), stretch.actions)
         found.setdefault(stretch.record, []).append(states)
     return {number: torch.cat(parts) for number, parts in found.items()}
+
+
+def _checked_physics(
+    physics: Physics | Callable[[Tensor], Tensor], records: Records, step: float | None
+) -> Physics:
+    """One physics of next states, of the control step of the records."""
+    spec = records.spec
+    whole = check_physics(physics, spec)
+    if len(parts := parts_of(whole)) > 1:
+        raise ValueError(
+            f"Expected one physics to follow, got {', '.join(map(repr, parts))}; smooth by one of "
+            "them."
+        )
+    times = next(s.times for s in in_control_steps(records.records, spec, step) if len(s.actions))
+    found = float(times[1] - times[0])
+    if isinstance(whole, ODEPhysics) and abs(whole.step - found) > _SAME * found:
+        raise ValueError(
+            f"Physics {whole.name!r} makes steps of {whole.step:g}, but the control step of the "
+            f"records is {found:g}; pass step={whole.step:g}, or build it with step={found:g}."
+        )
+    return whole
 
 
 def _variances(given: Tensor | None, name: str, records: Records) -> Array:

@@ -313,3 +313,36 @@ def test_a_lost_particle_stays_in_spite_of_process_noise():
     run = Drift().free_run(start, on, **given)
     assert run.lost[0].tolist() == [0, 0, 1, 1, 1]
     assert torch.equal(run.particles[:, :, 1], run.particles[:, :, 4])
+
+
+def test_process_noise_leads_out_of_bounds_and_lags_have_none_of_their_own():
+    start, still = torch.zeros(1, 1).double(), torch.zeros(1, 20, 1).double()
+    bounds = torch.tensor([[-1.0], [1.0]])
+    given = {"process_noise": torch.tensor([0.5]), "noise": False, "num_functions": 200}
+    run = Drift().free_run(start, still, state_bounds=bounds, **given)
+    assert run.particles.abs().max() <= 1
+    assert run.lost[0, -1] > 0.5
+    spec = StateSpec(["x", "x_1"], ["v"], previous={"x_1": "x"})
+    dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + X[:, 1:])
+    given["process_noise"] = torch.tensor([0.5, 0.5])
+    walk = dynamics.free_run(torch.zeros(1, 2).double(), still, **given).particles
+    torch.testing.assert_close(walk[:, :, 1:, 1], walk[:, :, :-1, 0])
+
+
+def test_lags_are_measured_with_the_noise_of_what_they_hold():
+    spec = StateSpec(["x", "x_1", "v_1"], ["v"], previous={"x_1": "x", "v_1": "v"})
+
+    class Noisy(Drift):
+        def sample_functions(self, num_functions, seed=None):
+            def step(x, v):
+                return torch.cat([x[..., :1] + v, x[..., :1], v], dim=-1)
+
+            return step
+
+        def noise_variance(self, states, actions):
+            return torch.tensor([0.09, 0.0, 0.0]).double().expand_as(states)
+
+    run = Noisy(spec=spec).free_run(
+        torch.zeros(1, 3).double(), torch.zeros(1, 3, 1).double(), num_functions=2000
+    )
+    assert run.particles[:, 0, 2].std(0).tolist() == pytest.approx([0.3, 0.3, 0], rel=0.1)

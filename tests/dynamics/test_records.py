@@ -144,15 +144,21 @@ def test_previous_actions_are_those_of_the_step_before(step):
     record = counted(7)
     states = torch.cat([record.states, torch.full_like(record.states, math.nan)], -1)
     states[0, 1] = -1.0
-    data = Records([Record(record.times, states, record.actions)], spec).transitions(step)
-    assert len(data.states) == round(0.06 / step)
-    torch.testing.assert_close(data.next_states[:, 1:], data.actions)
-    torch.testing.assert_close(data.states[1:, 1:], data.actions[:-1])
-    assert data.states[0, 1] == -1
+    known = Records([Record(record.times, states, record.actions)], spec)
     states[0, 1] = math.nan
+    unknown = Records([Record(record.times, states, record.actions)], spec)
     with pytest.warns(UserWarning, match="1 of which start"):
-        later = Records([Record(record.times, states, record.actions)], spec).transitions(step)
-    torch.testing.assert_close(later.states, data.states[1:])
+        later = unknown.transitions(step)
+    assert len(later.states) == round(0.06 / step) - 1
+    torch.testing.assert_close(later.next_states[:, 1:], later.actions)
+    torch.testing.assert_close(later.states[1:, 1:], later.actions[:-1])
+    if step == 0.01:
+        data = known.transitions(step)
+        assert data.states[0, 1] == -1
+    else:  # what was recorded at the first row is of a row before, not of a step
+        with pytest.warns(UserWarning, match="1 of which start"):
+            data = known.transitions(step)
+    torch.testing.assert_close(later.states, data.states[-len(later.states) :])
 
 
 @pytest.mark.parametrize("names", [("x_1", "x_2", "u_1"), ("u_1", "x_2", "x_1")])
@@ -180,9 +186,10 @@ def test_previous_states_are_those_of_the_steps_before(names, step):
     assert records.windows(3, step).initial_states[0, 3] == 2 * k
     states[0, :3] = torch.tensor([-1.0, -2.0, -3.0])  # of the first row it is known
     records = Records([Record(record.times, states, record.actions, record.segments)], spec)
-    with pytest.warns(UserWarning, match="2 of which start"):
+    left = "2 of which start" if k == 1 else "4 of which start"  # of a row before, not of a step
+    with pytest.warns(UserWarning, match=left):
         data = records.transitions(step)
-    assert data.states[:2, 3].tolist() == [0, k]
+    assert data.states[0, 3] == (0 if k == 1 else 2 * k)
 
 
 def test_the_step_of_the_spec_is_the_default():

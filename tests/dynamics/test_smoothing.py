@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from gpadjust.dynamics import Record, Records, SmoothingWarning, StateSpec, smooth
-from gpadjust.dynamics.kalman import Link, draw
-from gpadjust.dynamics.kalman import smooth as smooth_chain
+from gpadjust.dynamics.kalman import Link, draw_paths, smooth_chain
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
 
 STEP, LENGTH = 0.1, 150
@@ -118,7 +117,7 @@ def test_the_smoother_is_the_conditional_distribution_of_all_states(chain):
 def test_draws_have_the_moments_and_one_constant(chain):
     mean, covariance, _ = dense(*chain)
     found, rng = smooth_chain(*chain)[0], np.random.default_rng(0)
-    draws = [np.concatenate(draw(found, 1, rng)) for _ in range(4000)]
+    draws = [np.concatenate(draw_paths(found, 1, rng)) for _ in range(4000)]
     assert all(np.ptp(path[:, 2]) == 0 for path in draws)
     paths = np.stack([path.ravel() for path in draws])
     np.testing.assert_allclose(paths.mean(0), mean, atol=0.05)
@@ -166,11 +165,17 @@ def test_a_hidden_state_and_rows_that_were_not_measured():
     states[:, 1] = math.nan
     states[20:30, 0] = math.nan
     record = Record(STEP * torch.arange(LENGTH).double(), states, actions)
-    found = smooth(Records(record, SPEC), spring(), start={"v": (0.0, 1.0)}, num_starts=1)
+    physics = spring()
+    found = smooth(Records(record, SPEC), physics, start={"v": (0.0, 1.0)}, num_starts=1)
     velocities = found.records.records[0].states[:, 1]
     assert (velocities - truth[:, 1]).square().mean().sqrt() < 0.1 * truth[:, 1].std()
     assert found.noise.isnan().tolist() == [False, True]
     assert found.sd[0][25, 0] > 1.5 * found.sd[0][60, 0]
+    # What is left of f_p's steps along the states is no more than the process noise.
+    path = found.records.records[0].states
+    rows = torch.cat([path[:-1], actions[:-1]], dim=-1)
+    steps = path[1:] - physics(rows, found.physics_parameters.mean)
+    assert (steps.square().mean(0).sqrt() < 1.2 * found.process_noise).all()
     assert inside(torch.tensor([STIFFNESS, DAMPING]), found.physics_parameters.interval(0.99))
 
 
@@ -207,7 +212,8 @@ def test_a_model_learns_from_draws_segment_by_segment():
     record = measured(truth, actions)
     labels = [0] * 70 + [1] * 79 + [2]
     parts = Record(record.times, record.states, record.actions, labels, "spring")
-    found = smooth(Records(parts, SPEC), spring())
+    with pytest.warns(UserWarning, match="1 of 3 stretches, shorter than a step"):
+        found = smooth(Records(parts, SPEC), spring())
     assert [record.name for record in found.records.records] == ["spring"]
     transitions = [found.draw(seed).transitions() for seed in (0, 0, 1)]
     assert len(transitions[0].states) == 69 + 78
@@ -222,6 +228,51 @@ def test_a_model_learns_from_draws_segment_by_segment():
     drawn, likely = scatter(transitions[0]), scatter(found.records.transitions())
     torch.testing.assert_close(drawn[1], found.process_noise[1], rtol=0.25, atol=0)
     assert likely[1] < 0.8 * drawn[1]
+
+
+def test_a_state_that_one_record_lacks_starts_about_where_it_is_in_others():
+    truth, actions = simulated(0)
+    level = torch.tensor([0.0, 300.0])  # far from zero
+
+    def shifted(state, action, p):
+        return rates(state - level, action, p)
+
+    physics = ODEPhysics(shifted, step=STEP, state_dim=2, unknowns=dict(spring().unknowns))
+    other = simulated(1)
+    records = [measured(truth + level, actions), measured(other[0] + level, other[1], seed=1)]
+    records[1].states[:, 1] = math.nan
+    found = smooth(Records(records, SPEC), physics)
+    error = found.records.records[1].states[:, 1] - (other[0] + level)[:, 1]
+    assert error.square().mean().sqrt() < 0.15
+    assert found.process_noise[1] < 0.1
+
+
+def test_a_turning_angle_goes_on_over_a_gap():
+    spec = StateSpec(["q", "dq"], ["u"], angles=["q"])
+    times = STEP * torch.arange(80).double()
+    generator = torch.Generator().manual_seed(0)
+    states = torch.stack([12 * times, torch.full_like(times, 12.0)], dim=-1)
+    states += 0.01 * torch.randn(states.shape, generator=generator)
+    states[30:37] = math.nan
+    record = Record(times, states, torch.zeros(80, 1).double())
+
+    def turn(X):
+        return torch.stack([X[:, 0] + STEP * X[:, 1], X[:, 1]], dim=-1)
+
+    found = smooth(Records(record, spec), turn)
+    assert found.process_noise[0] < 0.02
+    torch.testing.assert_close(found.records.records[0].states[:, 0], 12 * times, atol=0.1, rtol=0)
+
+
+def test_earlier_outputs_are_those_of_the_smoothed_states():
+    truth, actions = simulated(0)
+    spec = StateSpec(["x", "v", "x_1"], ["force"], previous={"x_1": "x"})
+    record = measured(truth, actions)
+    lagged = torch.cat([record.states, torch.full((LENGTH, 1), math.nan).double()], dim=-1)
+    found = smooth(Records(Record(record.times, lagged, actions), spec), spring())
+    states, noise = found.records.records[0].states, found.noise
+    assert torch.equal(states[1:, 2], states[:-1, 0])
+    assert noise[2] == found.process_noise[2] == 0
 
 
 def test_a_step_that_goes_where_the_physics_fails_is_taken_in_part():
@@ -240,7 +291,7 @@ def test_a_step_that_goes_where_the_physics_fails_is_taken_in_part():
 def test_a_physics_that_fails_at_measured_states_is_told():
     truth, actions = simulated(0)
     physics = FunctionPhysics(lambda X: torch.where(X[:, :2] > 0.9, math.nan, X[:, :2]))
-    with pytest.raises(PhysicsError, match=r"fails at .* smoothing needs it there"):
+    with pytest.raises(PhysicsError, match=r"fails at .* where smoothing begins"):
         smooth(Records(measured(truth, actions), SPEC), physics)
 
 
@@ -293,6 +344,19 @@ def test_bad_input_is_refused(given, error, message):
     truth, actions = simulated(0, length=20)
     with pytest.raises(error, match=re.escape(message)):
         smooth(Records(measured(truth, actions), SPEC), spring(), **given)
+
+
+def test_a_physics_of_another_step_or_other_outputs_is_refused():
+    records = Records(measured(*simulated(0, length=20)), SPEC)
+    slow = ODEPhysics(lambda x, u: x, step=2 * STEP, state_dim=2)
+    with pytest.raises(ValueError, match=r"makes steps of 0.2, but the control step .* is 0.1"):
+        smooth(records, slow)
+    with pytest.raises(ValueError, match=r"next values of the 2 states .* got 1 columns"):
+        smooth(records, lambda X: X[:, :1])
+    with pytest.raises(ValueError, match="Expected one physics to follow"):
+        smooth(records, [lambda X: X[:, :2], lambda X: X[:, :2]])
+    with pytest.raises(ValueError, match="seed as a whole number"):
+        smooth(records, spring(), noise=NOISE, process_noise=SCATTER).draw(1.5)
 
 
 def test_hidden_states_need_a_start_and_something_must_be_measured():

@@ -1,0 +1,304 @@
+"""Adjusted physics as a regressor of scikit-learn."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from inspect import Parameter, signature
+from numbers import Integral
+from typing import Any, Literal, Self
+
+import numpy as np
+import torch
+from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.utils.sampling import manual_seed
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils import check_random_state
+from sklearn.utils.validation import check_is_fitted, validate_data
+from torch import Size, Tensor
+
+from gpadjust.inference import FitResult, SampleResult, fit
+from gpadjust.models import (
+    CKA,
+    RRA,
+    AdjustedGP,
+    CalibratedPhysics,
+    PhysicsMeanGP,
+    PhysicsParameters,
+    ScaleGP,
+    ZeroMeanGP,
+)
+from gpadjust.models.training_data import column_names
+from gpadjust.physics import Physics
+from gpadjust.physics.carrier import pack, unpack
+from gpadjust.sklearn.array_physics import array_physics
+
+Array = NDArray[np.float64]
+
+MODELS: dict[str, type[AdjustedGP]] = {
+    "cka": CKA,
+    "rra": RRA,
+    "physics_mean": PhysicsMeanGP,
+    "scale": ScaleGP,
+    "calibrated_physics": CalibratedPhysics,
+    "zero_mean": ZeroMeanGP,
+}
+_NO_OPTIONS = ("train_X", "train_Y", "physics")
+
+
+class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    r"""A physics adjusted to data, in the conventions of ``GaussianProcessRegressor``.
+
+    It is :class:`~gpadjust.CKA`, or another model of this library, behind ``fit`` and ``predict``
+    of NumPy arrays and frames, for pipelines, ``cross_val_score`` and ``GridSearchCV``: the
+    fitted ``model_`` says all that a model says, such as ``model_.rho`` and ``model_.summary()``.
+    The model finds its own scales of inputs and targets; it needs no scaler.
+
+    *What the physics sees* is the X that the regressor is given, columns by their order, as arrays.
+    After a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics, or scale
+    inside of the model, with ``model_options={"input_transform": Normalize(d)}`` of BoTorch. It
+    must return what y is in: ``TransformedTargetRegressor`` transforms y, not the physics.
+
+    *NumPy or torch.* Any function of rows will do. One that returns a tensor, or takes nothing
+    else, is a torch function; others get NumPy arrays. ``fit`` finds out, by the first row of X.
+
+    It passes scikit-learn's ``check_estimator``; with a physics all but
+    ``check_regressor_multioutput``, whose targets have more columns than the physics.
+
+    Args:
+        physics: The physics f_p: a function of rows ``N x d`` to ``N`` or ``N x m``, of NumPy
+            arrays or of torch tensors; a torch module, of which ``fit`` trains a copy; or a
+            :class:`~gpadjust.Physics`, such as ``BlackBoxPhysics(function, batched=False)`` of
+            single rows, or one with unknown parameters. Several: a list, or a dictionary with their
+            names. None: no physics; the model is then :class:`~gpadjust.ZeroMeanGP`, which is what
+            CKA of :math:`f_p = 0` is.
+        model: ``"cka"``, ``"rra"``, ``"physics_mean"``, ``"scale"``, ``"calibrated_physics"``,
+            ``"zero_mean"`` (which leaves the physics out, to compare with), or a class: a subclass
+            of :class:`~gpadjust.models.AdjustedGP`.
+        fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`. None: the library's
+            calibrated default, full Bayes where the model can have it.
+        model_options: Further arguments of the model, such as ``{"delta_mean": "learn"}``, or
+            ``{"train_Yvar": 0.01}`` for noise of known variance. Copies of them are taken.
+        fit_options: Further arguments of :func:`gpadjust.fit`, such as ``{"num_samples": 32}``.
+            Its ``seed`` is ``random_state``, unless it is among them.
+        random_state: The seed of the fit; a ``RandomState``, or None for NumPy's, draws it.
+
+    Attributes:
+        model_: The fitted model; its own methods take and return float64 tensors.
+        fit_result_: What :func:`gpadjust.fit` returned.
+        physics_parameters_: The :class:`~gpadjust.models.PhysicsParameters`, draws of the unknown
+            parameters of the physics by their names. Only if it has some.
+        n_features_in_: The number ``d`` of columns of X.
+        feature_names_in_: Their names, if X was a frame.
+
+    Example:
+        >>> import numpy as np
+        >>> from gpadjust.sklearn import CKARegressor
+        >>> X = np.linspace(0, 1, 8).reshape(-1, 1)
+        >>> y = 2 * np.sin(6 * X[:, 0]) + X[:, 0]
+        >>> regressor = CKARegressor(lambda X: np.sin(6 * X[:, 0]), random_state=0).fit(X, y)
+        >>> mean, std = regressor.predict([[0.33]], return_std=True)
+        >>> mean.round(2)
+        array([2.16])
+        >>> std.shape
+        (1,)
+    """
+
+    model_: AdjustedGP
+    fit_result_: FitResult | SampleResult
+    physics_parameters_: PhysicsParameters
+
+    def __init__(
+        self,
+        physics: Any = None,
+        *,
+        model: str | type[AdjustedGP] = "cka",
+        fit_method: Literal["bayes", "map"] | None = None,
+        model_options: dict[str, Any] | None = None,
+        fit_options: dict[str, Any] | None = None,
+        random_state: int | np.random.RandomState | None = None,
+    ) -> None:
+        self.physics = physics
+        self.model = model
+        self.fit_method = fit_method
+        self.model_options = model_options
+        self.fit_options = fit_options
+        self.random_state = random_state
+
+    def fit(self, X: Any, y: Any) -> Self:
+        """Build the model on the data, and fit it.
+
+        Args:
+            X: Inputs, ``n x d``, ``n >= 2``, in the units that the physics reads.
+            y: Targets, ``n`` or ``n x m``, in the units that it returns. Several columns make
+                independent outputs.
+
+        Returns:
+            The regressor.
+
+        Raises:
+            ValueError: If data are not finite real numbers, or shapes disagree (scikit-learn says
+                it); or if the model, or an option, is none. Of outputs that are missing in some
+                rows, take the models of this library.
+            TypeError: If the physics is none, or an option has a wrong type.
+            PhysicsError: If the physics fails, or returns NaN or a wrong shape.
+        """
+        names_of_y = column_names(y)
+        X, y = validate_data(
+            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
+        )
+        targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
+        model = self._build(X, targets)
+        model.input_names = tuple(getattr(self, "feature_names_in_", model.input_names))
+        model.output_names = names_of_y or model.output_names
+        options = {"seed": _seed(self.random_state), **(self.fit_options or {})}
+        result: Any = fit(model, self.fit_method, **options)
+        self.model_, self.fit_result_ = model, result
+        self.__dict__.pop("physics_parameters_", None)
+        if model.has_unknowns:
+            self.physics_parameters_ = model.physics_parameters
+        return self
+
+    def predict(
+        self,
+        X: Any,
+        return_std: bool = False,
+        return_cov: bool = False,
+        observation_noise: bool = False,
+    ) -> Array | tuple[Array, Array]:
+        """Predict the function, or observations of it.
+
+        Args:
+            X: Inputs, ``q x d``.
+            return_std: Whether to return standard deviations, too.
+            return_cov: Whether to return the covariances of the points, too.
+            observation_noise: Whether these are to be of observations, instead of the function
+                without noise, which scikit-learn predicts, unless a ``WhiteKernel`` says otherwise.
+
+        Returns:
+            The means, ``q`` or, of several outputs, ``q x m``. With ``return_std`` also standard
+            deviations of the same shape; with ``return_cov`` also covariances, ``q x q`` or
+            ``q x q x m``. After full Bayes, all are those of the mixture over hyper-parameters.
+
+        Raises:
+            NotFittedError: If the regressor was not fitted.
+            RuntimeError: If both standard deviations and covariances are asked for.
+            ValueError: If X is not finite, or has not the columns that the regressor was fitted to.
+            PhysicsError: If the physics fails at X.
+        """
+        if return_std and return_cov:
+            raise RuntimeError(
+                "Expected return_std or return_cov, got both; standard deviations are the roots of "
+                "the covariances' diagonals."
+            )
+        inputs = self._inputs(X)
+        with torch.no_grad():
+            mean, variance = self.model_.predict(inputs, observation_noise)
+            if return_cov:
+                return _array(mean), _array(self._covariance(inputs, observation_noise))
+        return (_array(mean), _array(variance.sqrt())) if return_std else _array(mean)
+
+    def sample_y(
+        self,
+        X: Any,
+        n_samples: int = 1,
+        random_state: int | np.random.RandomState | None = 0,
+        observation_noise: bool = False,
+    ) -> Array:
+        """Draw functions from the posterior, jointly at all points.
+
+        After full Bayes each is drawn with one of the held samples of hyper-parameters, over which
+        the draws are spread evenly.
+
+        Args:
+            X: Inputs, ``q x d``.
+            n_samples: The number of draws.
+            random_state: The seed; a ``RandomState``, or None for NumPy's, draws it.
+            observation_noise: Whether to draw observations instead of the function.
+
+        Returns:
+            ``q x n_samples`` or, of several outputs, ``q x m x n_samples``.
+
+        Raises:
+            NotFittedError: If the regressor was not fitted.
+            ValueError: If ``n_samples`` is not positive; and as :meth:`predict`.
+        """
+        if not isinstance(n_samples, Integral) or n_samples < 1:
+            raise ValueError(f"Expected n_samples as a whole number >= 1, got {n_samples!r}.")
+        inputs, held = self._inputs(X), self.model_.num_samples or 1
+        with torch.no_grad(), manual_seed(_seed(random_state)):
+            posterior = self.model_.posterior(inputs, observation_noise=observation_noise)
+            draws = posterior.rsample(Size([-(-int(n_samples) // held)]))
+            draws = draws.reshape(-1, *draws.shape[-2:])
+            draws = draws[torch.randperm(len(draws))[:n_samples]]
+        return _array(draws.permute(1, 2, 0), dim=1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for a pickle; a physics without a name travels with cloudpickle only."""
+        state: dict[str, Any] = super().__getstate__()
+        if not isinstance(self.physics, Physics):
+            name = getattr(self.physics, "__name__", type(self.physics).__name__)
+            packed = pack(self.physics, name, "function", may_be_lost=False)
+            state = {**state, "physics": packed}  # not in place: it may be the object's own
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Takes the state of a pickle."""
+        super().__setstate__({**state, "physics": unpack(state["physics"])})
+
+    def _build(self, X: Array, Y: Array) -> AdjustedGP:
+        """The model that the parameters say."""
+        model_class = MODELS.get(self.model) if isinstance(self.model, str) else self.model
+        if not isinstance(model_class, type) or not issubclass(model_class, AdjustedGP):
+            raise ValueError(
+                f"Expected model as one of {', '.join(map(repr, MODELS))}, or a subclass of "
+                f"gpadjust.models.AdjustedGP, got {self.model!r}."
+            )
+        if self.physics is None and model_class is CKA:
+            model_class = ZeroMeanGP
+        options = deepcopy(self.model_options or {})
+        parameters = signature(model_class).parameters
+        known = [name for name in parameters if name not in _NO_OPTIONS]
+        takes_any = any(p.kind is Parameter.VAR_KEYWORD for p in parameters.values())
+        wrong = [n for n in options if n in _NO_OPTIONS or not (takes_any or n in known)]
+        if wrong:
+            raise ValueError(
+                f"{model_class.__name__} takes no {', '.join(wrong)} in model_options; expected "
+                f"some of {', '.join(known)}."
+            )
+        if not issubclass(model_class, ZeroMeanGP):
+            if self.physics is None:
+                raise ValueError(
+                    f"Expected a physics for the model {self.model!r}, got None; without one take "
+                    "model='zero_mean'."
+                )
+            options["physics"] = array_physics(self.physics, X)
+        return model_class(X, Y, **options)
+
+    def _inputs(self, X: Any) -> Tensor:
+        check_is_fitted(self)
+        return torch.tensor(validate_data(self, X, dtype=np.float64, reset=False))
+
+    def _covariance(self, X: Tensor, observation_noise: bool) -> Tensor:
+        """The covariances of the points, ``q x q x m``."""
+        covariances = []
+        for output in range(self.model_.num_outputs):
+            posterior: Any = self.model_.posterior(X, [output], observation_noise)
+            mean, covariance = posterior.mean, posterior.distribution.covariance_matrix
+            if self.model_.num_samples is not None:
+                spread = mean - mean.mean(MCMC_DIM, keepdim=True)  # S x q x 1
+                covariance = (covariance + spread @ spread.mT).mean(0)
+            covariances.append(covariance)
+        return torch.stack(covariances, dim=-1)
+
+
+def _array(values: Tensor, dim: int = -1) -> Array:
+    """An array without the dimension of outputs if there is one output."""
+    return np.asarray(values.squeeze(dim).numpy())
+
+
+def _seed(random_state: int | np.random.RandomState | None) -> int:
+    """An integer as it is, so that results are those of the library with that seed."""
+    if isinstance(random_state, Integral):
+        return int(random_state)
+    return int(check_random_state(random_state).randint(2**31 - 1))

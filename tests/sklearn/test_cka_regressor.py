@@ -1,0 +1,405 @@
+"""CKARegressor in scikit-learn's own checks, in its tools, and against the library's models."""
+
+import pickle
+
+import cloudpickle
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from sklearn.base import clone
+from sklearn.compose import TransformedTargetRegressor
+from sklearn.exceptions import NotFittedError
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from gpadjust import (
+    AR1,
+    CKA,
+    BlackBoxPhysics,
+    PhysicsError,
+    PhysicsMeanGP,
+    Unknown,
+    ZeroMeanGP,
+    fit,
+)
+from gpadjust.sklearn import CKARegressor
+
+FAST = {"num_starts": 2, "num_screened": 16}
+
+
+def wave(X):
+    return np.sin(6 * X[:, 0])
+
+
+def waves(X):
+    return np.column_stack([wave(X), wave(X) ** 2])
+
+
+def torch_wave(X):
+    return torch.sin(6 * X[:, 0])
+
+
+def fast(physics=wave, **parameters):
+    options = {"fit_method": "map", "fit_options": FAST, "random_state": 0, **parameters}
+    return CKARegressor(physics, **options)
+
+
+@pytest.fixture
+def data():
+    X = np.linspace(0, 1, 10).reshape(-1, 1)
+    noise = 0.05 * np.random.RandomState(0).randn(10)
+    return X, 2 * wave(X) + X[:, 0] + noise
+
+
+Z = np.linspace(-0.2, 1.2, 7).reshape(-1, 1)
+
+
+class Named:
+    """A function whose repr, and so the names of tests, is the same in all processes."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def __call__(self, X):
+        return self.function(X)
+
+    def __repr__(self):
+        return self.function.__name__
+
+
+def expected_failures(regressor):
+    """A physics has as many outputs as it has, and the check has its own number of them."""
+    if regressor.physics is None:
+        return {}
+    return {"check_regressor_multioutput": "y has five columns, the physics has one"}
+
+
+@parametrize_with_checks([CKARegressor(fit_method="map", fit_options=FAST)], legacy=True)
+def test_scikit_learn_accepts_it(estimator, check):
+    check(estimator)
+
+
+@pytest.mark.slow
+@parametrize_with_checks(
+    [CKARegressor(), fast(Named(wave)), CKARegressor(Named(torch_wave))],
+    legacy=True,
+    expected_failed_checks=expected_failures,
+)
+def test_scikit_learn_accepts_it_by_full_bayes_and_with_physics(estimator, check):
+    check(estimator)
+
+
+@pytest.mark.parametrize("method", [None, "map"])
+@pytest.mark.parametrize("noise", [False, True])
+def test_it_says_what_the_model_says(data, method, noise):
+    X, y = data
+    regressor = CKARegressor(wave, fit_method=method, random_state=3).fit(X, y)
+    model = CKA(X, y.reshape(-1, 1), physics=BlackBoxPhysics(wave))
+    result = fit(model, method, seed=3)
+    assert type(regressor.fit_result_) is type(result)
+    mean, variance = (values.detach().numpy()[:, 0] for values in model.predict(Z, noise))
+    found, std = regressor.predict(Z, return_std=True, observation_noise=noise)
+    np.testing.assert_array_equal(found, mean)
+    np.testing.assert_allclose(std**2, variance, rtol=1e-12)
+    np.testing.assert_array_equal(regressor.predict(Z), mean)
+    found, covariance = regressor.predict(Z, return_cov=True, observation_noise=noise)
+    np.testing.assert_array_equal(found, mean)
+    np.testing.assert_allclose(np.diag(covariance), variance, rtol=1e-6)
+
+
+def test_numpy_and_torch_are_one(data):
+    by_numpy, by_torch = (fast(f).fit(*data).predict(Z) for f in (wave, torch_wave))
+    np.testing.assert_allclose(by_numpy, by_torch, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", [None, "map"])
+def test_several_outputs(data, method):
+    X, y = data
+    Y = np.column_stack([y, y**2 + X[:, 0]])
+    regressor = fast(waves, fit_method=method).fit(X, Y)
+    mean, std = regressor.predict(Z, return_std=True)
+    _, covariance = regressor.predict(Z, return_cov=True)
+    assert mean.shape == std.shape == (7, 2)
+    assert covariance.shape == (7, 7, 2)
+    np.testing.assert_allclose(np.einsum("iij->ij", covariance), std**2, rtol=1e-4)
+    assert regressor.sample_y(Z, 3).shape == (7, 2, 3)
+    assert regressor.score(X, Y) > 0.9
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_shapes_are_those_of_a_gaussian_process_regressor(data, columns):
+    X, y = data
+    Y = y if columns == 1 else np.column_stack([y, y])
+    found, expected = (
+        (
+            regressor.predict(Z),
+            *regressor.predict(Z, return_std=True),
+            *regressor.predict(Z, return_cov=True),
+            regressor.sample_y(Z),
+            regressor.sample_y(Z, 3),
+        )
+        for regressor in (fast(None).fit(X, Y), GaussianProcessRegressor(optimizer=None).fit(X, Y))
+    )
+    assert [each.shape for each in found] == [each.shape for each in expected]
+
+
+def test_one_column_of_targets_is_one_output(data):
+    X, y = data
+    regressor = fast().fit(X, y.reshape(-1, 1))
+    np.testing.assert_array_equal(regressor.predict(Z), fast().fit(X, y).predict(Z))
+
+
+@pytest.mark.parametrize("method", [None, "map"])
+@pytest.mark.parametrize("noise", [False, True])
+def test_moments_of_draws(data, method, noise):
+    regressor = fast(fit_method=method).fit(*data)
+    draws = regressor.sample_y(Z, 20_000, random_state=1, observation_noise=noise)
+    mean, covariance = regressor.predict(Z, return_cov=True, observation_noise=noise)
+    sd = np.sqrt(np.diag(covariance))
+    assert draws.shape == (7, 20_000)
+    assert (np.abs(draws.mean(1) - mean) < 0.03 * sd).all()
+    np.testing.assert_allclose(
+        np.cov(draws) / np.outer(sd, sd), covariance / np.outer(sd, sd), atol=0.06
+    )
+
+
+def test_the_seed_of_draws(data):
+    regressor = fast(fit_method=None).fit(*data)
+    first = regressor.sample_y(Z, 3)
+    np.testing.assert_array_equal(first, regressor.sample_y(Z, 3, random_state=0))
+    assert (first != regressor.sample_y(Z, 3, random_state=1)).all()
+    state = np.random.RandomState(0)
+    assert (regressor.sample_y(Z, 1, state) != regressor.sample_y(Z, 1, state)).all()
+
+
+def test_the_seed_of_the_fit(data):
+    def scales(state):
+        regressor = CKARegressor(wave, random_state=state, fit_options={"num_draws": 16})
+        return [p.detach() for p in regressor.fit(*data).model_.parameters()]
+
+    def same(a, b):
+        return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+    assert same(scales(5), scales(5))
+    assert not same(scales(5), scales(6))
+    assert same(scales(np.random.RandomState(0)), scales(np.random.RandomState(0)))
+
+
+def test_physics_none_is_a_gaussian_process_without_physics(data):
+    X, y = data
+    for regressor in (fast(None), fast(wave, model="zero_mean")):
+        assert type(regressor.fit(X, y).model_) is ZeroMeanGP
+    model = ZeroMeanGP(X, y.reshape(-1, 1))
+    fit(model, "map", **FAST, seed=0)
+    np.testing.assert_array_equal(
+        regressor.predict(Z), model.predict(Z).mean.detach().numpy()[:, 0]
+    )
+
+
+def test_a_class_of_models_with_options(data):
+    X, y = data
+    options = {"rho_mean": "learn", "train_Yvar": 0.05**2}
+    regressor = fast(model=PhysicsMeanGP, model_options=options).fit(X, y)
+    model = PhysicsMeanGP(X, y.reshape(-1, 1), physics=BlackBoxPhysics(wave), **options)
+    fit(model, "map", **FAST, seed=0)
+    np.testing.assert_array_equal(
+        regressor.predict(Z), model.predict(Z).mean.detach().numpy()[:, 0]
+    )
+    assert options == {"rho_mean": "learn", "train_Yvar": 0.05**2}
+
+
+def test_parameters_are_left_as_they_are(data):
+    linear, kernel_options = torch.nn.Linear(1, 1).double(), {"center": 0.0}
+    before = linear.weight.item()
+    regressor = fast(linear, model_options=kernel_options).fit(*data)
+    assert linear.weight.item() == before != regressor.model_.physics.function.weight.item()
+    parameters = regressor.get_params()
+    assert parameters["physics"] is linear
+    assert parameters["model_options"] is kernel_options
+
+
+@pytest.mark.parametrize("method", [None, "map"])
+def test_unknown_parameters(data, method):
+    X = data[0]
+    law = BlackBoxPhysics(
+        lambda X, p: np.sin(p.rate * X[:, 0]), unknowns={"rate": Unknown(5.0, sd=1.0)}
+    )
+    regressor = fast(law, fit_method=method, model="calibrated_physics")
+    regressor.fit(X, data[1] - X[:, 0] - wave(X))
+    assert regressor.physics_parameters_["rate"].mean().item() == pytest.approx(6, abs=0.2)
+    assert not hasattr(
+        regressor.set_params(physics=wave, model="cka").fit(*data), "physics_parameters_"
+    )
+
+
+def test_several_physics(data):
+    physics = {"coarse": lambda X: X[:, 0], "fine": torch_wave}
+    regressor = fast(physics).fit(*data)
+    assert regressor.model_.rho_names == ("rho_coarse", "rho_fine")
+    assert regressor.score(*data) > 0.9
+
+
+def test_the_physics_sees_what_the_regressor_is_given(data):
+    X, y = data
+    seen = []
+
+    def records(X):
+        seen.append(X.copy())
+        return wave(X)
+
+    pipeline = make_pipeline(StandardScaler(), fast(records)).fit(X, y)
+    scaled = StandardScaler().fit_transform(X)
+    assert any(len(rows) == 10 and np.allclose(rows, scaled) for rows in seen)
+    assert all(np.isin(rows.round(9), scaled.round(9)).all() for rows in seen)
+    mean, std = pipeline.predict(Z, return_std=True)
+    assert mean.shape == std.shape == (7,)
+
+
+def test_grid_search_over_models_and_physics(data):
+    X, y = data
+    rows = np.random.RandomState(0).permutation(len(X))
+    grid = [
+        {"model": ["cka", "physics_mean"], "physics": [wave, torch_wave]},
+        {"physics": [None]},
+    ]
+    search = GridSearchCV(fast(), grid, cv=2).fit(X[rows], y[rows])
+    assert np.isfinite(search.cv_results_["mean_test_score"]).all()
+    assert search.best_params_["physics"] is not None
+    assert search.best_estimator_.predict(Z).shape == (7,)
+
+
+@pytest.mark.slow
+def test_processes_take_a_lambda(data):
+    X, y = data
+    search = GridSearchCV(
+        fast(lambda X: np.sin(6 * X[:, 0])), {"model": ["cka", "physics_mean"]}, cv=2, n_jobs=2
+    )
+    assert np.isfinite(search.fit(X, y).cv_results_["mean_test_score"]).all()
+
+
+def test_other_tools(data):
+    X, y = data
+    rows = np.random.RandomState(0).permutation(len(X))
+    assert cross_val_score(fast(), X[rows], y[rows], cv=2, n_jobs=1).mean() > 0.8
+    doubled = TransformedTargetRegressor(
+        fast(lambda X: wave(X) / 2), func=lambda y: y / 2, inverse_func=lambda y: 2 * y
+    )
+    np.testing.assert_allclose(doubled.fit(X, y).predict(X), fast().fit(X, y).predict(X), rtol=1e-6)
+
+
+def test_a_frame_gives_names(data):
+    X, y = data
+    frame = pd.DataFrame({"time": X[:, 0], "load": X[:, 0] ** 2})
+    regressor = fast().fit(frame, pd.Series(y, name="height"))
+    assert [*regressor.feature_names_in_] == ["time", "load"]
+    assert regressor.n_features_in_ == 2
+    assert regressor.model_.input_names == ("time", "load")
+    assert regressor.model_.output_names == ("height",)
+    assert regressor.predict(frame).shape == (10,)
+    assert regressor.sample_y(frame).shape == (10, 1)
+    with pytest.raises(ValueError, match="feature names"):
+        regressor.predict(frame[["load", "time"]])
+    with pytest.warns(UserWarning, match="feature names"):
+        regressor.predict(frame.to_numpy())
+
+
+@pytest.mark.parametrize("kind", ["list", "float32", "tensor", "read-only"])
+def test_kinds_of_arrays(data, kind):
+    X, y = data
+    expected = fast().fit(X, y).predict(Z)
+    if kind == "read-only":
+        X.setflags(write=False)
+    made = {"list": np.ndarray.tolist, "float32": np.float32, "tensor": torch.tensor}
+    X, y, points = (made.get(kind, np.asarray)(each) for each in (X, y, Z))
+    found = fast().fit(X, y).predict(points)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("copied", [lambda r: pickle.loads(pickle.dumps(r)), clone])
+def test_copies_before_the_fit(data, copied):
+    X, y = data
+    regressor = copied(fast())
+    np.testing.assert_array_equal(regressor.fit(X, y).predict(Z), fast().fit(X, y).predict(Z))
+
+
+@pytest.mark.parametrize("physics", [wave, torch_wave, None, BlackBoxPhysics(wave)])
+@pytest.mark.parametrize("method", [None, "map"])
+def test_a_pickle_of_what_was_fitted(data, physics, method):
+    regressor = fast(physics, fit_method=method).fit(*data)
+    again = pickle.loads(pickle.dumps(regressor))
+    for found, expected in zip(
+        again.predict(Z, return_std=True), regressor.predict(Z, return_std=True), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+    with pytest.raises(NotFittedError):
+        clone(again).predict(Z)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_lambda_needs_cloudpickle(data, several):
+    own = lambda X: wave(X)  # noqa: E731
+    physics = [own, wave] if several else own
+    regressor = fast(physics).fit(*data)
+    with pytest.raises(pickle.PicklingError, match="Define it there, pickle with cloudpickle"):
+        pickle.dumps(regressor)
+    assert regressor.physics is physics
+    again = cloudpickle.loads(cloudpickle.dumps(regressor))
+    np.testing.assert_allclose(again.predict(Z), regressor.predict(Z), rtol=1e-9)
+    assert clone(again).fit(*data).score(*data) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda X, y: (X * np.nan, y), ValueError, "Input X contains NaN"),
+        (lambda X, y: (X, y * np.nan), ValueError, "Input y contains NaN"),
+        (lambda X, y: (X, y * 1j), ValueError, "Complex data not supported"),
+        (lambda X, y: (X[:, 0], y), ValueError, "Expected 2D array, got 1D"),
+        (lambda X, y: (X, y[1:]), ValueError, "inconsistent numbers of samples"),
+        (lambda X, y: (X[:1], y[:1]), ValueError, "minimum of 2 is required"),
+        (lambda X, y: (X, np.column_stack([y, y])), ValueError, "returned 1 columns, expected 2"),
+    ],
+)
+def test_bad_data(data, change, error, message):
+    with pytest.raises(error, match=message):
+        fast().fit(*change(*data))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "error", "message"),
+    [
+        ({"model": "krr"}, ValueError, "one of 'cka', 'rra'.*got 'krr'"),
+        ({"model": AR1}, ValueError, "a subclass of gpadjust.models.AdjustedGP, got"),
+        ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
+        ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
+        ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
+        ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes' or 'map'"),
+        ({"fit_options": {"num_samples": 4}}, ValueError, "it is one of method 'bayes'"),
+        ({"model_options": {"centre": 0}}, ValueError, "CKA takes no centre.* center"),
+        ({"model_options": {"physics": wave}}, ValueError, "CKA takes no physics"),
+        ({"physics": None, "model_options": {"center": 0}}, ValueError, "ZeroMeanGP takes no cen"),
+        ({"random_state": "seed"}, ValueError, "cannot be used to seed"),
+    ],
+)
+def test_bad_parameters(data, parameters, error, message):
+    regressor = fast(**parameters)  # no error before the fit, as scikit-learn has it
+    with pytest.raises(error, match=message):
+        regressor.fit(*data)
+    assert not hasattr(regressor, "model_")
+
+
+def test_bad_requests(data):
+    with pytest.raises(NotFittedError):
+        fast().predict(Z)
+    regressor = fast().fit(*data)
+    with pytest.raises(RuntimeError, match="return_std or return_cov, got both"):
+        regressor.predict(Z, return_std=True, return_cov=True)
+    with pytest.raises(ValueError, match="X has 2 features, but CKARegressor is expecting 1"):
+        regressor.predict(np.hstack([Z, Z]))
+    with pytest.raises(ValueError, match="n_samples as a whole number >= 1, got 0"):
+        regressor.sample_y(Z, 0)
