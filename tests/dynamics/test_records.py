@@ -554,3 +554,20 @@ def test_what_is_asked_of_files_is_there(csv, tmp_path):
         Records.read_csv(tmp_path / "none.csv", POINT)
     with pytest.raises(ValueError, match="expected a CSV file in UTF-8, but"):
         Records.read_csv(csv("time,é\n", encoding="latin-1"), POINT)
+
+
+def test_windows_are_drawn_evenly_and_are_records_again():
+    record = counted(40)
+    windows = Records([record], SPEC).windows(3, 0.01)
+    drawn = windows.spread(4, seed=1)
+    assert drawn.states.shape == (4, 4, 1)
+    numbers = (drawn.states[:, 0, 0] / 3).tolist()  # of 13, one of each of four parts
+    assert all(low <= i < high for low, i, high in zip((0, 3, 6, 9), numbers, (3, 6, 9, 13)))
+    assert torch.equal(windows.spread(4, seed=1).states, drawn.states)
+    again = drawn.as_records(SPEC, 0.01)
+    assert [len(each.times) for each in again] == [4] * 4
+    back = again.windows(3, 0.01)
+    for part, other in zip(back, drawn, strict=True):
+        assert torch.equal(part, other)
+    with pytest.raises(ValueError, match="number <= 13, the windows that there are, got 14"):
+        windows.spread(14)
