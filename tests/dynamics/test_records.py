@@ -1,6 +1,7 @@
 """Records of machines: transitions, windows and even steps, and what is no record."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -562,7 +563,8 @@ def test_windows_are_drawn_evenly_and_are_records_again():
     drawn = windows.spread(4, seed=1)
     assert drawn.states.shape == (4, 4, 1)
     numbers = (drawn.states[:, 0, 0] / 3).tolist()  # of 13, one of each of four parts
-    assert all(low <= i < high for low, i, high in zip((0, 3, 6, 9), numbers, (3, 6, 9, 13)))
+    ends = pairwise((0, 3, 6, 9, 13))
+    assert all(low <= i < high for i, (low, high) in zip(numbers, ends, strict=True))
     assert torch.equal(windows.spread(4, seed=1).states, drawn.states)
     again = drawn.as_records(SPEC, 0.01)
     assert [len(each.times) for each in again] == [4] * 4
