@@ -172,7 +172,6 @@ def smooth(
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
     spec = records.spec
-    whole = _checked_physics(physics, records, step)
     check_number(max_rounds, "max_rounds")
     stretches = in_control_steps(records.records, spec, step)
     if short := sum(not len(stretch.actions) for stretch in stretches):
@@ -182,6 +181,7 @@ def smooth(
             stacklevel=2,
         )
         stretches = [stretch for stretch in stretches if len(stretch.actions)]
+    whole = _checked_physics(physics, records, stretches[0])
     known = Known(
         _variances(noise, "noise", records),
         _variances(process_noise, "process_noise", records),
@@ -240,18 +240,16 @@ def _by_record(
 
 
 def _checked_physics(
-    physics: Physics | Callable[[Tensor], Tensor], records: Records, step: float | None
+    physics: Physics | Callable[[Tensor], Tensor], records: Records, stretch: Stretch
 ) -> Physics:
-    """One physics of next states, of the control step of the records."""
-    spec = records.spec
-    whole = check_physics(physics, spec)
+    """One physics of next states, of the control step of a stretch."""
+    whole = check_physics(physics, records.spec)
     if len(parts := parts_of(whole)) > 1:
         raise ValueError(
             f"Expected one physics to follow, got {', '.join(map(repr, parts))}; smooth by one of "
             "them."
         )
-    times = next(s.times for s in in_control_steps(records.records, spec, step) if len(s.actions))
-    found = float(times[1] - times[0])
+    found = float(stretch.times[1] - stretch.times[0])
     if isinstance(whole, ODEPhysics) and abs(whole.step - found) > _SAME * found:
         raise ValueError(
             f"Physics {whole.name!r} makes steps of {whole.step:g}, but the control step of the "
