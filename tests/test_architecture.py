@@ -50,9 +50,10 @@ def first_call():
 
 def test_the_first_call_passes_few_files_and_classes():
     files, classes = passed(first_call)
-    # The 19th are physics/unknown.py and its Unknowns, which say that nothing is unknown.
-    assert len(files) <= 19, sorted(files)
-    assert len(classes) <= 19, sorted(classes)
+    # Among them physics/unknown.py, which says that nothing is unknown, and three of models/ that
+    # say what a model predicts, what of rho and delta, and how an exact one is made.
+    assert len(files) <= 21, sorted(files)
+    assert len(classes) <= 21, sorted(classes)
 
 
 def imports(path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 from botorch.acquisition import AcquisitionFunction
@@ -13,7 +14,7 @@ from botorch.utils.transforms import (
 from torch import Tensor
 
 from gpadjust.active.information import UnknownCovariance, information_gain
-from gpadjust.models import AdjustedGP, PaperRRA
+from gpadjust.models import AdjustedModel, PaperRRA, VariationalCKA
 
 About = Literal["rho", "delta", "both"]
 
@@ -91,7 +92,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     """
 
     def __init__(
-        self, model: AdjustedGP, about: About = "both", X_pending: Tensor | None = None
+        self, model: AdjustedModel, about: About = "both", X_pending: Tensor | None = None
     ) -> None:
         _check(model, about)
         super().__init__(model=model)
@@ -131,12 +132,19 @@ class _Rest:
         about: The adjustment in question.
     """
 
-    def __init__(self, model: AdjustedGP, about: About) -> None:
+    def __init__(self, model: AdjustedModel, about: About) -> None:
         self.source = model.strategy()
-        self.whole = UnknownCovariance(model)
+        self.whole: Any = _posterior_covariance(model)
         others = {"rho": model.other_names, "delta": model.rho_names, "both": ()}[about]
         others = tuple(name for name in others if name in model.term_names)
         self.remaining = UnknownCovariance(model, others) if others else None
+
+
+def _posterior_covariance(model: AdjustedModel) -> Callable[[Tensor], Tensor]:
+    """What the data leave unknown of f_a at transformed inputs."""
+    if not isinstance(model, VariationalCKA):
+        return UnknownCovariance(model)
+    return lambda inputs: model._joint(inputs, model._bases(inputs))[1]
 
 
 def _check(model: Any, about: str) -> None:
@@ -144,12 +152,12 @@ def _check(model: Any, about: str) -> None:
     if about not in get_args(About):
         raise ValueError(f"Unknown {about=}; expected 'rho', 'delta' or 'both'.")
     name = type(model).__name__
-    if isinstance(model, AdjustedGP) and not model.term_names:
+    if isinstance(model, AdjustedModel) and not model.term_names:
         raise TypeError(
             f"{type(model).__name__} has neither rho nor delta to learn about; what observations "
             "tell of parameters of the physics is not computed. CKA has both."
         )
-    if not isinstance(model, AdjustedGP) or "f" in model.term_names:
+    if not isinstance(model, AdjustedModel) or "f" in model.term_names:
         raise TypeError(
             f"Expected a model with rho or delta (CKA, RRA, ScaleGP, PhysicsMeanGP, BiasGP), got "
             f"{name}; for a model without them, take BoTorch's qNegIntegratedPosteriorVariance."
@@ -161,6 +169,11 @@ def _check(model: Any, about: str) -> None:
         )
     if about == "both":
         return
+    if isinstance(model, VariationalCKA):
+        raise TypeError(
+            "The inducing values of a VariationalCKA do not tell what would remain unknown if "
+            f"{about} were known: ask about 'both', or take an exact CKA of some thousand points."
+        )
     if not set(model.rho_names if about == "rho" else ("delta",)) & set(model.term_names):
         other = "delta" if about == "rho" else "rho"
         raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")

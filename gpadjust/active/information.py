@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from gpadjust.gp import SumOfTerms
 from gpadjust.gp.gaussian import cholesky
 from gpadjust.models.cholesky_strategy import Factors, conditional_covariance
 from gpadjust.models.exact_gp_base import ExactGPBase
+from gpadjust.models.terms_model import TermsModel
 
 
 class UnknownCovariance:
@@ -73,10 +75,10 @@ class UnknownCovariance:
 
 
 def information_gain(
-    model: ExactGPBase,
+    model: TermsModel,
     X: Tensor,
-    unknown: UnknownCovariance,
-    remaining: UnknownCovariance | None = None,
+    unknown: Callable[[Tensor], Tensor],
+    remaining: Callable[[Tensor], Tensor] | None = None,
     counted: Tensor | None = None,
 ) -> Tensor:
     r"""The information of noisy observations at a batch of points, in nats.
@@ -97,7 +99,8 @@ def information_gain(
         each of these, ``batch_shape x S``.
     """
     inputs = model.model_inputs(X)
-    batch_shape = torch.broadcast_shapes(inputs.shape[:-2], model.train_inputs[0].shape[:-2])
+    (train,) = model.strategy().train_inputs
+    batch_shape = torch.broadcast_shapes(inputs.shape[:-2], train.shape[:-2])
     inputs = inputs.expand(*batch_shape, *inputs.shape[-2:])
     noise = model.observation_noise(inputs).expand(inputs.shape[:-1])
     if counted is not None:

@@ -15,7 +15,7 @@ from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
 from gpadjust.inference.fitting import Method, check_options
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models import ExactGPBase
+from gpadjust.models import TermsModel
 from gpadjust.models.rra import NOT_SAMPLED, PaperRRA
 from gpadjust.states import StateSpec
 
@@ -31,7 +31,7 @@ class DynamicsFitOptions(FitOptions, total=False):
 
 
 def checked_fit_options(
-    options: DynamicsFitOptions | None, model: type[ExactGPBase]
+    options: DynamicsFitOptions | None, model: type[TermsModel]
 ) -> DynamicsFitOptions:
     """The options of the first fit, once they are found to be right."""
     if options is not None and not isinstance(options, Mapping):
@@ -57,7 +57,7 @@ class Fitted(NamedTuple):
         searched_at: The number of transitions at the last search of the hyper-parameters.
     """
 
-    model: ExactGPBase
+    model: TermsModel
     result: FitResult | SampleResult
     searched_at: int
 

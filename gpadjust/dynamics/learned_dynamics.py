@@ -24,7 +24,7 @@ from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitResult, SampleResult
-from gpadjust.models import CKA, ExactGPBase, Prediction
+from gpadjust.models import CKA, Prediction, TermsModel
 from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.models.sampled_functions import check_num_features
 from gpadjust.states import StateSpec
@@ -88,7 +88,7 @@ class LearnedDynamics(Dynamics):
         spec: StateSpec,
         physics: PhysicsLike | None = None,
         *,
-        model: type[ExactGPBase] = CKA,
+        model: type[TermsModel] = CKA,
         target: Target = "difference",
         encode_angles: bool = True,
         model_options: Mapping[str, Any] | None = None,
@@ -108,7 +108,7 @@ class LearnedDynamics(Dynamics):
         self.num_features = num_features
         self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions
-        self._means: tuple[ExactGPBase, Any] | None = None  # of a model, made once
+        self._means: tuple[TermsModel, Any] | None = None  # of a model, made once
 
     @property
     def is_fitted(self) -> bool:
@@ -116,12 +116,12 @@ class LearnedDynamics(Dynamics):
         return self._learnt is not None
 
     @property
-    def model(self) -> ExactGPBase:
+    def model(self) -> TermsModel:
         """The model, whose targets are what ``target`` says of the predicted states."""
         return self._known_so_far().model
 
     @property
-    def model_class(self) -> type[ExactGPBase]:
+    def model_class(self) -> type[TermsModel]:
         """The class of the model."""
         return self._recipe.model_class
 

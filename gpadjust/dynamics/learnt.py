@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.models import ExactGPBase
+from gpadjust.models import TermsModel
 from gpadjust.states import StateSpec
 
 
@@ -29,8 +29,8 @@ class Learnt(NamedTuple):
     known: Tensor | None
     chunks: tuple[int, ...]
     searched_at: int
-    fitted: ExactGPBase
-    model: ExactGPBase
+    fitted: TermsModel
+    model: TermsModel
 
     def with_rows(self, data: Transitions, known: Tensor | None) -> tuple[Transitions, Any]:
         """All transitions, and what the physics says there, with those of further ones."""

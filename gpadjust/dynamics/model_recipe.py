@@ -18,7 +18,7 @@ from gpadjust.dynamics.next_state_physics import parts_of, warn_of_differences
 from gpadjust.dynamics.physics_probes import PhysicsProbes
 from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.models import ExactGPBase
+from gpadjust.models import TermsModel
 from gpadjust.physics import Physics, as_physics
 
 _OWN = ("train_X", "train_Y", "train_Yvar", "physics", "input_transform")
@@ -44,7 +44,7 @@ class ModelRecipe:
         self,
         targets: TransitionTargets,
         physics: Physics | None,
-        model: type[ExactGPBase],
+        model: type[TermsModel],
         options: Mapping[str, Any] | None,
         encode_angles: bool,
     ) -> None:
@@ -58,7 +58,7 @@ class ModelRecipe:
         self.physics = as_physics(self.parts) if self.parts else None
         self.columns = targets.angles if encode_angles else []
 
-    def build(self, data: Transitions, quiet: bool) -> ExactGPBase:
+    def build(self, data: Transitions, quiet: bool) -> TermsModel:
         """The model of some transitions; quiet where the first one has given its warnings."""
         options = {
             name: deepcopy(value) if isinstance(value, Module) else value
@@ -71,13 +71,13 @@ class ModelRecipe:
         with warnings.catch_warnings():
             if quiet:
                 warnings.simplefilter("ignore")
-            make: Callable[..., ExactGPBase] = self.model_class
+            make: Callable[..., TermsModel] = self.model_class
             model = make(*self._rows(data), **options)
         model.input_names = self.targets.input_names
         model.output_names = self.targets.output_names
         return model
 
-    def condition(self, model: ExactGPBase, data: Transitions) -> ExactGPBase:
+    def condition(self, model: TermsModel, data: Transitions) -> TermsModel:
         """The model with further transitions, its hyper-parameters as they are."""
         with torch.no_grad():
             return model.condition_on_observations(*self._rows(data))
@@ -136,10 +136,10 @@ class ModelRecipe:
 
 
 def checked_options(
-    model: type[ExactGPBase], has_physics: bool, options: Mapping[str, Any] | None
+    model: type[TermsModel], has_physics: bool, options: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """The further arguments of a class of models, once they and the class are found to be right."""
-    if not isinstance(model, type) or not issubclass(model, ExactGPBase):
+    if not isinstance(model, type) or not issubclass(model, TermsModel):
         is_module = isinstance(model, Module)
         found = f"an instance of {type(model).__name__}" if is_module else repr(model)
         raise TypeError(

@@ -17,7 +17,8 @@ from gpadjust.inference.calibrated_fit import calibrate
 from gpadjust.inference.full_bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
-from gpadjust.models import ExactGPBase
+from gpadjust.inference.variational_fit import fit_variational
+from gpadjust.models import ExactGPBase, VariationalCKA
 
 Method = Literal["bayes", "map"]
 
@@ -68,7 +69,7 @@ def fit(
 
 
 def fit(
-    model: BatchedMultiOutputGPyTorchModel | ModelListGP,
+    model: BatchedMultiOutputGPyTorchModel | VariationalCKA | ModelListGP,
     method: Method | None = None,
     **options: Unpack[FitOptions],
 ) -> FitResult | SampleResult | list[FitResult | SampleResult]:
@@ -139,6 +140,14 @@ def fit(
     given: dict[str, Any] = {**options}
     if isinstance(model, ModelListGP):
         return _fit_list(model, method, given)
+    if isinstance(model, VariationalCKA):
+        check_options("map" if method is None else method, given)
+        if method == "bayes":
+            raise ValueError(
+                "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many "
+                "observations tell its hyper-parameters, which are not sampled."
+            )
+        return fit_variational(model, Search(**given))
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(
             "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics
 from gpadjust.inference.linearisation import Shared
-from gpadjust.inference.log_parameters import magnitude
+from gpadjust.inference.log_parameters import LogParameters, magnitude
 from gpadjust.inference.objective import Objective
 
 _TOLERANCE = 1e-8  # relative decrease of the objective below which L-BFGS stops
@@ -62,6 +62,16 @@ class FitResult:
     converged: Tensor
 
 
+class Differentiable(Protocol):
+    """What L-BFGS brings to its minimum."""
+
+    parameters: LogParameters
+
+    def value_and_gradient(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Values ``k x B`` and gradients ``k x B x p`` at vectors ``k x B x p``."""
+        ...
+
+
 def maximise(
     model: BatchedMultiOutputGPyTorchModel, search: Search, shared: Shared | None = None
 ) -> FitResult:
@@ -70,7 +80,7 @@ def maximise(
     With many observations the search is made on some of them. What unknown parameters of a physics
     add to the targets' distribution is ``shared``.
     """
-    with _centers_at_rest(model):
+    with centers_at_rest(model):
         objective = Objective(model, shared=shared)
         parameters = objective.parameters
         if not parameters.names:  # all is known but the parameters of the physics
@@ -78,7 +88,7 @@ def maximise(
             model.eval()
             return FitResult(-value, torch.ones_like(value, dtype=torch.bool))
         starts = _starts(objective, search)
-        reached, values, converged = _optimise(objective, starts, search.max_iterations)
+        reached, values, converged = optimise(objective, starts, search.max_iterations)
         best = values.argmin(0), torch.arange(parameters.num_problems)
         objective.assign(reached[best])
     model.eval()
@@ -95,7 +105,7 @@ def maximise(
 
 
 @contextmanager
-def _centers_at_rest(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
+def centers_at_rest(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
     """Let centres rest: the most likely ones are found far out, where intervals are too narrow."""
     learnt = [
         module.center
@@ -114,7 +124,7 @@ def _centers_at_rest(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
 def optima(objective: Objective, search: Search) -> tuple[Tensor, Tensor]:
     """Rough optima, not assigned to the model: ``k x B x p`` and their values ``k x B``."""
     starts = _starts(objective, search)
-    reached, values, _ = _optimise(objective, starts, min(search.max_iterations, 60), _ROUGH)
+    reached, values, _ = optimise(objective, starts, min(search.max_iterations, 60), _ROUGH)
     return reached, values
 
 
@@ -143,7 +153,7 @@ def _optima_of_some(objective: Objective, search: Search) -> Tensor:
         num_starts=search.num_starts or few, num_screened=search.num_screened or _SEARCHED
     )
     starts = _screened(part, search)
-    reached, values, _ = _optimise(part, starts, min(search.max_iterations, 40), _ROUGH)
+    reached, values, _ = optimise(part, starts, min(search.max_iterations, 40), _ROUGH)
     if part.concentrated:
         reached, values = part.at_best_scale(reached)
     return _rows(reached, values.argsort(dim=0)[:_COMPARED])
@@ -195,8 +205,8 @@ def _rows(vectors: Tensor, numbers: Tensor) -> Tensor:
     return vectors.gather(0, numbers.unsqueeze(-1).expand(-1, -1, vectors.shape[-1]))
 
 
-def _optimise(
-    objective: Objective, starts: Tensor, max_iterations: int, tolerance: float = _TOLERANCE
+def optimise(
+    objective: Differentiable, starts: Tensor, max_iterations: int, tolerance: float = _TOLERANCE
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run L-BFGS from all starts of all problems; return where it got, values, convergence.
 

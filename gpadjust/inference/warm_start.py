@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics
-from gpadjust.models import ExactGPBase
+from gpadjust.models import ExactGPBase, TermsModel, VariationalCKA
 from gpadjust.models.hyperparameters import constraint_of, is_rho, kernels_of, kind_of
 
 
-def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
+def warm_start(model: TermsModel, previous: TermsModel) -> None:
     """Give a model the hyper-parameters of an earlier one of the same structure.
 
     They are the same in the user's units: lengthscales, centres, unknown parameters of the physics,
@@ -24,6 +24,8 @@ def warm_start(model: ExactGPBase, previous: ExactGPBase) -> None:
         model: The model to start, changed in place.
         previous: The model with the hyper-parameters, of other data.
     """
+    if isinstance(model, VariationalCKA) and isinstance(previous, VariationalCKA):
+        model, previous = model.start, previous.start
     unitless = [path for path, _, _, basis in kernels_of(model) if is_rho(basis)]
     if previous.num_samples is not None:
         previous = _mean_of_samples(previous)

@@ -212,13 +212,13 @@ def _stacked(change: Callable[[Tensor], Tensor], left: Tensor, right: Tensor) ->
 
 def conditional_covariance(prior: Tensor, root: Tensor) -> Tensor:
     """A prior covariance ``... x q x q`` less what a root ``... x q x n`` of it says is known."""
-    least = _least_variance(prior.diagonal(dim1=-1, dim2=-2), root.shape[-1])
+    least = least_variance(prior.diagonal(dim1=-1, dim2=-2), root.shape[-1])
     covariance = prior - root @ root.mT
     excess = (least - covariance.detach().diagonal(dim1=-1, dim2=-2)).clamp_min(0)
     return covariance + torch.diag_embed(excess) if excess.any() else covariance
 
 
-def _least_variance(prior_variance: Tensor, n: int) -> Tensor:
+def least_variance(prior_variance: Tensor, n: int) -> Tensor:
     """What rounding errors leave of a variance at a point that is known without noise."""
     return (4 * n * torch.finfo(prior_variance.dtype).eps * prior_variance).detach()
 
@@ -278,6 +278,23 @@ class CholeskyStrategy(DefaultPredictionStrategy):
                 factor.grad_fn.register_hook(self._forget)
         self._factors = factors
         return factors
+
+    def pathwise_update(self, prior: Tensor) -> Tensor:
+        r"""The weights :math:`K^{-1} (y - f - \varepsilon)` that make functions meet the data.
+
+        Matheron's rule (Wilson et al. 2020): a function f from the prior, plus its covariances with
+        the data times these weights, is one from the posterior.
+
+        Args:
+            prior: Functions from the prior at the training inputs, ``k x ... x n``.
+
+        Returns:
+            ``k x ... x n``; zero where an observation is missing.
+        """
+        (train,) = self.train_inputs
+        sd = noise_variances(self.likelihood, train).sqrt()
+        noise = sd * torch.randn(len(prior), *train.shape[:-1]).to(train)
+        return self.factors().solve((self.train_labels - prior - noise).nan_to_num(nan=0.0))
 
     def noisy_covariance(self, kernel: SumOfTerms) -> Tensor:
         """The covariance of the targets under a kernel, noise included, ``... x n x n``."""
@@ -360,9 +377,12 @@ class CholeskyStrategy(DefaultPredictionStrategy):
             part = term.covariance(inputs, inputs, diag=True) if variance is None else variance
             prior = prior + (part if weight is None else part * weight.square())
         cross = self.cross_covariance(inputs, weights)
+        return self.exact_predictive_mean(mean, cross), self._reduced(prior, cross)
+
+    def _reduced(self, prior: Tensor, cross: Tensor) -> Tensor:
+        """Prior variances ``... x q`` less what covariances with the data say is known."""
         known = torch.linalg.vector_norm(self._whiten(cross), dim=-1).square()
-        variance = (prior - known).maximum(_least_variance(prior, self.num_train))
-        return self.exact_predictive_mean(mean, cross), variance
+        return (prior - known).maximum(least_variance(prior, self.num_train))
 
     def _whiten(self, cross: Tensor) -> Tensor:
         """As that of the factors; for few points with noise by the inverse, which is faster."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Literal
 
@@ -20,6 +21,8 @@ from gpadjust.models.adjusted_gp import (
 )
 from gpadjust.models.hyperparameters import scaled_rbf
 from gpadjust.models.training_data import ArrayLike
+
+_MANY = 5000  # points, of which exact models are slow
 
 
 class CKA(AdjustedGP):
@@ -70,6 +73,10 @@ class CKA(AdjustedGP):
             ``train_Y - f_p``. Hyper-parameters are in the units after it.
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
 
+    Warns:
+        UserWarning: Of more than 5,000 points, for which there is
+            :class:`~gpadjust.VariationalCKA`.
+
     Raises:
         TypeError: If data are no float64 tensors, arrays or frames, or the physics is not callable.
         ValueError: If shapes disagree, data are not finite, or there are fewer than two points.
@@ -104,6 +111,16 @@ class CKA(AdjustedGP):
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
     ) -> None:
+        n = getattr(train_X, "shape", (0, 0))[-2]
+        if type(self) is CKA and n > _MANY:
+            warnings.warn(
+                f"CKA is exact: of {n} points a fit takes from many minutes to hours, and each "
+                f"covariance {8e-9 * n**2:.1f} GB. "
+                "gpadjust.VariationalCKA takes the same arguments and learns from all of them in "
+                "minutes.",
+                UserWarning,
+                stacklevel=2,
+            )
         super().__init__(
             train_X,
             train_Y,

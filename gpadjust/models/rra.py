@@ -178,7 +178,8 @@ class RRA(AdjustedGP):
         shift, scale = self._units()
         with torch.no_grad():
             if X is None:
-                inputs, obs = self.train_inputs[0], self.train_targets * scale + shift
+                inputs: Tensor = self.train_inputs[0]
+                obs: Tensor | None = self.train_targets * scale + shift
                 noise = noise_variances(self.likelihood, inputs)
             else:
                 inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)

@@ -15,7 +15,6 @@ from torch import Size, Tensor
 from torch.nn import Module, ModuleList
 
 from gpadjust.gp import OrthogonalKernel, SumOfTerms, Term
-from gpadjust.gp.gaussian import noise_variances
 from gpadjust.models.cholesky_strategy import covariances, prepare
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.physics.base import whole_number
@@ -37,8 +36,8 @@ class SampledFunctions(Module):
         model: The model; later changes of it have no effect here.
         features: The features of each term.
         weights: The weights w of each term, ``k x batch_shape x (m) x D_t``.
-        updates: :math:`B_t v` of each term, ``k x batch_shape x (m) x n``; none for functions that
-            the weights say all about.
+        updates: :math:`B_t v` of each term, ``k x batch_shape x (m) x n``, None for one that the
+            data do not reach; none at all for functions that the weights say all about.
     """
 
     terms: Any  # modules, as those of the model
@@ -51,7 +50,7 @@ class SampledFunctions(Module):
         model: Any,
         features: Sequence[TermFeatures],
         weights: Sequence[Tensor],
-        updates: Sequence[Tensor] = (),
+        updates: Sequence[Tensor | None] = (),
     ) -> None:
         super().__init__()
         self.input_transform = deepcopy(getattr(model, "input_transform", None))
@@ -63,13 +62,15 @@ class SampledFunctions(Module):
             self.register_buffer(name, tensor)
         self.weights, self.updates = [*weights], [*updates]
         self.requires_grad_(False).eval()
-        unknown = [term for term in self.terms if not term.is_known]
-        self.data = prepare(unknown, model.train_inputs[0].detach())
+        updated = [t for t, u in zip(self.terms, self.updates, strict=False) if u is not None]
+        unknown = [term for term in updated if not term.is_known]
+        self.data = prepare(unknown, model.strategy().train_inputs[0].detach()) if unknown else None
 
     @classmethod
     def by_matheron(cls, model: Any, num_functions: int, num_features: int) -> SampledFunctions:
         """Draw ``k`` functions of each batch of a model from its posterior."""
-        strategy, (train,) = model.strategy(), model.train_inputs
+        strategy = model.strategy()
+        (train,) = strategy.train_inputs
         with torch.no_grad():
             features = [TermFeatures(term, num_features) for term in model.terms]
             shape = (num_functions, *model._aug_batch_shape)
@@ -77,26 +78,18 @@ class SampledFunctions(Module):
                 torch.randn(*shape, each.num_features, dtype=torch.float64).to(train)
                 for each in features
             ]
-            sd = noise_variances(model.likelihood, train).sqrt()
-            noise = sd * torch.randn(num_functions, *train.shape[:-1]).to(train)
             prior = cls(model, features, weights)._values(train)
-            residual = (model.train_targets - prior - noise).nan_to_num(nan=0.0)
-            update = strategy.factors().solve(residual)
-            bases = [term.weights(train) for term in model.terms]
-            updates = [update if basis is None else basis * update for basis in bases]
-            return cls(model, features, weights, updates)
+            update = strategy.pathwise_update(prior)
+            return cls(model, features, weights, _by_terms(model, update))
 
     @classmethod
     def mean(cls, model: Any) -> SampledFunctions:
         """The posterior mean of each batch of a model, as a single function."""
-        strategy, (train,) = model.strategy(), model.train_inputs
         with torch.no_grad():
-            alpha = strategy.factors().alpha.unsqueeze(0)
-            bases = [term.weights(train) for term in model.terms]
-            updates = [alpha if basis is None else basis * alpha for basis in bases]
+            alpha = model.strategy().mean_cache.unsqueeze(0)
             features = [TermFeatures(term, 0) for term in model.terms]
             weights = [alpha[..., :0]] * len(features)
-            return cls(model, features, weights, updates)
+            return cls(model, features, weights, _by_terms(model, alpha))
 
     def forward(self, X: Tensor) -> Tensor:
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
@@ -133,14 +126,27 @@ class SampledFunctions(Module):
             extra: How many dimensions of them lead those of the model.
         """
         total = inputs.new_zeros(())
-        cross = iter(covariances(self.data, inputs) if self.updates else [])
+        cross = iter([] if self.data is None else covariances(self.data, inputs))
         for i, (term, features) in enumerate(zip(self.terms, self.features, strict=True)):
             part = term.mean + _product(features(inputs), self.weights[i], extra)
-            if self.updates and not term.is_known:
-                part = part + _product(next(cross), self.updates[i], extra)
+            update = self.updates[i] if self.updates and not term.is_known else None
+            if update is not None:
+                part = part + _product(next(cross), update, extra)
             basis = term.weights(inputs)
             total = total + (part if basis is None else part * basis) + term.moved_mean
         return total
+
+
+def _by_terms(model: Any, update: Tensor) -> list[Tensor | None]:
+    """The update of a sum as one of each term, ``k x ... x n``; None for what data do not reach."""
+    strategy = model.strategy()
+    reached = {term.name for term in strategy.kernel.terms}
+    parts: list[Tensor | None] = []
+    for term in model.terms:
+        basis = term.weights(strategy.train_inputs[0])
+        part = update if basis is None else basis * update
+        parts.append(part if term.name in reached else None)
+    return parts
 
 
 def _product(matrix: Tensor, vectors: Tensor, extra: int) -> Tensor:

@@ -9,15 +9,15 @@ from typing import Any
 import torch
 
 from gpadjust.gp import PhysicsInput
-from gpadjust.models.exact_gp_base import ExactGPBase
 from gpadjust.models.stacked import StackedGP
+from gpadjust.models.terms_model import TermsModel
 from gpadjust.physics import JoinedPhysics, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
 _FORMAT = 1
 
 
-def save(model: ExactGPBase, path: str | Path) -> None:
+def save(model: TermsModel, path: str | Path) -> None:
     """Save a model: data, settings, hyper-parameters (or samples of them), and names.
 
     The physics is saved by its import path, if it is a function or object of a module. What cannot
@@ -49,7 +49,7 @@ def save(model: ExactGPBase, path: str | Path) -> None:
             "of (of a comparison its `models`) one by one, beside its `weights`, and stack them "
             "again when they are loaded."
         )
-    if not isinstance(model, ExactGPBase):
+    if not isinstance(model, TermsModel):
         raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
     name = f"{type(model).__module__}:{type(model).__qualname__}"
     if getattr(import_module(type(model).__module__), type(model).__qualname__, None) is None:
@@ -84,7 +84,7 @@ def save(model: ExactGPBase, path: str | Path) -> None:
     part.replace(path)
 
 
-def load(path: str | Path, **objects: Any) -> ExactGPBase:
+def load(path: str | Path, **objects: Any) -> TermsModel:
     """Load a model that :func:`save` wrote.
 
     The classes of model and physics are imported by the names in the file, which runs the code of
@@ -118,7 +118,7 @@ def load(path: str | Path, **objects: Any) -> ExactGPBase:
         )
     module, _, name = content["class"].partition(":")
     model_class = getattr(import_module(module), name, None)
-    if not isinstance(model_class, type) or not issubclass(model_class, ExactGPBase):
+    if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
         raise ValueError(f"{path} is of {content['class']}, which is no model of gpadjust.")
     if content["physics"] is not None and "physics" not in objects:
         parts = {name: physics_from_path(path) for name, path in content["physics"].items()}

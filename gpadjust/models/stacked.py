@@ -19,7 +19,7 @@ from torch import Size, Tensor
 from torch.nn import Module, ModuleList
 from torch.quasirandom import SobolEngine
 
-from gpadjust.models.exact_gp_base import ExactGPBase, Prediction
+from gpadjust.models.exact_gp_base import ExactGPBase
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.mixed_functions import MixedFunctions, OutputsSideBySide
 from gpadjust.models.posteriors import (
@@ -29,6 +29,7 @@ from gpadjust.models.posteriors import (
     mixture_moments,
 )
 from gpadjust.models.sampled_functions import check_number, seeded
+from gpadjust.models.terms_model import Prediction
 from gpadjust.models.training_data import (
     ArrayLike,
     check_columns,

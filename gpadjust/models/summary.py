@@ -52,7 +52,8 @@ def log_likelihood(model: Any) -> Tensor:
 def _lines(model: Any) -> list[str]:
     """What there is to say of one output."""
     scale, sizes = model._units()[1].squeeze(-1), typical_sizes(model)
-    lines = [f"  log likelihood {_text(log_likelihood(model))}"]
+    evidence, value = model._evidence()
+    lines = [f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
     for i, term in enumerate(model.terms):
         unit = torch.ones_like(scale) if is_rho(term.basis) else scale
         mean = model.term_mean(term.name) if hasattr(model, "term_mean") else 0.0
@@ -86,10 +87,11 @@ def _of_term(
 ) -> list[str]:
     """A line for each hyper-parameter of a term's kernel."""
     lines: list[str] = []
-    for name, _ in [] if term.kernel is None else term.kernel.named_parameters(path):
+    kernel: Any = term.kernel
+    for name, _ in [] if kernel is None else kernel.named_parameters():
         module, _, leaf = name.rpartition(".")
-        kind, size = kind_of(leaf), sizes.get(name)
-        value: Tensor = getattr(model.get_submodule(module), kind)
+        kind, size = kind_of(leaf), sizes.get(f"{path}.{name}")
+        value: Tensor = getattr(kernel.get_submodule(module), kind)
         if kind == "outputscale":
             lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, kind, size)}")
         elif kind == "lengthscale":

@@ -21,11 +21,12 @@ from gpadjust.inference import FitResult, SampleResult, fit
 from gpadjust.models import (
     CKA,
     RRA,
-    AdjustedGP,
+    AdjustedModel,
     CalibratedPhysics,
     PhysicsMeanGP,
     PhysicsParameters,
     ScaleGP,
+    VariationalCKA,
     ZeroMeanGP,
 )
 from gpadjust.models.training_data import column_names
@@ -35,13 +36,14 @@ from gpadjust.sklearn.array_physics import array_physics
 
 Array = NDArray[np.float64]
 
-MODELS: dict[str, type[AdjustedGP]] = {
+MODELS: dict[str, type[AdjustedModel]] = {
     "cka": CKA,
     "rra": RRA,
     "physics_mean": PhysicsMeanGP,
     "scale": ScaleGP,
     "calibrated_physics": CalibratedPhysics,
     "zero_mean": ZeroMeanGP,
+    "variational": VariationalCKA,
 }
 _NO_OPTIONS = ("train_X", "train_Y", "physics")
 
@@ -74,7 +76,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             CKA of :math:`f_p = 0` is.
         model: ``"cka"``, ``"rra"``, ``"physics_mean"``, ``"scale"``, ``"calibrated_physics"``,
             ``"zero_mean"`` (which leaves the physics out, to compare with), or a class: a subclass
-            of :class:`~gpadjust.models.AdjustedGP`.
+            of :class:`~gpadjust.models.AdjustedModel`.
         fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`. None: the library's
             calibrated default, full Bayes where the model can have it.
         model_options: Further arguments of the model, such as ``{"delta_mean": "learn"}``, or
@@ -104,7 +106,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         (1,)
     """
 
-    model_: AdjustedGP
+    model_: AdjustedModel
     fit_result_: FitResult | SampleResult
     physics_parameters_: PhysicsParameters
 
@@ -112,7 +114,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         physics: Any = None,
         *,
-        model: str | type[AdjustedGP] = "cka",
+        model: str | type[AdjustedModel] = "cka",
         fit_method: Literal["bayes", "map"] | None = None,
         model_options: dict[str, Any] | None = None,
         fit_options: dict[str, Any] | None = None,
@@ -246,13 +248,13 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Takes the state of a pickle."""
         super().__setstate__({**state, "physics": unpack(state["physics"])})
 
-    def _build(self, X: Array, Y: Array) -> AdjustedGP:
+    def _build(self, X: Array, Y: Array) -> AdjustedModel:
         """The model that the parameters say."""
         model_class = MODELS.get(self.model) if isinstance(self.model, str) else self.model
-        if not isinstance(model_class, type) or not issubclass(model_class, AdjustedGP):
+        if not isinstance(model_class, type) or not issubclass(model_class, AdjustedModel):
             raise ValueError(
                 f"Expected model as one of {', '.join(map(repr, MODELS))}, or a subclass of "
-                f"gpadjust.models.AdjustedGP, got {self.model!r}."
+                f"gpadjust.models.AdjustedModel, got {self.model!r}."
             )
         if self.physics is None and model_class is CKA:
             model_class = ZeroMeanGP

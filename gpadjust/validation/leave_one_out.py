@@ -17,7 +17,7 @@ from linear_operator import to_dense
 from torch import Tensor
 
 from gpadjust.gp.gaussian import noise_variances
-from gpadjust.models import ExactGPBase, StackedGP
+from gpadjust.models import ExactGPBase, StackedGP, VariationalCKA
 from gpadjust.models.cholesky_strategy import Factors
 from gpadjust.models.stacked import Part
 from gpadjust.validation import scores
@@ -124,6 +124,11 @@ def leave_one_out(
         return _join([leave_one_out(part) for part in model.models])
     if isinstance(model, StackedGP):
         return _join([_mixture_of(parts) for parts in model.parts])
+    if isinstance(model, VariationalCKA):
+        raise TypeError(
+            "Expected an exact model, got a VariationalCKA: of so many observations hold some out, "
+            "build the model of the others, and compare model.interval(X) with what was held out."
+        )
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(
             "Expected a model of this library, a SingleTaskGP, or a ModelListGP of such, got "

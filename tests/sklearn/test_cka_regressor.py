@@ -374,7 +374,7 @@ def test_bad_data(data, change, error, message):
     ("parameters", "error", "message"),
     [
         ({"model": "krr"}, ValueError, "one of 'cka', 'rra'.*got 'krr'"),
-        ({"model": AR1}, ValueError, "a subclass of gpadjust.models.AdjustedGP, got"),
+        ({"model": AR1}, ValueError, "a subclass of gpadjust.models.AdjustedModel, got"),
         ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
         ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
         ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),

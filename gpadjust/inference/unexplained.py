@@ -1,0 +1,122 @@
+"""How much of the residuals of a sparse model is function, and how much noise."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from gpadjust.gp.gaussian import cholesky, threads_for
+
+_BLOCKS = 32  # places where neighbours are compared
+_NEIGHBOURS = 256
+_LEAST = 8  # neighbours that tell anything
+_LENGTHS = (0.02, 50.0)  # lengthscales, in standard deviations of the inputs
+_LEAST_SHARE = 1e-6  # of the residuals' variance
+
+
+class Unexplained(NamedTuple):
+    """The two parts of a sparse model's residuals.
+
+    Attributes:
+        variance: That of what varies with the inputs, ``(m)``; 0 where there is none to be seen.
+        lengthscales: Those over which it varies, ``(m) x 1 x d``.
+        noise: The variance of the rest, ``(m)``.
+    """
+
+    variance: Tensor
+    lengthscales: Tensor
+    noise: Tensor
+
+
+def unexplained(inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: int) -> Unexplained:
+    r"""Split residuals into a smooth part and noise, by the likelihood of groups of neighbours.
+
+    Few inducing points leave structure in the residuals, which is noise to a sparse model. Close
+    observations share it, but not the noise. The residuals of each of some groups of neighbours
+    are :math:`N(0, v k + \sigma^2 I)` with an RBF kernel k of one lengthscale for each input; v is
+    kept if it makes them more likely by more than its own parameters cost (Akaike 1974).
+
+    Args:
+        inputs: ``n x d``.
+        residuals: ``(m) x n``; NaN where there is none.
+        known: Known noise variances, ``(m) x n``, or None if they are to be found.
+        seed: Seed of the places.
+    """
+    rows = residuals.reshape(-1, residuals.shape[-1])
+    noises = (
+        [None] * len(rows) if known is None else [*known.expand_as(residuals).reshape(rows.shape)]
+    )
+    with threads_for(_NEIGHBOURS, others=True):
+        found = [_of_one(inputs, r, noise, seed) for r, noise in zip(rows, noises, strict=True)]
+    variance, lengths, noise = (torch.stack(each) for each in zip(*found, strict=True))
+    batch = residuals.shape[:-1]
+    return Unexplained(
+        variance.reshape(batch), lengths.reshape(*batch, 1, -1), noise.reshape(batch)
+    )
+
+
+def _of_one(
+    inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    seen = ~residuals.isnan()
+    inputs, residuals = inputs[seen], residuals[seen]
+    known = None if known is None else known[seen]
+    spread = inputs.std(0)
+    spread = spread.where(spread > 0, torch.ones_like(spread))
+    size = residuals.square().mean()
+    whole = size if known is None else known.mean()
+    k = min(_NEIGHBOURS, len(inputs) // 4)
+    if k < _LEAST or not size > 0:
+        return torch.zeros_like(size), spread, whole
+    z = inputs / spread
+    generator = torch.Generator().manual_seed(seed)
+    centres = torch.randperm(len(z), generator=generator)[: min(_BLOCKS, len(z) // k)].to(z.device)
+    nearest = torch.cdist(z[centres], z).topk(k, largest=False).indices
+    x, r = z[nearest], residuals[nearest] / size.sqrt()
+    own = None if known is None else known[nearest] / size
+
+    def objective(vector: np.ndarray) -> tuple[float, np.ndarray]:
+        """The negative log likelihood of a residual, of logarithms of lengths, v and noise."""
+        p = torch.tensor(vector, dtype=torch.float64, device=x.device, requires_grad=True)
+        value = _negative_log_likelihood(x, r, p, own) / r.numel()
+        value.backward()
+        assert p.grad is not None
+        return value.item(), p.grad.cpu().numpy()
+
+    d = x.shape[-1]
+    tiny, most = math.log(_LEAST_SHARE), math.log(4.0)
+    bounds = [tuple(map(math.log, _LENGTHS))] * d + [(tiny, most)] * (1 if known is not None else 2)
+    starts = [[math.log(length)] * d + [math.log(0.3)] for length in (0.5, 2.0)]
+    starts = [s if known is not None else [*s, math.log(0.7)] for s in starts]
+    runs = [minimize(objective, s, jac=True, method="L-BFGS-B", bounds=bounds) for s in starts]
+    best = min(runs, key=lambda run: float(run.fun))
+    without = _noise_alone(r, own)
+    gain = (without - float(best.fun)) * r.numel()
+    if gain <= d + 1:
+        return torch.zeros_like(size), spread, whole
+    p = torch.as_tensor(best.x, dtype=torch.float64, device=x.device).exp()
+    return size * p[d], p[:d] * spread, whole if known is not None else size * p[d + 1]
+
+
+def _negative_log_likelihood(x: Tensor, r: Tensor, p: Tensor, known: Tensor | None) -> Tensor:
+    """Of groups ``b x k x d`` with residuals ``b x k``, at logarithms of the parameters."""
+    d = x.shape[-1]
+    z = x / p[:d].exp()
+    z = z - z.mean(-2, keepdim=True)
+    half = 0.5 * z.square().sum(-1)
+    exponent = (z @ z.mT - half.unsqueeze(-1) - half.unsqueeze(-2)).clamp_max(0.0)
+    noise = p[d + 1].exp().expand_as(r) if known is None else known
+    chol, _ = cholesky(p[d].exp() * exponent.exp() + torch.diag_embed(noise))
+    white = torch.linalg.solve_triangular(chol, r.unsqueeze(-1), upper=False)
+    return 0.5 * white.square().sum() + chol.diagonal(dim1=-1, dim2=-2).log().sum()
+
+
+def _noise_alone(r: Tensor, known: Tensor | None) -> float:
+    """The same of a residual without the smooth part, at the most likely noise."""
+    noise = r.square().mean().expand_as(r) if known is None else known
+    return float(0.5 * (r.square() / noise + noise.log()).mean())
