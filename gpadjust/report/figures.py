@@ -1,0 +1,235 @@
+"""Figures as images that are part of the page."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from base64 import b64encode
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from gpadjust.physics import PhysicsError
+from gpadjust.report.markup import Markup, tag
+from gpadjust.report.numbers import number, with_unit
+from gpadjust.report.subject import Subject
+from gpadjust.validation.plots import (
+    plot_adjustment,
+    plot_adjustment_pair,
+    plot_calibration,
+    plot_leave_one_out,
+    plot_pit,
+    plot_trust,
+    plot_trust_pair,
+)
+from gpadjust.validation.plots.drawing import (
+    DOTS,
+    GREY,
+    RED,
+    band,
+    column,
+    labels,
+    mean_and_half_width,
+    tidy,
+)
+from gpadjust.validation.trust import Trust
+
+_STYLE: dict[str, Any] = {
+    "font.size": 9.5,
+    "axes.labelsize": 9.5,
+    "axes.titlesize": 9.5,
+    "axes.linewidth": 0.7,
+    "legend.fontsize": 8.5,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "gpadjust",
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+_LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
+_MOST = 12  # inputs along which slices are drawn, in all outputs together
+_POINTS = 80  # of a curve
+_PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
+_NEEDLESS = re.compile(
+    r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)", flags=re.DOTALL
+)
+_STYLES = ("--", "-.", ":")
+
+
+def drawn(kind: str, draw: Callable[[], list[Markup]]) -> Markup:
+    """Figures side by side, or why there are none: a physics may fail where there are no data."""
+    try:
+        with rc_context(_STYLE), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            images = draw()
+    except PhysicsError as error:
+        return tag("p", f"No figure: {error.args[0]}", class_="caution")
+    if not images:
+        return Markup()
+    return tag("div", *(tag("figure", image) for image in images), class_=kind)
+
+
+def inputs_drawn(subject: Subject) -> list[int]:
+    """The inputs along which slices are drawn: all, or those that move the predictions most."""
+    d, m = len(subject.inputs), len(subject.outputs)
+    most = max(2, _MOST // m)
+    if d <= most:
+        return [*range(d)]
+    spread = subject.Y.sub(subject.Y.nanmean(0)).square().nanmean(0).sqrt()
+    effect = torch.zeros(d, dtype=torch.float64)
+    for i in range(d):
+        mean = subject.model.predict(_slice(subject, i, 21)).mean
+        effect[i] = ((mean.amax(0) - mean.amin(0)) / spread.clamp_min(1e-300)).max()
+    return sorted(effect.argsort(descending=True)[:most].tolist())
+
+
+def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
+    """Along each input what is predicted, the physics, rho and delta, the others at the median."""
+    shown = subject.adjusted[output]
+    terms = [] if shown is None else [n for n in shown.model.term_names if n != "f"]
+    figures = []
+    d = len(subject.inputs)
+    axes = np.empty((1 + len(terms), d), dtype=object)
+    for i in range(d):
+        figure = Figure(figsize=(4.3, 2.5 + 1.75 * len(terms)), layout="constrained")
+        heights = [1.4, *[1.0] * len(terms)]
+        grid = figure.subplots(1 + len(terms), 1, sharex=True, squeeze=False, height_ratios=heights)
+        axes[:, i] = grid[:, 0]
+        figures.append(figure)
+    with torch.no_grad():
+        for i in inputs:
+            _prediction(subject, output, i, axes[0, i])
+    low, high = zip(*(axes[0, i].get_ylim() for i in inputs), strict=True)
+    for i in inputs:
+        axes[0, i].set_ylim(min(low), max(high))
+    if shown is not None and terms:
+        plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
+        axes[1, 0].get_legend().remove()
+        for i in range(1, d):
+            for row, name in zip(axes[1:, i], axes[1:, 0], strict=True):
+                row.set_ylabel(name.get_ylabel())
+    else:
+        for i, label in enumerate(labels(subject.model, "input", d)):
+            axes[-1, i].set_xlabel(label)
+    parts = "the prediction and the physics" if shown is not None else "the prediction"
+    below = f"; below, {' and '.join(terms)}" if terms else ""
+    return [
+        image(figures[i], f"{parts} of {subject.outputs[output]} over {subject.inputs[i]}{below}")
+        for i in inputs
+    ]
+
+
+def pairs(subject: Subject, output: int) -> list[Markup]:
+    """The mean and sd of rho and delta over both of two inputs."""
+    shown = subject.adjusted[output]
+    if shown is None or len(subject.inputs) != 2:
+        return []
+    terms = [name for name in shown.model.term_names if name != "f"]
+    figures = [Figure(figsize=(7.4, 3.1), layout="constrained") for _ in terms]
+    axes = [figure.subplots(1, 2) for figure in figures]
+    if terms:
+        plot_adjustment_pair(shown.model, output=shown.output, axes=np.array(axes), num_points=30)
+    of = f"over {' and '.join(subject.inputs)}"
+    pair = zip(figures, terms, strict=True)
+    return [image(figure, f"mean and standard deviation of {name} {of}") for figure, name in pair]
+
+
+def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> list[Markup]:
+    """What predictions rest on, over both of two inputs or along each."""
+    alt = f"whether the prediction of {page_output} rests on physics, data or neither"
+    if len(trusted.input_names) == 2:
+        figure = Figure(figsize=(5.4, 3.4), layout="constrained")
+        plot_trust_pair(trusted, output=output, ax=figure.subplots())
+        return [image(figure, alt)]
+    figures = [Figure(figsize=(4.3, 2.3), layout="constrained") for _ in trusted.input_names]
+    axes = [figure.subplots() for figure in figures]
+    plot_trust(trusted, output=output, axes=axes)
+    axes[-1].get_legend().remove()
+    for ax in axes:
+        ax.set_ylabel(axes[0].get_ylabel())
+    return [image(figures[i], f"{alt}, over {trusted.input_names[i]}") for i in inputs]
+
+
+def left_out(subject: Subject, output: int) -> list[Markup]:
+    """Left-out predictions against observations, and their standardized residuals."""
+    figures = [Figure(figsize=(4.3, 3.3), layout="constrained") for _ in range(2)]
+    plot_leave_one_out(subject.loo, output=output, axes=[f.subplots() for f in figures])
+    name = subject.outputs[output]
+    alts = (f"predictions of left-out {name} against observations", f"their residuals, of {name}")
+    return [image(figure, alt) for figure, alt in zip(figures, alts, strict=True)]
+
+
+def calibration(subject: Subject, output: int) -> list[Markup]:
+    """Observed against nominal coverage, and the histogram of PIT values."""
+    figures = [Figure(figsize=(4.3, 3.3), layout="constrained") for _ in range(2)]
+    plot_calibration(subject.loo, output=output, ax=figures[0].subplots())
+    n = int((~subject.Y[:, output].isnan()).sum())
+    plot_pit(subject.loo, output=output, bins=max(4, min(10, n // 4)), ax=figures[1].subplots())
+    name = subject.outputs[output]
+    alts = (f"observed against nominal coverage of {name}", f"histogram of PIT values of {name}")
+    return [image(figure, alt) for figure, alt in zip(figures, alts, strict=True)]
+
+
+def held(subject: Subject, inputs: list[int]) -> str:
+    """At what the other inputs stay."""
+    if len(subject.inputs) == 1:
+        return ""
+    values = zip(subject.inputs, subject.base.tolist(), strict=True)
+    pairs = [f"{name} = {with_unit(number(v), name)}" for name, v in values]
+    pairs = [re.sub(r"\s*\[[^\[\]]*\] =", " =", pair) for pair in pairs]
+    drawn_of = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
+    few = drawn_of if len(inputs) < len(pairs) else ""
+    return f"Along each input the others stay at the median of the data: {', '.join(pairs)}{few}."
+
+
+def image(figure: Figure, alt: str) -> Markup:
+    """A figure as an image in the page: curves as they are, or many points as pixels."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
+    source = f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
+    if len(text) > _LARGE:
+        buffer = BytesIO()
+        figure.savefig(buffer, format="png", dpi=180)
+        pixels = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
+        source = min(source, pixels, key=len)
+    width, height = (str(round(96 * size)) for size in figure.get_size_inches())
+    return tag("img", src=Markup(source), alt=alt, width=width, height=height)
+
+
+def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
+    low, high = subject.X[:, i].min(), subject.X[:, i].max()
+    pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
+    X = subject.base.repeat(number_of_points, 1)
+    X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points).to(X)
+    return X
+
+
+def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
+    X = _slice(subject, i, _POINTS)
+    x = X[:, i]
+    mean, half = mean_and_half_width(_Moments(*subject.model.predict(X)), output, 0.95)
+    band(ax, x, mean, half, 0.95)
+    curves = subject.physics_at(X, output)
+    for k, (name, values) in enumerate(curves):
+        ax.plot(x, values, color=GREY, ls=_STYLES[k % 3], lw=1.2, label=name)
+    if len(subject.inputs) == 1:
+        ax.plot(subject.X[:, 0], column(subject.Y, output), color=RED, **DOTS)
+    ax.set_ylabel(labels(subject.model, "output", len(subject.outputs))[output])
+    ax.set_xlim(float(x[0]), float(x[-1]))
+    if len(curves) > 1:
+        ax.legend(frameon=False)
+    tidy(ax)
+
+
+class _Moments:
+    """Means and variances, as of a posterior."""
+
+    def __init__(self, mean: Tensor, variance: Tensor) -> None:
+        self.mean, self.variance = mean, variance
