@@ -129,8 +129,10 @@ class CsvColumns:
                 "rename those that are not meant."
             )
         found = ", ".join(map(repr, self.names))
-        near = get_close_matches(name, self.names, n=1)
-        meant = f" Is it {near[0]!r}?" if near else ""
+        # Units in brackets and capitals are no part of a likeness.
+        plain = {other.partition("[")[0].strip().casefold(): other for other in self.names}
+        near = get_close_matches(name.partition("[")[0].strip().casefold(), plain, n=1)
+        meant = f" Is it {plain[near[0]]!r}?" if near else ""
         hint = self._other_delimiter() or f" {self._hint}"
         raise ValueError(f"{where}: expected a column {name!r}, found {found}.{meant}{hint}")
 

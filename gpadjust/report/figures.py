@@ -110,7 +110,7 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
         axes[0, i].set_ylim(min(low), max(high))
     if shown is not None and terms:
         plot_adjustment(shown.model, output=shown.output, axes=axes[1:], num_points=_POINTS)
-        axes[1, 0].get_legend().remove()
+        _without_legend(axes[1, 0])
         for i in range(1, d):
             for row, name in zip(axes[1:, i], axes[1:, 0], strict=True):
                 row.set_ylabel(name.get_ylabel())
@@ -134,7 +134,7 @@ def pairs(subject: Subject, output: int) -> list[Markup]:
     figures = [Figure(figsize=(7.4, 3.1), layout="constrained") for _ in terms]
     axes = [figure.subplots(1, 2) for figure in figures]
     if terms:
-        plot_adjustment_pair(shown.model, output=shown.output, axes=np.array(axes), num_points=30)
+        plot_adjustment_pair(shown.model, output=shown.output, axes=np.array(axes), num_points=20)
     of = f"over {' and '.join(subject.inputs)}"
     pair = zip(figures, terms, strict=True)
     return [image(figure, f"mean and standard deviation of {name} {of}") for figure, name in pair]
@@ -150,7 +150,7 @@ def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> 
     figures = [Figure(figsize=(4.3, 2.3), layout="constrained") for _ in trusted.input_names]
     axes = [figure.subplots() for figure in figures]
     plot_trust(trusted, output=output, axes=axes)
-    axes[-1].get_legend().remove()
+    _without_legend(axes[-1])
     for ax in axes:
         ax.set_ylabel(axes[0].get_ylabel())
     return [image(figures[i], f"{alt}, over {trusted.input_names[i]}") for i in inputs]
@@ -226,6 +226,12 @@ def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
     if len(curves) > 1:
         ax.legend(frameon=False)
     tidy(ax)
+
+
+def _without_legend(ax: Any) -> None:
+    """The page says what is drawn, once for all figures."""
+    if ax.get_legend() is not None:
+        ax.get_legend().remove()
 
 
 class _Moments:

@@ -103,10 +103,8 @@ class Comparison:
             for name in ("mean", "variance", "log_density")
         )
         weight = _weights(self.models, [*self.table.values()]).unsqueeze(-2)  # K x 1 x m
-        mixed = mixture_of(mean, variance, density, weight)
-        return replace(
-            each[0], **dict(zip(("mean", "variance", "log_density"), mixed, strict=True))
-        )
+        mean, variance, density = mixture_of(mean, variance, density, weight)
+        return replace(each[0], mean=mean, variance=variance, log_density=density)
 
     def __str__(self) -> str:
         width = max(len(row.structure) for rows in self.table.values() for row in rows)
