@@ -17,7 +17,7 @@ _BANDS = (
 )
 _APART = (
     "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
-    "data tell far less surely than their sum, which is the topmost curve."
+    "data tell far less surely than their sum."
 )
 
 
@@ -69,9 +69,10 @@ def trusted(subject: Subject) -> Markup:
         parts.append(
             figures.drawn("slices", partial(figures.trusts, found, shown.output, inputs, name))
         )
-    if len(subject.inputs) != 2:
-        colours = "Blue: physics; orange: data; grey: neither."
-        parts.append(tag("p", f"Along each input, over all values of the others. {colours}"))
+    over = "Over both inputs" if len(subject.inputs) == 2 else "Along each input"
+    others = ", for all values of the others" if len(subject.inputs) > 2 else ""
+    colours = "blue where it rests on the physics, orange on the data, grey on neither"
+    parts.append(tag("p", f"{over}{others}: {colours}.", class_="note"))
     return join(parts)
 
 
@@ -86,7 +87,7 @@ def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
         off = off[~off.isnan()]
         rms, mean = float(off.square().mean().sqrt()), float(off.mean())
         found.append(
-            f"At the data the {physics} {subject.as_it_is} is off by "
+            f"At the data, the {physics} ({subject.as_it_is}) is off by "
             f"{with_unit(number(rms), name)} (root mean square; observed less physics is "
             f"{with_unit(number(mean), name)} in the mean)."
         )
@@ -100,8 +101,8 @@ def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
     if terms:
         weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
         found.append(
-            f"Below: {listed(terms)} of {shown.structure}{weight}; dashed, where they are if "
-            "the physics is left as it is."
+            f"Below: {listed(terms)} of {shown.structure}{weight}; dashed, what leaves the "
+            "physics as it is."
         )
         if len(terms) > 1:
             found.append(_APART)

@@ -54,11 +54,13 @@ _STYLE: dict[str, Any] = {
 }
 _LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
-_POINTS = 80  # of a curve
+_WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
+_POINTS = 120  # of a curve
 _PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
 _NEEDLESS = re.compile(
     r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)", flags=re.DOTALL
 )
+_OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
 _STYLES = ("--", "-.", ":")
 
 
@@ -66,7 +68,7 @@ def drawn(kind: str, draw: Callable[[], list[Markup]]) -> Markup:
     """Figures side by side, or why there are none: a physics may fail where there are no data."""
     try:
         with rc_context(_STYLE), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            warnings.filterwarnings("ignore", message=_OF_FONTS)
             images = draw()
     except PhysicsError as error:
         return tag("p", f"No figure: {error.args[0]}", class_="caution")
@@ -84,7 +86,10 @@ def inputs_drawn(subject: Subject) -> list[int]:
     spread = subject.Y.sub(subject.Y.nanmean(0)).square().nanmean(0).sqrt()
     effect = torch.zeros(d, dtype=torch.float64)
     for i in range(d):
-        mean = subject.model.predict(_slice(subject, i, 21)).mean
+        try:
+            mean = subject.model.predict(_slice(subject, i, 21)).mean
+        except PhysicsError:
+            continue  # its figure will say so, if it is among them
         effect[i] = ((mean.amax(0) - mean.amin(0)) / spread.clamp_min(1e-300)).max()
     return sorted(effect.argsort(descending=True)[:most].tolist())
 
@@ -97,7 +102,7 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     d = len(subject.inputs)
     axes = np.empty((1 + len(terms), d), dtype=object)
     for i in range(d):
-        figure = Figure(figsize=(4.3, 2.5 + 1.75 * len(terms)), layout="constrained")
+        figure = Figure(figsize=(_WIDTH, 2.1 + 1.5 * len(terms)), layout="constrained")
         heights = [1.4, *[1.0] * len(terms)]
         grid = figure.subplots(1 + len(terms), 1, sharex=True, squeeze=False, height_ratios=heights)
         axes[:, i] = grid[:, 0]
@@ -131,7 +136,7 @@ def pairs(subject: Subject, output: int) -> list[Markup]:
     if shown is None or len(subject.inputs) != 2:
         return []
     terms = [name for name in shown.model.term_names if name != "f"]
-    figures = [Figure(figsize=(7.4, 3.1), layout="constrained") for _ in terms]
+    figures = [Figure(figsize=(2 * _WIDTH, 2.9), layout="constrained") for _ in terms]
     axes = [figure.subplots(1, 2) for figure in figures]
     if terms:
         plot_adjustment_pair(shown.model, output=shown.output, axes=np.array(axes), num_points=20)
@@ -144,10 +149,10 @@ def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> 
     """What predictions rest on, over both of two inputs or along each."""
     alt = f"whether the prediction of {page_output} rests on physics, data or neither"
     if len(trusted.input_names) == 2:
-        figure = Figure(figsize=(5.4, 3.4), layout="constrained")
-        plot_trust_pair(trusted, output=output, ax=figure.subplots())
+        figure = Figure(figsize=(_WIDTH, 2.8), layout="constrained")
+        _without_legend(plot_trust_pair(trusted, output=output, ax=figure.subplots()))
         return [image(figure, alt)]
-    figures = [Figure(figsize=(4.3, 2.3), layout="constrained") for _ in trusted.input_names]
+    figures = [Figure(figsize=(_WIDTH, 2.0), layout="constrained") for _ in trusted.input_names]
     axes = [figure.subplots() for figure in figures]
     plot_trust(trusted, output=output, axes=axes)
     _without_legend(axes[-1])
@@ -158,7 +163,7 @@ def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> 
 
 def left_out(subject: Subject, output: int) -> list[Markup]:
     """Left-out predictions against observations, and their standardized residuals."""
-    figures = [Figure(figsize=(4.3, 3.3), layout="constrained") for _ in range(2)]
+    figures = [Figure(figsize=(_WIDTH, 2.9), layout="constrained") for _ in range(2)]
     plot_leave_one_out(subject.loo, output=output, axes=[f.subplots() for f in figures])
     name = subject.outputs[output]
     alts = (f"predictions of left-out {name} against observations", f"their residuals, of {name}")
@@ -167,7 +172,7 @@ def left_out(subject: Subject, output: int) -> list[Markup]:
 
 def calibration(subject: Subject, output: int) -> list[Markup]:
     """Observed against nominal coverage, and the histogram of PIT values."""
-    figures = [Figure(figsize=(4.3, 3.3), layout="constrained") for _ in range(2)]
+    figures = [Figure(figsize=(_WIDTH, 2.9), layout="constrained") for _ in range(2)]
     plot_calibration(subject.loo, output=output, ax=figures[0].subplots())
     n = int((~subject.Y[:, output].isnan()).sum())
     plot_pit(subject.loo, output=output, bins=max(4, min(10, n // 4)), ax=figures[1].subplots())

@@ -41,7 +41,8 @@ def summary(subject: Subject) -> Markup:
     """The summary of what predicts, in the user's units."""
     words = (
         "In the units of the data; of samples the median, and the range of 95 % of them. A "
-        "lengthscale is the distance over which a function changes, sd how much."
+        "lengthscale is the distance over which a function changes, sd how much. Means are those "
+        "of the prior; what was learnt of rho and delta is in the figures."
     )
     text = code(subject.model.summary())
     return join(

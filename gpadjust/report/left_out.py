@@ -45,10 +45,7 @@ def calibration(subject: Subject) -> Markup:
             share = float(subject.loo.coverage(level)[j])
             low, high = (int(binom.ppf(p, n, level)) for p in (0.025, 0.975))
             held = round(share * n)
-            if held < low:
-                says = "too narrow"
-            else:
-                says = "too wide" if held > high else "as promised, by these data"
+            says = "too narrow" if held < low else "too wide" if held > high else "in that range"
             cells = [f"{held} of {n}", percent(share), f"{low} to {high} of {n}", says]
             rows.append([f"{name}, {percent(level)}", *cells])
         parts.append(figures.drawn("slices", partial(figures.calibration, subject, j)))

@@ -39,7 +39,12 @@ def join(children: Iterable[str]) -> Markup:
 
 
 def table(
-    caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, marked: int | None = None
+    caption: str,
+    head: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    marked: int | None = None,
+    kind: str = "numbers",
 ) -> Markup:
     """A table whose first column names its rows, in a box that scrolls on a narrow screen.
 
@@ -48,6 +53,7 @@ def table(
         head: The names of its columns.
         rows: Its cells.
         marked: The row that is set off.
+        kind: What is in its cells, ``"numbers"`` or ``"words"``.
     """
     body = []
     for i, (name, *cells) in enumerate(rows):
@@ -60,6 +66,7 @@ def table(
         tag("caption", caption),
         tag("thead", tag("tr", *names)),
         tag("tbody", *body),
+        class_=kind,
     )
     return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
 

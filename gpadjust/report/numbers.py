@@ -14,11 +14,7 @@ def number(value: float, digits: int = 3) -> str:
     if not math.isfinite(value):
         return "none" if math.isnan(value) else f"{value:g}"
     text = f"{value:.{digits}g}"
-    value = float(text)
-    if value == 0 or not 1e-4 <= abs(value) < 1e7:
-        return text
-    behind = digits - 1 - math.floor(math.log10(abs(value)))
-    return f"{value:.{max(behind, 0)}f}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text
 
 
 def percent(share: float) -> str:

@@ -39,9 +39,9 @@ def page(
         "Left-out predictions": lambda: left_out.predictions(subject),
         "Calibration": lambda: left_out.calibration(subject),
         "Parameters of the physics": lambda: learnt.parameters(subject),
+        "What was learnt": lambda: learnt.summary(subject),
         "Advice": lambda: verdict.advice(subject, [*origin.notes]),
         "Data": lambda: provenance.data(subject, origin),
-        "What was learnt": lambda: learnt.summary(subject),
         "Load the model, predict": lambda: _loading(subject, saved, origin),
         "Settings": lambda: provenance.settings(subject, origin),
     }

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import gpadjust
 from gpadjust.report.markup import Markup, bullets, code, join, table, tag
-from gpadjust.report.numbers import name_and_unit, number, plural, with_unit
+from gpadjust.report.numbers import listed, name_and_unit, number, plural, with_unit
 from gpadjust.report.subject import Subject
 
 _LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
@@ -52,7 +52,7 @@ def data(subject: Subject, origin: Origin) -> Markup:
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
     remarks = [f"{plural(len(subject.X), 'row')} of data.", *_repeats(subject), *origin.remarks]
-    return join([table("The data", head, rows), bullets(remarks)])
+    return join([table("Columns", head, rows), bullets(remarks)])
 
 
 def _repeats(subject: Subject) -> list[str]:
@@ -95,7 +95,7 @@ def settings(subject: Subject, origin: Origin) -> Markup:
     own = f"gpadjust {gpadjust.__version__}"
     rows.append(["versions", ", ".join([own, f"Python {platform.python_version()}", *versions])])
     rows.append(["date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")])
-    return table("Settings", ["setting", "value"], rows)
+    return table("How this page came about", ["setting", "value"], rows, kind="words")
 
 
 def loading(subject: Subject, file: str, content: Mapping[str, Any], origin: Origin) -> Markup:
@@ -116,8 +116,8 @@ def loading(subject: Subject, file: str, content: Mapping[str, Any], origin: Ori
         imports += [f"import {module}" for module in origin.modules]
         boxes = any("BlackBoxPhysics(" in each for each in origin.physics.values())
         imports.append(f"from gpadjust import {'BlackBoxPhysics, ' * boxes}load")
-        where = ", ".join(f"{module}.py" for module in origin.modules)
-        words.append(f"Python has to find {where}: put it there, or its folder on PYTHONPATH.")
+        where = f"module{'s' * (len(origin.modules) > 1)} {listed(origin.modules)}"
+        words.append(f"Python has to find the {where}: there, or in a folder on PYTHONPATH.")
         arguments.append(f"physics={_expression(origin.physics)}")
         missing = [name for name in missing if name != "physics"]
     else:

@@ -55,7 +55,7 @@ def recommendation(subject: Subject) -> Markup:
         name = comparison.chosen
         return tag("p", "Recommended: ", tag("strong", name), f", {_what(name)}. {why}")
     few = int((~subject.Y.isnan()).sum(0).min())
-    why = "No structure is clearly best for all outputs"
+    why = "No structure is clearly best" + " for all outputs" * (len(subject.outputs) > 1)
     if few < ENOUGH:
         why = f"{plural(few, 'observation')} cannot show a structure to be clearly best"
     why += ": the mixture keeps the doubt between them in its intervals."
@@ -125,7 +125,7 @@ def headline(subject: Subject) -> str:
     answers = [_answer(subject, j) for j in range(len(subject.outputs))]
     if len(answers) == 1:
         answer, _, (first, *_) = answers[0]
-        return f"{answer}: {first}"
+        return f"{answer}. {first}"
     pairs = zip(subject.outputs, answers, strict=True)
     return "; ".join(f"{name}: {answer[0].lower()}" for name, answer in pairs) + "."
 
@@ -145,14 +145,13 @@ def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
     gain = None if comparison is None else comparison.gain.get(name)
     if comparison is None or gain is None:
         return "Not asked", "open", [_not_asked(subject), *_errors(subject, output)]
-    score = f"{gain.elpd:+.1f} ± {gain.se:.1f} nats"
-    pair = f"by {gain.structure}, over those without it, by {gain.without}"
     ratio = math.exp(max(-50.0, min(50.0, gain.elpd / n)))
     rows = {row.structure: row for row in comparison.table[name]}
     numbers = (
-        f"The log score of {plural(n, 'left-out observation')} is {score} with the physics, {pair} "
-        f"(the sum and its standard error): in geometric mean each is {number(ratio)} times as "
-        f"likely. {_rmse(rows, gain, name, spread_of(subject, output))}"
+        f"Log score of {plural(n, 'left-out observation')}, with the physics ({gain.structure}) "
+        f"less without ({gain.without}): {gain.elpd:+.1f} ± {gain.se:.1f} nats (sum and standard "
+        f"error), which makes each {number(ratio)} times as likely in geometric mean. "
+        f"{_rmse(rows, gain, name, spread_of(subject, output))}"
     )
     if gain.shown > 0:
         first = f"The physics helps to predict {name}."
@@ -170,8 +169,8 @@ def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
         if sign_of(gain.elpd, gain.se) > 0:
             rest[1] = (
                 f"{gain.structure} is better by more than two standard errors, but its fitted "
-                "constants may do that by themselves; no structure that takes the physics as it "
-                "is, is shown to be better."
+                "constants may do that by themselves: the best structure without such constants is "
+                "not shown to be better."
             )
     if n < ENOUGH:
         few = f"From {plural(n, 'observation')} a standard error is itself uncertain: take care."
@@ -183,7 +182,7 @@ def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
 def _rmse(rows: dict[str, Candidate], gain: Gain, name: str, spread: float) -> str:
     with_it, without = (rows[s].rmse * spread for s in (gain.structure, gain.without))
     return (
-        f"Their root mean square error is {with_unit(number(with_it), name)} with it and "
+        f"Root mean square errors: {with_unit(number(with_it), name)} with it, "
         f"{with_unit(number(without), name)} without."
     )
 
@@ -206,14 +205,14 @@ def _errors(subject: Subject, output: int) -> list[str]:
     Y = subject.Y[:, output]
     for physics, values in subject.physics_at(subject.X, output):
         error = float((Y - values).square().nanmean().sqrt())
-        errors.append(f"{with_unit(number(error), name)} by the {physics} {subject.as_it_is}")
+        errors.append(f"{with_unit(number(error), name)} by the {physics} ({subject.as_it_is})")
     return [f"Root mean square error of left-out {name}: {listed(errors)}."]
 
 
 def _weights(subject: Subject) -> Markup:
     """The weights of a mixture that came without a comparison."""
     if not isinstance(subject.model, StackedGP):
-        return tag("p", "One model was given, so there are no structures to compare.")
+        return Markup()
     rows = [[name, *map("{:.2f}".format, w)] for name, w in subject.model.weights.items()]
     return table("Weights of the mixture", ["structure", *subject.outputs], rows)
 

@@ -224,7 +224,10 @@ def compare(
                 physics=deepcopy(part),
                 input_transform=deepcopy(input_transform),
             )
-            with warnings.catch_warnings(), threads_for(len(data.X), others=True):
+            with (
+                warnings.catch_warnings(record=True) as caught,
+                threads_for(len(data.X), others=True),
+            ):
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
                 result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
@@ -238,6 +241,8 @@ def compare(
         except Exception as error:
             error.add_note(f"This is of the structure {structure.name!r}.")
             raise
+        for each in caught:
+            warnings.warn(f"{structure.name}: {each.message}", each.category, stacklevel=2)
         power[structure.name] = result.power.flatten()
         models[structure.name] = _thinned(model, _HELD)
     by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
