@@ -49,7 +49,7 @@ def trusted(subject: Subject) -> Markup:
         except PhysicsError as error:
             parts.append(tag("p", f"{name}: {error.args[0]}", class_="caution"))
     if not shares:
-        return join([*parts, tag("p", "There is no physics that could be trusted or overridden.")])
+        return join([*parts, *([] if parts else [tag("p", _none(subject))])])
     rows = []
     for name, shown, found in shares:
         three = (found.physics, found.data, found.neither)
@@ -76,10 +76,17 @@ def trusted(subject: Subject) -> Markup:
     return join(parts)
 
 
+def _none(subject: Subject) -> str:
+    """Why neither rho and delta nor trust can be shown."""
+    if subject.is_sampled:
+        return "AR1 knows its physics through samples alone, so that nothing is held against it."
+    return "There is no physics that could be adjusted, trusted or overridden."
+
+
 def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
     """What the figures of an output show."""
     if shown is None:
-        return ["No physics is adjusted here; the figures show the prediction. " + _BANDS]
+        return [f"{_none(subject)} The figures show the prediction. {_BANDS}"]
     name = subject.outputs[output]
     found = []
     for physics, values in subject.physics_at(subject.X, output):

@@ -61,6 +61,8 @@ _NEEDLESS = re.compile(
     r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)", flags=re.DOTALL
 )
 _OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
+_PATH = re.compile(r"\b(?:d|x|y)='[^']*'")
+_BEHIND = re.compile(r"(\.\d\d)\d+")  # hundredths of a point are more than a screen shows
 _STYLES = ("--", "-.", ":")
 
 
@@ -198,6 +200,7 @@ def image(figure: Figure, alt: str) -> Markup:
     buffer = BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
+    text = _PATH.sub(lambda path: _BEHIND.sub(r"\1", path[0]), text)
     source = f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
     if len(text) > _LARGE:
         buffer = BytesIO()

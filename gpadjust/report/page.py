@@ -55,7 +55,7 @@ def page(
         f"{listed(subject.outputs)} from {listed(subject.inputs)}: "
         f"{plural(len(subject.X), 'row')} of data, f_a(x) = rho(x) f_p(x) + delta(x)."
     )
-    if not subject.physics:
+    if not subject.physics and not subject.is_sampled:
         lead = lead.replace(", f_a(x) = rho(x) f_p(x) + delta(x)", ", without physics")
     main = tag(
         "main",

@@ -90,7 +90,8 @@ def settings(subject: Subject, origin: Origin) -> Markup:
         for name, each in subject.physics.items()
     )
     rows = [[name, value] for name, value in origin.settings.items()]
-    rows += [["model", repr(subject.model)], ["physics", physics or "none"]]
+    physics = physics or ("known through samples" if subject.is_sampled else "none")
+    rows += [["model", repr(subject.model)], ["physics", physics]]
     versions = [f"{name} {version(name)}" for name in _LIBRARIES]
     own = f"gpadjust {gpadjust.__version__}"
     rows.append(["versions", ", ".join([own, f"Python {platform.python_version()}", *versions])])

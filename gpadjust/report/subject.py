@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.gp import PhysicsInput
-from gpadjust.models import AdjustedGP, ExactGPBase, StackedGP
+from gpadjust.models import AR1, AdjustedGP, ExactGPBase, StackedGP
 from gpadjust.physics import JoinedPhysics, Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
 from gpadjust.validation.leave_one_out import observations
@@ -83,6 +83,11 @@ class Subject:
                 parts = zip(given.names, given.parts, strict=True) if several else ()
                 found |= dict(parts) if several else {given.name: given}
         return found
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether the physics is known through samples alone, as AR1 has it."""
+        return any(isinstance(model, AR1) for model in self._models())
 
     @property
     def as_it_is(self) -> str:

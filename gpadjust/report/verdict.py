@@ -140,7 +140,7 @@ def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
     """The answer, what kind it is, and sentences."""
     comparison, name = subject.comparison, subject.outputs[output]
     n = int((~subject.Y[:, output].isnan()).sum())
-    if not subject.physics:
+    if not subject.physics and not subject.is_sampled:
         return "No physics", "open", [f"The model of {name} has no physics to be judged."]
     gain = None if comparison is None else comparison.gain.get(name)
     if comparison is None or gain is None:
