@@ -30,8 +30,8 @@ def where_wrong(subject: Subject) -> Markup:
             parts.append(tag("h3", name))
         shown = subject.adjusted[j]
         parts.append(tag("p", " ".join(_words(subject, shown, j))))
-        parts.append(figures.drawn("slices", partial(figures.slices, subject, j, inputs)))
-        parts.append(figures.drawn("pairs", partial(figures.pairs, subject, j)))
+        parts.append(figures.drawn(partial(figures.slices, subject, j, inputs)))
+        parts.append(figures.drawn(partial(figures.pairs, subject, j)))
     held = figures.held(subject, inputs)
     notes = [tag("p", held, class_="note")] if held else []
     return join([*notes, *parts])
@@ -66,9 +66,7 @@ def trusted(subject: Subject) -> Markup:
     parts += [tag("p", words), table("What predictions rest on", head, rows)]
     inputs = figures.inputs_drawn(subject)
     for name, shown, found in shares:
-        parts.append(
-            figures.drawn("slices", partial(figures.trusts, found, shown.output, inputs, name))
-        )
+        parts.append(figures.drawn(partial(figures.trusts, found, shown.output, inputs, name)))
     over = "Over both inputs" if len(subject.inputs) == 2 else "Along each input"
     others = ", for all values of the others" if len(subject.inputs) > 2 else ""
     colours = "blue where it rests on the physics, orange on the data, grey on neither"

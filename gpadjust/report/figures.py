@@ -54,19 +54,22 @@ _STYLE: dict[str, Any] = {
 }
 _LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
+_FEW = 2  # outputs, above which slices have to do, or the page grows large
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _POINTS = 120  # of a curve
 _PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
 _NEEDLESS = re.compile(
-    r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)", flags=re.DOTALL
+    r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)|(?<=<g) id=\"[^\"]*\"",
+    flags=re.DOTALL,
 )
 _OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
 _PATH = re.compile(r"\b(?:d|x|y)='[^']*'")
+_SPACE = re.compile(r"\s*\n?([MLQCz])\s*")
 _BEHIND = re.compile(r"(\.\d\d)\d+")  # hundredths of a point are more than a screen shows
 _STYLES = ("--", "-.", ":")
 
 
-def drawn(kind: str, draw: Callable[[], list[Markup]]) -> Markup:
+def drawn(draw: Callable[[], list[Markup]]) -> Markup:
     """Figures side by side, or why there are none: a physics may fail where there are no data."""
     try:
         with rc_context(_STYLE), warnings.catch_warnings():
@@ -76,7 +79,7 @@ def drawn(kind: str, draw: Callable[[], list[Markup]]) -> Markup:
         return tag("p", f"No figure: {error.args[0]}", class_="caution")
     if not images:
         return Markup()
-    return tag("div", *(tag("figure", image) for image in images), class_=kind)
+    return tag("div", *(tag("figure", image) for image in images), class_="figures")
 
 
 def inputs_drawn(subject: Subject) -> list[int]:
@@ -135,16 +138,16 @@ def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
 def pairs(subject: Subject, output: int) -> list[Markup]:
     """The mean and sd of rho and delta over both of two inputs."""
     shown = subject.adjusted[output]
-    if shown is None or len(subject.inputs) != 2:
+    if shown is None or len(subject.inputs) != 2 or len(subject.outputs) > _FEW:
         return []
     terms = [name for name in shown.model.term_names if name != "f"]
-    figures = [Figure(figsize=(2 * _WIDTH, 2.9), layout="constrained") for _ in terms]
-    axes = [figure.subplots(1, 2) for figure in figures]
+    figures = [Figure(figsize=(_WIDTH, 2.9), layout="constrained") for _ in range(2 * len(terms))]
+    axes = np.array([figure.subplots() for figure in figures]).reshape(-1, 2)
     if terms:
-        plot_adjustment_pair(shown.model, output=shown.output, axes=np.array(axes), num_points=20)
+        plot_adjustment_pair(shown.model, output=shown.output, axes=axes, num_points=20)
     of = f"over {' and '.join(subject.inputs)}"
-    pair = zip(figures, terms, strict=True)
-    return [image(figure, f"mean and standard deviation of {name} {of}") for figure, name in pair]
+    alts = [f"{what} of {name} {of}" for name in terms for what in ("mean", "standard deviation")]
+    return [image(figure, alt, pixels=True) for figure, alt in zip(figures, alts, strict=True)]
 
 
 def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> list[Markup]:
@@ -195,20 +198,25 @@ def held(subject: Subject, inputs: list[int]) -> str:
     return f"Along each input the others stay at the median of the data: {', '.join(pairs)}{few}."
 
 
-def image(figure: Figure, alt: str) -> Markup:
-    """A figure as an image in the page: curves as they are, or many points as pixels."""
+def image(figure: Figure, alt: str, *, pixels: bool = False) -> Markup:
+    """A figure as an image in the page: as curves, or many points or areas as pixels."""
+    source = "" if pixels else _curves(figure)
+    if pixels or len(source) > _LARGE:
+        buffer = BytesIO()
+        figure.savefig(buffer, format="png", dpi=180)
+        raster = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
+        source = min(source or raster, raster, key=len)
+    width, height = (str(round(96 * size)) for size in figure.get_size_inches())
+    return tag("img", src=Markup(source), alt=alt, width=width, height=height)
+
+
+def _curves(figure: Figure) -> str:
+    """A figure as SVG, without what a page does not need."""
     buffer = BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
-    text = _PATH.sub(lambda path: _BEHIND.sub(r"\1", path[0]), text)
-    source = f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
-    if len(text) > _LARGE:
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=180)
-        pixels = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
-        source = min(source, pixels, key=len)
-    width, height = (str(round(96 * size)) for size in figure.get_size_inches())
-    return tag("img", src=Markup(source), alt=alt, width=width, height=height)
+    text = _PATH.sub(lambda path: _SPACE.sub(r"\1", _BEHIND.sub(r"\1", path[0])), text)
+    return f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
 
 
 def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:

@@ -81,7 +81,7 @@ def read():
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leaves the figures out, which take most of the time."""
-    monkeypatch.setattr("gpadjust.report.figures.drawn", lambda kind, draw: Markup())
+    monkeypatch.setattr("gpadjust.report.figures.drawn", lambda draw: Markup())
 
 
 def f_p(X):
