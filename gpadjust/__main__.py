@@ -48,7 +48,12 @@ def parser() -> ArgumentParser:
         metavar="module:function",
         help="the physics: head of pump.py is pump:head. Several: give it again",
     )
-    add("--out", default="report.html", help="the page to write (%(default)s); the model beside it")
+    add(
+        "--out",
+        default="report.html",
+        metavar="page.html",
+        help="the page to write (%(default)s); the model beside it",
+    )
     add("--units", metavar="a=m,y=Pa", help='units, of columns that do not say them, as "a [m]"')
     add("--noise", metavar="0.1", help="known standard deviation of the outputs; or y=0.1,z=2")
     add(
@@ -58,10 +63,12 @@ def parser() -> ArgumentParser:
         help="compare structures, which tells whether the physics helps (the default); or one CKA "
         "alone, by full Bayes or at the likeliest hyper-parameters, which is quicker",
     )
-    add("--seed", type=int, default=0, help="of the fits (%(default)s)")
-    add("--delimiter", default=",", help='between two fields (","); ";" or tab, say')
-    add("--decimal", default=".", choices=(".", ","), help='the decimal mark (".")')
-    add("--title", help="the title of the page")
+    add("--seed", type=int, default=0, metavar="0", help="of the fits (%(default)s)")
+    add(
+        "--delimiter", default=",", metavar="mark", help='between two fields (","); ";" or tab, say'
+    )
+    add("--decimal", default=".", choices=(".", ","), metavar="mark", help='the decimal mark (".")')
+    add("--title", metavar="text", help="the title of the page")
     return main_parser
 
 

@@ -30,7 +30,7 @@ class CsvColumns:
         delimiter: What is between two fields.
         decimal: The decimal mark of its numbers, a point or a comma.
         hint: What to do about a column that is not there.
-        option: How errors write an option, such as ``"--{}"`` on a command line.
+        option: How errors write an option, such as ``"--{} {!r}"`` on a command line.
 
     Attributes:
         names: The names of all columns.
@@ -48,7 +48,7 @@ class CsvColumns:
         *,
         decimal: str = ".",
         hint: str = _OF_RECORDS,
-        option: str = "`{}`",
+        option: str = "`{}={!r}`",
     ) -> None:
         self.file, self.decimal = str(file), decimal
         self._hint, self._option = hint, option
@@ -143,7 +143,7 @@ class CsvColumns:
             return ""
         return (
             f" There seem to be {_OTHERS[marks[0]]} between its fields: say so by "
-            f"{self._option.format('delimiter')}."
+            f"{self._option.format('delimiter', marks[0])}."
         )
 
     def _refuse(self, line: int, column: int, expected: str, text: str) -> NoReturn:
@@ -163,7 +163,7 @@ class CsvColumns:
         if other not in text:
             return ""
         name = {",": "comma", ".": "point"}[other]
-        option = self._option.format("decimal")
+        option = self._option.format("decimal", other)
         return f" If this {name} is a decimal {name}, say so by {option}."
 
 

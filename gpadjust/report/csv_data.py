@@ -87,7 +87,7 @@ def read_csv(
         near = get_close_matches(Path(file).name, names, n=1)
         meant = f" Is it {near[0]!r}?" if near else ""
         raise FileNotFoundError(f"There is no file {file!r}.{meant}")
-    table = CsvColumns(file, delimiter, decimal=decimal, hint=_HINT, option="--{}")
+    table = CsvColumns(file, delimiter, decimal=decimal, hint=_HINT, option="--{} {!r}")
     headers = [_header(table.names, name) for name in (*inputs, *outputs)]
     if again := sorted({name for name in headers if headers.count(name) > 1}):
         raise ValueError(

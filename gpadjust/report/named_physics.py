@@ -22,6 +22,7 @@ from gpadjust.report.csv_data import CsvData
 
 _FORM = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 _SHOWN = 5
+_MOST = 12
 
 
 class NamedPhysics(NamedTuple):
@@ -53,7 +54,9 @@ def named_physics(paths: Sequence[str], data: CsvData) -> NamedPhysics:
         try:
             physics = array_physics(thing, data.X.to_numpy())
         except (TypeError, PhysicsError) as error:
-            raise ValueError(f"--physics {path}: {error}") from error
+            row = f" The first row is line {data.lines[0]} of the file."
+            where = row * isinstance(error, PhysicsError)
+            raise ValueError(f"--physics {path}: {error}{where}") from error
         _check(physics, path, data)
         short = name.rpartition(".")[2]
         key = path if short in parts else short
@@ -99,13 +102,19 @@ def _imported(path: str) -> Any:
     try:
         return attrgetter(name)(found)
     except AttributeError as error:
-        names = [each for each in vars(found) if not each.startswith("_")]
-        callables = [each for each in names if callable(getattr(found, each))]
-        near = get_close_matches(name, names, n=1)
+        own = [each for each, value in vars(found).items() if _is_physics_of(value, module)]
+        names = ", ".join([*own[:_MOST], "..."] if len(own) > _MOST else own)
+        near = get_close_matches(name, own, n=1)
         meant = f" Is it {near[0]!r}?" if near else ""
         raise ValueError(
-            f"{module} has no {name!r}; it has {', '.join(callables) or 'no functions'}.{meant}"
+            f"{module} has no {name!r}; it has {names or 'no functions'}.{meant}"
         ) from error
+
+
+def _is_physics_of(value: Any, module: str) -> bool:
+    """Whether it may be meant as a physics, and was not imported from elsewhere."""
+    own = getattr(value, "__module__", None) == module
+    return isinstance(value, Physics) or (own and callable(value))
 
 
 def _place(error: BaseException) -> str:

@@ -159,6 +159,15 @@ def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
     elif gain.shown < 0:
         first = f"With the physics, {name} is predicted worse than without it."
         rest = [numbers]
+    elif n < ENOUGH:
+        first = (
+            f"{plural(n, 'observation')} of {name} are too few to show whether the physics helps."
+        )
+        rest = [
+            numbers,
+            f"Of fewer than {ENOUGH} observations the standard error is itself unknown: neither is "
+            "it shown that the physics helps, nor that it does not.",
+        ]
     else:
         first = f"These data do not show whether the physics helps to predict {name}."
         rest = [
@@ -172,9 +181,6 @@ def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
                 "constants may do that by themselves: the best structure without such constants is "
                 "not shown to be better."
             )
-    if n < ENOUGH:
-        few = f"From {plural(n, 'observation')} a standard error is itself uncertain: take care."
-        rest.append(few)
     kind = {1: "yes", 0: "open", -1: "no"}[gain.shown]
     return _ANSWERS[gain.shown], kind, [first, *rest]
 

@@ -87,8 +87,12 @@ def checked_path(file: str | Path) -> Path:
         raise FileNotFoundError(f"There is no folder {str(path.parent)!r} to write {path.name} to.")
     if path.is_dir():
         raise IsADirectoryError(f"{str(path)!r} is a folder; give the name of a file.")
-    with TemporaryDirectory(prefix=".report-", dir=path.parent):
-        return path  # before the work rather than after it
+    try:  # before the work rather than after it
+        with TemporaryDirectory(prefix=".report-", dir=path.parent):
+            return path
+    except OSError as error:
+        folder = str(path.parent.absolute())
+        raise type(error)(f"Nothing can be written to {folder!r}: {error.strerror}.") from error
 
 
 def write(

@@ -110,7 +110,8 @@ def _gains(
         text = _elpd(physics.elpd, physics.se, physics.structure, "without it", physics.without)
         if physics.shown <= 0:
             says = "makes predictions worse" if physics.shown < 0 else "is not shown to help"
-            by_constants = sign_of(physics.elpd, physics.se) > 0
+            enough = len(density[physics.structure]) >= ENOUGH
+            by_constants = enough and sign_of(physics.elpd, physics.se) > 0
             alone = "; its unknown constants may do so by themselves" if by_constants else ""
             return [f"The physics {says}: {text}{alone}."]
         sentences.append(f"The physics helps: {text}.")

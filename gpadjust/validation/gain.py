@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from gpadjust.validation.ranking import difference, sign_of
+from gpadjust.validation.ranking import ENOUGH, difference, sign_of
 from gpadjust.validation.structures import Structure
 
 
@@ -22,7 +22,7 @@ class Gain(NamedTuple):
             themselves, if that is shown to be better.
         without: The structure without the physics.
         shown: 1 if the physics is shown to help, -1 if it is shown to make predictions worse, and
-            0 if neither is, by two standard errors.
+            0 if neither is, by two standard errors, or there are fewer than eight observations.
     """
 
     elpd: float
@@ -47,9 +47,10 @@ def physics_gain(
     others = [name for name in names if not structures[name].uses_physics]
     if not (physical and others):
         return None
+    shows = len(density[physical[0]]) >= ENOUGH  # of fewer the error is itself unknown
     fair = next((name for name in physical if not structures[name].unknowns), physical[0])
     elpd, se = difference(density[fair], density[others[0]])
-    if sign_of(elpd, se) > 0:
+    if shows and sign_of(elpd, se) > 0:
         return Gain(elpd, se, fair, others[0], 1)
     elpd, se = difference(density[physical[0]], density[others[0]])
-    return Gain(elpd, se, physical[0], others[0], min(sign_of(elpd, se), 0))
+    return Gain(elpd, se, physical[0], others[0], min(sign_of(elpd, se), 0) if shows else 0)

@@ -40,8 +40,8 @@ def test_decimal_marks(columns, decimal, text, value):
 @pytest.mark.parametrize(
     ("decimal", "text", "hint"),
     [
-        (".", "1,5", "If this comma is a decimal comma, say so by `decimal`."),
-        (",", "1.5", "If this point is a decimal point, say so by `decimal`."),
+        (".", "1,5", "If this comma is a decimal comma, say so by `decimal=','`."),
+        (",", "1.5", "If this point is a decimal point, say so by `decimal='.'`."),
         (",", "1.234,5", "leave the line out."),
         (".", "1_000", "leave the line out."),
         (".", "1,5 m", "leave the line out."),
@@ -66,6 +66,6 @@ def test_a_column_that_is_not_there_has_the_likest_name(columns):
 @pytest.mark.parametrize(("mark", "name"), [(";", "semicolons"), ("\t", "tabs"), ("|", "bars")])
 def test_another_delimiter_is_told(columns, mark, name):
     with pytest.raises(ValueError, match=f"seem to be {name} .* say so by --delimiter"):
-        columns(f"x{mark}y\n1{mark}2\n", option="--{}").numbers("x")
+        columns(f"x{mark}y\n1{mark}2\n", option="--{} {!r}").numbers("x")
     with pytest.raises(ValueError, match=f"expected 1 fields.* seem to be {name}"):
         columns(f"x{mark}y\n1{mark}2,5\n")

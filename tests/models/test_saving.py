@@ -108,6 +108,23 @@ def test_a_state_of_another_model_changes_nothing(uniform):
     torch.testing.assert_close(model.predict(Z), before)
 
 
+def test_whether_it_is_fitted_is_known_of_a_loaded_model(uniform, path):
+    X, Y, _ = problem(uniform)
+    model = CKA(X, Y, physics=relu)
+    save(model, path)
+    assert not model.is_fitted
+    assert not load(path).is_fitted
+    with torch.no_grad():
+        model.likelihood.noise_covar.raw_noise += 0.1
+    save(model, path)
+    assert model.is_fitted
+    assert load(path).is_fitted
+    known = CKA(X, Y, physics=relu)
+    for parameter in known.parameters():
+        parameter.requires_grad_(False)
+    assert known.is_fitted  # as nothing is to be learnt
+
+
 def test_a_stacked_model_comes_back(uniform, path):
     X, Y, Z = problem(uniform)
     models = {name: BUILDS[name](X, Y) for name in ("learnt centre", "zero mean")}

@@ -84,7 +84,7 @@ def _fails(capsys, *options, physics="hill:wave"):
 BAD_TABLES = {
     "": "found an empty file",
     "time,head\n": "found only a line of names",
-    "time;head\n0;1\n1;2\n": "semicolons between its fields: say so by --delimiter",
+    "time;head\n0;1\n1;2\n": "semicolons between its fields: say so by --delimiter ';'",
     "time,pressure\n0,1\n": r"line 1: expected a column 'head', found 'time', 'pressure'",
     "time,Head [m]\n0,1\n": r"Is it 'Head \[m\]'\?",
     "time,head,head\n0,1,2\n": "line 1: expected one column 'head', found columns 2 and 3",
@@ -92,7 +92,7 @@ BAD_TABLES = {
     "time,head\n0,1\n,2\n": r"line 3, column 1 \('time'\): expected a number, found ''",
     "time,head\nnan,1\n1,2\n": r"line 2, column 1 \('time'\): expected a number, found 'nan'",
     "time,head\n0,inf\n1,2\n": r"line 2, column 2 \('head'\): .*found 'inf'",
-    'time,head\n0,"1,5"\n1,2\n': "If this comma is a decimal comma, say so by --decimal",
+    'time,head\n0,"1,5"\n1,2\n': "If this comma is a decimal comma, say so by --decimal ','",
     "time,head\n0,1\n1,2,3\n": "line 3: expected 2 fields, one for each name, found 3",
     "time,head\n0,1\n1,\n": "expected two rows or more with a number in 'head', found 1",
 }
