@@ -6,6 +6,7 @@ from functools import partial
 
 from gpadjust.physics import PhysicsError
 from gpadjust.report import figures
+from gpadjust.report.images import drawn
 from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.numbers import listed, number, percent, with_unit
 from gpadjust.report.subject import Adjusted, Subject
@@ -30,8 +31,8 @@ def where_wrong(subject: Subject) -> Markup:
             parts.append(tag("h3", name))
         shown = subject.adjusted[j]
         parts.append(tag("p", " ".join(_words(subject, shown, j))))
-        parts.append(figures.drawn(partial(figures.slices, subject, j, inputs)))
-        parts.append(figures.drawn(partial(figures.pairs, subject, j)))
+        parts.append(drawn(partial(figures.slices, subject, j, inputs)))
+        parts.append(drawn(partial(figures.pairs, subject, j)))
     held = figures.held(subject, inputs)
     notes = [tag("p", held, class_="note")] if held else []
     return join([*notes, *parts])
@@ -66,11 +67,11 @@ def trusted(subject: Subject) -> Markup:
     parts += [tag("p", words), table("What predictions rest on", head, rows)]
     inputs = figures.inputs_drawn(subject)
     for name, shown, found in shares:
-        parts.append(figures.drawn(partial(figures.trusts, found, shown.output, inputs, name)))
-    over = "Over both inputs" if len(subject.inputs) == 2 else "Along each input"
-    others = ", for all values of the others" if len(subject.inputs) > 2 else ""
+        parts.append(drawn(partial(figures.trusts, found, shown.output, inputs, name)))
+    over = {1: "Along the input", 2: "Over both inputs"}.get(len(subject.inputs))
+    over = over or "Along each input, for all values of the others"
     colours = "blue where it rests on the physics, orange on the data, grey on neither"
-    parts.append(tag("p", f"{over}{others}: {colours}.", class_="note"))
+    parts.append(tag("p", f"{over}: {colours}.", class_="note"))
     return join(parts)
 
 

@@ -1,23 +1,18 @@
-"""Figures as images that are part of the page."""
+"""The figures of the page."""
 
 from __future__ import annotations
 
 import re
-import warnings
-from base64 import b64encode
-from collections.abc import Callable
-from io import BytesIO
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import torch
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from gpadjust.physics import PhysicsError
-from gpadjust.report.markup import Markup, tag
+from gpadjust.report.images import image
+from gpadjust.report.markup import Markup
 from gpadjust.report.numbers import number, with_unit
 from gpadjust.report.subject import Subject
 from gpadjust.validation.plots import (
@@ -41,47 +36,14 @@ from gpadjust.validation.plots.drawing import (
 )
 from gpadjust.validation.trust import Trust
 
-_STYLE: dict[str, Any] = {
-    "font.size": 9.5,
-    "axes.labelsize": 9.5,
-    "axes.titlesize": 9.5,
-    "axes.linewidth": 0.7,
-    "legend.fontsize": 8.5,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "gpadjust",
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-}
-_LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
 _MOST = 12  # inputs along which slices are drawn, in all outputs together
 _FEW = 2  # outputs, above which slices have to do, or the page grows large
 _WIDTH = 3.6  # inches: as wide as a column of the page, so that text has its size
 _POINTS = 120  # of a curve
-_PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
-_NEEDLESS = re.compile(
-    r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)|(?<=<g) id=\"[^\"]*\"",
-    flags=re.DOTALL,
-)
-_OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
-_PATH = re.compile(r"\b(?:d|x|y)='[^']*'")
-_SPACE = re.compile(r"\s*\n?([MLQCz])\s*")
-_BEHIND = re.compile(r"(\.\d\d)\d+")  # hundredths of a point are more than a screen shows
 _STYLES = ("--", "-.", ":")
 
 
-def drawn(draw: Callable[[], list[Markup]]) -> Markup:
-    """Figures side by side, or why there are none: a physics may fail where there are no data."""
-    try:
-        with rc_context(_STYLE), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=_OF_FONTS)
-            images = draw()
-    except PhysicsError as error:
-        return tag("p", f"No figure: {error.args[0]}", class_="caution")
-    if not images:
-        return Markup()
-    return tag("div", *(tag("figure", image) for image in images), class_="figures")
-
-
+@torch.no_grad()
 def inputs_drawn(subject: Subject) -> list[int]:
     """The inputs along which slices are drawn: all, or those that move the predictions most."""
     d, m = len(subject.inputs), len(subject.outputs)
@@ -198,27 +160,6 @@ def held(subject: Subject, inputs: list[int]) -> str:
     return f"Along each input the others stay at the median of the data: {', '.join(pairs)}{few}."
 
 
-def image(figure: Figure, alt: str, *, pixels: bool = False) -> Markup:
-    """A figure as an image in the page: as curves, or many points or areas as pixels."""
-    source = "" if pixels else _curves(figure)
-    if pixels or len(source) > _LARGE:
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=180)
-        raster = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
-        source = min(source or raster, raster, key=len)
-    width, height = (str(round(96 * size)) for size in figure.get_size_inches())
-    return tag("img", src=Markup(source), alt=alt, width=width, height=height)
-
-
-def _curves(figure: Figure) -> str:
-    """A figure as SVG, without what a page does not need."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
-    text = _PATH.sub(lambda path: _SPACE.sub(r"\1", _BEHIND.sub(r"\1", path[0])), text)
-    return f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"
-
-
 def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
     low, high = subject.X[:, i].min(), subject.X[:, i].max()
     pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
@@ -230,7 +171,7 @@ def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:
     X = _slice(subject, i, _POINTS)
     x = X[:, i]
-    mean, half = mean_and_half_width(_Moments(*subject.model.predict(X)), output, 0.95)
+    mean, half = mean_and_half_width(subject.model.predict(X), output, 0.95)
     band(ax, x, mean, half, 0.95)
     curves = subject.physics_at(X, output)
     for k, (name, values) in enumerate(curves):
@@ -248,10 +189,3 @@ def _without_legend(ax: Any) -> None:
     """The page says what is drawn, once for all figures."""
     if ax.get_legend() is not None:
         ax.get_legend().remove()
-
-
-class _Moments:
-    """Means and variances, as of a posterior."""
-
-    def __init__(self, mean: Tensor, variance: Tensor) -> None:
-        self.mean, self.variance = mean, variance

@@ -7,6 +7,7 @@ from functools import partial
 from scipy.stats import binom
 
 from gpadjust.report import figures
+from gpadjust.report.images import drawn
 from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.numbers import name_and_unit, number, percent, plural, with_unit
 from gpadjust.report.subject import Subject
@@ -30,7 +31,7 @@ def predictions(subject: Subject) -> Markup:
         )
         parts += [
             tag("p", words),
-            figures.drawn(partial(figures.left_out, subject, j)),
+            drawn(partial(figures.left_out, subject, j)),
             _worst(subject, j),
         ]
     return join(parts)
@@ -48,7 +49,7 @@ def calibration(subject: Subject) -> Markup:
             says = "too narrow" if held < low else "too wide" if held > high else "in that range"
             cells = [f"{held} of {n}", percent(share), f"{low} to {high} of {n}", says]
             rows.append([f"{name}, {percent(level)}", *cells])
-        parts.append(figures.drawn(partial(figures.calibration, subject, j)))
+        parts.append(drawn(partial(figures.calibration, subject, j)))
     head = ["interval", "holds", "share", "if calibrated", "the intervals are"]
     words = (
         "If intervals are honest, those of 95 % hold 95 % of left-out observations, but for "

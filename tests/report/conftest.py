@@ -81,7 +81,8 @@ def read():
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leaves the figures out, which take most of the time."""
-    monkeypatch.setattr("gpadjust.report.figures.drawn", lambda draw: Markup())
+    for module in ("adjustment", "left_out"):
+        monkeypatch.setattr(f"gpadjust.report.{module}.drawn", lambda draw: Markup())
 
 
 def f_p(X):

@@ -76,7 +76,7 @@ def test_the_code_in_the_page_predicts_as_the_model(
     assert names["lower"] < mean < names["upper"]
 
 
-def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch):
+def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undrawn):
     X = torch.rand(7, 2, dtype=torch.float64)
     model = CKA(X, X.sum(-1, keepdim=True).sin(), physics=lambda X: X[:, :1])
     model.output_names = ("p [Pa]",)
