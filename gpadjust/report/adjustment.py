@@ -10,12 +10,11 @@ from gpadjust.report.images import drawn
 from gpadjust.report.markup import Markup, join, table, tag
 from gpadjust.report.numbers import listed, number, percent, with_unit
 from gpadjust.report.subject import Adjusted, Subject
+from gpadjust.report.verdict import spread_of
 from gpadjust.validation import Trust, trust
 
-_BANDS = (
-    "Solid lines are means, bands hold 95 % (of the function, without the noise of measurements), "
-    "ticks at the bottom are the data."
-)
+_BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
+_ROUNDING = 1e-9  # of the observations' standard deviation
 _APART = (
     "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
     "data tell far less surely than their sum."
@@ -106,9 +105,14 @@ def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
     found.append(f"Topmost: {top}.")
     if terms:
         weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
+        means = [shown.model.term_mean(term, shown.output) for term in terms]
+        means = [
+            0.0 if abs(mean) < _ROUNDING * spread_of(subject, output) else mean for mean in means
+        ]
+        back = [f"{term} = {number(mean)}" for term, mean in zip(terms, means, strict=True)]
         found.append(
-            f"Below: {listed(terms)} of {shown.structure}{weight}; dashed, what leaves the "
-            "physics as it is."
+            f"Below: {listed(terms)} of {shown.structure}{weight}, with ticks at the data; dashed, "
+            f"what they fall back to without data, {listed(back)}."
         )
         if len(terms) > 1:
             found.append(_APART)

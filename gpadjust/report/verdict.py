@@ -117,7 +117,7 @@ def advice(subject: Subject, notes: list[str]) -> Markup:
     """What the comparison says in sentences, and warnings of the fit."""
     told = [] if subject.comparison is None else subject.comparison.advice
     sentences = [text.replace("+-", "±") for text in (*told, *notes)]
-    return bullets(sentences) if sentences else tag("p", "There is nothing more to say.")
+    return bullets(sentences) if sentences else Markup()
 
 
 def headline(subject: Subject) -> str:
@@ -197,7 +197,8 @@ def _not_asked(subject: Subject) -> str:
     if subject.comparison is None:
         return (
             "This is a report of one model; whether the physics helps takes a comparison with a "
-            "model that has none: report(compare(train_X, train_Y, physics))."
+            "model that has none: report(compare(train_X, train_Y, physics)), or the command without "
+            "--fit."
         )
     return (
         "The comparison has no structure without the physics, or none with it; add 'zero mean' to "

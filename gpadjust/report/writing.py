@@ -40,7 +40,8 @@ def report(
     Args:
         model: A fitted model, a :class:`~gpadjust.StackedGP`, or a :class:`~gpadjust.Comparison`,
             of which what it recommends is saved.
-        file: Where to write the page, ``*.html``. A file that is there is replaced.
+        file: Where to write the page, ``*.html``. Files that are there, this and the model's, are
+            replaced.
         title: The title. Default: the names of the outputs.
         rows: What to call each observation, ``n``, such as its line in your file. Default: by its
             number, from 0.
