@@ -197,8 +197,8 @@ def _not_asked(subject: Subject) -> str:
     if subject.comparison is None:
         return (
             "This is a report of one model; whether the physics helps takes a comparison with a "
-            "model that has none: report(compare(train_X, train_Y, physics)), or the command without "
-            "--fit."
+            "model that has none: report(compare(train_X, train_Y, physics)), or the command "
+            "without --fit."
         )
     return (
         "The comparison has no structure without the physics, or none with it; add 'zero mean' to "
