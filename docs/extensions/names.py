@@ -75,10 +75,27 @@ def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
         getLogger("docs").warning("%s has no entry: give it a docstring", name)
 
 
+def mend_ways_back(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: document | None
+) -> None:
+    """Lead from the source to the entry also where viewcode mistakes the module of its name."""
+    entries, module = app.env.get_domain("py").objects, page.removeprefix("_modules/")
+
+    def mended(anchor: re.Match[str]) -> str:
+        parts = anchor[1].split(".")
+        ends = [".".join(parts[i:]) for i in range(1, len(parts))]
+        names = [anchor[1], *(f"{module.replace('/', '.')}.{end}" for end in ends)]
+        return f'#{next(name for name in names if name in entries)}"'
+
+    if page.startswith("_modules/gpadjust/"):
+        context["body"] = re.sub(r'(?<=html)#(gpadjust[\w.]*)"', mended, context["body"])
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the hooks."""
     app.connect("doctree-read", link_literals)
     app.connect("missing-reference", link_other_names)
     app.connect("autodoc-skip-member", skip_field_aliases)
     app.connect("env-check-consistency", check_complete)
+    app.connect("html-page-context", mend_ways_back)
     return {"parallel_read_safe": True}
