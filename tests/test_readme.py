@@ -1,4 +1,4 @@
-"""What the README shows runs, and its commands are those of CI."""
+"""What the README and the guide show runs."""
 
 import math
 import re
@@ -11,12 +11,31 @@ from gpadjust import CKA
 from gpadjust.control import CrossEntropy, Planner
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
+WITH_DATA = {"check", "control", "measure", "records", "saving"}  # pages that are tested below
+GUIDE = [p for p in sorted((ROOT / "docs" / "guide").glob("*.md")) if p.stem not in WITH_DATA]
+FIRST = [ROOT / "docs" / "start.md", ROOT / "docs" / "install.md"]
+
+
+def blocks(name):
+    """The Python blocks of a document, by its path in the repository."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(), flags=re.DOTALL)
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 250
+
+
+@pytest.mark.parametrize("page", [*FIRST, *GUIDE], ids=lambda page: page.stem)
+def test_each_page_runs_by_itself(page):
+    names = {}
+    for block in blocks(page):
+        exec(block, names)
 
 
 def test_the_examples_run(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    first, held, second, *_ = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    (first,), (held,) = blocks("README.md"), blocks("docs/guide/saving.md")
+    (second,) = blocks("docs/guide/check.md")
     names = {}
     exec(first, names)
     truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
@@ -37,7 +56,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
 
 def test_measuring(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[3]
+    (code,) = blocks("docs/guide/measure.md")
     names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
     exec(code, names)
     X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
@@ -48,7 +67,7 @@ def test_measuring(tmp_path, monkeypatch):
 
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    law, log = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[4:6]
+    (law,), (log,) = blocks("docs/guide/parameters.md"), blocks("docs/guide/records.md")
     names = {}
     exec(law, names)
     truth = torch.tensor([0.19, 3.65, 0.1], dtype=torch.float64)  # inertia, moment, friction
@@ -70,7 +89,7 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[6:]
+    code, again = blocks("docs/guide/control.md")
     assert "=2 * 25" in code
     quick = "Planner(search=CrossEntropy(1), horizon=3, num_random=16)"
     code = code.replace("=2 * 25", "=25").replace(

@@ -32,14 +32,16 @@ for room in ROOMS:  # autodoc looks for them in the room's __init__ alone
             docs["", name] = CONSTANTS[id(getattr(room, name))]
 
 
-LITERALS = {entry.rpartition(".")[2]: entry for entry in ENTRIES.values()}
+WORDS = re.compile(r"collect|compare|smooth|fit\(model")
+LITERALS = {n: ENTRIES[id(getattr(room, n))] for room in ROOMS for n in room.__all__}
 
 
 def link_literals(app: Sphinx, document: document) -> None:
     """Link code in a line that is a public name, or a call of one, such as ``CKA(...)``."""
     for node in list(document.findall(literal)):
-        name = re.sub(r"\(.*", "", node.astext(), flags=re.DOTALL).rpartition(".")[2]
-        if name not in LITERALS or name.isidentifier() and name.islower() and "_" not in name:
+        text = node.astext()
+        name = re.sub(r"\(.*", "", text, flags=re.DOTALL).rpartition(".")[2]
+        if name not in LITERALS or name.islower() and "_" not in name and not WORDS.match(text):
             continue  # words such as fit and score are methods of others, too
         if isinstance(node.parent, reference | title | pending_xref):
             continue
