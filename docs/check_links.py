@@ -1,6 +1,6 @@
 """Check a built site: python docs/check_links.py docs/_build.
 
-Each link inside it leads to a file and an anchor that exist, and nothing is loaded from another host.
+Each link inside it leads to a file and an anchor, and nothing is loaded from another host.
 """
 
 import re
@@ -47,11 +47,13 @@ def problems(site: Path) -> list[str]:
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             if not target.is_file():
                 found.append(f"{path.name} links to {link}, which does not exist")
-            elif target in pages and parts.fragment:
-                if unquote(parts.fragment) not in pages[target].anchors:
-                    found.append(f"{path.name} links to {link}, which has no such anchor")
+                continue
+            anchors = pages[target].anchors if target in pages else set()
+            if target in pages and parts.fragment and unquote(parts.fragment) not in anchors:
+                found.append(f"{path.name} links to {link}, which has no such anchor")
+    elsewhere = r"""(?:url\(|@import)\s*["']?((?:https?:)?//[^"')]+)"""
     for path in site.rglob("*.css"):
-        loaded = re.findall(r"(?:url\(|@import)\s*[\"']?((?:https?:)?//[^\"')]+)", path.read_text())
+        loaded = re.findall(elsewhere, path.read_text())
         found += [f"{path.name} loads {link}" for link in loaded]
     print(f"{len(pages)} pages, {links} internal links: {len(found)} problems")
     return found

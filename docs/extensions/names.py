@@ -41,8 +41,9 @@ def link_literals(app: Sphinx, document: document) -> None:
     for node in list(document.findall(literal)):
         text = node.astext()
         name = re.sub(r"\(.*", "", text, flags=re.DOTALL).rpartition(".")[2]
-        if name not in LITERALS or name.islower() and "_" not in name and not WORDS.match(text):
-            continue  # words such as fit and score are methods of others, too
+        plain = name.islower() and "_" not in name  # fit and score are methods of others, too
+        if name not in LITERALS or (plain and not WORDS.match(text)):
+            continue
         if isinstance(node.parent, reference | title | pending_xref):
             continue
         target = {"refdomain": "py", "reftype": "obj", "reftarget": LITERALS[name]}

@@ -1,7 +1,8 @@
 """Pages that are kept elsewhere: the tutorials, the paper's results, CONTRIBUTING and CHANGELOG.
 
-`assemble` copies them beside the other pages, where git ignores them. Links in Markdown and in notebooks are those of
-the repository, so that they work there, too; `localise` turns them into the site's as Sphinx reads a page.
+`assemble` copies them beside the other pages, where git ignores them. Links in Markdown and in
+notebooks are those of the repository, so that they work there, too; `localise` turns them into the
+site's as Sphinx reads a page.
 """
 
 import base64
@@ -77,7 +78,8 @@ def gallery(text: str) -> str:
     cards = [CARD.format(number=n, title=t, stem=s, text=text) for n, t, s, text in rows]
     grid = "\n".join(["::::{grid} 1 2 2 3", ":gutter: 3", *cards, "::::"])
     tree = "\n".join(["```{toctree}", ":hidden:", *(stem for _, _, stem, _ in rows), "```"])
-    return re.sub(r"^\|.*^\|.*?$", lambda _: f"{grid}\n\n{tree}", text, 1, re.MULTILINE | re.DOTALL)
+    table = re.search(r"^\|.*^\|.*?$", text, re.MULTILINE | re.DOTALL)
+    return text.replace(table[0], f"{grid}\n\n{tree}")
 
 
 def split_results(text: str) -> None:
