@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gpadjust import CKA
+import gpadjust
+from gpadjust import CKA, FunctionPhysics, Unknown
 from gpadjust.control import CrossEntropy, Planner
 
 ROOT = Path(__file__).parents[1]
@@ -52,6 +53,42 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
         names["comparison"].recommended.predict(names["test_X"]).mean - truth
     ).abs().max() < 1e-2
     assert names["loo"].rmse < 1e-2
+
+
+def abilities(name):
+    """Samples, rho, delta, several physics, unknown parameters: what a model has of these."""
+    X = torch.linspace(0.1, 1, 6, dtype=torch.float64).unsqueeze(-1)
+    unknown = FunctionPhysics(lambda X, p: p.a[:, None] * X, unknowns={"a": Unknown(1.0, sd=0.5)})
+    options = {"bounds": [[0.0], [1.0]]} if name == "AR1" else {}
+
+    def made(physics):
+        return getattr(gpadjust, name)(X, X.exp(), physics=physics, **options)
+
+    if name == "ZeroMeanGP":
+        model = gpadjust.ZeroMeanGP(X, X.exp())
+    else:
+        model = made(unknown if name == "CalibratedPhysics" else torch.sin)
+    tries = [
+        lambda: gpadjust.fit(model).draws,
+        lambda: model.rho(X),
+        lambda: model.delta(X),
+        lambda: made({"sine": torch.sin, "line": torch.abs if name == "AR1" else unknown}),
+        lambda: made(unknown),
+    ]
+    for each in tries:
+        try:
+            each()
+            yield "yes"
+        except (AttributeError, TypeError, ValueError):
+            yield "no"
+
+
+def test_the_models_can_do_what_the_guide_says():
+    text = (ROOT / "docs" / "guide" / "models.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (yes .*) \|$", text, flags=re.MULTILINE)
+    assert len(rows) == 7
+    for name, marks in rows:
+        assert list(abilities(name)) == marks.split(" | "), name
 
 
 def test_measuring(tmp_path, monkeypatch):

@@ -84,6 +84,7 @@ def gallery(text: str) -> str:
 
 def split_results(text: str) -> None:
     """A page for each section of the paper's README, a first one for what is before them."""
+    text = text.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")  # in cells of tables
     first, *sections = re.split(r"^(?=## )", text, flags=re.MULTILINE)
     names = []
     for section in sections:
