@@ -30,6 +30,7 @@ COPIES = {  # files of the repository that are pages of the site
     **{path: f"tutorials/{path.name}" for path in NOTEBOOKS},
 }
 ORIGINS = {place.rpartition(".")[0]: path for path, place in COPIES.items()}
+WRITTEN: set[Path] = set()
 ANCHORS: dict[str, str] = {}  # of the paper's results, and the page that each is on
 
 CARD = """:::{{grid-item-card}} {number}. {title}
@@ -43,17 +44,22 @@ CARD = """:::{{grid-item-card}} {number}. {title}
 
 def assemble() -> None:
     """Write the pages that are kept elsewhere into the folder of the site."""
-    for path, place in COPIES.items():
-        write(place, path.read_text())
+    for path in COPIES.keys() - {TUTORIALS, *NOTEBOOKS}:
+        write(COPIES[path], path.read_text())
     for path in NOTEBOOKS:
         add_notebook(path)
     write(COPIES[TUTORIALS], gallery(TUTORIALS.read_text()))
     split_results(PAPER.read_text())
+    for folder in ("tutorials", "paper"):  # what a former build wrote of pages that are no more
+        for path in (DOCS / folder).rglob("*.*"):
+            if path not in WRITTEN:
+                path.unlink()
 
 
 def write(place: str, content: str | bytes) -> None:
     """Write a page or picture, unless it is there: Sphinx reads anew what has changed."""
     path = DOCS / place
+    WRITTEN.add(path)
     data = content.encode() if isinstance(content, str) else content
     if not path.exists() or path.read_bytes() != data:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,8 +114,10 @@ def localise(app: Sphinx, page: str, source: list[str]) -> None:
 
 def place(origin: Path, link: str, anchor: str) -> str:
     """Where a link of the repository leads to on the site."""
-    target = (origin.parent / link).resolve() if link else origin
     end = f"#{anchor}" if anchor else ""
+    if not link and not anchor:
+        return ""
+    target = (origin.parent / link).resolve() if link else origin
     if target == PAPER:
         return f"/paper/{ANCHORS[anchor] if anchor else 'index'}.md{end}"
     if not link or not target.is_file():
