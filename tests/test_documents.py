@@ -23,6 +23,7 @@ TOOLS = {"ruff", "mypy", "sphinx-build", "twine"}  # of the extra `dev`
 BUILT = {"docs/_build", "docs/_build/index.html"}
 PICTURES = "tutorials/pictures/"  # taken from the notebooks as the site is built
 REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.rst"))
+EXAMPLES = [p for p in sorted((ROOT / "docs").rglob("*.rst")) if "_build" not in p.parts]
 
 each_document = pytest.mark.parametrize("name", DOCUMENTS)
 
@@ -115,7 +116,7 @@ def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
     assert sorted(listed) == sorted(gpadjust.__all__)
 
 
-@pytest.mark.parametrize("page", REFERENCE, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.stem)
 def test_the_examples_of_the_reference_run(page):
     assert not doctest.testfile(str(page), module_relative=False).failed
 

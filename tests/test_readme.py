@@ -27,10 +27,15 @@ def test_the_readme_is_short():
 
 
 @pytest.mark.parametrize("page", [*FIRST, *GUIDE], ids=lambda page: page.stem)
-def test_each_page_runs_by_itself(page):
+def test_each_page_runs_by_itself(page, capsys):
     names = {}
     for block in blocks(page):
         exec(block, names)
+    shown = re.findall(r"```text\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    words = re.compile(r"[^\W\d]+")  # its numbers are those of one machine
+    if shown:
+        printed = capsys.readouterr().out
+        assert sorted(words.findall(printed)) == sorted(words.findall("".join(shown)))
 
 
 def test_the_examples_run(capsys, tmp_path, monkeypatch):
