@@ -31,6 +31,7 @@ COPIES = {  # files of the repository that are pages of the site
 }
 ORIGINS = {place.rpartition(".")[0]: path for path, place in COPIES.items()}
 WRITTEN: set[Path] = set()
+MARKER = r"^<!-- (\S+:\S+) -->$"  # of a table, to which pages may link
 ANCHORS: dict[str, str] = {}  # of the paper's results, and the page that each is on
 
 CARD = """:::{{grid-item-card}} {number}. {title}
@@ -95,12 +96,14 @@ def split_results(text: str) -> None:
     names = []
     for section in sections:
         titles = re.findall(r"^#+ (.+)$", section, re.MULTILINE)
+        tables = re.findall(MARKER, section, re.MULTILINE)
         names.append(slugify(titles[0]))
-        ANCHORS.update(dict.fromkeys(map(slugify, titles), names[-1]))
+        ANCHORS.update(dict.fromkeys([*map(slugify, titles), *tables], names[-1]))
     ANCHORS[slugify(first.partition("\n")[0].strip("# "))] = "index"
     tree = "\n".join(["```{toctree}", ":maxdepth: 1", *names, "records", "```", ""])
     for name, content in zip(["index", *names], [first + tree, *sections], strict=True):
-        write(f"paper/{name}.md", re.sub(r"^#(#+ )", r"\1", content, flags=re.MULTILINE))
+        page = re.sub(r"^#(#+ )", r"\1", content, flags=re.MULTILINE)
+        write(f"paper/{name}.md", re.sub(MARKER, r"(\1)=\n", page, flags=re.MULTILINE))
         ORIGINS[f"paper/{name}"] = PAPER
 
 
@@ -119,7 +122,7 @@ def place(origin: Path, link: str, anchor: str) -> str:
         return ""
     target = (origin.parent / link).resolve() if link else origin
     if target == PAPER:
-        return f"/paper/{ANCHORS[anchor] if anchor else 'index'}.md{end}"
+        return f"/paper/{ANCHORS[anchor] if anchor else 'index'}.md{end.lower()}"
     if not link or not target.is_file():
         return link + end
     if target in COPIES:
