@@ -198,7 +198,7 @@ class StackedGP(Model):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Posterior:
-        """The joint posterior at raw ``X`` (``... x q x d``), a mixture; see BoTorch."""
+        """The joint posterior at raw ``X`` (``batch_shape x q x d``), a mixture; see BoTorch."""
         if output_indices is not None:
             subset = self.subset_output(list(output_indices))
             return subset.posterior(X, None, observation_noise, posterior_transform)
