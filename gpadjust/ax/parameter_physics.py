@@ -40,13 +40,15 @@ class ParameterPhysics:
     """
 
     def __init__(self, physics: Any) -> None:
+        path = None
         if isinstance(physics, ParameterPhysics):
-            physics = physics.physics
+            path, physics = physics.path, physics.physics
         if isinstance(physics, str):
-            physics = physics_from_path(physics)
+            path, physics = physics, physics_from_path(physics)
             if type(physics) is FunctionPhysics:
                 physics = physics.function  # whose arguments may have names of parameters
         as_physics(physics)  # says what is expected
+        self._path = path
         self.physics: Physics | Callable[..., Tensor] = physics
         self._made: dict[tuple[str, ...], Physics] = {}
 
@@ -59,7 +61,7 @@ class ParameterPhysics:
     @property
     def path(self) -> str | None:
         """The import path by which it is saved; None if it has none, as a lambda."""
-        return import_path(self.physics)
+        return self._path or import_path(self.physics)
 
     def names_of(self, parameters: Sequence[str]) -> tuple[str, ...]:
         """The parameters that it reads, in its order.

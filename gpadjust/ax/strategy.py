@@ -50,7 +50,7 @@ def generator_kwargs(
     """
     if not isinstance(physics, Mapping) or not physics:
         raise TypeError(
-            "Expected the physics of at least one metric by its name, {'yield': f_p}, found "
+            "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
             f"{physics!r}."
         )
     fitted = {"mll_options": dict(fit_options or {})}
@@ -102,8 +102,8 @@ def generation_strategy(
         >>> client = Client()
         >>> time = RangeParameterConfig(name="time", parameter_type="float", bounds=(0, 10))
         >>> client.configure_experiment(parameters=[time])
-        >>> client.configure_optimization(objective="yield")
-        >>> strategy = generation_strategy({"yield": lambda time: 1 - (-time).exp()})
+        >>> client.configure_optimization(objective="conversion")
+        >>> strategy = generation_strategy({"conversion": lambda time: 1 - (-time).exp()})
         >>> client.set_generation_strategy(strategy)
         >>> strategy.name
         'Center+Sobol+MBM:CKA'

@@ -102,9 +102,7 @@ def _constant(name: str, value: float, columns: Columns) -> None:
     columns[name] = first.new_tensor(value)
 
 
-def _value_of(
-    name: str, values: Sequence[Any], one_hot: Sequence[str], columns: Columns
-) -> None:
+def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns: Columns) -> None:
     """A choice, of its number or of a column for each value, of which the largest counts."""
     if one_hot:
         index = torch.stack([columns.pop(each) for each in one_hot], dim=-1).argmax(-1)
@@ -150,7 +148,9 @@ def _one_hot(t: OneHot) -> list[Callable[[Columns], None]]:
 
 
 def _fixed(t: RemoveFixed) -> list[Callable[[Columns], None]]:
-    values = {n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()}
+    values: dict[str, Any] = {
+        n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
+    }
     return [partial(_constant, n, float(v)) for n, v in values.items() if _are_numbers([v])]
 
 
