@@ -16,6 +16,13 @@ from botorch.models.transforms.input import Normalize
 from gpadjust import CKA, BlackBoxPhysics
 from gpadjust.ax import TRANSFORMS, ParameterPhysics, TellPhysics, generator_kwargs
 
+# Data without noise, on which Ax's acquisition functions are nearly singular.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::linear_operator.utils.warnings.NumericalWarning",
+    "ignore::botorch.exceptions.warnings.OptimizationWarning",
+    "ignore:Optimization failed",
+)
+
 FAST = {"method": "map", "num_starts": 1, "num_screened": 4}
 PARAMETERS = [
     RangeParameterConfig(name="rate", parameter_type="float", bounds=(1e-4, 1.0), scaling="log"),
@@ -104,7 +111,6 @@ def test_the_physics_is_asked_in_the_search_space_and_answers_as_the_metric(tran
     assert cost.abs().max() < 5  # and metrics standardised
 
 
-@pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
 def test_what_is_asked_for_a_candidate_is_in_the_search_space():
     f_p = Recorded(error=20.0)
     fitted = adapter(experiment(), f_p)
