@@ -23,10 +23,10 @@ class PhysicsInUnits(Physics):
     def __init__(
         self, origin: ParameterPhysics, metric: str, units: Units, parameters: list[str]
     ) -> None:
-        self_names = origin.names_of(parameters)
-        inner = origin.of(self_names)
+        reads = origin.names_of(parameters)
+        inner = origin.of(reads)
         super().__init__(unknowns=dict(inner.unknowns.items()), name=inner.name)
-        self.origin, self.metric, self.units, self.reads = origin, metric, units, self_names
+        self.origin, self.metric, self.units, self.reads = origin, metric, units, reads
         self.inner = inner
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:

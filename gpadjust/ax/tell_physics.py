@@ -9,6 +9,7 @@ from typing import Any
 from ax.adapter.base import Adapter
 from ax.adapter.data_utils import ExperimentData
 from ax.adapter.transforms.base import Transform
+from ax.core.parameter import RangeParameter
 from ax.core.search_space import SearchSpace
 from ax.generators.torch.botorch_modular.generator import BoTorchGenerator
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
@@ -59,7 +60,12 @@ class TellPhysics(Transform):
                 "A physics cannot be asked in a hierarchical search space; make one of parameters "
                 "that are always there."
             )
-        units = Units(before, [*search_space.parameters])
+        ranges = {
+            p.name: (float(p.lower), float(p.upper))
+            for p in given.parameters.values()
+            if isinstance(p, RangeParameter)
+        }
+        units = Units(before, [*search_space.parameters], ranges)
         told = _Told(units, [*given.parameters], experiment_data.metric_signatures)
         # The generator's own specification: the user's may belong to several.
         if generator.surrogate_spec is not None:

@@ -39,12 +39,19 @@ class Units:
     Args:
         transforms: Ax's transforms, initialised, in the order in which they were applied.
         names: The columns that the model sees.
+        ranges: Lower and upper bounds of parameters, within which a physics is asked: BoTorch also
+            looks around the data, beyond them.
 
     Raises:
         ValueError: If there is a transform that it does not know.
     """
 
-    def __init__(self, transforms: Sequence[Transform], names: Sequence[str]) -> None:
+    def __init__(
+        self,
+        transforms: Sequence[Transform],
+        names: Sequence[str],
+        ranges: Mapping[str, tuple[float, float]],
+    ) -> None:
         known = (*_BACK, *_FORTH, *_NEITHER)
         unknown = [type(t).__name__ for t in transforms if type(t) not in known]
         if unknown:
@@ -53,7 +60,7 @@ class Units:
                 f"expected some of {', '.join(each.__name__ for each in known)}. Leave the others "
                 "out: transforms=gpadjust.ax.TRANSFORMS."
             )
-        self.names = tuple(names)
+        self.names, self.ranges = tuple(names), dict(ranges)
         self._back: list[Callable[[Columns], None]] = []
         for t in reversed(transforms):
             self._back += _BACK[type(t)](t) if type(t) in _BACK else []
@@ -82,7 +89,14 @@ class Units:
                 "or no part of the model. Make choices numbers, or let the physics name the "
                 "parameters that it reads as its arguments: def f_p(x1, x2)."
             )
-        return torch.stack([columns[name].expand(len(X)) for name in names], dim=-1)
+        return torch.stack([self._within(name, columns[name].expand(len(X))) for name in names], -1)
+
+    def _within(self, name: str, values: Tensor) -> Tensor:
+        """Values in the range of a parameter; their derivative is kept, as that at a bound is."""
+        if name not in self.ranges:
+            return values
+        lower, upper = self.ranges[name]
+        return values.detach().clamp(lower, upper) + (values - values.detach())
 
     def metric(self, Y: Tensor, metric: str) -> Tensor:
         """Values of a metric, in its units, as the model is to see them."""

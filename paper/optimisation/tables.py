@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,12 @@ from paper.common.tables import claims_table, markdown
 from paper.optimisation import LABELS, PROBLEMS, Optimisation
 
 REFERENCE = "ax"
-CLAIMS: dict[str, str] = {name: f"O{i + 1}" for i, name in enumerate(PROBLEMS)}
+JUDGED = ("cka", "cka-few")
+CLAIMS = {
+    (name, learner): f"O{i + 1 + j * len(PROBLEMS)}"
+    for j, learner in enumerate(JUDGED)
+    for i, name in enumerate(PROBLEMS)
+}
 
 
 def load(records: Sequence[Record]) -> pd.DataFrame:
@@ -45,7 +51,8 @@ def tables(records: Sequence[Record], experiment: Optimisation) -> dict[str, Tab
     """All tables, by name."""
     runs, most = load(records), experiment.settings.trials
     percent = f"{experiment.settings.regret:.0%}".replace("%", " %")
-    found = {"claims": Table("Targets", claims_table("target", {"": verdicts(runs, most)}))}
+    judged = [each for learner in JUDGED for each in verdicts(runs, most, learner)]
+    found = {"claims": Table("Targets", claims_table("target", {"": judged}))}
     found["trials"] = Table(
         f"Median of the trials to {percent} regret, the initial ones included; in brackets the "
         f"runs that came there within {most}, if not all did",
@@ -65,19 +72,20 @@ def tables(records: Sequence[Record], experiment: Optimisation) -> dict[str, Tab
 def verdicts(runs: pd.DataFrame, most: int, learner: str = "cka") -> list[Judged]:
     """Whether a learner needs at most half the trials of Ax's default, in the median."""
     judged = []
-    for name, part in runs.groupby("problem", sort=False):
+    for problem, part in runs.groupby("problem", sort=False):
+        name: Any = problem
         text = f"{name}: {LABELS[learner]} needs at most half the trials of Ax's default"
         by_seed = part.pivot(index="seed", columns="learner", values="trials")
         both = by_seed.reindex(columns=[learner, REFERENCE]).dropna()
         if len(both) < FEWEST:
-            judged.append(Judged(CLAIMS[str(name)], text, "not run", "too few runs of both"))
+            judged.append(Judged(CLAIMS[name, learner], text, "not run", "too few runs of both"))
             continue
         own, reference = (float(np.median(both[each])) for each in (learner, REFERENCE))
         said = [f"{x:g}" if np.isfinite(x) else f"more than {most}" for x in (own, reference)]
         measured = f"{counted(len(both))}: {said[0]}, Ax's default {said[1]} (medians)"
         # Of a median beyond the last trial half of that is the least that it can be.
         half = min(reference, most + 1) / 2
-        judged.append(Judged(CLAIMS[str(name)], text, met(own <= half), measured))
+        judged.append(Judged(CLAIMS[name, learner], text, met(own <= half), measured))
     return judged
 
 

@@ -124,6 +124,19 @@ def test_what_is_asked_for_a_candidate_is_in_the_search_space():
     assert candidate["width"] in range(1, 10)
 
 
+def test_it_is_asked_within_the_search_space_alone():
+    fitted = adapter(experiment(), Recorded(), metrics=["cost"])
+    model = models(fitted)["cost"]
+    inside = model.data()["train_X"][:1].clone()
+    beyond = inside - 0.7 * torch.eye(inside.shape[-1], dtype=torch.float64)[:3]
+    asked = model.physics.units.raw(beyond, ["rate", "width", "x"])
+    assert asked[0].tolist() == [1e-4, 1.0, -2.0]
+    assert (asked >= torch.tensor([1e-4, 1.0, -2.0], dtype=torch.float64)).all()
+    beyond.requires_grad_()
+    (slope,) = torch.autograd.grad(model.physics(beyond).sum(), beyond)
+    assert (slope[:, :2] != 0).any()  # or a search that begins at a bound would stay there
+
+
 def test_gradients_pass_the_transforms():
     fitted = adapter(experiment(), Recorded())
     for model in models(fitted).values():
