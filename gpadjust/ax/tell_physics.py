@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -30,7 +29,8 @@ class TellPhysics(Transform):
 
     Raises:
         ValueError: If it is not the last of the transforms; if there is one that a physics cannot
-            be asked behind; or if a physics is given for several metrics at once.
+            be asked behind; or if a physics is given for several metrics at once, or for none that
+            the experiment has.
     """
 
     no_op_for_experiment_data = True
@@ -66,7 +66,9 @@ class TellPhysics(Transform):
             if isinstance(p, RangeParameter)
         }
         units = Units(before, [*search_space.parameters], ranges)
-        told = _Told(units, [*given.parameters], experiment_data.metric_signatures)
+        observed = set(experiment_data.metric_signatures)
+        metrics = observed | {each.signature for each in adapter._experiment.metrics.values()}
+        told = _Told(units, [*given.parameters], observed, metrics)
         # The generator's own specification: the user's may belong to several.
         if generator.surrogate_spec is not None:
             generator.surrogate_spec = told.spec(generator.surrogate_spec)
@@ -77,12 +79,21 @@ class TellPhysics(Transform):
 class _Told:
     """Specifications of which each physics knows the units."""
 
-    def __init__(self, units: Units, parameters: list[str], metrics: Iterable[str]) -> None:
-        self.units, self.parameters, self.metrics = units, parameters, set(metrics)
+    def __init__(
+        self, units: Units, parameters: list[str], observed: set[str], metrics: set[str]
+    ) -> None:
+        self.units, self.parameters = units, parameters
+        self.observed, self.metrics = observed, metrics
 
     def spec(self, spec: SurrogateSpec) -> SurrogateSpec:
         own = spec.metric_to_model_configs
-        others = sorted(self.metrics - own.keys())
+        wrong = sorted(own.keys() - self.metrics)
+        if wrong:
+            raise ValueError(
+                f"A model is given for {', '.join(wrong)}, which is no metric of the experiment; "
+                f"expected some of {', '.join(sorted(self.metrics))}."
+            )
+        others = sorted(self.observed - own.keys())
         return replace(
             spec,
             model_configs=[self.config(each, others) for each in spec.model_configs],

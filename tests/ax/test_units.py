@@ -225,11 +225,12 @@ def test_without_this_room_it_is_an_error_too(monkeypatch):
             {"config": {"input_transform_classes": [Normalize]}},
             "makes its own parts; found input_transform_classes",
         ),
+        ({"metrics": ["costs"]}, "for costs, which is no metric.*some of cost, load"),
         ({"physics": lambda X: X[:, 0]}, r"reads the parameter\(s\) glue, which are text"),
         ({"physics": lambda rate, speed: rate}, "but speed is no parameter"),
         ({"physics": lambda rate: torch.stack([rate, rate], -1)}, "2 columns for the metric"),
     ],
-    ids=["not last", "log y", "categorical", "parts", "text", "name", "columns"],
+    ids=["not last", "log y", "categorical", "parts", "metric", "text", "name", "columns"],
 )
 def test_what_cannot_be_right_is_an_error(change, message):
     options = {"physics": Recorded(), **change}
