@@ -83,9 +83,12 @@ def verdicts(runs: pd.DataFrame, most: int, learner: str = "cka") -> list[Judged
         own, reference = (float(np.median(both[each])) for each in (learner, REFERENCE))
         said = [f"{x:g}" if np.isfinite(x) else f"more than {most}" for x in (own, reference)]
         measured = f"{counted(len(both))}: {said[0]}, Ax's default {said[1]} (medians)"
-        # Of a median beyond the last trial half of that is the least that it can be.
+        # Of a median beyond the last trial nobody knows the half, only the least that it can be.
         half = min(reference, most + 1) / 2
-        judged.append(Judged(CLAIMS[name, learner], text, met(own <= half), measured))
+        verdict = met(own <= half)
+        if own > half and not np.isfinite(reference):
+            verdict = "inconclusive"
+        judged.append(Judged(CLAIMS[name, learner], text, verdict, measured))
     return judged
 
 
