@@ -56,7 +56,7 @@ def specs(ours):
 
 
 def test_it_goes_on_from_a_file(named, tmp_path):
-    first = client({"y": named}, 4)
+    first = client({"y": named}, 3)
     first.save_to_json_file(str(tmp_path / "client.json"))
     again = Client.load_from_json_file(str(tmp_path / "client.json"))
     spec, transforms = specs(again)

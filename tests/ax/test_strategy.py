@@ -131,6 +131,7 @@ def test_other_models_and_their_options():
     assert config.model_options["rho_mean"] == 2.0
 
 
+@pytest.mark.slow
 def test_a_physics_with_unknown_parameters():
     physics = FunctionPhysics(
         lambda X, p: 100 * X[:, 1] * (1 - torch.exp(-p.rate * X[:, 0])) - 20 * X[:, 1] ** 2,

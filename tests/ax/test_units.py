@@ -111,6 +111,7 @@ def test_the_physics_is_asked_in_the_search_space_and_answers_as_the_metric(tran
     assert cost.abs().max() < 5  # and metrics standardised
 
 
+@pytest.mark.slow
 def test_what_is_asked_for_a_candidate_is_in_the_search_space():
     f_p = Recorded(error=20.0)
     fitted = adapter(experiment(), f_p)
