@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from inspect import signature
 from typing import Any, NamedTuple, Self
@@ -435,7 +436,18 @@ class TermsModel(Model):
         Args:
             training_data: The data (of AR1, of the high level).
             options: Further arguments of the model: the physics and all others.
+
+        Raises:
+            ValueError: If Ax calls this with a physics, without :mod:`gpadjust.ax`, which tells a
+                physics what Ax did to inputs and targets.
         """
+        caller = sys._getframe(1).f_globals.get("__name__", "")
+        if caller.startswith("ax.") and options.get("physics") is not None:
+            raise ValueError(
+                "Ax transforms parameters and metrics before a model sees them, so that this "
+                "physics would be asked in other units than its own. Import gpadjust.ax, and make "
+                "the generation strategy by gpadjust.ax.generation_strategy({'the metric': f_p})."
+            )
         return {**super().construct_inputs(training_data), **options}
 
 

@@ -1,0 +1,22 @@
+"""The models in Ax, with a physics of the search space's parameters (the extra ``ax``)."""
+
+try:
+    import ax as _  # noqa: F401
+except ImportError as error:
+    raise ImportError('gpadjust.ax needs Ax; run `pip install "gpadjust[ax]"`.') from error
+
+from gpadjust.ax import storage, surrogate
+from gpadjust.ax.parameter_physics import ParameterPhysics
+from gpadjust.ax.strategy import TRANSFORMS, generation_strategy, generator_kwargs
+from gpadjust.ax.tell_physics import TellPhysics
+
+__all__ = [
+    "TRANSFORMS",
+    "ParameterPhysics",
+    "TellPhysics",
+    "generation_strategy",
+    "generator_kwargs",
+]
+
+surrogate.register()
+storage.register()

@@ -1,0 +1,53 @@
+"""A physics of parameters, as a model in Ax asks it."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from gpadjust.ax.parameter_physics import ParameterPhysics
+from gpadjust.ax.units import Units
+from gpadjust.physics import Physics, PhysicsError
+from gpadjust.physics.unknown import ParameterValues
+
+
+class PhysicsInUnits(Physics):
+    """A physics behind Ax's transforms: of what a model sees, in the units of what it learns.
+
+    Args:
+        origin: The user's physics.
+        metric: What it is of.
+        units: What the transforms did.
+        parameters: The parameters of the search space, in its order.
+    """
+
+    def __init__(
+        self, origin: ParameterPhysics, metric: str, units: Units, parameters: list[str]
+    ) -> None:
+        reads = origin.names_of(parameters)
+        inner = origin.of(reads)
+        super().__init__(unknowns=dict(inner.unknowns.items()), name=inner.name)
+        self.origin, self.metric, self.units, self.reads = origin, metric, units, reads
+        self.inner = inner
+
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
+        """The physics in the search space's units, and what the transforms make of it.
+
+        Args:
+            X: ``N x d'``, as the model sees it.
+            parameters: Those that are unknown, if there are any.
+
+        Returns:
+            ``N x 1``.
+
+        Raises:
+            PhysicsError: If the physics fails, or has several outputs.
+        """
+        raw = self.units.raw(X, self.reads)
+        # Not forward: an error's rows are then still those of X.
+        Y = self.inner._evaluate_rows(self.inner.rows_of(raw, *parameters))
+        if Y.shape[-1] != 1:
+            raise PhysicsError(
+                f"The physics {self.name!r} returned {Y.shape[-1]} columns for the metric "
+                f"{self.metric!r}, expected one; give each metric a physics of its own."
+            )
+        return self.units.metric(Y, self.metric)

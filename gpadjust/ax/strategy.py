@@ -1,0 +1,127 @@
+"""Ax's generation strategy, with a physics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ax.adapter.registry import MBM_X_trans
+from ax.adapter.transforms.base import Transform
+from ax.adapter.transforms.derelativize import Derelativize
+from ax.adapter.transforms.standardize_y import StandardizeY
+from ax.api.utils.generation_strategy_dispatch import choose_generation_strategy
+from ax.api.utils.structs import GenerationStrategyDispatchStruct
+from ax.generation_strategy.generation_strategy import GenerationStrategy
+from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
+from ax.generators.torch.botorch_modular.utils import ModelConfig
+
+from gpadjust.ax.parameter_physics import ParameterPhysics
+from gpadjust.ax.tell_physics import TellPhysics
+from gpadjust.models import CKA, AdjustedGP, ZeroMeanGP
+
+TRANSFORMS: list[type[Transform]] = [*MBM_X_trans, Derelativize, StandardizeY, TellPhysics]
+"""Ax's transforms of parameters; of metrics shift and scale alone, as others would bend what f_p
+says (``Winsorize``, ``BilogY``); and ``TellPhysics``."""
+
+
+def generator_kwargs(
+    physics: Mapping[str, Any],
+    *,
+    model: type[AdjustedGP] = CKA,
+    model_options: Mapping[str, Any] | None = None,
+    fit_options: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The arguments of Ax's ``BOTORCH_MODULAR`` generator, for a ``GeneratorSpec`` of one's own.
+
+    Args:
+        physics: For each metric that has one, its physics, as :class:`ParameterPhysics` takes it;
+            several of one metric as a list, or a dictionary with their names.
+        model: The model of these metrics; the others have a :class:`~gpadjust.ZeroMeanGP`.
+        model_options: Further arguments of ``model``; numbers with units are in those after Ax's
+            transforms.
+        fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``, for all
+            metrics.
+
+    Returns:
+        ``surrogate_spec`` and ``transforms``.
+
+    Raises:
+        TypeError: If ``physics`` is no mapping of metrics, or holds something else than physics.
+    """
+    if not isinstance(physics, Mapping) or not physics:
+        raise TypeError(
+            "Expected the physics of at least one metric by its name, {'cost': f_p}, found "
+            f"{physics!r}."
+        )
+    fitted = {"mll_options": dict(fit_options or {})}
+    configs = {
+        metric: ModelConfig(
+            botorch_model_class=model,
+            model_options={**(model_options or {}), "physics": _stored(given)},
+            name=f"{model.__name__} of {metric}",
+            **fitted,
+        )
+        for metric, given in physics.items()
+    }
+    other = ModelConfig(botorch_model_class=ZeroMeanGP, name="ZeroMeanGP", **fitted)
+    spec = SurrogateSpec(
+        model_configs=[other],
+        metric_to_model_configs={metric: [config] for metric, config in configs.items()},
+    )
+    return {"surrogate_spec": spec, "transforms": TRANSFORMS}
+
+
+def generation_strategy(
+    physics: Mapping[str, Any],
+    *,
+    model: type[AdjustedGP] = CKA,
+    model_options: Mapping[str, Any] | None = None,
+    fit_options: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> GenerationStrategy:
+    """Ax's default strategy, with models that adjust a physics in place of its own.
+
+    Args:
+        physics: As in :func:`generator_kwargs`, like the next three.
+        model: As there.
+        model_options: As there.
+        fit_options: As there.
+        options: Those of ``Client.configure_generation_strategy`` but ``method``, such as
+            ``initialization_budget`` and ``initialization_random_seed``.
+
+    Returns:
+        For ``client.set_generation_strategy``.
+
+    Raises:
+        TypeError: As there.
+
+    Example:
+        >>> from ax.api.client import Client
+        >>> from ax.api.configs import RangeParameterConfig
+        >>> from gpadjust.ax import generation_strategy
+        >>> client = Client()
+        >>> time = RangeParameterConfig(name="time", parameter_type="float", bounds=(0, 10))
+        >>> client.configure_experiment(parameters=[time])
+        >>> client.configure_optimization(objective="conversion")
+        >>> strategy = generation_strategy({"conversion": lambda time: 1 - (-time).exp()})
+        >>> client.set_generation_strategy(strategy)
+        >>> strategy.name
+        'Center+Sobol+MBM:CKA'
+    """
+    own = generator_kwargs(
+        physics, model=model, model_options=model_options, fit_options=fit_options
+    )
+    struct = GenerationStrategyDispatchStruct(method="custom", **options)
+    strategy = choose_generation_strategy(struct, model_config=ModelConfig(name=model.__name__))
+    for node in strategy._nodes:
+        if node.name == "MBM":
+            node.generator_specs[0].generator_kwargs.update(own)
+    return strategy
+
+
+def _stored(physics: Any) -> Any:
+    if isinstance(physics, Mapping):
+        return {name: _stored(part) for name, part in physics.items()}
+    if isinstance(physics, list | tuple):
+        return [_stored(part) for part in physics]
+    return ParameterPhysics(physics)

@@ -1,0 +1,89 @@
+"""How Ax's surrogate builds and fits these models."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ax.core.search_space import SearchSpaceDigest
+from ax.generators.torch.botorch_modular.surrogate import (
+    Surrogate,
+    submodel_input_constructor,
+)
+from ax.generators.torch.botorch_modular.utils import ModelConfig, fit_botorch_model
+from botorch.utils.datasets import SupervisedDataset
+from botorch.utils.types import DEFAULT
+
+from gpadjust.ax.physics_in_units import PhysicsInUnits
+from gpadjust.inference import fit
+from gpadjust.models import AdjustedGP
+
+_PARTS = (
+    "covar_module_class",
+    "likelihood_class",
+    "outcome_transform_classes",
+    "input_transform_classes",
+)
+
+
+def register() -> None:
+    """Enter both functions where Ax looks for them."""
+    submodel_input_constructor.register(AdjustedGP)(model_inputs)
+    fit_botorch_model.register(AdjustedGP)(fit_model)
+
+
+def model_inputs(
+    botorch_model_class: type[AdjustedGP],
+    model_config: ModelConfig,
+    dataset: SupervisedDataset,
+    search_space_digest: SearchSpaceDigest,
+    surrogate: Surrogate,
+) -> dict[str, Any]:
+    """The arguments of a model: the data as Ax transformed them, and ``model_options``.
+
+    The models scale inputs and targets by themselves, so that Ax's default input transform is left
+    out. Other arguments are as Ax says.
+
+    Raises:
+        ValueError: If a physics was not told of Ax's transforms, or if something is asked for that
+            these models do not have.
+    """
+    name = botorch_model_class.__name__
+    found = [part for part in _PARTS if getattr(model_config, part) not in (None, [], DEFAULT)]
+    if found:
+        raise ValueError(
+            f"{name} makes its own parts; found {', '.join(found)} in ModelConfig. Put what the "
+            "model takes in model_options, such as {'delta_covar_module': ...}."
+        )
+    special = [
+        kind
+        for kind in ("task", "fidelity", "categorical")
+        if getattr(search_space_digest, f"{kind}_features")
+    ]
+    if special:
+        raise ValueError(
+            f"{name} has no kernel for {' and '.join(special)} parameters. Leave categories to "
+            "OneHot (transforms=gpadjust.ax.TRANSFORMS), and give each task or fidelity a model of "
+            "its own."
+        )
+    for each in _parts(model_config.model_options.get("physics")):
+        if not isinstance(each, PhysicsInUnits) or each.units.names != tuple(dataset.feature_names):
+            raise ValueError(
+                f"The physics of {', '.join(dataset.outcome_names)} was not told what Ax's "
+                "transforms do, and would be asked in other units than the search space's. Make "
+                "TellPhysics the last of them: generator_kwargs={'surrogate_spec': ..., "
+                "'transforms': gpadjust.ax.TRANSFORMS}; or let "
+                "gpadjust.ax.generation_strategy({'the metric': f_p}) do it."
+            )
+    return botorch_model_class.construct_inputs(dataset, **model_config.model_options)
+
+
+def fit_model(model: AdjustedGP, mll_class: Any, mll_options: dict[str, Any] | None = None) -> None:
+    """Fit a model by :func:`gpadjust.fit`, whose options are ``mll_options``."""
+    fit(model, **(mll_options or {}))
+
+
+def _parts(physics: Any) -> list[Any]:
+    if physics is None:
+        return []
+    several = physics.values() if isinstance(physics, dict) else physics
+    return [*several] if isinstance(physics, dict | list) else [physics]

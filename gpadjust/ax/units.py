@@ -1,0 +1,206 @@
+"""What Ax's transforms did to parameters and metrics, undone and done in PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from ax.adapter.transforms.base import Transform
+from ax.adapter.transforms.bilog_y import BilogY
+from ax.adapter.transforms.cast import Cast
+from ax.adapter.transforms.choice_encode import (
+    ChoiceToNumericChoice,
+    OrderedChoiceToIntegerRange,
+)
+from ax.adapter.transforms.derelativize import Derelativize
+from ax.adapter.transforms.fill_missing_parameters import FillMissingParameters
+from ax.adapter.transforms.int_to_float import IntToFloat
+from ax.adapter.transforms.log import Log
+from ax.adapter.transforms.logit import Logit
+from ax.adapter.transforms.map_key_to_float import MapKeyToFloat
+from ax.adapter.transforms.one_hot import OneHot
+from ax.adapter.transforms.remove_fixed import RemoveFixed
+from ax.adapter.transforms.standardize_y import StandardizeY
+from ax.adapter.transforms.unit_x import UnitX
+from ax.adapter.transforms.winsorize import Winsorize
+from torch import Tensor
+
+Columns = dict[str, Tensor]
+
+
+class Units:
+    """From what a model in Ax sees to the units of the search space, and back for the metrics.
+
+    It is differentiable but for choices, and holds plain values, not Ax's objects, so that models
+    can be copied and pickled.
+
+    Args:
+        transforms: Ax's transforms, initialised, in the order in which they were applied.
+        names: The columns that the model sees.
+        ranges: Lower and upper bounds of parameters, within which a physics is asked: BoTorch also
+            looks around the data, beyond them.
+
+    Raises:
+        ValueError: If there is a transform that it does not know.
+    """
+
+    def __init__(
+        self,
+        transforms: Sequence[Transform],
+        names: Sequence[str],
+        ranges: Mapping[str, tuple[float, float]],
+    ) -> None:
+        known = (*_BACK, *_FORTH, *_NEITHER)
+        unknown = [type(t).__name__ for t in transforms if type(t) not in known]
+        if unknown:
+            raise ValueError(
+                f"A physics cannot be asked behind the transform(s) {', '.join(unknown)} of Ax; "
+                f"expected some of {', '.join(each.__name__ for each in known)}. Leave the others "
+                "out: transforms=gpadjust.ax.TRANSFORMS."
+            )
+        self.names, self.ranges = tuple(names), dict(ranges)
+        self._back: list[Callable[[Columns], None]] = []
+        for t in reversed(transforms):
+            self._back += _BACK[type(t)](t) if type(t) in _BACK else []
+        self._forth = [_FORTH[type(t)](t) for t in transforms if type(t) in _FORTH]
+
+    def raw(self, X: Tensor, names: Sequence[str]) -> Tensor:
+        """Parameters in the units of the search space.
+
+        Args:
+            X: What the model sees, ``N x d'``.
+            names: Some parameters.
+
+        Returns:
+            ``N x len(names)``.
+
+        Raises:
+            ValueError: If the values of one of them are no numbers.
+        """
+        columns = dict(zip(self.names, X.unbind(-1), strict=True))
+        for step in self._back:
+            step(columns)
+        lost = [name for name in names if name not in columns]
+        if lost:
+            raise ValueError(
+                f"The physics reads the parameter(s) {', '.join(lost)}, which are text, derived, "
+                "or no part of the model. Make choices numbers, or let the physics name the "
+                "parameters that it reads as its arguments: def f_p(x1, x2)."
+            )
+        return torch.stack([self._within(name, columns[name].expand(len(X))) for name in names], -1)
+
+    def _within(self, name: str, values: Tensor) -> Tensor:
+        """Values in the range of a parameter; their derivative is kept, as that at a bound is."""
+        if name not in self.ranges:
+            return values
+        lower, upper = self.ranges[name]
+        return values.detach().clamp(lower, upper) + (values - values.detach())
+
+    def metric(self, Y: Tensor, metric: str) -> Tensor:
+        """Values of a metric, in its units, as the model is to see them."""
+        for steps in self._forth:
+            if metric in steps:
+                Y = steps[metric](Y)
+        return Y
+
+
+def _change(function: Callable[[Tensor], Tensor], name: str, columns: Columns) -> None:
+    if name in columns:
+        columns[name] = function(columns[name])
+
+
+def _constant(name: str, value: float, columns: Columns) -> None:
+    first = next(iter(columns.values()))
+    columns[name] = first.new_tensor(value)
+
+
+def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns: Columns) -> None:
+    """A choice, of its number or of a column for each value, of which the largest counts."""
+    if one_hot:
+        index = torch.stack([columns.pop(each) for each in one_hot], dim=-1).argmax(-1)
+    else:
+        index = columns.pop(name).round().long().clamp(0, len(values) - 1)
+    if _are_numbers(values):
+        columns[name] = torch.tensor(values, dtype=torch.float64)[index]
+
+
+def _are_numbers(values: Sequence[Any]) -> bool:
+    return all(isinstance(value, bool | int | float) for value in values)
+
+
+def _power_of_ten(x: Tensor) -> Tensor:
+    return 10**x
+
+
+def _from_unit(lower: float, upper: float, x: Tensor) -> Tensor:
+    return lower + x * (upper - lower)
+
+
+def _log(t: Log) -> list[Callable[[Columns], None]]:
+    return [partial(_change, _power_of_ten, name) for name in t.transform_parameters]
+
+
+def _logit(t: Logit) -> list[Callable[[Columns], None]]:
+    return [partial(_change, torch.sigmoid, name) for name in t.transform_parameters]
+
+
+def _unit(t: UnitX) -> list[Callable[[Columns], None]]:
+    return [partial(_change, partial(_from_unit, *t.bounds[name]), name) for name in t.bounds]
+
+
+def _number(t: ChoiceToNumericChoice) -> list[Callable[[Columns], None]]:
+    return [partial(_value_of, name, [*code], ()) for name, code in t.encoded_parameters.items()]
+
+
+def _one_hot(t: OneHot) -> list[Callable[[Columns], None]]:
+    return [
+        partial(_value_of, name, values, t.encoded_parameters[name])
+        for name, values in t.encoded_values.items()
+    ]
+
+
+def _fixed(t: RemoveFixed) -> list[Callable[[Columns], None]]:
+    values: dict[str, Any] = {
+        n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
+    }
+    return [partial(_constant, n, float(v)) for n, v in values.items() if _are_numbers([v])]
+
+
+def _clip(t: Winsorize) -> dict[str, Callable[[Tensor], Tensor]]:
+    return {m: partial(torch.clamp, min=low, max=high) for m, (low, high) in t.cutoffs.items()}
+
+
+def _bilog(t: BilogY) -> dict[str, Callable[[Tensor], Tensor]]:
+    return {metric: partial(_bilog_of, bound) for metric, bound in t.metric_to_bound.items()}
+
+
+def _bilog_of(bound: float, Y: Tensor) -> Tensor:
+    return bound + (Y - bound).sign() * (Y - bound).abs().log1p()
+
+
+def _standardize(t: StandardizeY) -> dict[str, Callable[[Tensor], Tensor]]:
+    return {m: partial(_scaled, float(t.Ymean[m]), float(t.Ystd[m])) for m in t.Ymean}
+
+
+def _scaled(mean: float, sd: float, Y: Tensor) -> Tensor:
+    return (Y - mean) / sd
+
+
+_BACK: Mapping[type[Transform], Callable[[Any], list[Callable[[Columns], None]]]] = {
+    Log: _log,
+    Logit: _logit,
+    UnitX: _unit,
+    ChoiceToNumericChoice: _number,
+    OrderedChoiceToIntegerRange: _number,
+    OneHot: _one_hot,
+    RemoveFixed: _fixed,
+}
+_FORTH: Mapping[type[Transform], Callable[[Any], dict[str, Callable[[Tensor], Tensor]]]] = {
+    Winsorize: _clip,
+    BilogY: _bilog,
+    StandardizeY: _standardize,
+}
+# MapKeyToFloat adds a parameter, which the physics does not read, if there are learning curves.
+_NEITHER = (FillMissingParameters, Cast, IntToFloat, MapKeyToFloat, Derelativize)

@@ -1,0 +1,158 @@
+"""generation_strategy in Ax's client: trials, constraints, predictions, cross-validation."""
+
+import math
+
+import pytest
+import torch
+from ax.adapter.cross_validation import cross_validate
+from ax.api.client import Client
+from ax.api.configs import RangeParameterConfig
+
+from gpadjust import CKA, PhysicsMeanGP, Unknown, ZeroMeanGP, fit
+from gpadjust.ax import TRANSFORMS, generation_strategy, generator_kwargs
+from gpadjust.physics import FunctionPhysics
+
+FAST = {"method": "map", "num_starts": 1, "num_screened": 8}
+# Data without noise, on which Ax's acquisition functions are nearly singular.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::linear_operator.utils.warnings.NumericalWarning",
+    "ignore::botorch.exceptions.warnings.OptimizationWarning",
+    "ignore:Optimization failed",
+    "ignore:When all training points are infeasible",
+)
+
+
+def crude(time, dose):
+    return 100 * dose * (1 - torch.exp(-time)) - 20 * dose**2
+
+
+def truth(time, dose):
+    noise = 0.5 * math.sin(40 * time + 9 * dose)
+    return {
+        "output": 90 * dose * (1 - math.exp(-1.3 * time)) - 22 * dose**2 + 5 + noise,
+        "waste": 3 * dose + 0.3 * time + 0.1 * noise,
+    }
+
+
+def client(physics=crude, fit_options=FAST, **options):
+    ours = Client()
+    ours.configure_experiment(
+        parameters=[
+            RangeParameterConfig(
+                name="time", parameter_type="float", bounds=(0.01, 10.0), scaling="log"
+            ),
+            RangeParameterConfig(name="dose", parameter_type="float", bounds=(0.0, 4.0)),
+        ]
+    )
+    ours.configure_optimization(objective="output", outcome_constraints=["waste <= 9"])
+    strategy = generation_strategy(
+        {"output": physics},
+        fit_options=fit_options,
+        initialization_random_seed=0,
+        **options,
+    )
+    ours.set_generation_strategy(strategy)
+    return ours
+
+
+def try_out(ours, trials):
+    for _ in range(trials):
+        for index, arm in ours.get_next_trials(max_trials=1).items():
+            ours.complete_trial(index, truth(**arm))
+    return ours
+
+
+def adapter(ours):
+    return ours._generation_strategy.adapter
+
+
+def test_trials_constraints_and_predictions():
+    torch.manual_seed(0)
+    ours = try_out(client(), 7)
+    model = adapter(ours).generator.surrogate.model
+    assert [type(each) for each in model.models] == [CKA, ZeroMeanGP]
+    tried = ours._experiment.trials[2].arm.parameters
+    (predicted,) = ours.predict([tried])
+    for metric, value in truth(**tried).items():
+        mean, sd = predicted[metric]
+        assert mean == pytest.approx(value, abs=3 * sd + 0.5)
+    best, metrics, _, _ = ours.get_best_parameterization()
+    assert truth(**best)["waste"] <= 9.2
+    assert metrics["output"][0] > 50
+
+
+def test_the_model_is_the_one_that_the_library_fits():
+    ours = try_out(client(), 6)
+    model = adapter(ours).generator.surrogate.model.models[0]
+    data, units = model.data(), adapter(ours).transforms["StandardizeY"]
+    Y = data["train_Y"] * units.Ystd["output"] + units.Ymean["output"]
+    log_time = CKA(data["train_X"], Y, physics=lambda X: crude(10 ** X[:, 0], X[:, 1]))
+    fit(log_time, **FAST)
+    point = torch.tensor([[0.2, 1.4]], dtype=torch.float64)
+    mean, variance = log_time.predict(point)
+    (found, sd) = ours.predict([{"time": 10**0.2, "dose": 1.4}])[0]["output"]
+    assert found == pytest.approx(mean.item(), rel=1e-3)
+    assert sd == pytest.approx(variance.sqrt().item(), rel=0.05, abs=1e-3)
+
+
+@pytest.mark.parametrize("fit_options", [FAST, pytest.param(None, marks=pytest.mark.slow)])
+def test_cross_validation_leaves_each_trial_out(fit_options):
+    ours = try_out(client(fit_options=fit_options), 6)
+    results = cross_validate(adapter(ours))
+    assert len(results) == 5  # those that the last choice knew
+    model = adapter(ours).generator.surrogate.model.models[0]
+    if fit_options is not None:
+        units = adapter(ours).transforms["StandardizeY"]
+        mean = model.left_out()[0].flatten()
+        by_arm = {r.observed.arm_name: r.predicted for r in results}
+        shift, scale = model._units()
+        for i, name in enumerate(sorted(by_arm)):
+            m = (mean[i] * scale + shift).item() * units.Ystd["output"] + units.Ymean["output"]
+            index = by_arm[name].metric_signatures.index("output")
+            assert by_arm[name].means[index] == pytest.approx(m, rel=1e-2, abs=0.2)
+    assert all(math.isfinite(r.predicted.means[0]) for r in results)
+
+
+def test_a_strategy_is_ax_s_own_but_for_the_model():
+    strategy = client(initialization_budget=3, initialize_with_center=False)._generation_strategy
+    assert strategy.name == "Sobol+MBM:CKA"
+    assert [node.name for node in strategy._nodes] == ["Sobol", "MBM"]
+    kwargs = strategy.nodes_by_name["MBM"].generator_specs[0].generator_kwargs
+    assert kwargs["transforms"] == TRANSFORMS
+    assert "acquisition_options" in kwargs
+
+
+def test_other_models_and_their_options():
+    kwargs = generator_kwargs(
+        {"output": crude}, model=PhysicsMeanGP, model_options={"rho_mean": 2.0}
+    )
+    (config,) = kwargs["surrogate_spec"].metric_to_model_configs["output"]
+    assert config.botorch_model_class is PhysicsMeanGP
+    assert config.model_options["rho_mean"] == 2.0
+
+
+@pytest.mark.slow
+def test_a_physics_with_unknown_parameters():
+    physics = FunctionPhysics(
+        lambda X, p: 100 * X[:, 1] * (1 - torch.exp(-p.rate * X[:, 0])) - 20 * X[:, 1] ** 2,
+        unknowns={"rate": Unknown(1.0, factor=2.0)},
+    )
+    ours = try_out(client(physics), 6)
+    model = adapter(ours).generator.surrogate.model.models[0]
+    assert model.physics_parameters["rate"].mean() > 0
+
+
+@pytest.mark.slow
+def test_full_bayes_is_the_default_and_finds_the_best():
+    torch.manual_seed(0)
+    ours = try_out(client(fit_options=None), 9)
+    models = adapter(ours).generator.surrogate.model.models
+    assert {each.num_samples for each in models} == {16}
+    best, *_ = ours.get_best_parameterization()
+    assert truth(**best)["output"] > 78
+
+
+@pytest.mark.parametrize("physics", [{}, None, crude, [crude]])
+def test_a_physics_is_of_a_metric(physics):
+    with pytest.raises(TypeError, match="the physics of at least one metric by its name"):
+        generator_kwargs(physics)

@@ -1,0 +1,260 @@
+"""What a physics is asked, and the units in which it answers, whatever Ax transforms."""
+
+import pytest
+import torch
+from ax.adapter.registry import Cont_X_trans, Generators, MBM_X_trans, Mixed_transforms, Y_trans
+from ax.adapter.transforms.log_y import LogY
+from ax.adapter.transforms.unit_x import UnitX
+from ax.api.client import Client
+from ax.api.configs import ChoiceParameterConfig, RangeParameterConfig
+from ax.exceptions.core import UserInputError
+from ax.generators.torch.botorch_modular import surrogate as ax_surrogate
+from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
+from ax.generators.torch.botorch_modular.utils import ModelConfig
+from botorch.models.transforms.input import Normalize
+
+from gpadjust import CKA, BlackBoxPhysics
+from gpadjust.ax import TRANSFORMS, ParameterPhysics, TellPhysics, generator_kwargs
+
+# Data without noise, on which Ax's acquisition functions are nearly singular.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::linear_operator.utils.warnings.NumericalWarning",
+    "ignore::botorch.exceptions.warnings.OptimizationWarning",
+    "ignore:Optimization failed",
+)
+
+FAST = {"method": "map", "num_starts": 1, "num_screened": 4}
+PARAMETERS = [
+    RangeParameterConfig(name="rate", parameter_type="float", bounds=(1e-4, 1.0), scaling="log"),
+    RangeParameterConfig(name="width", parameter_type="int", bounds=(1, 9)),
+    RangeParameterConfig(name="x", parameter_type="float", bounds=(-2.0, 3.0)),
+    ChoiceParameterConfig(
+        name="glue", parameter_type="str", values=["a", "b", "c"], is_ordered=False
+    ),
+    ChoiceParameterConfig(
+        name="size", parameter_type="float", values=[0.5, 2.0, 8.0], is_ordered=True
+    ),
+    ChoiceParameterConfig(name="grid", parameter_type="int", values=[7, 3, 5], is_ordered=False),
+]
+ARMS = [
+    {"rate": 1e-4, "width": 1, "x": -2.0, "glue": "a", "size": 0.5, "grid": 3},
+    {"rate": 0.03, "width": 4, "x": 3.0, "glue": "c", "size": 8.0, "grid": 7},
+    {"rate": 1.0, "width": 9, "x": 0.1, "glue": "b", "size": 2.0, "grid": 5},
+    {"rate": 0.2, "width": 2, "x": 1.5, "glue": "b", "size": 0.5, "grid": 5},
+    {"rate": 1e-3, "width": 7, "x": -0.4, "glue": "a", "size": 8.0, "grid": 3},
+]
+
+
+def truth(rate, width, x, size, grid):
+    return 400 + 50 * rate + width * x**3 + 10 * size + grid
+
+
+class Recorded:
+    """A physics that remembers what it was asked."""
+
+    def __init__(self, error=0.0):
+        self.asked = []
+        self.error = error
+
+    def __call__(self, rate, x, width, size, grid):
+        self.asked.append(torch.stack([rate, width, x, size, grid], dim=-1).detach())
+        return truth(rate, width, x, size, grid) + self.error * torch.sin(5 * x + width)
+
+
+def experiment(parameters=PARAMETERS, arms=ARMS, constrained=True):
+    client = Client()
+    client.configure_experiment(parameters=parameters)
+    constraints = ["load <= 415"] if constrained else []
+    client.configure_optimization(objective="-cost", outcome_constraints=constraints)
+    for arm in arms:
+        index = client.attach_trial(arm)
+        y = truth(*(arm.get(name, 0.0) for name in ("rate", "width", "x", "size", "grid")))
+        client.complete_trial(index, {"cost": y, **({"load": y} if constrained else {})})
+    return client._experiment
+
+
+def adapter(experiment, physics, transforms=TRANSFORMS, config=None, metrics=("cost", "load")):
+    options = {"botorch_model_class": CKA, "mll_options": FAST, **(config or {})}
+    configs = {
+        metric: [ModelConfig(model_options={"physics": physics}, **options)] for metric in metrics
+    }
+    spec = SurrogateSpec(metric_to_model_configs=configs)
+    return Generators.BOTORCH_MODULAR(
+        experiment=experiment, surrogate_spec=spec, transforms=transforms
+    )
+
+
+def models(adapter):
+    surrogate = adapter.generator.surrogate
+    found = getattr(surrogate.model, "models", [surrogate.model])
+    return dict(zip(surrogate.outcomes, found, strict=True))
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [TRANSFORMS, [*MBM_X_trans, *Y_trans, TellPhysics], [*Cont_X_trans, *Y_trans, TellPhysics]],
+    ids=["ours", "Ax's default", "continuous relaxation"],
+)
+def test_the_physics_is_asked_in_the_search_space_and_answers_as_the_metric(transforms):
+    f_p = Recorded()
+    fitted = adapter(experiment(), f_p, transforms)
+    names = ("rate", "width", "x", "size", "grid")
+    expected = torch.tensor([[arm[n] for n in names] for arm in ARMS], dtype=torch.float64)
+    torch.testing.assert_close(f_p.asked[0], expected, rtol=1e-9, atol=1e-12)
+    for model in models(fitted).values():
+        data = model.data()
+        # f_p is the truth, so that what it says is what Ax made of the data.
+        f = model.input_transform.values(data["train_X"])
+        torch.testing.assert_close(f, data["train_Y"], rtol=1e-9, atol=1e-9)
+    size, cost = data["train_X"].shape[-1], data["train_Y"]
+    assert size > 6  # codes of choices are columns
+    assert cost.abs().max() < 5  # and metrics standardised
+
+
+@pytest.mark.slow
+def test_what_is_asked_for_a_candidate_is_in_the_search_space():
+    f_p = Recorded(error=20.0)
+    fitted = adapter(experiment(), f_p)
+    f_p.asked.clear()
+    candidate = fitted.gen(n=1).arms[0].parameters
+    asked = torch.cat(f_p.asked)
+    lower, upper = torch.tensor([1e-4, 1, -2, 0.5, 3.0]), torch.tensor([1.0, 9, 3, 8, 7])
+    assert len(asked) > 20
+    assert (asked >= lower - 1e-9).all()
+    assert (asked <= upper + 1e-9).all()
+    assert candidate["width"] in range(1, 10)
+
+
+def test_it_is_asked_within_the_search_space_alone():
+    fitted = adapter(experiment(), Recorded(), metrics=["cost"])
+    model = models(fitted)["cost"]
+    inside = model.data()["train_X"][:1].clone()
+    beyond = inside - 0.7 * torch.eye(inside.shape[-1], dtype=torch.float64)[:3]
+    asked = model.physics.units.raw(beyond, ["rate", "width", "x"])
+    assert asked[0].tolist() == [1e-4, 1.0, -2.0]
+    assert (asked >= torch.tensor([1e-4, 1.0, -2.0], dtype=torch.float64)).all()
+    beyond.requires_grad_()
+    (slope,) = torch.autograd.grad(model.physics(beyond).sum(), beyond)
+    assert (slope[:, :2] != 0).any()  # or a search that begins at a bound would stay there
+
+
+def test_gradients_pass_the_transforms():
+    fitted = adapter(experiment(), Recorded())
+    for model in models(fitted).values():
+        X = model.data()["train_X"].clone()
+        physics = model.physics
+        inner = X[1:2, :2].clone().requires_grad_()  # rate and width, which are numbers
+        point = torch.cat([inner, X[1:2, 2:]], dim=-1)
+        (slope,) = torch.autograd.grad(physics(point).sum(), inner)
+        step = 1e-6 * torch.eye(2, X.shape[-1], dtype=torch.float64)
+        by_difference = ((physics(X[1:2] + step) - physics(X[1:2] - step)) / 2e-6).mT
+        torch.testing.assert_close(slope, by_difference, rtol=1e-5, atol=1e-7)
+        assert slope.abs().min() > 1e-3
+
+
+def test_a_tensor_has_the_columns_of_the_search_space():
+    parameters = [PARAMETERS[2], PARAMETERS[0]]
+    arms = [{"x": arm["x"], "rate": arm["rate"]} for arm in ARMS]
+    asked = []
+
+    def f_p(X):
+        asked.append(X.copy())
+        return X[:, 0] + X[:, 1]
+
+    adapter(experiment(parameters, arms), BlackBoxPhysics(f_p), metrics=["cost"])
+    expected = torch.tensor([[arm["x"], arm["rate"]] for arm in arms], dtype=torch.float64)
+    torch.testing.assert_close(torch.from_numpy(asked[0]), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_fixed_parameter_is_a_column_too():
+    parameters = [
+        PARAMETERS[2],
+        ChoiceParameterConfig(name="width", parameter_type="int", values=[4]),
+    ]
+    asked = []
+
+    def f_p(X):
+        asked.append(X)
+        return X.sum(-1)
+
+    arms = [{"x": arm["x"], "width": 4} for arm in ARMS]
+    adapter(experiment(parameters, arms), f_p, metrics=["cost"])
+    assert asked[0].tolist() == [[arm["x"], 4.0] for arm in arms]
+
+
+def test_a_metric_without_physics_has_ax_s_own_model():
+    found = models(adapter(experiment(), Recorded(), metrics=["cost"]))
+    assert type(found["cost"]) is CKA
+    assert type(found["load"]).__name__ == "SingleTaskGP"
+
+
+def test_a_second_experiment_leaves_the_units_of_the_first():
+    f_p = ParameterPhysics(Recorded())
+    kwargs = generator_kwargs({"cost": f_p}, fit_options=FAST)
+    first = Generators.BOTORCH_MODULAR(experiment=experiment(), **kwargs)
+    before = models(first)["cost"].physics.units
+    shifted = experiment(arms=ARMS[:4])
+    second = Generators.BOTORCH_MODULAR(experiment=shifted, **kwargs)
+    assert models(first)["cost"].physics.units is before
+    assert models(second)["cost"].physics.units is not before
+    assert first.generator.surrogate_spec is not second.generator.surrogate_spec
+    assert kwargs["surrogate_spec"].metric_to_model_configs["cost"][0].model_options == {
+        "physics": f_p
+    }
+
+
+def test_a_plain_model_config_says_what_is_missing():
+    with pytest.raises(ValueError, match=r"was not told what Ax's transforms do.*TellPhysics"):
+        adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans])
+
+
+def test_without_this_room_it_is_an_error_too(monkeypatch):
+    own = ax_surrogate._submodel_input_constructor_base
+    monkeypatch.setattr(ax_surrogate, "submodel_input_constructor", own)
+    config = {"input_transform_classes": None}
+    with pytest.raises(ValueError, match=r"other units than its own. Import gpadjust.ax"):
+        adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans], config)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transforms": [*TRANSFORMS, UnitX]}, "TellPhysics as the last.*found UnitX after it"),
+        ({"transforms": [*MBM_X_trans, LogY, TellPhysics]}, r"behind the transform\(s\) LogY"),
+        ({"transforms": [*Mixed_transforms, TellPhysics]}, "no kernel for categorical parameters"),
+        (
+            {"config": {"input_transform_classes": [Normalize]}},
+            "makes its own parts; found input_transform_classes",
+        ),
+        ({"metrics": ["costs"]}, "for costs, which is no metric.*some of cost, load"),
+        ({"physics": lambda X: X[:, 0]}, r"reads the parameter\(s\) glue, which are text"),
+        ({"physics": lambda rate, speed: rate}, "but speed is no parameter"),
+        ({"physics": lambda rate: torch.stack([rate, rate], -1)}, "2 columns for the metric"),
+    ],
+    ids=["not last", "log y", "categorical", "parts", "metric", "text", "name", "columns"],
+)
+def test_what_cannot_be_right_is_an_error(change, message):
+    options = {"physics": Recorded(), **change}
+    with pytest.raises((ValueError, UserInputError, RuntimeError), match=message):
+        adapter(experiment(), **options)
+
+
+def test_a_physics_of_all_metrics_is_of_none():
+    config = ModelConfig(botorch_model_class=CKA, model_options={"physics": Recorded()})
+    with pytest.raises(ValueError, match="for one metric, found one for cost, load"):
+        Generators.BOTORCH_MODULAR(
+            experiment=experiment(),
+            surrogate_spec=SurrogateSpec(model_configs=[config]),
+            transforms=TRANSFORMS,
+        )
+
+
+def test_of_a_single_metric_it_is_of_that():
+    f_p = Recorded()
+    config = ModelConfig(botorch_model_class=CKA, model_options={"physics": f_p}, mll_options=FAST)
+    fitted = Generators.BOTORCH_MODULAR(
+        experiment=experiment(constrained=False),
+        surrogate_spec=SurrogateSpec(model_configs=[config]),
+        transforms=TRANSFORMS,
+    )
+    assert models(fitted)["cost"].physics.metric == "cost"
