@@ -19,6 +19,7 @@ from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.inference.variational_fit import fit_variational
 from gpadjust.models import ExactGPBase, VariationalCKA
+from gpadjust.models.variational_cka import NEVER_SAMPLED
 
 Method = Literal["bayes", "map"]
 
@@ -143,10 +144,7 @@ def fit(
     if isinstance(model, VariationalCKA):
         check_options("map" if method is None else method, given)
         if method == "bayes":
-            raise ValueError(
-                "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many "
-                "observations tell its hyper-parameters, which are not sampled."
-            )
+            raise ValueError(NEVER_SAMPLED)
         return fit_variational(model, Search(**given))
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(

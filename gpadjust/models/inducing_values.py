@@ -41,6 +41,10 @@ def inducing_root(covariance: Tensor) -> Tensor:
 class ScaleFreeVariationalStrategy(VariationalStrategy):
     """GPyTorch's whitened strategy, with a nugget that follows the size of the covariance."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is remembered with its graph, which cannot be copied."""
+        return {name: each for name, each in vars(self).items() if name != "_memoize_cache"}
+
     @cached(name="cholesky_factor", ignore_args=True)  # type: ignore[untyped-decorator]
     def _cholesky_factor(self, induc_induc_covar: LinearOperator) -> TriangularLinearOperator:
         return TriangularLinearOperator(inducing_root(to_dense(induc_induc_covar)))
