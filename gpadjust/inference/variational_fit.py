@@ -81,7 +81,7 @@ def _fit(model: VariationalCKA, search: Search) -> FitResult:
     converged = torch.ones_like(noise_of_weight_one(start), dtype=torch.bool)
     with centers_at_rest(start), _physics_at_rest(model):
         for _ in range(_ROUNDS if searches else 1):
-            model.place(_places(model, data, order))
+            model.model.place(_places(model, data, order))
             bound = CollapsedBound(start, some, model.model.inducing_points)
             if not bound.parameters.names:
                 break
@@ -89,11 +89,11 @@ def _fit(model: VariationalCKA, search: Search) -> FitResult:
                 bound, bound.parameters.clipped(bound.parameters.current()), iterations, _ROUGH
             )
             bound.parameters.assign(reached[0])
-        model.place(_places(model, data, order))  # where they are best for what was found
+        model.model.place(_places(model, data, order))  # where they are best for what was found
         whole = CollapsedBound(start, data, model.model.inducing_points)
         found = whole.optimum()
     start.eval()
-    model.hold(found.mean, found.root)
+    model.model.hold(found.mean, found.root)
     model.evidence = found.bound.detach()
     _split(model, data, search.seed)
     return FitResult(model.evidence, converged.reshape(model.evidence.shape))

@@ -145,7 +145,6 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         self._original_train_inputs, self._has_transformed_inputs = data.X, True
         self._hold_data(columns, self._outputs_first(data.Y))
         self._take(columns, data.Y, data.Yvar)
-        self._strategy: InducingStrategy | None = None
         self.register_buffer("evidence", torch.full_like(self.train_targets[..., 0], torch.nan))
         self.eval()
 
@@ -188,34 +187,14 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
 
     def strategy(self) -> InducingStrategy:
         """What is remembered of the inducing values to predict from; made if it is not there."""
-        if self._strategy is None:
-            self._strategy = InducingStrategy(self.model, self.likelihood)
-        return self._strategy
-
-    def train(self, mode: bool = True) -> Self:
-        """Put the model in train mode, or eval mode."""
-        self._strategy = None
-        return super().train(mode)
-
-    def eval(self) -> Self:
-        """Put the model in eval mode."""
-        if self.training:
-            self._strategy = None
-        return super().eval()
+        if self.model.strategy is None:
+            self.model.strategy = InducingStrategy(self.model, self.likelihood)
+        strategy: InducingStrategy = self.model.strategy
+        return strategy
 
     def forget(self) -> None:
         """Forget what predictions are made of, after a change of parameters."""
-        self._strategy = None
-
-    def hold(self, mean: Tensor, root: Tensor) -> None:
-        """Take a distribution of the whitened inducing values, as :meth:`InducingGP.hold`."""
-        self.model.hold(mean, root)
-        self._strategy = None
-
-    def place(self, points: Tensor) -> None:
-        """Move the inducing points, as :meth:`InducingGP.place`."""
-        self.model.place(points)
-        self._strategy = None
+        self.model.strategy = None
 
     def ask_physics(self) -> None:
         """Ask the physics about the training inputs again, by what was learnt of its parameters."""
@@ -246,7 +225,7 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         if any(not torch.equal(tensor, before[name]) for name, tensor in after.items()):
             self.ask_physics()
         self.model.variational_strategy._clear_cache()
-        self._strategy = None
+        self.forget()
         return keys
 
     def subset_output(self, idcs: list[int]) -> Self:
@@ -276,7 +255,6 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         new._hold_data(self.train_inputs[0], self.train_targets[index])
         new.evidence = self.evidence[index]
         new.__dict__["start"] = None
-        new._strategy = None
         return new.eval()
 
     def condition_on_observations(self, X: Tensor, Y: Tensor, **kwargs: Any) -> NoReturn:
@@ -328,7 +306,7 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         self._hold_data(fn(self.train_inputs[0]), fn(self.train_targets))
         if self.start is not None:
             self.start._apply(fn)
-        self._strategy = None
+        self.forget()
         return new
 
 
