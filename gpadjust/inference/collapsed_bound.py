@@ -207,7 +207,9 @@ class CollapsedBound:
         """The bound ``(m)``, the Cholesky factor of Lambda, and :math:`b / s`."""
         identity = torch.eye(sums.square.shape[-1]).to(sums.square)
         # Without a nugget, which would be more than the identity in it.
-        precision, failed = torch.linalg.cholesky_ex(identity + sums.square / noise[..., None, None])
+        precision, failed = torch.linalg.cholesky_ex(
+            identity + sums.square / noise[..., None, None]
+        )
         target = sums.cross / noise.unsqueeze(-1)
         explained = torch.linalg.solve_triangular(precision, target.unsqueeze(-1), upper=False)
         log_det = 2 * precision.diagonal(dim1=-1, dim2=-2).log().sum(-1)

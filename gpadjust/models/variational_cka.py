@@ -29,8 +29,8 @@ _SEARCHED = 1000  # observations that an exact model of some takes
 NOTHING = -60.0
 """The logarithm of a variance that is none."""
 NEVER_SAMPLED = (
-    "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many observations tell its "
-    "hyper-parameters, which are not sampled."
+    "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many observations tell "
+    "its hyper-parameters, which are not sampled."
 )
 
 

@@ -79,7 +79,7 @@ class Titsias:
 
 @pytest.fixture(params=["", "missing", "known noise"])
 def bound_of(request, num_outputs, uniform, shuffle):
-    """A model at random hyper-parameters, its bound, and the formulas of each output."""
+    """A model's bound at random hyper-parameters, and the formulas of each output."""
     X, _, Y = problem(25)
     Y, Yvar = torch.cat([Y, 2 * Y.flip(0)], dim=-1)[:, :num_outputs], None
     if request.param == "missing":
@@ -96,16 +96,18 @@ def bound_of(request, num_outputs, uniform, shuffle):
     known = None if Yvar is None else model.likelihood.noise
     data = observations(model.start, model.train_inputs[0], model.train_targets, known)
     bound = CollapsedBound(model.start, data, model.model.inducing_points)
-    return model, bound, [Titsias(model, X, Y, Yvar, j) for j in range(num_outputs)]
+    return bound, [Titsias(model, X, Y, Yvar, j) for j in range(num_outputs)]
 
 
 def test_the_bound_and_its_optimum_are_titsias(bound_of, close):
-    model, bound, formulas = bound_of
+    bound, formulas = bound_of
     found = bound.optimum()
     values, _ = bound.value_and_gradient(bound.parameters.current())
     close(-values.flatten(), found.bound.flatten())
     for j, formula in enumerate(formulas):
-        mean, root = (t.reshape(-1, *t.shape[-k:])[j] for t, k in ((found.mean, 1), (found.root, 2)))
+        mean, root = (
+            t.reshape(-1, *t.shape[-k:])[j] for t, k in ((found.mean, 1), (found.root, 2))
+        )
         chol = torch.linalg.cholesky(formula.kuu)
         expected, covariance = formula.posterior()
         close(found.bound.flatten()[j], formula.bound(), 1e-6)
@@ -114,7 +116,7 @@ def test_the_bound_and_its_optimum_are_titsias(bound_of, close):
 
 
 def test_gradient_and_parts(bound_of, close, monkeypatch):
-    _, bound, _ = bound_of
+    bound, _ = bound_of
     vector = bound.parameters.current()
     value, gradient = bound.value_and_gradient(vector)
     for i in range(vector.shape[-1]):
@@ -329,6 +331,22 @@ def test_an_error_leaves_the_model_as_it_was(monkeypatch, error):
     assert all(p.requires_grad for n, p in model.named_parameters() if "raw_noise" in n)
 
 
+def test_many_observations_in_parts(monkeypatch, close):
+    X, f, Y = problem(300)
+    whole = make(X, Y)
+    fit(whole, num_screened=0)
+    monkeypatch.setattr(collapsed_bound, "_AT_ONCE", 12 * 64)
+    monkeypatch.setattr(variational_fit, "_AT_ONCE", 64)
+    model = make(X, Y)
+    fit(model, num_screened=0)
+    close(model.predict(X).mean, whole.predict(X).mean, 1e-3)
+    monkeypatch.setattr(variational_fit, "_REFINED", 150)
+    model = make(X, Y)
+    fit(model, num_screened=0)
+    assert (model.evidence - whole.evidence).abs() < 20.0  # of all, not of those that refine
+    assert (model.predict(X).mean - f).std() < 0.05
+
+
 def test_options():
     model = make(*problem(10)[::2])
     with pytest.raises(ValueError, match="got 'bayes'"):
@@ -371,7 +389,7 @@ def test_few_observations(n):
 
 
 def test_inputs_that_repeat_or_rest():
-    X, f, Y = problem(100)
+    X, _, Y = problem(100)
     cases = {
         "repeated": torch.cat([X[:50], X[:50]]),
         "constant": torch.cat([X, torch.ones_like(X)], dim=-1),

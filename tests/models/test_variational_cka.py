@@ -104,7 +104,9 @@ def test_points_at_all_inputs_make_the_exact_model(shuffle, close, num_outputs, 
         close(ours.variance, theirs.variance, 1e-3)
         covariances = (p.distribution.covariance_matrix for p in (ours, theirs))
         close(*covariances, 1e-3)
-    for ours, theirs in zip(model.interval(Z, 0.8, True), exact.interval(Z, 0.8, True), strict=True):
+    for ours, theirs in zip(
+        model.interval(Z, 0.8, True), exact.interval(Z, 0.8, True), strict=True
+    ):
         close(ours, theirs, 1e-3)
 
 
@@ -132,7 +134,9 @@ def test_all_that_predicts_agrees(close, fitted, rest):
     lower, upper = fitted.interval(Z, 0.95)
     close(upper - lower, 2 * 1.959963984540054 * variance.sqrt(), 1e-6)
     noise = fitted.likelihood.noise.squeeze(-1) * fitted.outcome_transform.stdvs.square()
-    close(fitted.predict(Z, True).variance - variance, noise.reshape(1, -1).expand(mean.shape), 1e-6)
+    close(
+        fitted.predict(Z, True).variance - variance, noise.reshape(1, -1).expand(mean.shape), 1e-6
+    )
     f_p = fitted.physics(Z)
     close(fitted.rho(Z).mean * f_p + fitted.delta(Z).mean, mean)
     draws = fitted.sample_functions(3000, seed=0, num_features=512)(Z)
