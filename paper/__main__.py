@@ -24,6 +24,7 @@ EXPERIMENTS = {
     "parameters": ("Parameters", "intervals of a physics' parameters, by several discrepancies"),
     "real": ("Real", "learners of real machines, by free runs beside what was measured"),
     "tanks": ("Tanks", "cascaded tanks: structures of f_p and GPs, by a free run"),
+    "large": ("Large", "100,000 observations: inducing points, or an exact model of some"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

@@ -12,7 +12,7 @@ from gpadjust import CKA, fit
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
     *("physics", "states", "envs", "gp", "models", "inference", "validation"),
-    *("sklearn", "active", "dynamics", "control", "rl"),
+    *("report", "sklearn", "active", "dynamics", "control", "rl"),
 ]
 
 

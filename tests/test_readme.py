@@ -1,4 +1,4 @@
-"""What the README shows runs, and its commands are those of CI."""
+"""What the README and the guide show runs."""
 
 import math
 import re
@@ -7,16 +7,41 @@ from pathlib import Path
 import pytest
 import torch
 
-from gpadjust import CKA
+import gpadjust
+from gpadjust import CKA, FunctionPhysics, Unknown
 from gpadjust.control import CrossEntropy, Planner
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
+WITH_DATA = {"check", "control", "measure", "records", "saving"}  # pages that are tested below
+GUIDE = [p for p in sorted((ROOT / "docs" / "guide").glob("*.md")) if p.stem not in WITH_DATA]
+FIRST = [ROOT / "docs" / "start.md", ROOT / "docs" / "install.md"]
+
+
+def blocks(name):
+    """The Python blocks of a document, by its path in the repository."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(), flags=re.DOTALL)
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 250
+
+
+@pytest.mark.parametrize("page", [*FIRST, *GUIDE], ids=lambda page: page.stem)
+def test_each_page_runs_by_itself(page, capsys):
+    names = {}
+    for block in blocks(page):
+        exec(block, names)
+    shown = re.findall(r"```text\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    words = re.compile(r"[^\W\d]+")  # its numbers are those of one machine
+    if shown:
+        printed = capsys.readouterr().out
+        assert sorted(words.findall(printed)) == sorted(words.findall("".join(shown)))
 
 
 def test_the_examples_run(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    first, held, second, *_ = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    (first,), (held,) = blocks("README.md"), blocks("docs/guide/saving.md")
+    (second,) = blocks("docs/guide/check.md")
     names = {}
     exec(first, names)
     truth = 2 * names["f_p"](names["test_X"]) + names["test_X"]
@@ -35,9 +60,45 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
     assert names["loo"].rmse < 1e-2
 
 
+def abilities(name):
+    """Samples, rho, delta, several physics, unknown parameters: what a model has of these."""
+    X = torch.linspace(0.1, 1, 6, dtype=torch.float64).unsqueeze(-1)
+    unknown = FunctionPhysics(lambda X, p: p.a[:, None] * X, unknowns={"a": Unknown(1.0, sd=0.5)})
+    options = {"bounds": [[0.0], [1.0]]} if name == "AR1" else {}
+
+    def made(physics):
+        return getattr(gpadjust, name)(X, X.exp(), physics=physics, **options)
+
+    if name == "ZeroMeanGP":
+        model = gpadjust.ZeroMeanGP(X, X.exp())
+    else:
+        model = made(unknown if name == "CalibratedPhysics" else torch.sin)
+    tries = [
+        lambda: gpadjust.fit(model).draws,
+        lambda: model.rho(X),
+        lambda: model.delta(X),
+        lambda: made({"sine": torch.sin, "line": torch.abs if name == "AR1" else unknown}),
+        lambda: made(unknown),
+    ]
+    for each in tries:
+        try:
+            each()
+            yield "yes"
+        except (AttributeError, TypeError, ValueError):
+            yield "no"
+
+
+def test_the_models_can_do_what_the_guide_says():
+    text = (ROOT / "docs" / "guide" / "models.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (yes .*) \|$", text, flags=re.MULTILINE)
+    assert len(rows) == 7
+    for name, marks in rows:
+        assert list(abilities(name)) == marks.split(" | "), name
+
+
 def test_measuring(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[3]
+    (code,) = blocks("docs/guide/measure.md")
     names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
     exec(code, names)
     X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
@@ -48,7 +109,7 @@ def test_measuring(tmp_path, monkeypatch):
 
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    law, log = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[4:6]
+    (law,), (log,) = blocks("docs/guide/parameters.md"), blocks("docs/guide/records.md")
     names = {}
     exec(law, names)
     truth = torch.tensor([0.19, 3.65, 0.1], dtype=torch.float64)  # inertia, moment, friction
@@ -70,7 +131,7 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, again = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[6:]
+    code, again = blocks("docs/guide/control.md")
     assert "=2 * 25" in code
     quick = "Planner(search=CrossEntropy(1), horizon=3, num_random=16)"
     code = code.replace("=2 * 25", "=25").replace(

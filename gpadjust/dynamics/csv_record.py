@@ -10,8 +10,8 @@ from typing import TypeVar
 import torch
 
 from gpadjust.dynamics.control_steps import checked_step
-from gpadjust.dynamics.csv_columns import CsvColumns
 from gpadjust.dynamics.record import Record
+from gpadjust.models.csv_columns import CsvColumns
 from gpadjust.states import StateSpec
 
 Column = TypeVar("Column", bound=str | None)
@@ -25,6 +25,7 @@ def read_record(
     time: str | float,
     segment: str | None,
     delimiter: str,
+    decimal: str,
 ) -> Record:
     """The record in a file; see :meth:`~gpadjust.dynamics.Records.read_csv`.
 
@@ -36,8 +37,9 @@ def read_record(
         time: The column of times, or the time from one row to the next.
         segment: The column of labels, if there is one.
         delimiter: What is between two fields.
+        decimal: The decimal mark of numbers.
     """
-    table = CsvColumns(file, delimiter)
+    table = CsvColumns(file, delimiter, decimal=decimal)
     if isinstance(time, str):
         times = table.numbers(time)
     else:

@@ -143,6 +143,7 @@ class Records:
         time: str | float = "time",
         segment: str | None = None,
         delimiter: str = ",",
+        decimal: str = ".",
     ) -> Records:
         r"""Read records from CSV files, one from each.
 
@@ -160,6 +161,7 @@ class Records:
             time: The column of times, or where there is none the time from one row to the next.
             segment: The column of the labels of segments. Default: a file is one segment.
             delimiter: What is between two fields.
+            decimal: The decimal mark of numbers, a point or a comma.
 
         Raises:
             OSError: If a file cannot be read.
@@ -188,7 +190,9 @@ class Records:
             checked_columns(actions, spec.actions, "actions"),
         )
         several = [files] if isinstance(files, str | Path) else files
-        records = [read_record(f, spec, *columns, time, segment, delimiter) for f in several]
+        records = [
+            read_record(f, spec, *columns, time, segment, delimiter, decimal) for f in several
+        ]
         return cls(records, spec)
 
     def transitions(self, step: float | None = None) -> Transitions:

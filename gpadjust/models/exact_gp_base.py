@@ -93,11 +93,23 @@ class ExactGPBase(TermsModel, SingleTaskGP):
             self.outcome_transform = outcome_transform
         self.input_names, self.output_names = data.input_names, data.output_names
         set_initial_values(self, *given, likelihood)
+        self.__dict__["initial"] = {n: p.detach().clone() for n, p in self._learnable()}
 
     @staticmethod
     def _learnt_noise(batch_shape: Size) -> Likelihood:
         """The default likelihood."""
         return learnt_noise(batch_shape)
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether a hyper-parameter is another than the model was built with, or none is learnt."""
+        initial = self.__dict__.get("initial", {})
+        learnable = self._learnable()
+        same = [n in initial and torch.equal(p, initial[n]) for n, p in learnable]
+        return not learnable or not all(same)
+
+    def _learnable(self) -> list[tuple[str, Tensor]]:
+        return [(n, p) for n, p in self.named_parameters() if p.requires_grad]
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the model at *transformed* inputs, as GPyTorch does."""

@@ -108,6 +108,7 @@ class StackedGP(Model):
         weights = _as_weights(weights)
         first = _check(models, weights)
         self.num_samples = num_components
+        self._made_of: dict[str, ExactGPBase] | None = {**models}
         self.input_names, self.output_names = first.input_names, first.output_names
         self.weights: dict[str, list[float]] = {name: [] for name in models}
         self.groups: Any = ModuleList()
@@ -132,6 +133,20 @@ class StackedGP(Model):
             [Part(name, model, n) for (name, n), model in zip(labels, group, strict=True)]
             for labels, group in pairs
         ]
+
+    @property
+    def made_of(self) -> dict[str, ExactGPBase]:
+        """The models that it was made of, by the names of their structures.
+
+        Raises:
+            ValueError: If it is a subset of outputs, or was conditioned on fantasies.
+        """
+        if self._made_of is None:
+            raise ValueError(
+                "This mixture is of parts of models, a subset of their outputs or fantasies; take "
+                "the StackedGP that it was made from."
+            )
+        return {**self._made_of}
 
     @property
     def num_outputs(self) -> int:
@@ -183,7 +198,7 @@ class StackedGP(Model):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Posterior:
-        """The joint posterior at raw ``X`` (``... x q x d``), a mixture; see BoTorch."""
+        """The joint posterior at raw ``X`` (``batch_shape x q x d``), a mixture; see BoTorch."""
         if output_indices is not None:
             subset = self.subset_output(list(output_indices))
             return subset.posterior(X, None, observation_noise, posterior_transform)
@@ -342,6 +357,7 @@ class StackedGP(Model):
         other = type(self).__new__(type(self))
         Model.__init__(other)
         other.num_samples, other.input_names = self.num_samples, self.input_names
+        other._made_of = None
         other.output_names = tuple(self.output_names[i] for i in idcs)
         other.weights = {name: [w[i] for i in idcs] for name, w in self.weights.items()}
         other.groups = ModuleList([ModuleList(group) for group in groups])

@@ -125,7 +125,7 @@ class TermsModel(Model):
         observation_noise: bool | Tensor = False,
         posterior_transform: PosteriorTransform | None = None,
     ) -> Posterior:
-        """The joint posterior at raw ``X`` (``... x q x d``); see BoTorch.
+        """The joint posterior at raw ``X`` (``batch_shape x q x d``); see BoTorch.
 
         Variances that are given as ``observation_noise`` are in the square of the user's units.
         """

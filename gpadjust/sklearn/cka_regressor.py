@@ -31,8 +31,8 @@ from gpadjust.models import (
 )
 from gpadjust.models.training_data import column_names
 from gpadjust.physics import Physics
+from gpadjust.physics.array_physics import array_physics
 from gpadjust.physics.carrier import pack, unpack
-from gpadjust.sklearn.array_physics import array_physics
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from botorch.posteriors.fully_bayesian import MCMC_DIM
@@ -11,6 +11,7 @@ from torch import Tensor
 from gpadjust.inference.full_bayes import LEAST_POWER
 from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.models import ExactGPBase
+from gpadjust.validation.gain import Gain, physics_gain
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, difference, sign_of
 from gpadjust.validation.refitting import LEAST
@@ -41,7 +42,7 @@ def advice(
     sentences, fewest = [], len(X)
     for j, (output, rows) in enumerate(table.items()):
         where = f"{output}: " if len(table) > 1 else ""
-        density = dict(zip(left_out, densities(left_out, j).unbind(-1), strict=True))
+        density = _density(left_out, j)
         fewest = min(fewest, len(density[rows[0].structure]))
         found = [_best(rows), *_gains(by_name, [row.structure for row in rows], density)]
         found += _preferred(models[rows[0].structure], X, j)
@@ -80,39 +81,53 @@ def _best(rows: list[Candidate]) -> str:
     )
 
 
+def gains(
+    structures: Sequence[Structure],
+    left_out: dict[str, LeaveOneOut],
+    table: dict[str, list[Candidate]],
+) -> dict[str, Gain]:
+    """What the physics is worth to each output, if there are structures with and without it."""
+    by_name = {structure.name: structure for structure in structures}
+    found = {}
+    for j, (output, rows) in enumerate(table.items()):
+        order = [row.structure for row in rows]
+        found[output] = physics_gain(by_name, order, _density(left_out, j))
+    return {output: gain for output, gain in found.items() if gain is not None}
+
+
+def _density(left_out: dict[str, LeaveOneOut], output: int) -> dict[str, Tensor]:
+    """The log predictive densities of an output's observations by each structure, ``n``."""
+    return dict(zip(left_out, densities(left_out, output).unbind(-1), strict=True))
+
+
 def _gains(
     structures: dict[str, Structure], order: list[str], density: dict[str, Tensor]
 ) -> list[str]:
     """Whether the physics helps, and whether scaling it does."""
-
-    def first(matches: Callable[[Structure], bool]) -> str | None:
-        return next((name for name in order if matches(structures[name])), None)
-
-    def gain(better: str, worse: str, otherwise: str) -> tuple[int, str]:
-        value, error = difference(density[better], density[worse])
-        nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
-        return sign_of(value, error), f"elpd {nats} ({better}) over that {otherwise} ({worse})"
-
-    best, without = first(lambda s: s.uses_physics), first(lambda s: not s.uses_physics)
     sentences = []
-    if best is not None and without is not None:
-        # An unknown constant may help by itself.
-        fair = first(lambda s: s.uses_physics and not s.unknowns) or best
-        sign, text = gain(fair, without, "without it")
-        if sign > 0:
-            sentences.append(f"The physics helps: {text}.")
-        else:
-            sign, text = gain(best, without, "without it")
-            says = "makes predictions worse" if sign < 0 else "is not shown to help"
-            alone = "; its unknown constants may do so by themselves" if sign > 0 else ""
+    physics = physics_gain(structures, order, density)
+    if physics is not None:
+        text = _elpd(physics.elpd, physics.se, physics.structure, "without it", physics.without)
+        if physics.shown <= 0:
+            says = "makes predictions worse" if physics.shown < 0 else "is not shown to help"
+            enough = len(density[physics.structure]) >= ENOUGH
+            by_constants = enough and sign_of(physics.elpd, physics.se) > 0
+            alone = "; its unknown constants may do so by themselves" if by_constants else ""
             return [f"The physics {says}: {text}{alone}."]
-    adjusting = first(lambda s: s.adjusts)
-    plain = first(lambda s: s.uses_physics and not s.adjusts)
-    if adjusting is not None and plain is not None:
-        sign, text = gain(adjusting, plain, "with the physics as a mean")
-        says = "helps" if sign > 0 else "is not shown to help"
+        sentences.append(f"The physics helps: {text}.")
+    adjusting = next((name for name in order if structures[name].adjusts), None)
+    plain = next((n for n in order if structures[n].uses_physics and not structures[n].adjusts), "")
+    if adjusting is not None and plain:
+        value, error = difference(density[adjusting], density[plain])
+        says = "helps" if sign_of(value, error) > 0 else "is not shown to help"
+        text = _elpd(value, error, adjusting, "with the physics as a mean", plain)
         sentences.append(f"Scaling the physics {says}: {text}.")
     return sentences
+
+
+def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -> str:
+    nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
+    return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
 
 
 def _unsampled(rows: list[Candidate], power: dict[str, Tensor], output: int) -> list[str]:

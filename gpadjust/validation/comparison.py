@@ -5,12 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from botorch.models.transforms.input import InputTransform
+from botorch.posteriors.fully_bayesian import MCMC_DIM
 from torch import Tensor
 from tqdm import tqdm
 
@@ -23,8 +24,14 @@ from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
 from gpadjust.physics import as_physics
-from gpadjust.validation.advice import advice
-from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, observations
+from gpadjust.validation.advice import advice, gains
+from gpadjust.validation.gain import Gain
+from gpadjust.validation.leave_one_out import (
+    LeaveOneOut,
+    leave_one_out,
+    mixture_of,
+    observations,
+)
 from gpadjust.validation.ranking import Candidate, is_clear, ranking
 from gpadjust.validation.refitting import LEAST, refitted
 from gpadjust.validation.structures import (
@@ -53,12 +60,18 @@ class Comparison:
         stacked: All of them, stacked with the weights of the tables.
         table: The candidates of each output, best first, by the names of the outputs.
         advice: What the comparison says about the physics, in sentences.
+        gain: What the physics is worth to each output, by the names of the outputs; empty without a
+            structure that uses none.
+        left_out: The predictions of left-out observations by each structure, which the tables tell
+            of.
     """
 
     models: dict[str, ExactGPBase]
     stacked: StackedGP
     table: dict[str, list[Candidate]]
     advice: list[str]
+    gain: dict[str, Gain] = field(default_factory=dict)
+    left_out: dict[str, LeaveOneOut] = field(default_factory=dict)
 
     @property
     def chosen(self) -> str:
@@ -76,6 +89,22 @@ class Comparison:
     def recommended(self) -> ExactGPBase | StackedGP:
         """The fitted model of the structure that is clearly best, otherwise the stacked one."""
         return self.models.get(self.chosen, self.stacked)
+
+    def leave_one_out(self) -> LeaveOneOut:
+        """Predictions of left-out observations by what is recommended, as in the tables.
+
+        Of a mixture its weights stay, which have seen all observations.
+        """
+        if self.chosen != STACKED:
+            return self.left_out[self.chosen]
+        each = [self.left_out[name] for name in self.models]
+        mean, variance, density = (
+            torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
+            for name in ("mean", "variance", "log_density")
+        )
+        weight = _weights(self.models, [*self.table.values()]).unsqueeze(-2)  # K x 1 x m
+        mean, variance, density = mixture_of(mean, variance, density, weight)
+        return replace(each[0], mean=mean, variance=variance, log_density=density)
 
     def __str__(self) -> str:
         width = max(len(row.structure) for rows in self.table.values() for row in rows)
@@ -195,7 +224,10 @@ def compare(
                 physics=deepcopy(part),
                 input_transform=deepcopy(input_transform),
             )
-            with warnings.catch_warnings(), threads_for(len(data.X), others=True):
+            with (
+                warnings.catch_warnings(record=True) as caught,
+                threads_for(len(data.X), others=True),
+            ):
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
                 result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
@@ -209,6 +241,8 @@ def compare(
         except Exception as error:
             error.add_note(f"This is of the structure {structure.name!r}.")
             raise
+        for each in caught:
+            warnings.warn(f"{structure.name}: {each.message}", each.category, stacklevel=2)
         power[structure.name] = result.power.flatten()
         models[structure.name] = _thinned(model, _HELD)
     by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
@@ -216,7 +250,8 @@ def compare(
     stacked = StackedGP(models, _weights(models, by_output), _HELD)
     fitted = [structure for structure, _ in found]
     sentences = advice(fitted, models, left_out, power, table, data.X)
-    return Comparison(models, stacked, table, sentences)
+    gain = gains(fitted, left_out, table)
+    return Comparison(models, stacked, table, sentences, gain, left_out)
 
 
 def _number(num_points: int) -> int:

@@ -6,6 +6,7 @@ from botorch.models.transforms import Normalize
 from torch.nn.functional import relu, silu
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, StackedGP, ZeroMeanGP, load, save
+from gpadjust.physics import as_physics
 
 
 @pytest.fixture
@@ -107,16 +108,49 @@ def test_a_state_of_another_model_changes_nothing(uniform):
     torch.testing.assert_close(model.predict(Z), before)
 
 
-def test_a_stacked_model_comes_back_by_its_parts(uniform, path):
+def test_whether_it_is_fitted_is_known_of_a_loaded_model(uniform, path):
+    X, Y, _ = problem(uniform)
+    model = CKA(X, Y, physics=relu)
+    save(model, path)
+    assert not model.is_fitted
+    assert not load(path).is_fitted
+    with torch.no_grad():
+        model.likelihood.noise_covar.raw_noise += 0.1
+    save(model, path)
+    assert model.is_fitted
+    assert load(path).is_fitted
+    known = CKA(X, Y, physics=relu)
+    for parameter in known.parameters():
+        parameter.requires_grad_(False)
+    assert known.is_fitted  # as nothing is to be learnt
+
+
+def test_a_stacked_model_comes_back(uniform, path):
     X, Y, Z = problem(uniform)
     models = {name: BUILDS[name](X, Y) for name in ("learnt centre", "zero mean")}
     stacked = StackedGP(models, torch.tensor([[0.5, 0.25], [0.5, 0.75]]).double())
-    with pytest.raises(TypeError, match="save the models that it was made of"):
-        save(stacked, path)
-    for name, model in models.items():
-        save(model, path)
-        models[name] = load(path)
-    same(StackedGP(models, torch.tensor([*stacked.weights.values()]).double()), stacked, Z)
+    save(stacked, path)
+    again = load(path)
+    assert again.weights == stacked.weights
+    same(again, stacked, Z)
+    with pytest.raises(ValueError, match="take the StackedGP that it was made from"):
+        save(stacked.subset_output([0]), path)
+    same(load(path), stacked, Z)
+
+
+def test_a_stacked_model_of_several_physics_is_given_those_without_a_name(uniform, path):
+    X, Y, Z = problem(uniform)
+    parts = {"low": lambda X: X - 1, "high": relu}
+    models = {
+        f"of {name}": CKA(X, Y, physics=part)
+        for name, part in zip(parts, as_physics(parts).parts, strict=True)
+    }
+    models |= {"of all": CKA(X, Y, physics=parts), "none": ZeroMeanGP(X, Y)}
+    stacked = StackedGP(models, torch.full((4, 2), 0.25).double())
+    save(stacked, path)
+    with pytest.raises(ValueError, match="could not hold physics"):
+        load(path)
+    same(load(path, physics=parts), stacked, Z)
 
 
 def test_files_that_are_no_models(path):

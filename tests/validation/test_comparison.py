@@ -2,13 +2,15 @@
 
 import math
 import sys
+import warnings
 
 import pytest
 import torch
 from botorch.models.transforms import Normalize
 
 from gpadjust import CKA, FunctionPhysics, StackedGP, Unknown, ZeroMeanGP, compare, fit
-from gpadjust.validation import STRUCTURES, Structure, leave_one_out, stacking_weights
+from gpadjust.validation import STRUCTURES, Gain, Structure, leave_one_out, stacking_weights
+from gpadjust.validation.gain import physics_gain
 from gpadjust.validation.ranking import Candidate, is_clear, ranking
 
 comparison_of = sys.modules["gpadjust.validation.comparison"]
@@ -124,6 +126,41 @@ def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
     assert str(comparison).count("its error") == 2
 
 
+def test_what_is_left_out_is_what_the_tables_tell_of(scaled, noise):
+    X, Y = scaled
+    structures = ["zero mean", "physics mean", "CKA"]
+    comparison = compare(X, Y + noise, crude, structures=structures, **QUICK)
+    rows = comparison.table["y"]
+    for each in rows:
+        loo = comparison.left_out[each.structure]
+        assert loo.log_density.sum().item() == pytest.approx(each.elpd)
+        assert loo.coverage().item() == pytest.approx(each.coverage)
+    gain = comparison.gain["y"]
+    elpd = {each.structure: each.elpd for each in rows}
+    assert gain.elpd == pytest.approx(elpd[gain.structure] - elpd["zero mean"])
+    whole = comparison.leave_one_out()
+    if comparison.chosen == "stacked":
+        weights = {each.structure: each.weight for each in rows}
+        parts = [weights[n] * loo.log_density.exp() for n, loo in comparison.left_out.items()]
+        means = [weights[n] * loo.mean for n, loo in comparison.left_out.items()]
+        torch.testing.assert_close(whole.log_density, sum(parts).log())
+        torch.testing.assert_close(whole.mean, sum(means))
+    else:
+        assert whole is comparison.left_out[comparison.chosen]
+
+
+def test_warnings_say_of_which_structure(scaled, monkeypatch):
+    def warned(model, *args, **options):
+        warnings.warn("careful", UserWarning, stacklevel=2)
+        return fit(model, *args, **options)
+
+    monkeypatch.setattr("gpadjust.validation.comparison.fit", warned)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        compare(*scaled, crude, 1e-3, structures=["CKA"], **QUICK)
+    assert "CKA: careful" in {str(each.message) for each in caught}
+
+
 @pytest.mark.parametrize("variance", [None, 0.01], ids=["learnt noise", "known noise"])
 def test_units_make_no_difference(X, scaled, variance):
     Y = scaled[1]
@@ -186,10 +223,10 @@ class TestAdvice:
     def test_a_physics_that_is_worse_than_none(self):
         names = {structure.name: structure for structure in STRUCTURES}
         density = {"zero mean": 4.0, "constant rho": 2.0, "CKA": 1.0, "physics mean": -9.0}
-        values = {n: torch.tensor([v, v + 0.1]).double() for n, v in density.items()}
+        values = {n: torch.tensor([v, v + 0.1] * 4).double() for n, v in density.items()}
         (sentence,) = advice_of._gains(names, [*density], values)
-        assert sentence.startswith("The physics makes predictions worse: elpd -4.0 +- 0.0 nats (c")
-        values["constant rho"] = values["zero mean"] + torch.tensor([1.0, -1.0])
+        assert sentence.startswith("The physics makes predictions worse: elpd -16.0 +- 0.0 nats (c")
+        values["constant rho"] = values["zero mean"] + torch.tensor([1.0, -1.0] * 4)
         (sentence,) = advice_of._gains(names, [*density], values)
         assert sentence.startswith("The physics is not shown to help: elpd +0.0")
         values["constant rho"] = values["zero mean"] + 1
@@ -201,6 +238,18 @@ class TestAdvice:
             "The physics helps",
             "Scaling the physics helps",
         ]
+
+    def test_the_physics_of_few_observations_is_neither_praised_nor_denied(self):
+        names = {structure.name: structure for structure in STRUCTURES}
+        for sign in (1.0, -1.0):
+            better = {"zero mean": torch.zeros(8), "CKA": sign * torch.ones(8)}
+            gain = physics_gain(names, [*better], better)
+            assert gain == Gain(8 * sign, 0.0, "CKA", "zero mean", int(sign))
+            few = {name: density[:7] for name, density in better.items()}
+            assert physics_gain(names, [*few], few).shown == 0
+            (sentence, *_) = advice_of._gains(names, [*few], few)
+            assert sentence.startswith("The physics is not shown to help: elpd")
+        assert physics_gain(names, ["CKA"], better) is None
 
     def test_a_smooth_bias(self, X, noise):
         Y, names = crude(X) + X.exp() + noise, ["physics mean", "CKA"]

@@ -23,6 +23,8 @@ from gpadjust.validation.plots.drawing import (
     whole,
 )
 
+_CONSTANT = 1e-9  # relative variation of what is constant
+
 
 def plot_adjustment(
     model: Any,
@@ -155,11 +157,16 @@ def plot_adjustment_pair(
         for ax, values, title, colors in zip(
             row, (mean, sd), ("mean", "sd"), ("viridis", "cividis"), strict=True
         ):
-            contour = ax.contourf(*grid, values.reshape(grid[0].shape), levels=12, cmap=colors)
-            ax.figure.colorbar(contour, ax=ax)
+            values = values.reshape(grid[0].shape)
+            middle, ticks = float(values.mean()), None
+            levels: int | list[float] = 12
+            if (values - middle).abs().max() <= _CONSTANT * abs(middle):  # rounding errors
+                levels, ticks = sorted([0.9 * middle, 1.1 * middle]), [middle]
+            contour = ax.contourf(*grid, values, levels=levels, cmap=colors)
+            ax.figure.colorbar(contour, ax=ax, ticks=ticks)
             ax.plot(train_X[:, i], train_X[:, j], "o", color=RED, ms=4, mec="white", mew=0.6)
             ax.set(title=f"{title} of {_symbol(name)}{suffix}", xlabel=label[i], ylabel=label[j])
-            ax.set(xlim=bounds[:, i], ylim=bounds[:, j])
+            ax.set(xlim=bounds[:, i].tolist(), ylim=bounds[:, j].tolist())
     return axes
 
 

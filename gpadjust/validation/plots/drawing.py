@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.mathtext import MathTextParser
 from torch import Tensor
 
 from gpadjust.validation.scores import check_level
@@ -84,7 +85,19 @@ def labels(of: Any, kind: str, number: int) -> list[str]:
     symbol = {"input": "x", "output": "y"}[kind]
     default = [symbol] if number == 1 else [f"{symbol}{k + 1}" for k in range(number)]
     names = getattr(of, f"{kind}_names", None) or default
-    return [re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", name) for name in names]
+    return [re.sub(r"^([xy])(\d+)$", r"$\1_{\2}$", _as_text(name)) for name in names]
+
+
+def _as_text(name: str) -> str:
+    """A name in which dollars are dollars, unless they hold a formula that can be drawn."""
+    lines = []
+    for line in name.split("\n"):
+        try:
+            MathTextParser("path").parse(line)
+            lines.append(line)
+        except ValueError:
+            lines.append(line.replace("$", r"\$"))
+    return "\n".join(lines)
 
 
 def new_axes(rows: int, columns: int, size: float = 3.2) -> Any:

@@ -93,7 +93,9 @@ def plot_prediction(
     order = X[:, 0].argsort()
     x = X[order, 0].detach()
     band(ax, x, mean[order], half[order], level)
-    for (name, physics), style in zip(_physics(model), cycle(("--", "-.", ":")), strict=False):
+    for (name, physics), style in zip(
+        physics_curves(model), cycle(("--", "-.", ":")), strict=False
+    ):
         with torch.no_grad():
             f_p = column(physics(X[order]), output)
         ax.plot(x, f_p, color=GREY, ls=style, lw=1.2, label=name)
@@ -157,7 +159,7 @@ def plot_leave_one_out(
     return axes
 
 
-def _physics(model: Any) -> list[tuple[str, Any]]:
+def physics_curves(model: Any) -> list[tuple[str, Any]]:
     """The physics of a model with their names, unknown parameters at their means."""
     physics: Any = getattr(model, "physics", None)
     known = model.physics_parameters if getattr(model, "has_unknowns", False) else {}

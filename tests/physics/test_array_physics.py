@@ -11,7 +11,7 @@ from gpadjust import (
     JoinedPhysics,
     PhysicsError,
 )
-from gpadjust.sklearn.array_physics import array_physics
+from gpadjust.physics.array_physics import array_physics
 
 X = np.linspace(0.1, 1, 6).reshape(3, 2)
 TENSOR = torch.tensor(X)

@@ -1,4 +1,4 @@
-"""What a user of scikit-learn gives as physics, as a Physics."""
+"""A function of NumPy arrays or of tensors, whichever it is, as a Physics."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, Physics, PhysicsError, as_physics
+from gpadjust.physics.base import Physics
+from gpadjust.physics.black_box import BlackBoxPhysics
+from gpadjust.physics.error import PhysicsError
+from gpadjust.physics.function import FunctionPhysics, as_physics
 
 
 def array_physics(physics: Any, X: NDArray[np.float64]) -> Physics:

@@ -1,0 +1,104 @@
+"""Public names: their entries in the reference, and links to these from wherever they stand."""
+
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+from pydoc import locate
+from typing import Any
+
+from docutils.nodes import Element, TextElement, document, literal, reference, title
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.pycode import ModuleAnalyzer
+from sphinx.util.logging import getLogger
+
+REFERENCE = Path(__file__).parents[1] / "reference"
+PAGES = {page.stem for page in REFERENCE.glob("*.rst")} - {"index"}
+ROOMS = [import_module(f"gpadjust.{name}") for name in (*sorted(PAGES), "validation.plots")]
+ENTRIES = {id(getattr(room, n)): f"{room.__name__}.{n}" for room in ROOMS for n in room.__all__}
+SOURCES = [ModuleAnalyzer.for_module(n) for n in list(sys.modules) if n.startswith("gpadjust.")]
+CONSTANTS = {  # the docstrings that follow assignments
+    id(getattr(sys.modules[source.modname], name)): lines
+    for source in SOURCES
+    for (owner, name), lines in source.find_attr_docs().items()
+    if owner == ""
+}
+for room in ROOMS:  # autodoc looks for them in the room's __init__ alone
+    docs = ModuleAnalyzer.for_module(room.__name__).find_attr_docs()
+    for name in room.__all__:
+        if id(getattr(room, name)) in CONSTANTS:
+            docs["", name] = CONSTANTS[id(getattr(room, name))]
+
+
+WORDS = re.compile(r"collect|compare|smooth|fit\(model")
+LITERALS = {n: ENTRIES[id(getattr(room, n))] for room in ROOMS for n in room.__all__}
+
+
+def link_literals(app: Sphinx, document: document) -> None:
+    """Link code in a line that is a public name, or a call of one, such as ``CKA(...)``."""
+    for node in list(document.findall(literal)):
+        text = node.astext()
+        name = re.sub(r"\(.*", "", text, flags=re.DOTALL).rpartition(".")[2]
+        plain = name.islower() and "_" not in name  # fit and score are methods of others, too
+        if name not in LITERALS or (plain and not WORDS.match(text)):
+            continue
+        if isinstance(node.parent, reference | title | pending_xref):
+            continue
+        target = {"refdomain": "py", "reftype": "obj", "reftarget": LITERALS[name]}
+        node.replace_self(pending_xref("", node.deepcopy(), refdoc=app.env.docname, **target))
+
+
+def link_other_names(
+    app: Sphinx, env: BuildEnvironment, node: Element, content: TextElement
+) -> Element | None:
+    """Link ``gpadjust.CKA`` to its entry in its room, and an inherited method to its base's."""
+    found = locate(node["reftarget"])
+    entry = ENTRIES.get(id(found))
+    if entry is None and hasattr(found, "__qualname__"):
+        owner, _, name = f"{found.__module__}.{found.__qualname__}".rpartition(".")
+        entry = f"{ENTRIES.get(id(locate(owner)), owner)}.{name}"
+    if entry in (None, node["reftarget"]):
+        return None
+    domain = env.get_domain("py")
+    return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", entry, node, content)
+
+
+def skip_field_aliases(
+    app: Sphinx, what: str, name: str, member: Any, skip: bool, options: Any
+) -> bool | None:
+    """Leave out a named tuple's fields, which its docstring tells."""
+    return str(getattr(member, "__doc__", "")).startswith("Alias for field number") or None
+
+
+def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
+    """Warn of public names that no page shows."""
+    for name in set(ENTRIES.values()) - set(env.get_domain("py").objects):
+        getLogger("docs").warning("%s has no entry: give it a docstring", name)
+
+
+def mend_ways_back(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: document | None
+) -> None:
+    """Lead from the source to the entry also where viewcode mistakes the module of its name."""
+    entries, module = app.env.get_domain("py").objects, page.removeprefix("_modules/")
+
+    def mended(anchor: re.Match[str]) -> str:
+        parts = anchor[1].split(".")
+        ends = [".".join(parts[i:]) for i in range(1, len(parts))]
+        names = [anchor[1], *(f"{module.replace('/', '.')}.{end}" for end in ends)]
+        return f'#{next(name for name in names if name in entries)}"'
+
+    if page.startswith("_modules/gpadjust/"):
+        context["body"] = re.sub(r'(?<=html)#(gpadjust[\w.]*)"', mended, context["body"])
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the hooks."""
+    app.connect("doctree-read", link_literals)
+    app.connect("missing-reference", link_other_names)
+    app.connect("autodoc-skip-member", skip_field_aliases)
+    app.connect("env-check-consistency", check_complete)
+    app.connect("html-page-context", mend_ways_back)
+    return {"parallel_read_safe": True}

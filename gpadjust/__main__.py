@@ -1,0 +1,102 @@
+"""The command line: ``python -m gpadjust report data.csv ...``."""
+
+from __future__ import annotations
+
+import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from collections.abc import Sequence
+
+_ABOUT = """\
+One page that shows whether a crude physics model helps to predict your measurements, where it is
+wrong, how well left-out measurements are predicted, and which model to take, which is saved beside
+it. You need a CSV file, whose first line names its columns, and a Python function: the physics.
+"""
+_EXAMPLE = """\
+example: pump.csv has the columns "flow [m3/h]", "speed [rpm]" and "head [m]", and pump.py
+
+    def head(X):  # a row for each measurement, its columns in the order of --inputs
+        flow, speed = X[:, 0], X[:, 1]
+        return 30 * (speed / 1450) ** 2 - 0.02 * flow**2
+
+of NumPy arrays or torch tensors. Then, in their folder,
+
+    python -m gpadjust report pump.csv --inputs flow,speed --outputs head --physics pump:head
+
+writes report.html and report.pt. Where an output was not measured its field is empty.
+"""
+
+
+def parser() -> ArgumentParser:
+    """The options, and what they say of themselves."""
+    main_parser = ArgumentParser(prog="python -m gpadjust", description="Adjust physics to data.")
+    commands = main_parser.add_subparsers(dest="command", required=True)
+    report = commands.add_parser(
+        "report",
+        help="a page about a CSV file and a physics",
+        description=_ABOUT,
+        epilog=_EXAMPLE,
+        formatter_class=RawDescriptionHelpFormatter,
+    )
+    add = report.add_argument
+    add("data", help="the CSV file, in UTF-8")
+    add("--inputs", required=True, metavar="a,b", help="the columns that the physics reads")
+    add("--outputs", required=True, metavar="y", help="the columns that it predicts")
+    add(
+        "--physics",
+        required=True,
+        action="append",
+        metavar="module:function",
+        help="the physics: head of pump.py is pump:head. Several: give it again",
+    )
+    add(
+        "--out",
+        default="report.html",
+        metavar="page.html",
+        help="the page to write (%(default)s); the model beside it",
+    )
+    add("--units", metavar="a=m,y=Pa", help='units, of columns that do not say them, as "a [m]"')
+    add("--noise", metavar="0.1", help="known standard deviation of the outputs; or y=0.1,z=2")
+    add(
+        "--fit",
+        choices=("compare", "bayes", "map"),
+        default="compare",
+        help="compare structures, which tells whether the physics helps (the default); or one CKA "
+        "alone, by full Bayes or at the likeliest hyper-parameters, which is quicker",
+    )
+    add("--seed", type=int, default=0, metavar="0", help="of the fits (%(default)s)")
+    add(
+        "--delimiter", default=",", metavar="mark", help='between two fields (","); ";" or tab, say'
+    )
+    add("--decimal", default=".", choices=(".", ","), metavar="mark", help='the decimal mark (".")')
+    add("--title", metavar="text", help="the title of the page")
+    return main_parser
+
+
+def main(command: Sequence[str] | None = None) -> int:
+    """Run a command, and return its exit status: 0, or 1 with a message, or 130 if interrupted."""
+    command = sys.argv[1:] if command is None else [*command]
+    arguments = parser().parse_args(command)
+    try:
+        # Not earlier: --help and what is wrong with options need no torch.
+        from gpadjust.physics import PhysicsError
+        from gpadjust.report.command import run
+    except ImportError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        return _fail("interrupted; nothing was written.", 130)
+    try:
+        run(arguments, command)
+    except (ValueError, OSError, PhysicsError) as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        return _fail("interrupted; nothing was written.", 130)
+    return 0
+
+
+def _fail(message: str, status: int = 1) -> int:
+    print(f"gpadjust: {message}", file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

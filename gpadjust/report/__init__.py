@@ -1,0 +1,12 @@
+"""A page to show: what a model or a comparison says (the extra ``plot``)."""
+
+try:
+    import matplotlib as _  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        'gpadjust.report needs matplotlib; run `pip install "gpadjust[plot]"`.'
+    ) from error
+
+from gpadjust.report.writing import report
+
+__all__ = ["report"]

@@ -1,0 +1,89 @@
+"""The command ``python -m gpadjust report``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import warnings
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+from gpadjust.inference import fit
+from gpadjust.models import CKA, ExactGPBase
+from gpadjust.report.csv_data import CsvData, noise_variances, pairs, read_csv, split
+from gpadjust.report.named_physics import NamedPhysics, named_physics
+from gpadjust.report.numbers import listed, plural
+from gpadjust.report.provenance import Origin
+from gpadjust.report.subject import subject_of
+from gpadjust.report.verdict import headline
+from gpadjust.report.writing import checked_path, write
+from gpadjust.validation import Comparison, compare
+
+
+def run(arguments: Namespace, command: Sequence[str]) -> None:
+    """Read a file, compare, and write the page; nothing is written if anything fails.
+
+    Args:
+        arguments: What :func:`gpadjust.__main__.parser` makes of a command line.
+        command: The command line, for the page.
+
+    Raises:
+        OSError: If a file cannot be read or written.
+        ValueError: If an option, the data or the physics are wrong.
+        PhysicsError: If the physics fails where the models evaluate it.
+    """
+    path = checked_path(arguments.out)
+    inputs, outputs = split(arguments.inputs), split(arguments.outputs)
+    units = {} if arguments.units is None else pairs(arguments.units, "--units")
+    variances = noise_variances(arguments.noise, outputs)
+    marks = (_mark(arguments.delimiter), arguments.decimal)
+    data = read_csv(arguments.data, inputs, outputs, units, *marks)
+    physics = named_physics(arguments.physics, data)
+    names = (listed(data.Y.columns), listed(data.X.columns))
+    _say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        model = _fitted(arguments, data, physics, variances)
+        subject = subject_of(model, [f"line {line}" for line in data.lines])
+    notes = tuple(
+        dict.fromkeys(
+            str(each.message)
+            for each in caught
+            if not issubclass(each.category, DeprecationWarning | PendingDeprecationWarning)
+        )
+    )
+    for note in notes:
+        _say(f"Warning: {note}")
+    settings = {
+        "command": f"python -m gpadjust {shlex.join(command)}",
+        "data file": f"{Path(arguments.data).name} (SHA-256 {data.digest}...)",
+        "seed": str(arguments.seed),
+    }
+    origin = Origin(settings, data.remarks, notes, physics.code, physics.modules)
+    write(subject, path, arguments.title, origin, progress=True)
+    print(f"{headline(subject)}\nWrote {path} and {path.with_suffix('.pt')}.")
+
+
+def _fitted(
+    arguments: Namespace, data: CsvData, physics: NamedPhysics, variances: list[float] | None
+) -> Comparison | ExactGPBase:
+    X, Y, f_p = data.X, data.Y, physics.physics
+    if arguments.fit == "compare":
+        return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True)
+    _say(f"Fitting CKA by {arguments.fit!r} ...")
+    model = CKA(X, Y, variances, physics=f_p)
+    fit(model, arguments.fit, seed=arguments.seed)
+    return model
+
+
+def _mark(text: str) -> str:
+    """What is between two fields; a tab may be written as in Python."""
+    mark = {"\\t": "\t", "tab": "\t"}.get(text, text)
+    if len(mark) != 1:
+        raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")
+    return mark
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,56 @@
+"""What the physics is worth to an output."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from torch import Tensor
+
+from gpadjust.validation.ranking import ENOUGH, difference, sign_of
+from gpadjust.validation.structures import Structure
+
+
+class Gain(NamedTuple):
+    """By how much an output is predicted better with the physics than without it.
+
+    Attributes:
+        elpd: The difference of expected log predictive densities, the sum over the observations, in
+            nats.
+        se: Its standard error.
+        structure: The structure with the physics; one without unknown constants, which may help by
+            themselves, if that is shown to be better.
+        without: The structure without the physics.
+        shown: 1 if the physics is shown to help, -1 if it is shown to make predictions worse, and
+            0 if neither is, by two standard errors, or there are fewer than eight observations.
+    """
+
+    elpd: float
+    se: float
+    structure: str
+    without: str
+    shown: int
+
+
+def physics_gain(
+    structures: Mapping[str, Structure], order: Iterable[str], density: Mapping[str, Tensor]
+) -> Gain | None:
+    """What the physics is worth; None if there is nothing with it, or nothing without it.
+
+    Args:
+        structures: The structures by their names.
+        order: The names, best first.
+        density: The log predictive densities of left-out observations by each, ``n``.
+    """
+    names = [*order]
+    physical = [name for name in names if structures[name].uses_physics]
+    others = [name for name in names if not structures[name].uses_physics]
+    if not (physical and others):
+        return None
+    shows = len(density[physical[0]]) >= ENOUGH  # of fewer the error is itself unknown
+    fair = next((name for name in physical if not structures[name].unknowns), physical[0])
+    elpd, se = difference(density[fair], density[others[0]])
+    if shows and sign_of(elpd, se) > 0:
+        return Gain(elpd, se, fair, others[0], 1)
+    elpd, se = difference(density[physical[0]], density[others[0]])
+    return Gain(elpd, se, physical[0], others[0], min(sign_of(elpd, se), 0) if shows else 0)

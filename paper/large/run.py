@@ -1,0 +1,94 @@
+"""Fitting a model of many observations, and its scores."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from gpytorch.mlls import VariationalELBO
+from torch import Tensor
+
+from gpadjust import CKA, VariationalCKA, fit
+from paper.common.experiment import Record
+from paper.large import Large
+from paper.large.problem import Data, draw
+
+_TEST = 10_000  # added to the seed
+_BATCH = 1024
+
+
+def run(
+    experiment: Large, problem: str, learner: str, observations: int, seed: int, *, unfinished: Path
+) -> Record:
+    """Fit the model; the errors of f and of its intervals, of each output.
+
+    Errors are in standard deviations of the function; ``seconds`` are those of building and
+    fitting, with one thread.
+    """
+    settings = experiment.settings
+    data, test = draw(problem, observations, seed), draw(problem, settings.num_test, seed + _TEST)
+    # A first fit loads what any later one needs.
+    fit(CKA(data.X[:10], data.Y[:10], physics=data.physics), "map")
+    begin = time.perf_counter()
+    if learner == "exact":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            model: Any = CKA(data.X, data.Y, physics=data.physics)
+        fit(model)
+    else:
+        model = VariationalCKA(
+            data.X, data.Y, physics=data.physics, num_inducing=settings.num_inducing
+        )
+        if learner == "variational":
+            fit(model)
+        else:
+            _by_minibatches(model, data, 60 * settings.minutes, seed)
+    found = {"seconds": time.perf_counter() - begin, **_scores(model, test)}
+    if learner == "variational":
+        rest = model.rest.kernel.outputscale.sqrt() * model.outcome_transform.stdvs.flatten()
+        found["rest_sd"] = (rest / test.f.std(0)).tolist()
+        with torch.no_grad():
+            model.rest.kernel.raw_outputscale.fill_(-40.0)
+        model.forget()
+        found["coverage_without_rest"] = _scores(model, test)["coverage"]
+    noise = model.likelihood.noise.sqrt().reshape(-1, test.f.shape[-1]).mean(0)
+    found["noise_sd"] = (noise * model.outcome_transform.stdvs.flatten() / test.f.std(0)).tolist()
+    return found
+
+
+def _scores(model: Any, test: Data) -> Record:
+    with torch.no_grad():
+        mean, _ = model.predict(test.X)
+        lower, upper = model.interval(test.X)
+    spread = test.f.std(0)
+    inside = ((test.f >= lower) & (test.f <= upper)).double()
+    width = (upper - lower).mean(0) / spread
+    return {
+        "rmse": ((mean - test.f).square().mean(0).sqrt() / spread).tolist(),
+        "coverage": inside.mean(0).tolist(),
+        "width": width.tolist(),
+    }
+
+
+def _by_minibatches(model: VariationalCKA, data: Data, seconds: float, seed: int) -> None:
+    """Train all parameters by Adam, as GPyTorch's tutorials do, from where the exact fit ends."""
+    begin = time.perf_counter()
+    fit(model.start, "map")
+    model.place(model.model.inducing_points.clone())
+    inner: Any = model.model
+    mll = VariationalELBO(model.likelihood, inner, num_data=len(data.X))
+    optimiser = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=0.01)
+    columns: Tensor = inner.train_inputs[0]
+    targets: Tensor = inner.train_targets
+    generator = torch.Generator().manual_seed(seed)
+    model.train()
+    while time.perf_counter() - begin < seconds:
+        rows = torch.randint(len(columns), (_BATCH,), generator=generator)
+        optimiser.zero_grad()
+        loss = -mll(inner(columns[rows]), targets[..., rows]).sum()
+        loss.backward()
+        optimiser.step()
+    model.eval()

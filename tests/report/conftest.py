@@ -1,0 +1,99 @@
+"""A page as a reader sees it, and small things to report on."""
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+import torch
+
+from gpadjust import compare
+from gpadjust.report.markup import Markup
+
+VOID = {"meta", "img", "br"}
+
+
+class Page(HTMLParser):
+    """What is in a page: its text, tables, images, code, and attributes; its tags are balanced."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.pieces, self.tables, self.images = [], [], {}, []
+        self.codes, self.attributes, self.styles, self.ids = [], [], [], []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+        self.text = " ".join(" ".join(self.pieces).split())
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.attributes += [(tag, *pair) for pair in attributes]
+        self.ids += [named["id"]] if "id" in named else []
+        if tag == "img":
+            self.images.append(named)
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "table":
+            self.rows = []
+        elif tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+        elif tag == "caption":
+            self.caption = ""
+        elif tag == "code":
+            self.codes.append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+        if tag == "table":
+            self.tables[self.caption] = self.rows
+
+    def handle_data(self, data):
+        if self.open[-1:] == ["style"]:
+            self.styles.append(data)
+            return
+        self.pieces.append(data)
+        if "code" in self.open:
+            self.codes[-1] += data
+        elif "caption" in self.open:
+            self.caption += data
+        elif {"td", "th"} & {*self.open}:
+            self.rows[-1][-1] += data
+
+    def needs_nothing_else(self):
+        """Whether it refers to nothing but its own sections, and runs no script."""
+        refers = [(t, value) for t, name, value in self.attributes if name in ("src", "href")]
+        own = all(
+            value.startswith("data:image/") if t == "img" else value[1:] in self.ids
+            for t, value in refers
+        )
+        names = {name for _, name, _ in self.attributes}
+        quiet = not any(name.startswith("on") for name in names) and "script" not in self.text
+        return own and quiet and not re.search(r"url\(|@import", "".join(self.styles))
+
+
+@pytest.fixture
+def read():
+    """Reads the page at a path."""
+    return lambda path: Page(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leaves the figures out, which take most of the time."""
+    for module in ("adjustment", "left_out"):
+        monkeypatch.setattr(f"gpadjust.report.{module}.drawn", lambda draw: Markup())
+
+
+def f_p(X):
+    return torch.sin(6 * X[:, :1])
+
+
+@pytest.fixture(scope="session")
+def comparison():
+    """Of ten noisy points of a wave."""
+    generator = torch.Generator().manual_seed(0)
+    X = torch.linspace(0, 1, 10, dtype=torch.float64).unsqueeze(-1)
+    Y = 2 * f_p(X) + X + 0.1 * torch.randn(10, 1, generator=generator, dtype=torch.float64)
+    structures = ["zero mean", "physics mean", "CKA"]
+    return compare(X, Y, f_p, structures=structures, num_starts=1, num_screened=8)

@@ -1,0 +1,190 @@
+"""The command: from a CSV file and a function to a page, or an error that says what to do."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gpadjust import load
+from gpadjust.__main__ import main
+
+MODULE = """
+import numpy as np, torch
+def wave(X): return torch.sin(6 * X[:, :1])
+def of_arrays(X): return np.sin(6 * X[:, 0])
+def two(X): return torch.stack([X[:, 0], X[:, 0]], -1)
+def root(X): return (0.55 - X[:, 0]).sqrt()
+def strict(X):
+    if (X > 0.95).any(): raise RuntimeError("too far")
+    return X[:, 0]
+no_function = 3.0
+"""
+ROWS = [(i / 8, round(2 * torch.tensor(6 * i / 8).sin().item() + i / 8, 4)) for i in range(9)]
+TABLE = "time [s],head [m],note\n" + "".join(f"{x},{y},ok\n" for x, y in ROWS)
+COMMAND = ["report", "data.csv", "--inputs", "time", "--outputs", "head", "--fit", "map"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working directory: a table, a module of physics, and an earlier report."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in ("hill", "broken", "leaves", "lacks"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    (tmp_path / "data.csv").write_text(TABLE)
+    (tmp_path / "hill.py").write_text(MODULE)
+    (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
+    (tmp_path / "leaves.py").write_text("import sys\nsys.exit('bye')\n")
+    (tmp_path / "lacks.py").write_text("import no_such_module_here\n")
+    (tmp_path / "report.html").write_text("earlier")
+    (tmp_path / "report.pt").write_text("earlier")
+    yield tmp_path
+    for name in ("hill", "broken", "leaves", "lacks"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("function", ["wave", "of_arrays"])
+def test_a_page_and_a_model_that_its_code_loads(folder, read, capsys, undrawn, function):
+    rows = TABLE.splitlines()
+    rows[3] = "0.25,,no measurement"
+    (folder / "data.csv").write_text("\n".join([*rows, ",,", ""]))
+    assert main([*COMMAND, "--physics", f"hill:{function}", "--seed", "3"]) == 0
+    out, err = capsys.readouterr()
+    assert "Wrote report.html and report.pt." in out
+    assert "data.csv: 8 rows, head [m] from time [s]." in err
+    page = read(folder / "report.html")
+    assert page.needs_nothing_else()
+    assert "Line 4 has no output and is left out." in page.text
+    told = dict(page.tables["How this page came about"])
+    assert told["command"].endswith(f"--physics hill:{function} --seed 3")
+    worst = page.tables["The 5 observations of head [m] that are farthest from their predictions"]
+    lines = [int(row[0].removeprefix("line ")) for row in worst[1:]]
+    shown = {line: float(row[-1]) for line, row in zip(lines, worst[1:], strict=True)}
+    assert shown == {line: pytest.approx(ROWS[line - 2][0]) for line in lines}
+    (code,) = [text for text in page.codes if "load(" in text]
+    assert ("BlackBoxPhysics(hill.of_arrays)" in code) == (function == "of_arrays")
+    names = {}
+    exec(code, names)
+    assert abs(names["mean"] - 2 * (6 * names["X"]).sin() - names["X"]) < 0.2
+    assert {each.name for each in folder.iterdir()} >= {"report.html", "report.pt"}
+    assert not [each for each in folder.iterdir() if each.name.startswith(".report")]
+
+
+def _fails(capsys, *options, physics="hill:wave"):
+    given = [*COMMAND, "--physics", physics, *options]
+    assert main(given) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "Traceback" not in err
+    return err
+
+
+BAD_TABLES = {
+    "": "found an empty file",
+    "time,head\n": "found only a line of names",
+    "time;head\n0;1\n1;2\n": "semicolons between its fields: say so by --delimiter ';'",
+    "time,pressure\n0,1\n": r"line 1: expected a column 'head', found 'time', 'pressure'",
+    "time,Head [m]\n0,1\n": r"Is it 'Head \[m\]'\?",
+    "time,head,head\n0,1,2\n": "line 1: expected one column 'head', found columns 2 and 3",
+    "time,head\n0,1\n1,two\n": r"line 3, column 2 \('head'\): expected a number, or nothing",
+    "time,head\n0,1\n,2\n": r"line 3, column 1 \('time'\): expected a number, found ''",
+    "time,head\nnan,1\n1,2\n": r"line 2, column 1 \('time'\): expected a number, found 'nan'",
+    "time,head\n0,inf\n1,2\n": r"line 2, column 2 \('head'\): .*found 'inf'",
+    'time,head\n0,"1,5"\n1,2\n': "If this comma is a decimal comma, say so by --decimal ','",
+    "time,head\n0,1\n1,2,3\n": "line 3: expected 2 fields, one for each name, found 3",
+    "time,head\n0,1\n1,\n": "expected two rows or more with a number in 'head', found 1",
+}
+
+
+@pytest.mark.parametrize("text", BAD_TABLES)
+def test_a_table_that_is_none(folder, capsys, text):
+    (folder / "data.csv").write_text(text)
+    _says(_fails(capsys), BAD_TABLES[text])
+    _nothing_was_written(folder)
+
+
+BAD_PHYSICS = {
+    "hill": "Expected --physics as module:function, such as pump:head .* found 'hill'",
+    "hill.py:wave": "There is no module 'hill.py'",
+    "./hill.py:wave": "Give the module without folder and .py, and run this in its folder",
+    "hil:wave": r"There is no module 'hil' .* Is it 'hill'\?",
+    "hill:wav": r"hill has no 'wav'; it has wave, of_arrays, two, root, strict. Is it 'wave'\?",
+    "hill:no_function": "physics must be a Physics or a callable.* found a float",
+    "broken:f": r"broken cannot be imported: ZeroDivisionError: .* \(broken.py, line 2\)",
+    "leaves:f": "leaves cannot be imported: SystemExit: bye",
+    "lacks:f": "lacks cannot be imported: it needs 'no_such_module_here', which is not installed",
+    "hill:two": "expected 1 columns, one for each of --outputs head",
+    "hill:root": r"returned NaN or inf in 4 of 9 row\(s\).*\n  line 7: time \[s\] = 0.625",
+    "hill:strict": r"raised RuntimeError: too far.*\n  line 10: time \[s\] = 1$",
+}
+
+
+@pytest.mark.parametrize("physics", BAD_PHYSICS)
+def test_a_physics_that_is_none_or_fails(folder, capsys, physics):
+    _says(_fails(capsys, physics=physics), BAD_PHYSICS[physics])
+    _nothing_was_written(folder)
+
+
+BAD_OPTIONS = {
+    ("--out", "report.pdf"): "Expected a page such as 'report.html'",
+    ("--out", "none/report.html"): "There is no folder 'none'",
+    ("--inputs", "time,head"): "as inputs and outputs, got 'head \\[m\\]' more than once",
+    ("--inputs", "tome"): r"Is it 'time \[s\]'\?",
+    ("--units", "head"): "Expected --units such as a=1,b=2, found 'head'",
+    ("--units", "tail=m"): "--units names 'tail', which is none of 'time', 'head'",
+    ("--noise", "much"): "standard deviation in the output's unit, such as 0.1, found 'much'",
+    ("--noise", "tail=1"): "--noise names 'tail', which is none of --outputs",
+    ("--delimiter", ";;"): "Expected --delimiter as one character",
+}
+
+
+@pytest.mark.parametrize("options", BAD_OPTIONS)
+def test_options_that_are_wrong(folder, capsys, options):
+    _says(_fails(capsys, *options), BAD_OPTIONS[options])
+    _nothing_was_written(folder)
+
+
+def test_a_file_that_is_not_there(folder, capsys):
+    (folder / "data.csv").rename(folder / "date.csv")
+    _says(_fails(capsys), r"There is no file 'data.csv'. Is it 'date.csv'\?")
+
+
+def _says(error, expected):
+    assert re.search(expected, error, flags=re.DOTALL | re.MULTILINE), error
+
+
+def _nothing_was_written(folder):
+    assert {(folder / name).read_text() for name in ("report.html", "report.pt")} == {"earlier"}
+    assert not [each for each in folder.iterdir() if each.name.startswith(".report")]
+
+
+def test_an_interrupted_fit_leaves_nothing(folder, capsys, monkeypatch):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gpadjust.report.command.fit", interrupted)
+    assert main([*COMMAND, "--physics", "hill:wave"]) == 130
+    assert "interrupted; nothing was written" in capsys.readouterr().err
+    _nothing_was_written(folder)
+
+
+def test_a_german_table_with_units_and_noise(folder, read, undrawn):
+    text = TABLE.replace(",", ";").replace(".", ",").replace("time [s]", "time")
+    (folder / "data.csv").write_text(text.replace("head [m]", "head"))
+    options = ["--delimiter", ";", "--decimal", ",", "--units", "time=ms,head=Pa", "--noise", "0.5"]
+    assert main([*COMMAND, "--physics", "hill:wave", *options, "--out", "new.htm"]) == 0
+    model = load("new.pt")
+    assert (model.input_names, model.output_names) == (("time [ms]",), ("head [Pa]",))
+    assert model.data()["train_Y"].flatten().tolist() == pytest.approx([y for _, y in ROWS])
+    assert model.data()["train_Yvar"].flatten().tolist() == pytest.approx([0.25] * 9)
+    assert "Pa" in read(folder / "new.htm").text
+
+
+def test_help_has_an_example_and_needs_no_torch():
+    code = "import sys; from gpadjust.__main__ import main\ntry: main(['report', '--help'])\n"
+    code += "except SystemExit as end: assert end.code == 0\nassert 'torch' not in sys.modules"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "--inputs flow,speed --outputs head --physics pump:head" in run.stdout

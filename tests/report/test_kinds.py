@@ -1,0 +1,182 @@
+"""Pages of all kinds of models, physics and names."""
+
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gpadjust import (
+    AR1,
+    CKA,
+    RRA,
+    CalibratedPhysics,
+    FunctionPhysics,
+    ScaleGP,
+    StackedGP,
+    Unknown,
+    compare,
+    fit,
+    load,
+)
+from gpadjust.report import report
+
+QUICK = {"num_starts": 1, "num_screened": 8}
+NASTY = ("<script>alert('1')</script>", '"><img src="https://x.y/z">', "$\\frac$ & 水 \n 5 €")
+
+
+def problem(d, m, n=12):
+    generator = torch.Generator().manual_seed(d)
+    X = torch.rand(n, d, generator=generator, dtype=torch.float64)
+    Y = torch.stack([(j + 1) * X.sum(-1).sin() + 0.1 * X[:, 0] for j in range(m)], -1)
+    return X, Y + 0.05 * torch.randn(n, m, generator=generator, dtype=torch.float64)
+
+
+def physics(m):
+    return lambda X: X.sum(-1, keepdim=True).sin().expand(-1, m)
+
+
+def named(d, m):
+    X, Y = problem(d, m)
+    model = CKA(X, Y, physics=physics(m))
+    model.input_names, model.output_names = NASTY[:d], NASTY[-m:]
+    fit(model, "map", **QUICK)
+    return model
+
+
+def test_names_are_shown_as_they_are(tmp_path, read, monkeypatch):
+    page = read(report(named(1, 1), tmp_path / "report.html", rows=[NASTY[0]] * 12))
+    assert "<script>alert" in page.text
+    assert not {"script", "iframe"} & {tag for tag, _, _ in page.attributes}
+    monkeypatch.chdir(tmp_path)
+    (code,) = [text for text in page.codes if "load(" in text]
+    exec(code, {"f_p": physics(1)})
+
+
+@pytest.mark.slow
+@settings(
+    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.text(min_size=1, max_size=12), st.text(min_size=1, max_size=12))
+def test_any_names_make_a_page(tmp_path, read, monkeypatch, first, second):
+    monkeypatch.chdir(tmp_path)
+    model = named(2, 1)
+    model.input_names, model.output_names = (first, second), (first,)
+    page = read(report(model, "report.html", title=second))
+    assert page.needs_nothing_else()
+    (code,) = [text for text in page.codes if "load(" in text]
+    names = {"f_p": physics(1)}
+    exec(code, names)
+    assert names["model"].input_names == (first, second)
+
+
+@pytest.mark.slow
+def test_several_outputs_some_of_them_missing_and_two_inputs(tmp_path, read):
+    X, Y = problem(2, 2)
+    Y[3, 0] = Y[5, 1] = math.nan
+    comparison = compare(X, Y, physics(2), **QUICK)
+    page = read(report(comparison, tmp_path / "report.html"))
+    assert page.needs_nothing_else()
+    assert [row[-1] for row in page.tables["Columns"][1:]] == ["0", "0", "1", "1"]
+    for j, name in enumerate(("y1", "y2")):
+        gain = comparison.gain[name]
+        assert f"{gain.elpd:+.1f} ± {gain.se:.1f} nats" in page.text
+        caption = f"The 5 observations of {name} that are farthest from their predictions"
+        assert f"row {(3, 5)[j]}" not in [row[0] for row in page.tables[caption]]
+    loaded = load(tmp_path / "report.pt", physics=physics(2))
+    torch.testing.assert_close(loaded.predict(X).mean, comparison.recommended.predict(X).mean)
+
+
+@pytest.mark.slow
+def test_several_physics(tmp_path, read):
+    X, Y = problem(1, 1)
+    parts = {"coarse": lambda X: X, "fine": physics(1)}
+    comparison = compare(X, Y, parts, structures=["zero mean", "CKA"], **QUICK)
+    page = read(report(comparison, tmp_path / "report.html"))
+    assert "coarse (FunctionPhysics), fine (FunctionPhysics)" in page.text
+    assert "(coarse)" in page.text
+    loaded = load(tmp_path / "report.pt", physics=parts)
+    torch.testing.assert_close(loaded.predict(X).mean, comparison.recommended.predict(X).mean)
+
+
+@pytest.mark.slow
+def test_unknown_parameters(tmp_path, read):
+    X, Y = problem(1, 1)
+    law = FunctionPhysics(
+        lambda X, p: p.gain * X.sum(-1).sin(), unknowns={"gain": Unknown(2.0, sd=1.0, unit="m")}
+    )
+    model = CalibratedPhysics(X, Y, physics=law)
+    fit(model)
+    page = read(report(model, tmp_path / "report.html"))
+    ((_, row),) = [page.tables["Parameters of the physics, by CalibratedPhysics"]]
+    assert row[0] == "gain"
+    assert float(row[1]) == pytest.approx(float(model.physics_parameters.mean), rel=1e-3)
+    assert row[-2:] == ["2 ± 1", "m"]
+    assert "(with fitted parameters) is off by" in page.text
+
+
+@pytest.mark.slow
+def test_many_inputs_are_drawn_where_they_matter(tmp_path, read):
+    X, _ = problem(14, 1, n=40)
+    model = CKA(X, X[:, 13:].sin(), physics=lambda X: X[:, :1] * 0)
+    fit(model, "map", **QUICK)
+    path = report(model, tmp_path / "report.html")
+    page = read(path)
+    assert "(drawn: 12 of 14 inputs, those that move predictions most)" in page.text
+    assert any(image["alt"].endswith("over x14; below, rho and delta") for image in page.images)
+    assert path.stat().st_size < 1_000_000
+
+
+@pytest.mark.slow
+def test_a_physics_that_fails_away_from_the_data(tmp_path, read):
+    X = torch.tensor([[0.0], [0.1], [0.2], [0.8], [0.9], [1.0]], dtype=torch.float64)
+    model = CKA(X, X.sin(), physics=lambda X: torch.where((X - 0.5).abs() < 0.1, torch.nan, X))
+    fit(model, "map", **QUICK)
+    page = read(report(model, tmp_path / "report.html"))
+    assert "No figure: Physics '<lambda>' returned NaN or inf" in page.text
+    assert "Coverage of left-out intervals" in page.tables
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["AR1", "RRA", "ScaleGP", "StackedGP", "several samples"])
+def test_other_models(tmp_path, read, kind):
+    X, Y = problem(1, 1)
+    makes = {
+        "AR1": lambda: AR1(X, Y, physics=physics(1), low_X=X + 0.01),
+        "RRA": lambda: RRA(X, Y, physics=physics(1), num_features=24),
+        "ScaleGP": lambda: ScaleGP(X, Y, physics=physics(1)),
+    }
+    model = makes.get(kind, lambda: CKA(X, Y, physics=physics(1)))()
+    fit(model, None if kind == "several samples" else "map", **QUICK)
+    if kind == "StackedGP":
+        model = StackedGP({"CKA": model}, [[1.0]])
+    page = read(report(model, tmp_path / "report.html"))
+    assert page.needs_nothing_else()
+    assert "Not asked" in page.text
+    loaded = load(tmp_path / "report.pt", **({} if kind == "AR1" else {"physics": physics(1)}))
+    torch.testing.assert_close(loaded.predict(X).mean, model.predict(X).mean)
+
+
+@pytest.mark.slow
+def test_the_whole_command_by_an_interpreter_of_its_own(tmp_path, read, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    X, Y = problem(2, 1)
+    rows = torch.cat([X, Y], -1).tolist()
+    text = "\n".join(",".join(map(str, row)) for row in (("a [m]", "b", "y [Pa]"), *rows))
+    (tmp_path / "data.csv").write_text(text)
+    (tmp_path / "crude_sine.py").write_text("import numpy\ndef f(X): return numpy.sin(X.sum(-1))\n")
+    arguments = ["--inputs", "a,b", "--outputs", "y", "--physics", "crude_sine:f"]
+    run = subprocess.run(
+        [sys.executable, "-m", "gpadjust", "report", "data.csv", *arguments],
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "structure" in run.stderr  # the progress
+    page = read(tmp_path / "report.html")
+    assert f"{run.stdout.partition('.')[0]} " in page.text
+    (code,) = [text for text in page.codes if "load(" in text]
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -1,0 +1,183 @@
+"""What a page says is what the comparison says, and it is a page by itself."""
+
+import dataclasses
+import re
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpadjust import CKA, ZeroMeanGP, fit, load
+from gpadjust.report import report
+from gpadjust.report.markup import table, tag
+from gpadjust.report.numbers import name_and_unit, number
+from gpadjust.report.subject import subject_of
+from gpadjust.report.verdict import headline, verdicts
+from gpadjust.validation import Gain
+
+from .conftest import Page, f_p
+
+
+def test_a_comparison(comparison, tmp_path, read):
+    path = report(comparison, tmp_path / "report.html", rows=range(2, 12), settings={"seed": 7})
+    assert {each.name for each in tmp_path.iterdir()} == {"report.html", "report.pt"}
+    page = read(path)
+    assert page.needs_nothing_else()
+    assert path.stat().st_size < 500_000
+    assert len(page.images) == 6
+    assert all(len(image["alt"]) > 10 for image in page.images)
+    _the_table_is_that_of(comparison, page)
+    (gain,) = comparison.gain.values()
+    assert "Yes The physics helps to predict y." in page.text
+    assert f"{gain.elpd:+.1f} ± {gain.se:.1f} nats" in page.text
+    for sentence in comparison.advice:
+        assert sentence.replace("+-", "±") in page.text
+    _left_out_is_that_of(comparison.leave_one_out(), page)
+    settings = dict(page.tables["How this page came about"][1:])
+    assert settings["seed"] == "7"
+    assert settings["physics"] == "f_p (FunctionPhysics)"
+
+
+def _the_table_is_that_of(comparison, page):
+    head, *rows = page.tables["Left-out predictions of y, best first"]
+    assert head[0] == "structure"
+    for row, expected in zip(rows, comparison.table["y"], strict=True):
+        assert row[0] == expected.structure
+        numbers = [float(text) for text in row[1:5]]
+        assert numbers == pytest.approx(expected[1:5], rel=0.06, abs=0.006)
+        assert float(row[6]) == pytest.approx(expected.rmse, rel=0.01)
+        assert row[7] == f"{100 * expected.coverage:.0f} %"
+
+
+def _left_out_is_that_of(loo, page):
+    head, *rows = page.tables["The 5 observations of y that are farthest from their predictions"]
+    worst = int(loo.residuals[:, 0].abs().argmax())
+    assert rows[0][0] == str(worst + 2)
+    assert float(rows[0][1]) == pytest.approx(float(loo.Y[worst]), rel=1e-3)
+    assert float(rows[0][2]) == pytest.approx(float(loo.mean[worst]), rel=1e-3)
+    assert float(rows[0][head.index("x")]) == pytest.approx(float(loo.X[worst]), rel=1e-3)
+    coverage = {row[0]: row[1] for row in page.tables["Coverage of left-out intervals"]}
+    assert coverage["y, 80 %"] == f"{round(10 * float(loo.coverage(0.8)))} of 10"
+
+
+def test_the_code_in_the_page_predicts_as_the_model(
+    comparison, tmp_path, read, monkeypatch, undrawn
+):
+    page = read(report(comparison, tmp_path / "a b.html"))
+    monkeypatch.chdir(tmp_path)
+    (code,) = [text for text in page.codes if "load(" in text]
+    assert "load('a b.pt')" in code
+    assert "by its name" in page.text
+    names = {}
+    exec(code, names)
+    mean, _ = comparison.recommended.predict(names["X"])
+    torch.testing.assert_close(names["mean"], mean)
+    assert names["lower"] < mean < names["upper"]
+
+
+def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undrawn):
+    X = torch.rand(7, 2, dtype=torch.float64)
+    model = CKA(X, X.sum(-1, keepdim=True).sin(), physics=lambda X: X[:, :1])
+    model.output_names = ("p [Pa]",)
+    fit(model, "map", num_starts=1, num_screened=4)
+    page = read(report(model, tmp_path / "report.html"))
+    assert "Not asked" in page.text
+    assert "report(compare(train_X, train_Y, physics))" in page.text
+    rmse = number(float(subject_of(model).loo.rmse[0]))
+    assert f"Root mean square error of left-out p [Pa]: {rmse} Pa by the model" in page.text
+    monkeypatch.chdir(tmp_path)
+    (code,) = [text for text in page.codes if "load(" in text]
+    names = {"f_p": lambda X: X[:, :1]}
+    exec(code, names)
+    torch.testing.assert_close(names["mean"], model.predict(names["X"]).mean)
+
+
+def test_a_model_without_physics(tmp_path, read, undrawn):
+    X = torch.rand(7, 1, dtype=torch.float64)
+    model = ZeroMeanGP(X, X.sin())
+    fit(model, "map", num_starts=1, num_screened=4)
+    page = read(report(model, tmp_path / "report.html"))
+    assert "has no physics to be judged" in page.text
+    assert "There is no physics that could be adjusted, trusted or overridden" in page.text
+    assert dict(page.tables["How this page came about"])["physics"] == "none"
+    assert load(tmp_path / "report.pt").output_names == ("y",)
+
+
+@pytest.mark.parametrize(
+    ("gain", "answer", "says"),
+    [
+        (Gain(5.0, 1.0, "CKA", "zero mean", 1), "Yes", "+5.0 ± 1.0 nats"),
+        (Gain(-5.0, 1.0, "CKA", "zero mean", -1), "No", "is predicted worse than without it"),
+        (Gain(1.0, 1.0, "CKA", "zero mean", 0), "Not shown", "not to say that it does not help"),
+        (Gain(9.0, 1.0, "CKA", "zero mean", 0), "Not shown", "constants may do that by themselves"),
+    ],
+)
+def test_what_is_not_shown_is_not_denied(comparison, gain, answer, says):
+    subject = subject_of(dataclasses.replace(comparison, gain={"y": gain}))
+    page = Page(verdicts(subject))
+    assert page.text.startswith(answer)
+    assert says in page.text
+    assert ("not to say" in page.text) == (gain.shown == 0 and gain.elpd < 2)
+    assert headline(subject).startswith(answer)
+
+
+def test_nothing_is_written_of_what_cannot_be_reported(comparison, tmp_path):
+    X = torch.rand(5, 1, dtype=torch.float64)
+    model = CKA(X, X.sin(), physics=f_p)
+    old = tmp_path / "report.html"
+    old.write_text("old")
+    with pytest.raises(ValueError, match=r"was not fitted: call `gpadjust.fit\(model\)` first"):
+        report(model, old)
+    with pytest.raises(TypeError, match=r"Expected a fitted model of gpadjust.* got Linear"):
+        report(torch.nn.Linear(1, 1), old)
+    with pytest.raises(ValueError, match="Expected 10 names of rows, one for each, got 2"):
+        report(comparison, old, rows=[1, 2])
+    with pytest.raises(ValueError, match=r"page such as 'report.html' to write to, got .*data.csv"):
+        report(comparison, tmp_path / "data.csv")
+    with pytest.raises(FileNotFoundError, match="There is no folder"):
+        report(comparison, tmp_path / "none" / "report.html")
+    (tmp_path / "folder.html").mkdir()
+    with pytest.raises(IsADirectoryError, match="give the name of a file"):
+        report(comparison, tmp_path / "folder.html")
+    assert old.read_text() == "old"
+    assert {each.name for each in tmp_path.iterdir()} == {"report.html", "folder.html"}
+
+
+def test_an_error_on_the_way_leaves_what_was_there(comparison, tmp_path, monkeypatch, undrawn):
+    old = tmp_path / "report.html"
+    old.write_text("old")
+
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gpadjust.report.provenance.settings", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        report(comparison, old)
+    assert old.read_text() == "old"
+    assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
+
+
+@settings(max_examples=30)
+@given(st.lists(st.text(), min_size=2, max_size=4))
+def test_any_text_comes_back_from_the_markup(texts):
+    first, *others = [re.sub(r"[\0\r\ud800-\udfff]", "", text) for text in texts]
+    html = tag("main", table(first, texts, [[first, *others]]), id=first)
+    page = Page(html)
+    assert page.ids == [first]
+    assert page.tables[first][1] == [first, *others]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (123456.0, "123000"), (0.00012345, "0.000123"), (1e9, "1e+09"), (-2.5, "-2.5")],
+)
+def test_numbers_are_read_without_exponents(value, text):
+    assert number(value) == text
+
+
+def test_a_name_may_carry_its_unit():
+    assert name_and_unit("head [m]") == ("head", "m")
+    assert name_and_unit("x[0]") == ("x", "0")
+    assert name_and_unit("[m]") == ("[m]", "")
+    assert name_and_unit("plain") == ("plain", "")
