@@ -16,6 +16,8 @@ from gpadjust.inference.unexplained import unexplained
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models.inducing_values import INDUCING_NUGGET
 
+QUICK = {"num_screened": 16, "num_starts": 2}
+
 
 def wave(X):
     return torch.sin(6 * X[..., :1])
@@ -149,7 +151,7 @@ def test_rounding_does_not_lift_the_bound():
 def test_enough_points_leave_no_rest():
     X, f, Y = problem(400)
     model = make(X, Y)
-    result = fit(model)
+    result = fit(model, **QUICK)
     assert torch.equal(result.log_likelihood, model.evidence)
     assert noise_sd(model).item() == pytest.approx(0.1, rel=0.1)
     assert model.rest.kernel.outputscale.item() < 1e-20
@@ -157,24 +159,24 @@ def test_enough_points_leave_no_rest():
     assert ((lower < f) & (f < upper)).double().mean() > 0.85
     assert (model.predict(X).mean - f).std() < 0.03
     exact = CKA(X, Y, physics=wave)
-    fit(exact, "map", num_screened=16, num_starts=2)
+    fit(exact, "map", **QUICK)
     torch.testing.assert_close(model.predict(X).mean, exact.predict(X).mean, rtol=0, atol=0.03)
 
 
 def test_a_fit_to_the_noise_does_not_lessen_it():
-    X, _, Y = problem(200, fine=0.5)
-    model = make(X, Y, num_inducing=200)
-    fit(model, num_screened=16, num_starts=2)
+    X, _, Y = problem(150, fine=0.5)
+    model = make(X, Y, num_inducing=150)
+    fit(model, **QUICK)
     residuals = (Y - model.predict(X).mean).std().item()
     assert residuals < 0.95 * noise_sd(model).item()
     assert noise_sd(model).item() == pytest.approx(0.1, rel=0.1)
 
 
-@pytest.mark.parametrize("n", [600, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [400, pytest.param(2000, marks=pytest.mark.slow)])
 def test_what_few_points_cannot_show_is_in_the_intervals(n):
     X, f, Y = problem(n, fine=0.5)
     model = make(X, Y, num_inducing=6)
-    fit(model, num_screened=16, num_starts=2)
+    fit(model, **QUICK)
 
     def coverage():
         lower, upper = model.interval(X)
@@ -189,8 +191,8 @@ def test_what_few_points_cannot_show_is_in_the_intervals(n):
 
 
 def test_noise_is_no_function(uniform):
-    for d, n in ((1, 400), (3, 120)):
-        for seed in range(3):
+    for d, n in ((1, 300), (3, 120)):
+        for seed in range(2):
             X = uniform(n, d, seed=seed)
             residuals = torch.randn(n, generator=torch.Generator().manual_seed(seed)).double()
             found = unexplained(X, residuals, None, 0)
@@ -228,26 +230,25 @@ def test_noise_that_the_user_set_stays():
 
 
 def test_priors_count():
-    X, _, Y = problem(200)
+    X, _, Y = problem(100)
     free, bound = make(X, Y), make(X, Y)
     kernel = bound.covar_module.terms[1].kernel.base_kernel
     kernel.register_prior("lengthscale_prior", LogNormalPrior(-3.0, 0.05), "lengthscale")
     for model in (free, bound):
-        fit(model, num_screened=16, num_starts=2)
+        fit(model, **QUICK)
     assert kernel.lengthscale.item() == pytest.approx(math.exp(-3), rel=0.1)
     assert free.covar_module.terms[1].kernel.base_kernel.lengthscale > 0.2
     assert bound.evidence < free.evidence
 
 
 def test_unknown_parameters_of_the_physics():
-    X, f, Y = problem(300)
+    X, f, Y = problem(120)
     physics = FunctionPhysics(
         lambda X, p: torch.sin(p["w"] * X[:, 0]), unknowns={"w": Unknown(5.0, sd=1.0)}
     )
     model = make(X, Y, physics=physics)
     before = model.predict(X[:3]).mean
-    options = {"num_screened": 16, "num_starts": 4}
-    fit(model, **options)
+    fit(model, num_screened=8, num_starts=2)
     found = model.physics_parameters["w"]
     assert found.item() == pytest.approx(6.0, abs=0.2)
     assert "  w: " in model.summary()
@@ -299,9 +300,9 @@ def test_a_physics_that_learns(monkeypatch):
 
 
 def test_several_physics_with_weights_to_learn(close):
-    X, f, Y = problem(200)
+    X, f, Y = problem(120)
     model = make(X, Y, physics={"a": wave, "b": lambda X: X.square()}, delta_mean="learn")
-    fit(model, num_screened=16, num_starts=2)
+    fit(model, **QUICK)
     assert (model.predict(X).mean - f).std() < 0.05
     parts = model.rho(X, "a").mean * wave(X) + model.rho(X, "b").mean * X.square()
     close(parts + model.delta(X).mean, model.predict(X).mean, 1e-6)
@@ -323,7 +324,7 @@ def test_an_error_leaves_the_model_as_it_was(monkeypatch, error):
 
     monkeypatch.setattr(variational_fit, "unexplained", fail)
     with pytest.raises(error):
-        fit(model, num_screened=16, num_starts=2, seed=1)
+        fit(model, **QUICK, seed=1)
     assert not model.training
     for name, tensor in model.state_dict().items():
         assert torch.equal(tensor, before[name])
@@ -332,15 +333,15 @@ def test_an_error_leaves_the_model_as_it_was(monkeypatch, error):
 
 
 def test_many_observations_in_parts(monkeypatch, close):
-    X, f, Y = problem(300)
+    X, f, Y = problem(150)
     whole = make(X, Y)
     fit(whole, num_screened=0)
-    monkeypatch.setattr(collapsed_bound, "_AT_ONCE", 12 * 64)
-    monkeypatch.setattr(variational_fit, "_AT_ONCE", 64)
+    monkeypatch.setattr(collapsed_bound, "_AT_ONCE", 12 * 40)
+    monkeypatch.setattr(variational_fit, "_AT_ONCE", 40)
     model = make(X, Y)
     fit(model, num_screened=0)
     close(model.predict(X).mean, whole.predict(X).mean, 1e-3)
-    monkeypatch.setattr(variational_fit, "_REFINED", 150)
+    monkeypatch.setattr(variational_fit, "_REFINED", 80)
     model = make(X, Y)
     fit(model, num_screened=0)
     assert (model.evidence - whole.evidence).abs() < 20.0  # of all, not of those that refine
@@ -360,9 +361,9 @@ def test_options():
 
 
 def test_a_warm_start_goes_on():
-    X, _, Y = problem(200)
+    X, _, Y = problem(100)
     model = make(X, Y)
-    reached = fit(model).log_likelihood
+    reached = fit(model, **QUICK).log_likelihood
     again = fit(model, num_screened=0).log_likelihood
     assert again > reached - 0.5
     later = make(X, Y, seed=1)
@@ -398,17 +399,17 @@ def test_inputs_that_repeat_or_rest():
     for name, inputs in cases.items():
         targets = torch.cat([Y[:50], Y[:50] + 0.1]) if name == "repeated" else Y
         model = make(inputs, targets)
-        fit(model, num_screened=16, num_starts=2)
+        fit(model, num_screened=4, num_starts=1)
         error = (model.predict(inputs).mean - targets).std()
         assert error < (2.0 if name == "all the same" else 0.2)
         assert model.evidence.isfinite().all()
 
 
 def test_outputs_with_observations_of_their_own():
-    X, f, Y = problem(200)
+    X, f, Y = problem(160)
     Y = torch.cat([Y, -Y], dim=-1)
-    Y[:100, 0], Y[190:, 1] = torch.nan, torch.nan
+    Y[:60, 0], Y[150:, 1] = torch.nan, torch.nan
     model = make(X, Y, physics=lambda X: wave(X).expand(*X.shape[:-1], 2))
-    fit(model, num_screened=16, num_starts=2)
+    fit(model, **QUICK)
     assert (model.predict(X).mean - torch.cat([f, -f], dim=-1)).std() < 0.08
     torch.testing.assert_close(noise_sd(model), torch.full((2,), 0.1).double(), rtol=0.2, atol=0)

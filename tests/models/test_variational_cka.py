@@ -49,7 +49,7 @@ def make(X, Y, *args, num_inducing=10, **options):
 @cache
 def fitted_once(num_outputs):
     model = make(*problem(120, num_outputs))
-    fit(model)
+    fit(model, num_screened=16, num_starts=2)
     return model
 
 
