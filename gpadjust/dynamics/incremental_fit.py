@@ -15,8 +15,9 @@ from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
 from gpadjust.inference.fitting import Method, check_options
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models import TermsModel
+from gpadjust.models import TermsModel, VariationalCKA
 from gpadjust.models.rra import NOT_SAMPLED, PaperRRA
+from gpadjust.models.variational_cka import NEVER_SAMPLED
 from gpadjust.states import StateSpec
 
 KEPT = ("method", "num_samples", "num_draws", "seed")  # options of later fits, too
@@ -40,10 +41,11 @@ def checked_fit_options(
         )
     own: Any = {**(options or {})}
     method = own.pop("method", None)
-    if issubclass(model, PaperRRA):
-        if method == "bayes":
-            raise ValueError(NOT_SAMPLED)
-        method = method or "map"
+    for unsampled, why in ((PaperRRA, NOT_SAMPLED), (VariationalCKA, NEVER_SAMPLED)):
+        if issubclass(model, unsampled):
+            if method == "bayes":
+                raise ValueError(why)
+            method = method or "map"
     check_options("bayes" if method is None else method, own)
     return {**(options or {})}
 

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from gpadjust.gp import TermsMean
-from gpadjust.gp.gaussian import cholesky
 from gpadjust.inference.log_parameters import LogParameters, Parameters
 from gpadjust.inference.log_priors import LogPriors
 from gpadjust.models import CKA
-from gpadjust.models.inducing_values import INDUCING_NUGGET, inducing_root
+from gpadjust.models.inducing_values import inducing_root
 
 _Pair = tuple[Tensor, Tensor]
 _Call = Callable[[Callable[[], _Pair]], _Pair]
@@ -62,11 +61,11 @@ class Optimum(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What the bound reads of all observations, with k their covariances with inducing values.
+    """What the bound reads of all observations, with v = L^-1 k of their covariances k.
 
     Attributes:
-        square: The sum of w k k^T, ``(m) x M x M``.
-        cross: The sum of w k r, ``(m) x M``.
+        square: The sum of w v v^T, ``(m) x M x M``.
+        cross: The sum of w v r, ``(m) x M``.
         prior: The sum of w times the prior variance, ``(m)``.
     """
 
@@ -79,11 +78,13 @@ class CollapsedBound:
     r"""The negative evidence lower bound at the best distribution of the inducing values.
 
     For Gaussian noise that is known in closed form (Titsias 2009), a natural-gradient step of
-    length one from anywhere (Hensman et al. 2013): with :math:`K_{uu} = L L^T`,
-    :math:`\Lambda = I + L^{-1} A L^{-T} / s` for :math:`A = \sum_i w_i k_i k_i^T` and
-    :math:`b = \sum_i w_i r_i k_i`, it is :math:`N(\Lambda^{-1} L^{-1} b / s, \Lambda^{-1})`. The
-    sums are made of one part of the observations after the other, and so is the gradient, by
-    autograd: memory does not grow with their number.
+    length one from anywhere (Hensman et al. 2013): with :math:`K_{uu} = L L^T` and
+    :math:`v_i = L^{-1} k_i`, :math:`\Lambda = I + \sum_i w_i v_i v_i^T / s` and
+    :math:`b = \sum_i w_i r_i v_i`, it is :math:`N(\Lambda^{-1} b / s, \Lambda^{-1})`. The sums are
+    made of one part of the observations after the other, and so is the gradient, by autograd:
+    memory does not grow with their number. (Sums of :math:`k_i k_i^T` would be faster, but their
+    rounding errors, divided by the nugget of :math:`K_{uu}`, are larger than what the points tell
+    where variances are far above the noise.)
 
     Args:
         start: The exact model whose hyper-parameters these are; its own data do not count.
@@ -122,8 +123,8 @@ class CollapsedBound:
     @torch.no_grad()
     def optimum(self) -> Optimum:
         """The best distribution at the hyper-parameters that the model has."""
-        sums = self._sums(lambda function: function())
-        bound, chol, white = self._bound(self._inducing_covariance(), sums, self._noise())
+        root = inducing_root(self._inducing_covariance())
+        bound, chol, white = self._bound(self._sums(root, _here), self._noise())
         mean = torch.cholesky_solve(white.unsqueeze(-1), chol).squeeze(-1)
         identity = torch.eye(chol.shape[-1]).to(chol).expand_as(chol)
         inverse = torch.linalg.solve_triangular(chol, identity, upper=False)
@@ -142,14 +143,15 @@ class CollapsedBound:
             found: _Pair = self.parameters.call_at(values, function)
             return found
 
+        with torch.enable_grad():
+            root, noise = call(lambda: (inducing_root(self._inducing_covariance()), self._noise()))
         with torch.no_grad():
-            sums = self._sums(call)
+            sums = self._sums(root, call)
         with torch.enable_grad():
             leaves = Sums(*(each.requires_grad_() for each in sums))
-            covariance, noise = call(lambda: (self._inducing_covariance(), self._noise()))
-            bound, *_ = self._bound(covariance, leaves, noise)
+            bound, *_ = self._bound(leaves, noise)
             bound.sum().backward()
-            self._pull_back(call, leaves)
+            self._pull_back(root, leaves, call)
         gradient = self.parameters.flatten(
             {
                 name: torch.zeros_like(value) if value.grad is None else value.grad
@@ -158,29 +160,35 @@ class CollapsedBound:
         )
         return -bound.detach().reshape(*gradient.shape[:-1], -1).sum(-1), -gradient
 
-    def _sums(self, call: _Call) -> Sums:
-        points = self._points
-        square = points.new_zeros(*points.shape[:-1], points.shape[-2])
+    def _sums(self, root: Tensor, call: _Call) -> Sums:
+        square = torch.zeros_like(root)
         cross, prior = square.new_zeros(square.shape[:-1]), square.new_zeros(square.shape[:-2])
-        for part in self._data.parts(points.shape[-2]):
+        for part in self._data.parts(root.shape[-1]):
             k, variance = call(partial(self._covariances, part.inputs))
-            weighted = k * part.weight.unsqueeze(-2)
-            square += weighted @ k.mT
+            white = torch.linalg.solve_triangular(root, k, upper=False)
+            weighted = white * part.weight.unsqueeze(-2)
+            square += weighted @ white.mT
             cross += (weighted @ part.residual.unsqueeze(-1)).squeeze(-1)
             prior += (part.weight * variance).sum(-1)
         return Sums(square, cross, prior)
 
-    def _pull_back(self, call: _Call, sums: Sums) -> None:
+    def _pull_back(self, root: Tensor, sums: Sums, call: _Call) -> None:
         """Bring the gradient by the sums to that by the hyper-parameters."""
         by_square, by_cross, by_prior = (each.grad for each in sums)
         if by_square is None or by_cross is None or by_prior is None:
             raise RuntimeError("The bound has no gradient by its sums.")
-        by_square = by_square + by_square.mT
-        for part in self._data.parts(self._points.shape[-2]):
+        by_square, chol = by_square + by_square.mT, root.detach()
+        for part in self._data.parts(chol.shape[-1]):
             k, variance = call(partial(self._covariances, part.inputs))
-            by_k = by_square @ k.detach() + by_cross.unsqueeze(-1) * part.residual.unsqueeze(-2)
+            white = torch.linalg.solve_triangular(chol, k.detach(), upper=False)
+            by_white = by_square @ white + by_cross.unsqueeze(-1) * part.residual.unsqueeze(-2)
+            by_k = torch.linalg.solve_triangular(chol.mT, by_white, upper=True)
             by_variance = by_prior.unsqueeze(-1) * part.weight
             torch.autograd.backward([k, variance], [by_k * part.weight.unsqueeze(-2), by_variance])
+        # Of all observations at once, as each has -L^-T (dv) v^T.
+        by_whites = by_square @ sums.square.detach()
+        by_whites = by_whites + by_cross.unsqueeze(-1) * sums.cross.detach().unsqueeze(-2)
+        root.backward(-torch.linalg.solve_triangular(chol.mT, by_whites, upper=True).tril())
 
     def _covariances(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Those with the inducing values, ``(m) x M x n``, and prior variances, ``(m) x n``."""
@@ -195,31 +203,26 @@ class CollapsedBound:
         """The noise variance s of a weight of one, ``(m)``."""
         return noise_of_weight_one(self._start)
 
-    def _bound(
-        self, covariance: Tensor, sums: Sums, noise: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The bound ``(m)``, the Cholesky factor of Lambda, and :math:`L^{-1} b / s`."""
-        chol = inducing_root(covariance)
-        half = torch.linalg.solve_triangular(chol, sums.square, upper=False)
-        white = torch.linalg.solve_triangular(chol, half.mT, upper=False)
-        s = noise[..., None, None]
-        identity = torch.eye(white.shape[-1]).to(white)
-        precision = _root_of_precision(identity + white / s)
-        target = torch.linalg.solve_triangular(chol, sums.cross.unsqueeze(-1), upper=False) / s
-        explained = torch.linalg.solve_triangular(precision, target, upper=False)
+    def _bound(self, sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The bound ``(m)``, the Cholesky factor of Lambda, and :math:`b / s`."""
+        identity = torch.eye(sums.square.shape[-1]).to(sums.square)
+        # Without a nugget, which would be more than the identity in it.
+        precision, failed = torch.linalg.cholesky_ex(
+            identity + sums.square / noise[..., None, None]
+        )
+        target = sums.cross / noise.unsqueeze(-1)
+        explained = torch.linalg.solve_triangular(precision, target.unsqueeze(-1), upper=False)
         log_det = 2 * precision.diagonal(dim1=-1, dim2=-2).log().sum(-1)
         size = self._count * (math.log(2 * math.pi) + noise.log()) - self._log_weights
         square = self._square / noise - explained.square().sum((-1, -2))
-        unseen = sums.prior - white.diagonal(dim1=-1, dim2=-2).sum(-1)
-        # Rounding must not let more be seen than there is, or bounds would rise without bound.
-        unseen = unseen.maximum(INDUCING_NUGGET * sums.prior) / noise
-        return -0.5 * (size + log_det + square + unseen), precision, target.squeeze(-1)
+        unseen = (sums.prior - sums.square.diagonal(dim1=-1, dim2=-2).sum(-1)) / noise
+        bound = -0.5 * (size + log_det + square + unseen)
+        return bound.masked_fill(failed > 0, -math.inf), precision, target
 
 
-def _root_of_precision(precision: Tensor) -> Tensor:
-    """Its Cholesky factor, without a nugget, which would be more than the identity in it."""
-    chol, info = torch.linalg.cholesky_ex(precision)
-    return cholesky(precision)[0] if info.any() else chol
+def _here(function: Callable[[], _Pair]) -> _Pair:
+    """Call a function at the hyper-parameters that the model has."""
+    return function()
 
 
 def noise_of_weight_one(start: CKA) -> Tensor:

@@ -19,6 +19,7 @@ from gpadjust.inference.log_parameters import shared_parameters
 from gpadjust.inference.map_fit import FitResult, Search, maximise
 from gpadjust.inference.variational_fit import fit_variational
 from gpadjust.models import ExactGPBase, VariationalCKA
+from gpadjust.models.variational_cka import NEVER_SAMPLED
 
 Method = Literal["bayes", "map"]
 
@@ -64,6 +65,14 @@ def fit(
 
 @overload
 def fit(
+    model: VariationalCKA,
+    method: Literal["map"] | None = ...,
+    **options: Unpack[FitOptions],
+) -> FitResult: ...
+
+
+@overload
+def fit(
     model: ModelListGP, method: Method | None = ..., **options: Unpack[FitOptions]
 ) -> list[FitResult | SampleResult]: ...
 
@@ -100,6 +109,10 @@ def fit(
     otherwise maximum likelihood). With few data its intervals are far too narrow. It is the default
     for models of other libraries, for batches of data sets, and for
     :class:`~gpadjust.models.PaperRRA`.
+
+    A :class:`~gpadjust.VariationalCKA` has ``"map"`` alone: the search is that of an exact model of
+    up to 1,000 of its observations, and what it finds goes on by the evidence lower bound. The
+    inducing points, the distribution there, and the sizes of ``rest`` and noise are found with it.
 
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
     Small problems are computed with one thread; the user's setting is restored after.
@@ -143,10 +156,7 @@ def fit(
     if isinstance(model, VariationalCKA):
         check_options("map" if method is None else method, given)
         if method == "bayes":
-            raise ValueError(
-                "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many "
-                "observations tell its hyper-parameters, which are not sampled."
-            )
+            raise ValueError(NEVER_SAMPLED)
         return fit_variational(model, Search(**given))
     if not isinstance(model, BatchedMultiOutputGPyTorchModel):
         raise TypeError(

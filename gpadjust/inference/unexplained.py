@@ -39,7 +39,8 @@ def unexplained(inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: i
     Few inducing points leave structure in the residuals, which is noise to a sparse model. Close
     observations share it, but not the noise. The residuals of each of some groups of neighbours
     are :math:`N(0, v k + \sigma^2 I)` with an RBF kernel k of one lengthscale for each input; v is
-    kept if it makes them more likely by more than its own parameters cost (Akaike 1974).
+    kept if it makes them more likely by more than its own parameters cost (Schwarz 1978): over
+    lengths that hold next to no neighbours it looks as noise does, and must not take its place.
 
     Args:
         inputs: ``n x d``.
@@ -97,7 +98,7 @@ def _of_one(
     best = min(runs, key=lambda run: float(run.fun))
     without = _noise_alone(r, own)
     gain = (without - float(best.fun)) * r.numel()
-    if gain <= d + 1:
+    if gain <= 0.5 * (d + 1) * math.log(r.numel()):
         return torch.zeros_like(size), spread, whole
     p = torch.as_tensor(best.x, dtype=torch.float64, device=x.device).exp()
     return size * p[d], p[:d] * spread, whole if known is not None else size * p[d + 1]

@@ -22,6 +22,7 @@ from gpadjust.inference.collapsed_bound import (
     noise_of_weight_one,
     observations,
 )
+from gpadjust.inference.log_parameters import LogParameters
 from gpadjust.inference.map_fit import FitResult, Search, centers_at_rest, maximise, optimise
 from gpadjust.inference.unexplained import unexplained
 from gpadjust.models import VariationalCKA
@@ -62,14 +63,15 @@ def fit_variational(model: VariationalCKA, search: Search) -> FitResult:
 def _fit(model: VariationalCKA, search: Search) -> FitResult:
     start = model.start
     searches = search.num_screened != 0
-    if searches:
+    physics_learns = start.has_unknowns or bool(_learnt_of_physics(model))
+    if searches or physics_learns:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", OptimizationWarning)  # what follows goes on
             if start.has_unknowns:
                 calibrate(start, search)
             else:
                 maximise(start, search)
-        if model.has_unknowns or _learnt_of_physics(model):
+        if physics_learns:
             model.ask_physics()
     data = observations(start, model.train_inputs[0], model.train_targets, _known_noise(model))
     generator = torch.Generator().manual_seed(search.seed)
@@ -79,7 +81,7 @@ def _fit(model: VariationalCKA, search: Search) -> FitResult:
     converged = torch.ones_like(noise_of_weight_one(start), dtype=torch.bool)
     with centers_at_rest(start), _physics_at_rest(model):
         for _ in range(_ROUNDS if searches else 1):
-            model.place(_places(model, data, order))
+            model.model.place(_places(model, data, order))
             bound = CollapsedBound(start, some, model.model.inducing_points)
             if not bound.parameters.names:
                 break
@@ -87,11 +89,11 @@ def _fit(model: VariationalCKA, search: Search) -> FitResult:
                 bound, bound.parameters.clipped(bound.parameters.current()), iterations, _ROUGH
             )
             bound.parameters.assign(reached[0])
-        model.place(_places(model, data, order))  # where they are best for what was found
+        model.model.place(_places(model, data, order))  # where they are best for what was found
         whole = CollapsedBound(start, data, model.model.inducing_points)
         found = whole.optimum()
     start.eval()
-    model.hold(found.mean, found.root)
+    model.model.hold(found.mean, found.root)
     model.evidence = found.bound.detach()
     _split(model, data, search.seed)
     return FitResult(model.evidence, converged.reshape(model.evidence.shape))
@@ -129,15 +131,23 @@ def _split(model: VariationalCKA, data: Observations, seed: int) -> None:
         parts.append((cross @ strategy.mean_cache.unsqueeze(-1)).squeeze(-1))
     residuals = data.residual - torch.cat(parts, dim=-1)
     residuals = residuals.masked_fill(data.weight == 0, torch.nan)
-    d = model.rest.num_inputs
+    d, likelihood = model.rest.num_inputs, model.likelihood
+    learns_noise = any(parameter.requires_grad for parameter in likelihood.parameters())
+    known = None if learns_noise else likelihood.noise.expand_as(residuals)
     with torch.enable_grad():
-        found = unexplained(data.inputs[:, :d], residuals, _known_noise(model), seed)
+        found = unexplained(data.inputs[:, :d], residuals, known, seed)
     kernel: Any = model.rest.kernel
     kernel.base_kernel.raw_lengthscale.copy_(found.lengthscales.log())
     none = torch.full_like(found.variance, NOTHING)
-    kernel.raw_outputscale.copy_(found.variance.log().where(found.variance > 0, none))
-    if any(parameter.requires_grad for parameter in model.likelihood.parameters()):
-        model.likelihood.noise = found.noise.unsqueeze(-1)
+    there = found.variance > 0
+    kernel.raw_outputscale.copy_(found.variance.log().where(there, none))
+    if learns_noise:
+        # Without a rest that of the bound stands, which counts what was fitted to the noise.
+        noise = found.noise.where(there, likelihood.noise.squeeze(-1)).unsqueeze(-1)
+        parameters = LogParameters(model.start)
+        values = parameters.unflatten(parameters.current())
+        values["likelihood.noise_covar.raw_noise"] = noise.log().unsqueeze(0)
+        parameters.assign(parameters.clipped(parameters.flatten(values))[0])
     model.forget()
 
 

@@ -114,13 +114,7 @@ class ExactGPBase(TermsModel, SingleTaskGP):
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the model at *transformed* inputs, as GPyTorch does."""
         if not self.training and self.train_inputs is not None and args:
-            expected, found = self.train_inputs[0].shape[-1], args[0].shape
-            if found[-1] != expected:
-                raise ValueError(
-                    f"In eval mode the model itself takes transformed inputs with {expected} "
-                    f"columns, got shape {tuple(found)}. Call `model.posterior(X)` on raw inputs, "
-                    "or `model(model.transform_inputs(X))`."
-                )
+            self.check_transformed(args[0])
             if prior_mode.off():
                 self.strategy()
         return super().__call__(*args, **kwargs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import torch
 from gpytorch.distributions import MultivariateNormal
@@ -41,6 +41,10 @@ def inducing_root(covariance: Tensor) -> Tensor:
 class ScaleFreeVariationalStrategy(VariationalStrategy):
     """GPyTorch's whitened strategy, with a nugget that follows the size of the covariance."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is remembered with its graph, which cannot be copied."""
+        return {name: each for name, each in vars(self).items() if name != "_memoize_cache"}
+
     @cached(name="cholesky_factor", ignore_args=True)  # type: ignore[untyped-decorator]
     def _cholesky_factor(self, induc_induc_covar: LinearOperator) -> TriangularLinearOperator:
         return TriangularLinearOperator(inducing_root(to_dense(induc_induc_covar)))
@@ -55,7 +59,12 @@ class InducingGP(ApproximateGP):
     Args:
         covar_module: The covariance of the sum, of batch shape ``(m)``.
         inducing_points: Where u is, ``(m) x M x (d + k)``.
+
+    Attributes:
+        strategy: What is remembered to predict from; None once anything may have changed.
     """
+
+    strategy: InducingStrategy | None = None
 
     def __init__(self, covar_module: SumOfTerms, inducing_points: Tensor) -> None:
         distribution = CholeskyVariationalDistribution(
@@ -79,6 +88,12 @@ class InducingGP(ApproximateGP):
         points: Tensor = self.variational_strategy.inducing_points
         return points
 
+    def train(self, mode: bool = True) -> Self:
+        """Put it in train mode, or eval mode."""
+        if mode or self.training:
+            self.strategy = None
+        return super().train(mode)
+
     @torch.no_grad()
     def place(self, points: Tensor) -> None:
         """Move the inducing points; what was known of the values there is forgotten."""
@@ -95,6 +110,7 @@ class InducingGP(ApproximateGP):
         distribution.chol_variational_covar.copy_(root)
         strategy.variational_params_initialized.fill_(1)
         strategy._clear_cache()
+        self.strategy = None
 
     def forward(self, x: Tensor) -> MultivariateNormal:
         """The prior at transformed inputs, ``... x n x (d + k)``."""

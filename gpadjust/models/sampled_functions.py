@@ -78,7 +78,8 @@ class SampledFunctions(Module):
                 torch.randn(*shape, each.num_features, dtype=torch.float64).to(train)
                 for each in features
             ]
-            prior = cls(model, features, weights)._values(train)
+            reached = {term.name for term in strategy.kernel.terms}
+            prior = cls(model, features, weights)._values(train, among=reached)
             update = strategy.pathwise_update(prior)
             return cls(model, features, weights, _by_terms(model, update))
 
@@ -118,16 +119,19 @@ class SampledFunctions(Module):
         values = values * self.scale + self.shift
         return values.mT if self.has_outputs else values.unsqueeze(-1)
 
-    def _values(self, inputs: Tensor, extra: int = 0) -> Tensor:
+    def _values(self, inputs: Tensor, extra: int = 0, among: set[str] | None = None) -> Tensor:
         """The functions in model units, ``k x ... x (m) x q``.
 
         Args:
             inputs: Transformed inputs, ``... x (m) x q x d``.
             extra: How many dimensions of them lead those of the model.
+            among: The names of the terms to sum. Default: all.
         """
         total = inputs.new_zeros(())
         cross = iter([] if self.data is None else covariances(self.data, inputs))
         for i, (term, features) in enumerate(zip(self.terms, self.features, strict=True)):
+            if among is not None and term.name not in among:
+                continue
             part = term.mean + _product(features(inputs), self.weights[i], extra)
             update = self.updates[i] if self.updates and not term.is_known else None
             if update is not None:

@@ -441,7 +441,8 @@ def _check(models: Mapping[str, ExactGPBase], weights: Tensor) -> ExactGPBase:
     for name, model in models.items():
         if not isinstance(model, ExactGPBase):
             raise TypeError(
-                f"Expected models of gpadjust, got a {type(model).__name__} as {name!r}."
+                "Expected exact models of gpadjust, such as CKA, got a "
+                f"{type(model).__name__} as {name!r}."
             )
     first, *others = models.values()
     for other in others:

@@ -55,6 +55,10 @@ def _lines(model: Any) -> list[str]:
     evidence, value = model._evidence()
     lines = [f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
     for i, term in enumerate(model.terms):
+        variance = term.variance()
+        if variance is not None and (variance < _ROUNDING**2).all():
+            lines.append(f"  {term.name}: none")
+            continue
         unit = torch.ones_like(scale) if is_rho(term.basis) else scale
         mean = model.term_mean(term.name) if hasattr(model, "term_mean") else 0.0
         mean = mean if abs(mean) > _ROUNDING * float(unit.flatten()[0]) else 0.0

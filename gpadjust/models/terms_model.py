@@ -320,6 +320,16 @@ class TermsModel(Model):
             )
         return inputs
 
+    def check_transformed(self, inputs: Tensor) -> None:
+        """Raise a ValueError if inputs of the model itself, in eval mode, are not transformed."""
+        expected = self.train_inputs[0].shape[-1]
+        if inputs.shape[-1] != expected:
+            raise ValueError(
+                f"In eval mode the model itself takes transformed inputs with {expected} columns, "
+                f"got shape {tuple(inputs.shape)}. Call `model.posterior(X)` on raw inputs, or "
+                "`model(model.transform_inputs(X))`."
+            )
+
     def _inputs_without_basis(self, X: Tensor) -> Tensor:
         return self.transform_inputs(X)
 

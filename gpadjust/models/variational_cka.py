@@ -11,6 +11,7 @@ from botorch.models.approximate_gp import ApproximateGPyTorchModel
 from botorch.models.transforms.input import InputTransform
 from botorch.models.transforms.outcome import Standardize
 from botorch.utils.types import DEFAULT, _DefaultType
+from gpytorch.distributions import MultivariateNormal
 from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, Likelihood
 from torch import Size, Tensor
 
@@ -25,8 +26,12 @@ from gpadjust.models.sampled_functions import check_number
 from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
 
 _SEARCHED = 1000  # observations that an exact model of some takes
-NOTHING = -40.0
+NOTHING = -60.0
 """The logarithm of a variance that is none."""
+NEVER_SAMPLED = (
+    "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many observations tell "
+    "its hyper-parameters, which are not sampled."
+)
 
 
 class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
@@ -60,7 +65,7 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         model: GPyTorch's variational model of one batch element per output, in model units.
         rest: The term of what the inducing points cannot show.
         evidence: The lower bound of the log marginal likelihood that the last fit reached, ``(m)``,
-            in model units; None before a fit.
+            in model units; NaN before a fit.
 
     Raises:
         ValueError: As :class:`~gpadjust.CKA`; and for a batch of data sets.
@@ -137,15 +142,10 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         self.rest = _rest(start.terms[-1].num_inputs, self._aug_batch_shape)
         self.input_names, self.output_names = data.input_names, data.output_names
         self.__dict__["start"] = start  # its modules are registered here
-        shift, scale = self._units()
-        self.train_targets = (self._outputs_first(data.Y) - shift) / scale
-        self._set_inputs(data.X, columns)
-        if data.Yvar is not None:
-            self.likelihood = FixedNoiseGaussianLikelihood(
-                self._outputs_first(data.Yvar) / scale.square(), learn_additional_noise=False
-            )
-        self._strategy: InducingStrategy | None = None
-        self.evidence: Tensor | None = None
+        self._original_train_inputs, self._has_transformed_inputs = data.X, True
+        self._hold_data(columns, self._outputs_first(data.Y))
+        self._take(columns, data.Y, data.Yvar)
+        self.register_buffer("evidence", torch.full_like(self.train_targets[..., 0], torch.nan))
         self.eval()
 
     @property
@@ -166,47 +166,43 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         return [*self.covar_module.terms, self.rest]
 
     @property
+    def term_names(self) -> tuple[str, ...]:
+        """The names of the terms that are unknown; the rest, which is in delta, goes without."""
+        return tuple(name for name in super().term_names if name != self.rest.name)
+
+    @property
     def batch_shape(self) -> Size:
         """Empty: it is a model of one data set."""
         return Size()
 
+    def forward(self, X: Tensor) -> MultivariateNormal:
+        """Evaluate the variational model: at raw ``X`` in train mode, else at transformed inputs.
+
+        Raises:
+            ValueError: If ``X`` is raw in eval mode.
+        """
+        if not self.training:
+            self.check_transformed(X)
+        return super().forward(X)
+
     def strategy(self) -> InducingStrategy:
         """What is remembered of the inducing values to predict from; made if it is not there."""
-        if self._strategy is None:
-            self._strategy = InducingStrategy(self.model, self.likelihood)
-        return self._strategy
-
-    def train(self, mode: bool = True) -> Self:
-        """Put the model in train mode, or eval mode."""
-        self._strategy = None
-        return super().train(mode)
-
-    def eval(self) -> Self:
-        """Put the model in eval mode."""
-        if self.training:
-            self._strategy = None
-        return super().eval()
+        if self.model.strategy is None:
+            self.model.strategy = InducingStrategy(self.model, self.likelihood)
+        strategy: InducingStrategy = self.model.strategy
+        return strategy
 
     def forget(self) -> None:
         """Forget what predictions are made of, after a change of parameters."""
-        self._strategy = None
-
-    def hold(self, mean: Tensor, root: Tensor) -> None:
-        """Take a distribution of the whitened inducing values, as :meth:`InducingGP.hold`."""
-        self.model.hold(mean, root)
-        self._strategy = None
-
-    def place(self, points: Tensor) -> None:
-        """Move the inducing points, as :meth:`InducingGP.place`."""
-        self.model.place(points)
-        self._strategy = None
+        self.model.strategy = None
 
     def ask_physics(self) -> None:
         """Ask the physics about the training inputs again, by what was learnt of its parameters."""
+        if self.start is not None:
+            self.start.train()  # its inputs are then transformed again
         with torch.no_grad():
-            self._set_inputs(
-                self._original_train_inputs, self.input_transform(self._original_train_inputs)
-            )
+            columns = self.input_transform(self._original_train_inputs)
+        self._hold_data(columns, self.train_targets)
 
     def data(self) -> dict[str, Tensor | None]:
         """The data that the model could be built on: raw inputs, targets and known variances."""
@@ -217,14 +213,19 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         targets = self._outputs_last(self.train_targets * scale + shift)
         return {"train_X": self._original_train_inputs, "train_Y": targets, "train_Yvar": noise}
 
-    def load_state_dict(self, state_dict: Any, strict: bool = True, **kwargs: Any) -> Any:
-        """Load parameters and inducing values."""
-        keys = super().load_state_dict(state_dict, strict, **kwargs)
-        self._strategy = None
-        self.start.train()  # its inputs are then transformed again
-        if self.has_unknowns:
+    def load_state_dict(
+        self, state_dict: Any, strict: bool = True, keep_transforms: bool = False, **kwargs: Any
+    ) -> Any:
+        """Load parameters and inducing values; the data are those that the model has."""
+        data: Any = self.data()
+        before = {n: tensor.clone() for n, tensor in self.input_transform.state_dict().items()}
+        keys = super().load_state_dict(state_dict, strict, keep_transforms=False, **kwargs)
+        self._take(self.train_inputs[0], data["train_Y"], data["train_Yvar"])
+        after = self.input_transform.state_dict()
+        if any(not torch.equal(tensor, before[name]) for name, tensor in after.items()):
             self.ask_physics()
         self.model.variational_strategy._clear_cache()
+        self.forget()
         return keys
 
     def subset_output(self, idcs: list[int]) -> Self:
@@ -251,25 +252,38 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         new._num_outputs = new._desired_num_outputs = len(kept)
         new._aug_batch_shape = Size([len(kept)] if len(kept) > 1 else [])
         new.output_names = tuple(self.output_names[i] for i in kept)
-        new.train_targets = self.train_targets[index]
-        new.evidence = None if self.evidence is None else self.evidence[index]
+        new._hold_data(self.train_inputs[0], self.train_targets[index])
+        new.evidence = self.evidence[index]
         new.__dict__["start"] = None
-        new._strategy = None
         return new.eval()
 
     def condition_on_observations(self, X: Tensor, Y: Tensor, **kwargs: Any) -> NoReturn:
         """Refuse: inducing values that are optimal for further data are another fit."""
+        self._refuse_conditioning()
+
+    def fantasize(self, X: Tensor, sampler: Any, **kwargs: Any) -> NoReturn:
+        """Refuse, as :meth:`condition_on_observations`."""
+        self._refuse_conditioning()
+
+    def _refuse_conditioning(self) -> NoReturn:
         raise NotImplementedError(
             "VariationalCKA cannot be conditioned on further observations, which fantasies and "
             "look-ahead acquisition functions need: build it of all data and fit it again (a warm "
             "start of few iterations will do), or take an exact CKA of some thousand."
         )
 
-    def _set_inputs(self, X: Tensor, columns: Tensor) -> None:
-        self._original_train_inputs, self.train_inputs = X, (columns,)
-        self._has_transformed_inputs = True
+    def _take(self, columns: Tensor, Y: Tensor, Yvar: Tensor | None) -> None:
+        """Take transformed inputs, targets and known variances, ``n x m`` in the user's units."""
+        shift, scale = self._units()
+        self._hold_data(columns, (self._outputs_first(Y) - shift) / scale)
+        if Yvar is not None:
+            noise = self._outputs_first(Yvar) / scale.square()
+            self.likelihood = FixedNoiseGaussianLikelihood(noise, learn_additional_noise=False)
+
+    def _hold_data(self, columns: Tensor, targets: Tensor) -> None:
+        self.train_inputs, self.train_targets = (columns,), targets
         # Where GPyTorch's closures look for the data of a variational model.
-        self.model.train_inputs, self.model.train_targets = (columns,), self.train_targets
+        self.model.train_inputs, self.model.train_targets = self.train_inputs, targets
 
     def _bases(self, inputs: Tensor) -> Weights:
         return [(term, term.weights(inputs)) for term in self.terms]
@@ -279,7 +293,7 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         return [*weights, (self.rest, None)] if name == "delta" else weights
 
     def _evidence(self) -> tuple[str, Tensor | None]:
-        if self.evidence is None:
+        if self.evidence.isnan().any():
             return "not fitted", None
         scale = self._units()[1].squeeze(-1)
         count = (~self.train_targets.isnan()).sum(-1)
@@ -288,11 +302,11 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the data with the model."""
         new = super()._apply(fn, recurse)
-        self.train_targets, (columns,) = fn(self.train_targets), self.train_inputs
-        self._set_inputs(fn(self._original_train_inputs), fn(columns))
+        self._original_train_inputs = fn(self._original_train_inputs)
+        self._hold_data(fn(self.train_inputs[0]), fn(self.train_targets))
         if self.start is not None:
             self.start._apply(fn)
-        self._strategy = None
+        self.forget()
         return new
 
 

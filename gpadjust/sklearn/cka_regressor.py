@@ -74,9 +74,9 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             single rows, or one with unknown parameters. Several: a list, or a dictionary with their
             names. None: no physics; the model is then :class:`~gpadjust.ZeroMeanGP`, which is what
             CKA of :math:`f_p = 0` is.
-        model: ``"cka"``, ``"rra"``, ``"physics_mean"``, ``"scale"``, ``"calibrated_physics"``,
-            ``"zero_mean"`` (which leaves the physics out, to compare with), or a class: a subclass
-            of :class:`~gpadjust.models.AdjustedModel`.
+        model: ``"cka"``, ``"variational"`` (of very many rows), ``"rra"``, ``"physics_mean"``,
+            ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (which leaves the physics out, to
+            compare with), or a class: a subclass of :class:`~gpadjust.models.AdjustedModel`.
         fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`. None: the library's
             calibrated default, full Bayes where the model can have it.
         model_options: Further arguments of the model, such as ``{"delta_mean": "learn"}``, or

@@ -211,6 +211,9 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
         models = model.models if isinstance(model, ModelListGP) else [g[0] for g in model.groups]
         parts = [observations(part) for part in models]
         return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
+    if isinstance(model, VariationalCKA):
+        data: Any = model.data()
+        return data["train_X"], data["train_Y"]
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
         Y = _outputs_last(model, model.train_targets)

@@ -77,7 +77,7 @@ def _by_minibatches(model: VariationalCKA, data: Data, seconds: float, seed: int
     """Train all parameters by Adam, as GPyTorch's tutorials do, from where the exact fit ends."""
     begin = time.perf_counter()
     fit(model.start, "map")
-    model.place(model.model.inducing_points.clone())
+    model.model.place(model.model.inducing_points.clone())
     inner: Any = model.model
     mll = VariationalELBO(model.likelihood, inner, num_data=len(data.X))
     optimiser = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=0.01)

@@ -10,7 +10,7 @@ from botorch.models import ModelListGP
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
 
-from gpadjust import BiasGP, BlackBoxPhysics, fit
+from gpadjust import BiasGP, BlackBoxPhysics, VariationalCKA, fit
 from gpadjust.active import qAdjustmentInformationGain
 
 ABOUT = ["rho", "delta", "both"]
@@ -166,6 +166,17 @@ class TestAgainstLinearAlgebra:
         expected = Gaussian(model, D, X)
         assert max(expected.constant.values()) > 1
         assert_close(ask(model, X, about), expected.information(about), 1e-5)
+
+    def test_inducing_values_by_the_posterior_covariance(self, data, X, crude_physics):
+        model = VariationalCKA(*data(num_outputs=2), physics=crude_physics, num_inducing=5)
+        fit(model, num_screened=0)
+        expected = 0.0
+        for j in range(2):
+            part = model.subset_output([j])
+            C = part.posterior(X[:3]).distribution.covariance_matrix.detach()
+            noise = part.predict(X[:1], True).variance - part.predict(X[:1]).variance
+            expected += 0.5 * torch.logdet(torch.eye(3).double() + C / noise.detach()).item()
+        assert_close(ask(model, X[:3], "both"), expected, 1e-6)
 
 
 class TestAgainstSimulation:
@@ -396,6 +407,12 @@ class TestErrors:
     def test_no_adjustment_at_all(self, data, build, kind):
         with pytest.raises(TypeError, match=f"rho or delta .* got {kind}"):
             qAdjustmentInformationGain(build(kind, *data()))
+
+    def test_inducing_values_of_a_sum(self, data, crude_physics):
+        model = VariationalCKA(*data(num_outputs=2), physics=crude_physics)
+        for about in ("rho", "delta"):
+            with pytest.raises(TypeError, match=f"if {about} were known: ask about 'both'"):
+                qAdjustmentInformationGain(model, about)
 
     def test_a_list_of_models(self, data, build):
         with pytest.raises(TypeError, match="got ModelListGP"):

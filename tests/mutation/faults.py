@@ -50,7 +50,7 @@ FAULTS = (
         "The gradient of a lengthscale that several inputs share is too small.",
     ),
     Fault(
-        "gpadjust/models/adjusted_gp.py",
+        "gpadjust/models/adjusted_model.py",
         "weights.append((term, -term.basis.origin / term.basis.scale))",
         "weights.append((term, -term.basis.origin))",
         "With a center, delta is in the wrong units wherever the targets are scaled.",

@@ -393,6 +393,19 @@ def test_bad_parameters(data, parameters, error, message):
     assert not hasattr(regressor, "model_")
 
 
+def test_inducing_points(data):
+    X, y = data
+    regressor = fast(model="variational", model_options={"num_inducing": 6}).fit(X, y)
+    assert type(regressor.model_).__name__ == "VariationalCKA"
+    mean, std = regressor.predict(X, return_std=True)
+    assert np.abs(mean - y).max() < 0.2
+    _, covariance = regressor.predict(X, return_cov=True)
+    np.testing.assert_allclose(np.diag(covariance), std**2, rtol=1e-6)
+    assert regressor.sample_y(Z, 3).shape == (7, 3)
+    again = pickle.loads(pickle.dumps(regressor))
+    np.testing.assert_array_equal(again.predict(Z), regressor.predict(Z))
+
+
 def test_bad_requests(data):
     with pytest.raises(NotFittedError):
         fast().predict(Z)

@@ -5,6 +5,7 @@ import torch
 from botorch.models import ModelListGP, SingleTaskGP
 from botorch.models.transforms import Log, Normalize, Standardize
 
+from gpadjust import VariationalCKA
 from gpadjust.models.training_data import standardize
 from gpadjust.validation import coverage, crps, leave_one_out, nlpd, pit, rmse
 
@@ -133,6 +134,8 @@ def test_other_models_are_refused(data):
         leave_one_out(torch.nn.Linear(1, 1))
     with pytest.raises(ValueError, match="outcome transform Log is not a shift and scale"):
         leave_one_out(SingleTaskGP(X, Y, outcome_transform=Log()))
+    with pytest.raises(TypeError, match="Expected an exact model, got a VariationalCKA"):
+        leave_one_out(VariationalCKA(X, Y, physics=lambda X: X[..., :1]))
 
 
 @pytest.mark.parametrize("normalize", [False, True])

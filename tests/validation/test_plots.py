@@ -11,7 +11,7 @@ from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from gpytorch.distributions import MultivariateNormal
 from matplotlib.figure import Figure
 
-from gpadjust import CKA, ZeroMeanGP
+from gpadjust import CKA, VariationalCKA, ZeroMeanGP
 from gpadjust.validation import leave_one_out, score
 from gpadjust.validation.plots import (
     plot_adjustment,
@@ -59,6 +59,16 @@ def band(ax):
         x: (vertices[vertices[:, 0] == x, 1].min(), vertices[vertices[:, 0] == x, 1].max())
         for x in np.unique(vertices[:, 0])
     }
+
+
+def test_inducing_points(data, crude_physics):
+    X, Y = data(num_outputs=2)
+    Y[:3, 1] = torch.nan
+    model = VariationalCKA(X, Y, physics=crude_physics)
+    axes = plot_adjustment(model, output=1)
+    assert axes.shape == (2, 2)  # the rest is drawn with delta
+    assert len(axes[0, 0].lines[-1].get_xdata()) == 6
+    assert plot_adjustment_pair(model, num_points=4).shape == (2, 2)
 
 
 def test_a_prediction_of_one_input(line, forrester):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust import AR1, CKA, BiasGP, StackedGP, ZeroMeanGP, fit
+from gpadjust import AR1, CKA, BiasGP, StackedGP, VariationalCKA, ZeroMeanGP, fit
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.validation import Trust, trust
 from gpadjust.validation.plots import plot_trust, plot_trust_pair
@@ -117,6 +117,16 @@ def test_all_models_with_a_physics_fall_back_to_it(kind, data, build, crude_phys
     Z = 3 * torch.rand(7, 2, dtype=torch.float64)
     torch.testing.assert_close(model.fallback(Z), crude_physics(Z))
     assert trust(model, Z).side.shape == (7, 2)
+
+
+def test_inducing_points_fall_back_to_the_physics_too(data, crude_physics):
+    X, Y = data(num_outputs=2)
+    Y[:3, 0] = torch.nan
+    model = VariationalCKA(X, Y, physics=crude_physics)
+    Z = 3 * torch.rand(7, 2, dtype=torch.float64)
+    torch.testing.assert_close(model.fallback(Z), crude_physics(Z))
+    assert trust(model, Z).side.shape == (7, 2)
+    assert trust(model, num_points=9).side.shape == (9, 2)
 
 
 def test_of_several_physics_the_weighted_sum_counts():

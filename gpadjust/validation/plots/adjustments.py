@@ -161,7 +161,8 @@ def plot_adjustment_pair(
             middle, ticks = float(values.mean()), None
             levels: int | list[float] = 12
             if (values - middle).abs().max() <= _CONSTANT * abs(middle):  # rounding errors
-                levels, ticks = sorted([0.9 * middle, 1.1 * middle]), [middle]
+                around = 0.1 * abs(middle) or 1.0
+                levels, ticks = [middle - around, middle + around], [middle]
             contour = ax.contourf(*grid, values, levels=levels, cmap=colors)
             ax.figure.colorbar(contour, ax=ax, ticks=ticks)
             ax.plot(train_X[:, i], train_X[:, j], "o", color=RED, ms=4, mec="white", mew=0.6)

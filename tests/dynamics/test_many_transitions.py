@@ -1,0 +1,79 @@
+"""Dynamics by a model with inducing points."""
+
+import pytest
+import torch
+
+from gpadjust import VariationalCKA
+from gpadjust.dynamics import LearnedDynamics, StateSpec
+
+SPEC = StateSpec(["x", "v"], ["u"])
+QUICK = {"num_screened": 16, "num_starts": 2}
+
+
+def step(X):
+    x, v, u = X.unbind(-1)
+    return torch.stack([x + 0.1 * v, 0.95 * v - 0.1 * x + 0.1 * u], dim=-1)
+
+
+def transitions(n, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    X = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    noise = 0.01 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    return X[:, :2], X[:, 2:], step(X) + 0.1 * X[:, :2].sin() + noise
+
+
+def make(**options):
+    return LearnedDynamics(
+        SPEC, physics=step, model=VariationalCKA, model_options={"num_inducing": 12}, **options
+    )
+
+
+@pytest.fixture(scope="module")
+def dynamics():
+    dynamics = make(fit_options=QUICK)
+    dynamics.update(*transitions(100))
+    return dynamics
+
+
+def test_they_come_back_and_go_on(dynamics):
+    before, dynamics = dynamics, make(fit_options=QUICK)
+    dynamics.load_state_dict(before.state_dict())
+    X = transitions(5)[:2]
+    for ours, theirs in zip(dynamics.predict(*X), before.predict(*X), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=0)
+    dynamics.update(*transitions(60, seed=1))
+    assert dynamics.num_transitions == 160
+    states, actions, next_states = transitions(50, seed=2)
+    mean, variance = dynamics.predict(states, actions)
+    error = mean - next_states
+    assert error.std() < 0.015
+    assert ((error.square() / variance).mean() - 1).abs() < 0.5
+    noise = dynamics.noise_variance(states, actions).sqrt()
+    assert (noise - 0.01).abs().max() < 0.003
+    assert dynamics.sample(states, actions).shape == (50, 2)
+    functions = dynamics.sample_functions(4, seed=0)
+    blocks = states.expand(4, -1, -1), actions.expand(4, -1, -1)
+    assert (functions(*blocks) - mean).abs().max() < 0.1
+    torch.testing.assert_close(dynamics.mean_function()(*blocks)[0], mean)
+
+
+def test_a_free_run(dynamics):
+    generator = torch.Generator().manual_seed(3)
+    actions = torch.randn(1, 10, 1, generator=generator, dtype=torch.float64)
+    path = [torch.tensor([[0.5, -0.5]], dtype=torch.float64)]
+    for action in actions.unbind(1):
+        path.append(step(torch.cat([path[-1], action], dim=-1)) + 0.1 * path[-1].sin())
+    run = dynamics.free_run(path[0], actions)
+    truth = torch.stack(path[1:], dim=1)
+    assert (run.mean - truth).abs().max() < 0.1
+    assert ((run.lower < truth) & (truth < run.upper)).double().mean() > 0.8
+
+
+def test_they_are_not_conditioned_or_sampled(dynamics):
+    with pytest.raises(NotImplementedError, match="build it of all data"):
+        dynamics.update(*transitions(5), refit=False)
+    assert dynamics.num_transitions == 100
+    with pytest.raises(ValueError, match="got 'bayes'"):
+        make(fit_options={"method": "bayes"})
+    with pytest.raises(ValueError, match="has no option 'num_samples'"):
+        make(fit_options={"num_samples": 8})
