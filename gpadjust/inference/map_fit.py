@@ -54,8 +54,10 @@ class FitResult:
     Attributes:
         log_likelihood: The log marginal likelihood (plus log priors, if the model has any) of
             each output, in the units of the model's targets; ``batch_shape x (m)``. Unknown
-            constant means are at their least squares estimates, not integrated out.
-        converged: Whether the optimiser converged, for each output, of the same shape.
+            constant means are at their least squares estimates, not integrated out. Of a
+            :class:`~gpadjust.VariationalCKA` the evidence lower bound of all observations.
+        converged: Whether the optimiser converged, for each output, of the same shape; of a
+            VariationalCKA, whose last search stops after 15 iterations, it seldom has.
     """
 
     log_likelihood: Tensor

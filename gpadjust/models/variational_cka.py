@@ -314,7 +314,7 @@ def _some_of_each_output(data: TrainingData, seed: int) -> Tensor:
     """Numbers of some rows, with observations of each output among them."""
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(data.X), generator=generator)
-    observed = ~data.Y.isnan()[order]
+    observed = ~data.Y.isnan().cpu()[order]
     rank = observed.cumsum(0)
     taken = (observed & (rank <= max(2, _SEARCHED // data.Y.shape[-1]))).any(-1)
     first = order[taken]
