@@ -136,7 +136,9 @@ def _starts(objective: Objective, search: Search) -> Tensor:
     starts = parameters.clipped(parameters.current())
     searches = search.num_screened != 0
     if searches and parameters.is_batched and objective.num_points > _MANY:
-        starts = _best(objective, torch.cat([starts, _optima_of_some(objective, search)]))
+        found = _best(objective, torch.cat([starts, _optima_of_some(objective, search)]))
+        # Few may show nothing but noise, an optimum of all that is better than any other start.
+        starts = torch.cat([found, starts])
     elif searches:
         starts = _screened(objective, search)
     if not objective(starts).amin(0).isfinite().all():

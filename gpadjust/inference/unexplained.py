@@ -101,7 +101,10 @@ def _of_one(
     if gain <= 0.5 * (d + 1) * math.log(r.numel()):
         return torch.zeros_like(size), spread, whole
     p = torch.as_tensor(best.x, dtype=torch.float64, device=x.device).exp()
-    return size * p[d], p[:d] * spread, whole if known is not None else size * p[d + 1]
+    noise = p[d + 1] if own is None else own.mean()
+    # Groups that are narrow beside the lengthscales do not tell v, but the residuals' size does.
+    variance = p[d].minimum((1 - noise).clamp_min(0.0))
+    return size * variance, p[:d] * spread, whole if known is not None else size * noise
 
 
 def _negative_log_likelihood(x: Tensor, r: Tensor, p: Tensor, known: Tensor | None) -> Tensor:

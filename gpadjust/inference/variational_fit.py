@@ -114,9 +114,9 @@ def _places(model: VariationalCKA, data: Observations, order: Tensor) -> Tensor:
             num_inducing=min(number, len(candidates)),
             input_batch_shape=Size(),
         )
-        # It stops where nothing is left to be explained.
-        more = data.inputs[order[: number - len(greedy)]]
-        each.append(torch.cat([greedy.detach(), more]))
+        # It stops where nothing is left to be explained; others fill up, anywhere.
+        more = data.inputs[seen.flip(0)[: number - len(greedy)]]
+        each.append(torch.cat([greedy.detach(), more, greedy[: number - len(greedy) - len(more)]]))
     return torch.stack(each).reshape(*batch, number, -1)
 
 

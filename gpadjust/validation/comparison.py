@@ -30,9 +30,8 @@ from gpadjust.validation.leave_one_out import (
     LeaveOneOut,
     leave_one_out,
     mixture_of,
-    observations,
 )
-from gpadjust.validation.ranking import Candidate, is_clear, ranking
+from gpadjust.validation.ranking import Candidate, densities, is_clear, ranking
 from gpadjust.validation.refitting import LEAST, refitted
 from gpadjust.validation.structures import (
     STACKED,
@@ -78,9 +77,9 @@ class Comparison:
         """The structure that is clearly best for all outputs, otherwise ``"stacked"``.
 
         It has nearly all weight, and all others are worse by more than two standard errors, by
-        eight observations or more.
+        observations of eight different inputs or more.
         """
-        numbers = (~observations(self.stacked)[1].isnan()).sum(0).tolist()
+        numbers = [len(densities(self.left_out, j)) for j in range(len(self.table))]
         names = {rows[0].structure for rows in self.table.values()}
         clear = all(map(is_clear, self.table.values(), numbers))
         return names.pop() if clear and len(names) == 1 else STACKED

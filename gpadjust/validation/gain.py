@@ -22,7 +22,8 @@ class Gain(NamedTuple):
             themselves, if that is shown to be better.
         without: The structure without the physics.
         shown: 1 if the physics is shown to help, -1 if it is shown to make predictions worse, and
-            0 if neither is, by two standard errors, or there are fewer than eight observations.
+            0 if neither is, by two standard errors, or there are observations of fewer than eight
+            different inputs.
     """
 
     elpd: float

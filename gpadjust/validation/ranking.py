@@ -14,7 +14,7 @@ from gpadjust.validation.leave_one_out import LeaveOneOut
 _BOOTSTRAPS = 200
 _STEPS = 300
 SURE = 2.0  # standard errors that a difference takes to be real
-ENOUGH = 8  # observations, for a structure to be clearly best
+ENOUGH = 8  # observations of different inputs, for a structure to be clearly best
 _CLEAR = 0.95  # weight of a structure that needs no others
 _LEAST = 1e-6  # nats; less is rounding
 _WORST = -1e6  # nats; a density of zero would make others' differences infinite
@@ -72,11 +72,19 @@ def ranking(left_out: dict[str, LeaveOneOut], output: int) -> list[Candidate]:
 
 
 def densities(left_out: dict[str, LeaveOneOut], output: int) -> Tensor:
-    """The log predictive densities of an output's observations by each structure, ``n x K``."""
+    """The log predictive densities of an output's observations by each structure, ``n x K``.
+
+    Observations of the same inputs are taken together, ``n`` are different inputs: repeated ones
+    are no further evidence of where a structure is right, but would seem to be.
+    """
     found = torch.stack([loo.log_density[:, output] for loo in left_out.values()], -1)
     (first, *_) = left_out.values()
     seen = ~first.Y[:, output].isnan()
-    return found[seen].nan_to_num(nan=_WORST, neginf=_WORST).clamp_min(_WORST)
+    each = found[seen].nan_to_num(nan=_WORST, neginf=_WORST).clamp_min(_WORST)
+    distinct, group = first.X[seen].unique(dim=0, return_inverse=True)
+    if len(distinct) == len(each):
+        return each  # in the order of the observations
+    return each.new_zeros(len(distinct), each.shape[-1]).index_add(0, group, each)
 
 
 def difference(first: Tensor, second: Tensor) -> tuple[float, float]:

@@ -306,3 +306,14 @@ class TestUsersChoices:
         before = log_likelihood(model)
         fit(model, "map", **QUICK)
         assert (log_likelihood(model) > before).all()
+
+
+def test_a_part_that_shows_nothing_but_noise_does_not_decide():
+    # On the 96 of these rows that are searched first, the likeliest function is none at all.
+    generator = torch.Generator().manual_seed(0)
+    X = torch.rand(300, 3, generator=generator, dtype=torch.float64)
+    f_p = torch.sin(6 * X[:, :1])
+    Y = 2 * f_p + torch.sin(9 * X[:, 1:2]) * torch.cos(9 * X[:, 2:])
+    Y = Y + 0.2 * torch.randn(300, 1, generator=generator, dtype=torch.float64)
+    model = CKA(X, Y, physics=lambda X: torch.sin(6 * X[:, :1]))
+    assert fit(model, "map").log_likelihood > -41

@@ -376,3 +376,12 @@ def test_a_physics_with_unknown_parameters_is_calibrated_by_each_structure():
     assert {row.structure for row in rows} == {"calibrated physics", "physics mean"}
     with pytest.raises(ValueError, match="has no unknown parameter for 'calibrated physics'"):
         compare(X, Y, torch.sin, structures="calibrated physics")
+
+
+def test_repeated_inputs_are_no_evidence_of_the_physics():
+    X = torch.tensor([[0.1], [0.5], [0.9]], dtype=torch.float64).repeat(8, 1)
+    generator = torch.Generator().manual_seed(0)
+    Y = torch.randn(24, 1, generator=generator, dtype=torch.float64)
+    comparison = compare(X, Y, lambda X: 5 * X.sin())
+    assert comparison.gain["y"].shown == 0
+    assert comparison.chosen == "stacked"
