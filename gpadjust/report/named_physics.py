@@ -160,8 +160,8 @@ def _check(physics: Physics, path: str, data: CsvData) -> None:
     if other := _where(~torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))):
         raise ValueError(
             f"--physics {path}: expected the same values whenever it is called, found others at "
-            f"the second call in {len(other)} of {plural(len(X), 'row')}. Without random numbers "
-            f"(or with a seed that it sets itself) it is a physics:{_told(other, data)}"
+            f"the second call in {len(other)} of {plural(len(X), 'row')}. Take random numbers "
+            f"out of it, or let it set their seed itself:{_told(other, data)}"
         )
 
 

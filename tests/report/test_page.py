@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from gpadjust import CKA, VariationalCKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
+from gpadjust.report.figures import _slice
 from gpadjust.report.markup import table, tag
 from gpadjust.report.numbers import failure, name_and_unit, number
 from gpadjust.report.subject import subject_of
@@ -172,6 +173,15 @@ def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
     page = read(report(comparison, tmp_path / "report.html"))
     assert "The model could not be saved: no way" in page.text
     assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
+
+
+@pytest.mark.parametrize("offset", [1.7e9, 1e60])
+def test_inputs_are_drawn_in_double_precision(offset):
+    X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
+    model = CKA(X, X / offset, physics=lambda X: torch.zeros_like(X))
+    fit(model, "map", num_starts=1, num_screened=4)
+    drawn = _slice(subject_of(model), 0, 9)
+    assert len(drawn.unique()) == 9
 
 
 def test_where_a_physics_fails_is_told_in_a_line():
