@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 
 _ABOUT = """\
@@ -24,6 +24,7 @@ of NumPy arrays or torch tensors. Then, in their folder,
 
 writes report.html and report.pt. Where an output was not measured its field is empty.
 """
+_SEEDS = 2**32
 
 
 def parser() -> ArgumentParser:
@@ -52,7 +53,8 @@ def parser() -> ArgumentParser:
         "--out",
         default="report.html",
         metavar="page.html",
-        help="the page to write (%(default)s); the model beside it",
+        help="the page to write (%(default)s); the model beside it, page.pt. Both replace what has "
+        "these names",
     )
     add("--units", metavar="a=m,y=Pa", help='units, of columns that do not say them, as "a [m]"')
     add("--noise", metavar="0.1", help="known standard deviation of the outputs; or y=0.1,z=2")
@@ -63,7 +65,7 @@ def parser() -> ArgumentParser:
         help="compare structures, which tells whether the physics helps (the default); or one CKA "
         "alone, by full Bayes or at the likeliest hyper-parameters, which is quicker",
     )
-    add("--seed", type=int, default=0, metavar="0", help="of the fits (%(default)s)")
+    add("--seed", type=_seed, default=0, metavar="0", help="of the fits (%(default)s)")
     add(
         "--delimiter", default=",", metavar="mark", help='between two fields (","); ";" or tab, say'
     )
@@ -88,9 +90,25 @@ def main(command: Sequence[str] | None = None) -> int:
         run(arguments, command)
     except (ValueError, OSError, PhysicsError) as error:
         return _fail(str(error))
+    except SystemExit as error:  # of the user's code
+        return _fail(
+            f"the physics ended Python by sys.exit({error.code!r}), expected values, or an error "
+            "that is raised; nothing was written."
+        )
     except KeyboardInterrupt:
         return _fail("interrupted; nothing was written.", 130)
     return 0
+
+
+def _seed(text: str) -> int:
+    """A seed that all generators take."""
+    try:
+        seed = int(text)
+    except ValueError:
+        seed = -1
+    if not 0 <= seed < _SEEDS:
+        raise ArgumentTypeError(f"expected a whole number from 0 to {_SEEDS - 1}, found {text!r}")
+    return seed
 
 
 def _fail(message: str, status: int = 1) -> int:

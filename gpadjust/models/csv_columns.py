@@ -12,6 +12,7 @@ from typing import NoReturn, TextIO
 import torch
 from torch import Tensor
 
+LARGEST = 1e100  # of which squares are still numbers
 _OTHERS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas"}
 _OF_RECORDS = (
     "Say which column it is, such as `states={'theta': 'q'}`, or what is between the fields, by "
@@ -67,9 +68,11 @@ class CsvColumns:
         self.lines = tuple(line for line, _ in self._rows)
         for line, fields in self._rows:
             if len(fields) != len(header):
+                expected = f"{len(header)} field" + "s" * (len(header) != 1)
+                hint = self._other_delimiter() or self._miscounted(line, fields, delimiter)
                 raise ValueError(
-                    f"{file}, line {line}: expected {len(header)} fields, one for each name, found "
-                    f"{len(fields)}; mend the line, or leave it out.{self._other_delimiter()}"
+                    f"{file}, line {line}: expected {expected}, one for each name, found "
+                    f"{len(fields)}; mend the line, or leave it out.{hint}"
                 )
 
     def __len__(self) -> int:
@@ -96,7 +99,8 @@ class CsvColumns:
             may_miss: Whether numbers may be missing: NaN, where a field is empty or says so.
 
         Raises:
-            ValueError: If there is no such column, or several, or a field is no finite number.
+            ValueError: If there is no such column, or several, or a field is no finite number, or
+                one beyond 1e100.
         """
         column, values = self._column(name), []
         expected = "a number, or nothing where it was not measured" if may_miss else "a number"
@@ -105,6 +109,10 @@ class CsvColumns:
             value = self._number(text)
             if not math.isfinite(value) and not (may_miss and math.isnan(value)):
                 self._refuse(line, column, expected, text)
+            if abs(value) > LARGEST:
+                self._refuse(
+                    line, column, f"a number between {-LARGEST:.0e} and {LARGEST:.0e}", text
+                )
             values.append(value)
         return torch.tensor(values, dtype=torch.float64)
 
@@ -145,6 +153,20 @@ class CsvColumns:
             f" There seem to be {_OTHERS[marks[0]]} between its fields: say so by "
             f"{self._option.format('delimiter', marks[0])}."
         )
+
+    def _miscounted(self, line: int, fields: list[str], delimiter: str) -> str:
+        """Why a row may have more fields than there are names."""
+        if len(self.names) == 1 and line == self.lines[0]:
+            return (
+                f" Line {self._header} has one name and line {line} has {len(fields)} fields: is "
+                f"line {self._header} a comment? Then take it away."
+            )
+        if len(fields) == len(self.names) + 1 and not fields[-1].strip():
+            return (
+                f" Its last field is empty: is there a {delimiter!r} too many at its end? Take it "
+                f"away, or put one at the end of line {self._header} too."
+            )
+        return ""
 
     def _refuse(self, line: int, column: int, expected: str, text: str) -> NoReturn:
         raise ValueError(

@@ -8,7 +8,7 @@ from gpadjust.physics import PhysicsError
 from gpadjust.report import figures
 from gpadjust.report.images import drawn
 from gpadjust.report.markup import Markup, join, table, tag
-from gpadjust.report.numbers import listed, number, percent, with_unit
+from gpadjust.report.numbers import failure, listed, number, percent, with_unit
 from gpadjust.report.subject import Adjusted, Subject
 from gpadjust.report.verdict import spread_of
 from gpadjust.validation import Trust, trust
@@ -47,7 +47,7 @@ def trusted(subject: Subject) -> Markup:
         try:
             shares.append((name, shown, trust(shown.model)))
         except PhysicsError as error:
-            parts.append(tag("p", f"{name}: {error.args[0]}", class_="caution"))
+            parts.append(tag("p", f"{name}: {failure(error)}", class_="caution"))
     if not shares:
         return join([*parts, *([] if parts else [tag("p", _none(subject))])])
     rows = []

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gpadjust.inference import fit
 from gpadjust.models import CKA, ExactGPBase
-from gpadjust.report.csv_data import CsvData, noise_variances, pairs, read_csv, split
+from gpadjust.report.csv_data import CsvData, names_of, noise_variances, pairs, read_csv
 from gpadjust.report.named_physics import NamedPhysics, named_physics
 from gpadjust.report.numbers import listed, plural
 from gpadjust.report.provenance import Origin
@@ -34,7 +34,8 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         PhysicsError: If the physics fails where the models evaluate it.
     """
     path = checked_path(arguments.out)
-    inputs, outputs = split(arguments.inputs), split(arguments.outputs)
+    inputs = names_of(arguments.inputs, "--inputs")
+    outputs = names_of(arguments.outputs, "--outputs")
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
     variances = noise_variances(arguments.noise, outputs)
     marks = (_mark(arguments.delimiter), arguments.decimal)
@@ -60,9 +61,25 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
         "data file": f"{Path(arguments.data).name} (SHA-256 {data.digest}...)",
         "seed": str(arguments.seed),
     }
-    origin = Origin(settings, data.remarks, notes, physics.code, physics.modules)
+    how = _comparing(command)
+    origin = Origin(settings, data.remarks, notes, physics.code, physics.modules, how)
     write(subject, path, arguments.title, origin, progress=True)
-    print(f"{headline(subject)}\nWrote {path} and {path.with_suffix('.pt')}.")
+    written = [str(each) for each in (path, path.with_suffix(".pt")) if each.exists()]
+    print(f"{headline(subject, how)}\nWrote {listed(written)}.")
+
+
+def _comparing(command: Sequence[str]) -> str:
+    """The command that compares structures: the same without ``--fit``."""
+    kept: list[str] = []
+    words = iter(command)
+    for word in words:
+        option, equals, _ = word.partition("=")
+        if option.startswith("--f") and "--fit".startswith(option):
+            if not equals:
+                next(words, None)
+            continue
+        kept.append(word)
+    return f"python -m gpadjust {shlex.join(kept)}"
 
 
 def _fitted(

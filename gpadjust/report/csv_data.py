@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.models.csv_columns import CsvColumns
+from gpadjust.models.csv_columns import LARGEST, CsvColumns
 from gpadjust.report.numbers import listed, name_and_unit, plural
 
 _HINT = (
@@ -82,8 +82,15 @@ def read_csv(
         ValueError: If a column is missing or asked for twice, a field is no number, an input is
             missing, or there are too few rows.
     """
-    if not Path(file).is_file():
-        names = [path.name for path in Path(file).absolute().parent.glob("*")]
+    if Path(file).is_dir():
+        raise IsADirectoryError(f"{file!r} is a folder, expected a CSV file: give the file's name.")
+    if Path(file).exists() and not Path(file).is_file():
+        raise OSError(
+            f"{file!r} is a device or a pipe, expected a CSV file: write what comes from it to one."
+        )
+    if not Path(file).exists():
+        folder = Path(file).absolute().parent
+        names = [path.name for path in folder.glob("*") if path.is_file()]
         near = get_close_matches(Path(file).name, names, n=1)
         meant = f" Is it {near[0]!r}?" if near else ""
         raise FileNotFoundError(f"There is no file {file!r}.{meant}")
@@ -130,9 +137,30 @@ def read_csv(
 
 
 def split(text: str) -> list[str]:
-    """Names with commas between them, quoted as in a CSV file where they have commas."""
-    (fields,) = csv.reader([text], skipinitialspace=True)
+    """Names with commas between them, quoted as in a CSV file where they have commas.
+
+    Raises:
+        ValueError: If they are of several lines.
+    """
+    try:
+        (fields,) = csv.reader([text], skipinitialspace=True)
+    except csv.Error as error:
+        raise ValueError(f"Expected names in one line, found {text!r}: {error}.") from error
     return [field.strip() for field in fields]
+
+
+def names_of(text: str, option: str) -> list[str]:
+    """The names of columns that an option of a command line has.
+
+    Raises:
+        ValueError: If there is none, or one is empty.
+    """
+    names = split(text)
+    if not names or "" in names:
+        raise ValueError(
+            f"Expected names with commas between them, such as a,b, found {option} {text!r}."
+        )
+    return names
 
 
 def pairs(text: str, what: str) -> dict[str, str]:
@@ -161,7 +189,7 @@ def noise_variances(text: str | None, outputs: Sequence[str]) -> list[float] | N
             sd = float(given[name])
         except ValueError:
             sd = math.nan
-        if not (math.isfinite(sd) and sd >= 0):
+        if not 0 <= sd <= LARGEST:
             raise ValueError(
                 f"Expected --noise as a standard deviation in the output's unit, such as 0.1, "
                 f"found {given[name]!r}."

@@ -164,7 +164,7 @@ def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
     low, high = subject.X[:, i].min(), subject.X[:, i].max()
     pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
     X = subject.base.repeat(number_of_points, 1)
-    X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points).to(X)
+    X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points, dtype=X.dtype)
     return X
 
 

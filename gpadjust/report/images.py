@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from gpadjust.physics import PhysicsError
 from gpadjust.report.markup import Markup, tag
+from gpadjust.report.numbers import failure
 
 _STYLE: dict[str, Any] = {
     "font.size": 9.5,
@@ -46,7 +47,7 @@ def drawn(draw: Callable[[], list[Markup]]) -> Markup:
             warnings.filterwarnings("ignore", message=_OF_FONTS)
             images = draw()
     except PhysicsError as error:
-        return tag("p", f"No figure: {error.args[0]}", class_="caution")
+        return tag("p", f"No figure: {failure(error)}", class_="caution")
     if not images:
         return Markup()
     return tag("div", *(tag("figure", image) for image in images), class_="figures")

@@ -16,12 +16,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.models.csv_columns import LARGEST
 from gpadjust.physics import BlackBoxPhysics, Physics, PhysicsError, as_physics
 from gpadjust.physics.array_physics import array_physics
 from gpadjust.report.csv_data import CsvData
+from gpadjust.report.numbers import plural
 
 _FORM = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 _SHOWN = 5
+_SAME = 1e-6  # as far as a model's file asks it when it is loaded
 _MOST = 12
 
 
@@ -44,8 +47,13 @@ def named_physics(paths: Sequence[str], data: CsvData) -> NamedPhysics:
 
     Raises:
         ValueError: If a name has another form, its module or what it names is not there or raises
-            an error, or is no physics; or if the physics fails in some row, which the error names.
+            an error, is no physics, or is named twice; or if the physics fails in some row, which
+            the error names, or returns other values when it is called again.
     """
+    if again := [path for path in dict.fromkeys(paths) if paths.count(path) > 1]:
+        raise ValueError(
+            f"Expected different --physics, found {again[0]} more than once; give it once."
+        )
     parts: dict[str, Physics] = {}
     code: dict[str, str] = {}
     for path in paths:
@@ -131,16 +139,35 @@ def _check(physics: Physics, path: str, data: CsvData) -> None:
     X, m = data.X.values, data.Y.values.shape[-1]
     try:
         with torch.no_grad():
-            found = physics(X).shape[-1]
+            Y = physics(X)
+            physics.forget()
+            again = physics(X)
     except PhysicsError as error:
         raise ValueError(f"--physics {path}: {_failure(error, physics, data)}") from error
     except ValueError as error:
         raise ValueError(f"--physics {path}: {error}") from error
-    if found != m:
+    if Y.shape[-1] != m:
         raise ValueError(
-            f"--physics {path}: expected {m} columns, one for each of --outputs "
-            f"{', '.join(data.Y.columns)}, found {found}."
+            f"--physics {path}: expected {plural(m, 'column')}, one for each of --outputs "
+            f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
         )
+    if huge := _where(Y.abs() > LARGEST):
+        raise ValueError(
+            f"--physics {path}: expected values between {-LARGEST:.0e} and {LARGEST:.0e}, found "
+            f"others in {len(huge)} of {plural(len(X), 'row')}. Mend the physics there, or keep "
+            f"such inputs out:{_told(huge, data)}"
+        )
+    if other := _where(~torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))):
+        raise ValueError(
+            f"--physics {path}: expected the same values whenever it is called, found others at "
+            f"the second call in {len(other)} of {plural(len(X), 'row')}. Take random numbers "
+            f"out of it, or let it set their seed itself:{_told(other, data)}"
+        )
+
+
+def _where(rows: Tensor) -> tuple[int, ...]:
+    """The rows with a True."""
+    return tuple(rows.any(-1).nonzero().flatten().tolist())
 
 
 def _failure(error: PhysicsError, physics: Physics, data: CsvData) -> str:
@@ -150,15 +177,18 @@ def _failure(error: PhysicsError, physics: Physics, data: CsvData) -> str:
         failing = [(i, found) for i, row in enumerate(X) if (found := _fails(physics, row))]
         if 0 < len(failing) < len(X):
             rows, message = tuple(i for i, _ in failing), failing[0][1]
-    if not rows:
-        return message
+    return f"{message}{_told(rows, data)}" if rows else message
+
+
+def _told(rows: Sequence[int], data: CsvData) -> str:
+    """The first of some rows by their lines in the file and their inputs."""
     shown = []
     for i in rows[:_SHOWN]:
-        values = zip(data.X.columns, X[i].tolist(), strict=True)
+        values = zip(data.X.columns, data.X.values[i].tolist(), strict=True)
         at = ", ".join(f"{name} = {value:.6g}" for name, value in values)
         shown.append(f"\n  line {data.lines[i]}: {at}")
     more = f"\n  and {len(rows) - _SHOWN} more" if len(rows) > _SHOWN else ""
-    return f"{message}{''.join(shown)}{more}"
+    return f"{''.join(shown)}{more}"
 
 
 def _fails(physics: Physics, row: Tensor) -> str:

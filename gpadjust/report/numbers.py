@@ -6,7 +6,10 @@ import math
 import re
 from collections.abc import Iterable
 
+from gpadjust.physics import PhysicsError
+
 _UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]*)\]", flags=re.DOTALL)
+_SHOWN = 3
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -25,6 +28,16 @@ def percent(share: float) -> str:
 def plural(count: int, noun: str) -> str:
     """Such as ``1 row`` and ``2 rows``."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def failure(error: PhysicsError) -> str:
+    """What a physics failed at, in a line, with the first inputs at which it did."""
+    message = str(error.args[0]).rstrip(": ")
+    if error.inputs is None or not len(error.inputs):
+        return message
+    rows = [f"({', '.join(map(number, row))})" for row in error.inputs[:_SHOWN].tolist()]
+    more = len(error.inputs) - len(rows)
+    return f"{message.rstrip('.')}: at inputs {listed([*rows, f'{more} more'] if more else rows)}."
 
 
 def name_and_unit(name: str) -> tuple[str, str]:

@@ -61,7 +61,7 @@ def page(
         "main",
         tag("header", tag("h1", title), tag("p", lead, class_="lead")),
         tag("h2", "Does the physics help?", class_="first"),
-        verdict.verdicts(subject),
+        verdict.verdicts(subject, origin.how),
         tag("nav", bullets(links), aria_label="Sections"),
         *body,
     )

@@ -15,6 +15,7 @@ import gpadjust
 from gpadjust.report.markup import Markup, bullets, code, join, table, tag
 from gpadjust.report.numbers import listed, name_and_unit, number, plural, with_unit
 from gpadjust.report.subject import Subject
+from gpadjust.report.verdict import COMPARE
 
 _LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
 
@@ -30,6 +31,7 @@ class Origin:
         physics: Python expressions of the physics by their names, for whoever loads the model; one
             of the name ``""`` if there is one physics. None: as far as the model's file knows.
         modules: The modules that these expressions need.
+        how: Code or a command that compares the model with others.
     """
 
     settings: Mapping[str, str] = field(default_factory=dict)
@@ -37,6 +39,7 @@ class Origin:
     notes: tuple[str, ...] = ()
     physics: Mapping[str, str] | None = None
     modules: tuple[str, ...] = ()
+    how: str = COMPARE
 
 
 def data(subject: Subject, origin: Origin) -> Markup:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.gp import PhysicsInput
-from gpadjust.models import AR1, AdjustedGP, ExactGPBase, StackedGP
+from gpadjust.models import AR1, AdjustedGP, ExactGPBase, StackedGP, VariationalCKA
 from gpadjust.physics import JoinedPhysics, Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
 from gpadjust.validation.leave_one_out import observations
@@ -127,6 +127,11 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
     """
     comparison = thing if isinstance(thing, Comparison) else None
     model = comparison.recommended if comparison is not None else thing
+    if isinstance(model, VariationalCKA):
+        raise TypeError(
+            "VariationalCKA has no leave-one-out predictions, expected a model that has: report "
+            "on `gpadjust.compare` of some hundred of its rows."
+        )
     if not isinstance(model, ExactGPBase | StackedGP):
         raise TypeError(
             "Expected a fitted model of gpadjust, a StackedGP, or a Comparison (which `compare` "

@@ -22,15 +22,21 @@ _WHAT = {
     "calibrated physics": "f_p with fitted parameters, and nothing else",
     STACKED: "the mixture of all structures with the weights of the table",
 }
+COMPARE = "report(compare(train_X, train_Y, physics))"
 _ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
 
-def verdicts(subject: Subject) -> Markup:
-    """The answer for each output, in words, with the number and its standard error."""
+def verdicts(subject: Subject, how: str = COMPARE) -> Markup:
+    """The answer for each output, in words, with the number and its standard error.
+
+    Args:
+        subject: What it is of.
+        how: Code or a command that compares, for a subject that was not compared.
+    """
     several = len(subject.outputs) > 1
     cards = []
     for j, name in enumerate(subject.outputs):
-        answer, kind, sentences = _answer(subject, j)
+        answer, kind, sentences = _answer(subject, j, how)
         heading = [tag("h3", name)] if several else []
         body = [tag("p", sentence) for sentence in sentences]
         big = tag("p", answer, class_="answer")
@@ -120,9 +126,9 @@ def advice(subject: Subject, notes: list[str]) -> Markup:
     return bullets(sentences) if sentences else Markup()
 
 
-def headline(subject: Subject) -> str:
+def headline(subject: Subject, how: str = COMPARE) -> str:
     """The answer of all outputs in one line, for the title and the terminal."""
-    answers = [_answer(subject, j) for j in range(len(subject.outputs))]
+    answers = [_answer(subject, j, how) for j in range(len(subject.outputs))]
     if len(answers) == 1:
         answer, _, (first, *_) = answers[0]
         return f"{answer}. {first}"
@@ -136,7 +142,7 @@ def spread_of(subject: Subject, output: int) -> float:
     return spread if spread > 0 else 1.0
 
 
-def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
+def _answer(subject: Subject, output: int, how: str) -> tuple[str, str, list[str]]:
     """The answer, what kind it is, and sentences."""
     comparison, name = subject.comparison, subject.outputs[output]
     n = int((~subject.Y[:, output].isnan()).sum())
@@ -144,7 +150,7 @@ def _answer(subject: Subject, output: int) -> tuple[str, str, list[str]]:
         return "No physics", "open", [f"The model of {name} has no physics to be judged."]
     gain = None if comparison is None else comparison.gain.get(name)
     if comparison is None or gain is None:
-        return "Not asked", "open", [_not_asked(subject), *_errors(subject, output)]
+        return "Not asked", "open", [_not_asked(subject, how), *_errors(subject, output)]
     ratio = math.exp(max(-50.0, min(50.0, gain.elpd / n)))
     rows = {row.structure: row for row in comparison.table[name]}
     numbers = (
@@ -193,12 +199,11 @@ def _rmse(rows: dict[str, Candidate], gain: Gain, name: str, spread: float) -> s
     )
 
 
-def _not_asked(subject: Subject) -> str:
+def _not_asked(subject: Subject, how: str) -> str:
     if subject.comparison is None:
         return (
             "This is a report of one model; whether the physics helps takes a comparison with a "
-            "model that has none: report(compare(train_X, train_Y, physics)), or the command "
-            "without --fit."
+            f"model that has none: {how}"
         )
     return (
         "The comparison has no structure without the physics, or none with it; add 'zero mean' to "

@@ -41,7 +41,8 @@ def report(
         model: A fitted model, a :class:`~gpadjust.StackedGP`, or a :class:`~gpadjust.Comparison`,
             of which what it recommends is saved.
         file: Where to write the page, ``*.html``. Files that are there, this and the model's, are
-            replaced.
+            replaced; where the model cannot be saved, the page says why, and an old file of it is
+            removed.
         title: The title. Default: the names of the outputs.
         rows: What to call each observation, ``n``, such as its line in your file. Default: by its
             number, from 0.
@@ -88,6 +89,12 @@ def checked_path(file: str | Path) -> Path:
         raise FileNotFoundError(f"There is no folder {str(path.parent)!r} to write {path.name} to.")
     if path.is_dir():
         raise IsADirectoryError(f"{str(path)!r} is a folder; give the name of a file.")
+    model_path = path.with_suffix(".pt")
+    if model_path.is_dir():
+        raise IsADirectoryError(
+            f"{str(model_path)!r} is a folder, where the model's file would be; give the page "
+            "another name."
+        )
     try:  # before the work rather than after it
         with TemporaryDirectory(prefix=".report-", dir=path.parent):
             return path
@@ -114,5 +121,7 @@ def write(
         part.write_bytes(text.encode("utf-8", errors="xmlcharrefreplace"))
         if model_part.exists():
             model_part.replace(model_path)
+        else:
+            model_path.unlink(missing_ok=True)  # of an earlier page
         part.replace(path)
     return path

@@ -67,5 +67,5 @@ def test_a_column_that_is_not_there_has_the_likest_name(columns):
 def test_another_delimiter_is_told(columns, mark, name):
     with pytest.raises(ValueError, match=f"seem to be {name} .* say so by --delimiter"):
         columns(f"x{mark}y\n1{mark}2\n", option="--{} {!r}").numbers("x")
-    with pytest.raises(ValueError, match=f"expected 1 fields.* seem to be {name}"):
+    with pytest.raises(ValueError, match=f"expected 1 field,.* seem to be {name}"):
         columns(f"x{mark}y\n1{mark}2,5\n")

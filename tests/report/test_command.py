@@ -11,6 +11,7 @@ from gpadjust import load
 from gpadjust.__main__ import main
 
 MODULE = """
+import sys
 import numpy as np, torch
 def wave(X): return torch.sin(6 * X[:, :1])
 def of_arrays(X): return np.sin(6 * X[:, 0])
@@ -19,6 +20,9 @@ def root(X): return (0.55 - X[:, 0]).sqrt()
 def strict(X):
     if (X > 0.95).any(): raise RuntimeError("too far")
     return X[:, 0]
+def noise(X): return torch.randn(len(X))
+def huge(X): return torch.where(X[:, 0] > 0.9, 1e300, X[:, 0])
+def leaves(X): sys.exit(2)
 no_function = 3.0
 """
 ROWS = [(i / 8, round(2 * torch.tensor(6 * i / 8).sin().item() + i / 8, 4)) for i in range(9)]
@@ -94,6 +98,11 @@ BAD_TABLES = {
     "time,head\n0,inf\n1,2\n": r"line 2, column 2 \('head'\): .*found 'inf'",
     'time,head\n0,"1,5"\n1,2\n': "If this comma is a decimal comma, say so by --decimal ','",
     "time,head\n0,1\n1,2,3\n": "line 3: expected 2 fields, one for each name, found 3",
+    "time,head\n0,1\n1,1e300\n": r"line 3, column 2 .*between -1e\+100 and 1e\+100, found '1e300'",
+    "time,head\n0,1\n-1e101,1\n": r"line 3, column 1 .*between -1e\+100 and 1e\+100",
+    "a pump\ntime,head,a\n0,1,2\n": "Line 1 has one name and line 2 has 3 fields: is line 1 a c",
+    "time,head\n0,1,\n1,2,\n": "last field is empty: is there a ',' too many at its end",
+    "time\n0,1\n": "expected 1 field, one for each name, found 2",
     "time,head\n0,1\n1,\n": "expected two rows or more with a number in 'head', found 1",
 }
 
@@ -110,12 +119,15 @@ BAD_PHYSICS = {
     "hill.py:wave": "There is no module 'hill.py'",
     "./hill.py:wave": "Give the module without folder and .py, and run this in its folder",
     "hil:wave": r"There is no module 'hil' .* Is it 'hill'\?",
-    "hill:wav": r"hill has no 'wav'; it has wave, of_arrays, two, root, strict. Is it 'wave'\?",
+    "hill:wav": r"hill has no 'wav'; it has wave, of_arrays, two, root, strict, .*. Is it 'wave'\?",
     "hill:no_function": "physics must be a Physics or a callable.* found a float",
     "broken:f": r"broken cannot be imported: ZeroDivisionError: .* \(broken.py, line 2\)",
     "leaves:f": "leaves cannot be imported: SystemExit: bye",
     "lacks:f": "lacks cannot be imported: it needs 'no_such_module_here', which is not installed",
-    "hill:two": "expected 1 columns, one for each of --outputs head",
+    "hill:two": "expected 1 column, one for each of --outputs head",
+    "hill:noise": "expected the same values whenever it is called, found others .* in 9 of 9 rows",
+    "hill:huge": r"found others in 1 of 9 rows.*\n  line 10: time \[s\] = 1$",
+    "hill:leaves": r"the physics ended Python by sys.exit\(2\), expected values",
     "hill:root": r"returned NaN or inf in 4 of 9 row\(s\).*\n  line 7: time \[s\] = 0.625",
     "hill:strict": r"raised RuntimeError: too far.*\n  line 10: time \[s\] = 1$",
 }
@@ -130,6 +142,12 @@ def test_a_physics_that_is_none_or_fails(folder, capsys, physics):
 BAD_OPTIONS = {
     ("--out", "report.pdf"): "Expected a page such as 'report.html'",
     ("--out", "none/report.html"): "There is no folder 'none'",
+    ("--out", "taken.html"): "'taken.pt' is a folder, where the model's file would be",
+    ("--physics", "hill:wave"): "Expected different --physics, found hill:wave more than once",
+    ("--inputs", ""): "names with commas between them, such as a,b, found --inputs ''",
+    ("--outputs", "head,"): "names with commas between them, such as a,b, found --outputs 'head,'",
+    ("--inputs", "time\nx"): "Expected names in one line",
+    ("--noise", "1e300"): "standard deviation in the output's unit, such as 0.1, found '1e300'",
     ("--inputs", "time,head"): "as inputs and outputs, got 'head \\[m\\]' more than once",
     ("--inputs", "tome"): r"Is it 'time \[s\]'\?",
     ("--units", "head"): "Expected --units such as a=1,b=2, found 'head'",
@@ -142,13 +160,30 @@ BAD_OPTIONS = {
 
 @pytest.mark.parametrize("options", BAD_OPTIONS)
 def test_options_that_are_wrong(folder, capsys, options):
+    (folder / "taken.pt").mkdir()
     _says(_fails(capsys, *options), BAD_OPTIONS[options])
     _nothing_was_written(folder)
 
 
 def test_a_file_that_is_not_there(folder, capsys):
     (folder / "data.csv").rename(folder / "date.csv")
+    (folder / "data.csv2").mkdir()
     _says(_fails(capsys), r"There is no file 'data.csv'. Is it 'date.csv'\?")
+    (folder / "data.csv").mkdir()
+    _says(_fails(capsys), "'data.csv' is a folder, expected a CSV file")
+
+
+def test_a_file_that_is_no_file(folder, capsys):
+    (folder / "data.csv").unlink()
+    (folder / "data.csv").symlink_to("/dev/null")
+    _says(_fails(capsys), "'data.csv' is a device or a pipe, expected a CSV file")
+
+
+@pytest.mark.parametrize("seed", ["-1", str(2**32), "1" * 400, "one"])
+def test_a_seed_that_is_none_is_refused_at_once(capsys, seed):
+    with pytest.raises(SystemExit):
+        main([*COMMAND, "--physics", "hill:wave", "--seed", seed])
+    assert "expected a whole number from 0 to 4294967295, found" in capsys.readouterr().err
 
 
 def _says(error, expected):
@@ -168,6 +203,17 @@ def test_an_interrupted_fit_leaves_nothing(folder, capsys, monkeypatch):
     assert main([*COMMAND, "--physics", "hill:wave"]) == 130
     assert "interrupted; nothing was written" in capsys.readouterr().err
     _nothing_was_written(folder)
+
+
+@pytest.mark.parametrize("option", [["--fit", "map"], ["--fit=map"], ["--fi", "map"]])
+def test_one_model_is_told_with_the_command_that_compares(folder, read, capsys, undrawn, option):
+    given = ["--physics", "hill:wave", "--seed", "1"]
+    assert main([*COMMAND[:-2], *option, *given]) == 0
+    how = f"python -m gpadjust {' '.join([*COMMAND[:-2], *given])}"
+    assert f"has none: {how}\n" in capsys.readouterr().out
+    page = read(folder / "report.html")
+    assert f"has none: {how} Root" in page.text
+    assert "report(compare(" not in page.text
 
 
 def test_a_german_table_with_units_and_noise(folder, read, undrawn):

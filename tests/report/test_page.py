@@ -8,10 +8,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpadjust import CKA, ZeroMeanGP, fit, load
+from gpadjust import CKA, VariationalCKA, ZeroMeanGP, fit, load
+from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
+from gpadjust.report.figures import _slice
 from gpadjust.report.markup import table, tag
-from gpadjust.report.numbers import name_and_unit, number
+from gpadjust.report.numbers import failure, name_and_unit, number
 from gpadjust.report.subject import subject_of
 from gpadjust.report.verdict import headline, verdicts
 from gpadjust.validation import Gain
@@ -140,6 +142,8 @@ def test_nothing_is_written_of_what_cannot_be_reported(comparison, tmp_path):
     (tmp_path / "folder.html").mkdir()
     with pytest.raises(IsADirectoryError, match="give the name of a file"):
         report(comparison, tmp_path / "folder.html")
+    with pytest.raises(TypeError, match=r"VariationalCKA has no leave-one-out .*some hundred"):
+        report(VariationalCKA(X, X.sin(), physics=f_p), old)
     assert old.read_text() == "old"
     assert {each.name for each in tmp_path.iterdir()} == {"report.html", "folder.html"}
 
@@ -156,6 +160,38 @@ def test_an_error_on_the_way_leaves_what_was_there(comparison, tmp_path, monkeyp
         report(comparison, old)
     assert old.read_text() == "old"
     assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
+    comparison, tmp_path, read, monkeypatch, undrawn
+):
+    def refuses(*args):
+        raise ValueError("no way")
+
+    (tmp_path / "report.pt").write_text("old")
+    monkeypatch.setattr("gpadjust.report.writing.save", refuses)
+    page = read(report(comparison, tmp_path / "report.html"))
+    assert "The model could not be saved: no way" in page.text
+    assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
+
+
+@pytest.mark.parametrize("offset", [1.7e9, 1e60])
+def test_inputs_are_drawn_in_double_precision(offset):
+    X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
+    model = CKA(X, X / offset, physics=lambda X: torch.zeros_like(X))
+    fit(model, "map", num_starts=1, num_screened=4)
+    drawn = _slice(subject_of(model), 0, 9)
+    assert len(drawn.unique()) == 9
+
+
+def test_where_a_physics_fails_is_told_in_a_line():
+    X = torch.arange(6.0).unsqueeze(-1)
+    with pytest.raises(PhysicsError) as error:
+        FunctionPhysics(lambda X: (1.5 - X).sqrt(), name="root")(X)
+    told = failure(error.value)
+    assert told.startswith("Physics 'root' returned NaN or inf in 4 of 6 row(s)")
+    assert told.endswith("keep such inputs out: at inputs (2), (3), (4) and 1 more.")
+    assert failure(PhysicsError("It fails.")) == "It fails."
 
 
 @settings(max_examples=30)
