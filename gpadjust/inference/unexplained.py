@@ -8,14 +8,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from scipy.stats import chi2
 from torch import Tensor
 
 from gpadjust.gp.gaussian import cholesky, threads_for
 
-_BLOCKS = 32  # places where neighbours are compared
+_BLOCKS = 64  # places where neighbours are compared
 _NEIGHBOURS = 256
 _LEAST = 8  # neighbours that tell anything
 _LENGTHS = (0.02, 50.0)  # lengthscales, in standard deviations of the inputs
+_CHANCE = 1e-3  # of finding structure where there is none, at most
 _LEAST_SHARE = 1e-6  # of the residuals' variance
 
 
@@ -39,8 +41,9 @@ def unexplained(inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: i
     Few inducing points leave structure in the residuals, which is noise to a sparse model. Close
     observations share it, but not the noise. The residuals of each of some groups of neighbours
     are :math:`N(0, v k + \sigma^2 I)` with an RBF kernel k of one lengthscale for each input; v is
-    kept if it makes them more likely by more than its own parameters cost (Schwarz 1978): over
-    lengths that hold next to no neighbours it looks as noise does, and must not take its place.
+    kept if a test of likelihoods finds it, with a chance of a thousandth where there is none (Wilks
+    1938): over lengths that hold next to no neighbours it looks as noise does, and must not take
+    its place.
 
     Args:
         inputs: ``n x d``.
@@ -98,7 +101,7 @@ def _of_one(
     best = min(runs, key=lambda run: float(run.fun))
     without = _noise_alone(r, own)
     gain = (without - float(best.fun)) * r.numel()
-    if gain <= 0.5 * (d + 1) * math.log(r.numel()):
+    if 2 * gain <= chi2.isf(_CHANCE, d + 1):
         return torch.zeros_like(size), spread, whole
     p = torch.as_tensor(best.x, dtype=torch.float64, device=x.device).exp()
     noise = p[d + 1] if own is None else own.mean()
