@@ -67,6 +67,7 @@ _ROOMS = (
     "validation",
     "gp",
     "states",
+    "files",
     "active",
     "dynamics",
     "control",

@@ -1,25 +1,37 @@
 """What an import brings, in a process of its own."""
 
+import os
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import gpadjust
 
 
-def python(code):
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+def python(code, **options):
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
     assert run.returncode == 0, run.stderr
     return run.stdout
+
+
+def test_a_script_beside_a_clone_imports_the_library(tmp_path):
+    """The clone's folder has the library's name, and no `__init__.py`: a namespace package."""
+    (tmp_path / "gpadjust").symlink_to(Path(__file__).parents[1], target_is_directory=True)
+    # As installed: a PYTHONPATH with the repository would hide what the installation does.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    code = "from gpadjust import CKA, __version__; print(CKA.__name__, __version__)"
+    found = python(code, cwd=tmp_path, env=environment)
+    assert found.split() == ["CKA", gpadjust.__version__]
 
 
 def test_what_is_not_needed_is_not_imported():
     """One after the other, so that none may bring what a later one is to do without."""
     steps = {
         "import gpadjust": "torch",
-        "import gpadjust.states": "botorch gpytorch linear_operator gymnasium",
+        "import gpadjust.states, gpadjust.files": "botorch gpytorch linear_operator gymnasium",
         "from gpadjust import ODEPhysics": "botorch gpytorch gymnasium",
         "import gpadjust.envs": "botorch gpytorch linear_operator stable_baselines3 opensim",
     }

@@ -50,15 +50,20 @@ def link_literals(app: Sphinx, document: document) -> None:
         node.replace_self(pending_xref("", node.deepcopy(), refdoc=app.env.docname, **target))
 
 
-def link_other_names(
-    app: Sphinx, env: BuildEnvironment, node: Element, content: TextElement
-) -> Element | None:
-    """Link ``gpadjust.CKA`` to its entry in its room, and an inherited method to its base's."""
-    found = locate(node["reftarget"])
+def entry_of(found: Any) -> str | None:
+    """Name in the reference of an object, or of a method by its class."""
     entry = ENTRIES.get(id(found))
     if entry is None and hasattr(found, "__qualname__"):
         owner, _, name = f"{found.__module__}.{found.__qualname__}".rpartition(".")
         entry = f"{ENTRIES.get(id(locate(owner)), owner)}.{name}"
+    return entry
+
+
+def link_other_names(
+    app: Sphinx, env: BuildEnvironment, node: Element, content: TextElement
+) -> Element | None:
+    """Link ``gpadjust.CKA`` to its entry in its room, and an inherited method to its base's."""
+    entry = entry_of(locate(node["reftarget"]))
     if entry in (None, node["reftarget"]):
         return None
     domain = env.get_domain("py")
@@ -87,7 +92,8 @@ def mend_ways_back(
     def mended(anchor: re.Match[str]) -> str:
         parts = anchor[1].split(".")
         ends = [".".join(parts[i:]) for i in range(1, len(parts))]
-        names = [anchor[1], *(f"{module.replace('/', '.')}.{end}" for end in ends)]
+        here = [f"{module.replace('/', '.')}.{end}" for end in ends]
+        names = [anchor[1], *here, *(entry_of(locate(name)) for name in here)]
         return f'#{next(name for name in names if name in entries)}"'
 
     if page.startswith("_modules/gpadjust/"):

@@ -14,7 +14,7 @@ from botorch.utils.transforms import (
 from torch import Tensor
 
 from gpadjust.active.information import UnknownCovariance, information_gain
-from gpadjust.models import AdjustedModel, PaperRRA, VariationalCKA
+from gpadjust.models import PaperRRA, TermsModel, VariationalCKA
 
 About = Literal["rho", "delta", "both"]
 
@@ -92,7 +92,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     """
 
     def __init__(
-        self, model: AdjustedModel, about: About = "both", X_pending: Tensor | None = None
+        self, model: TermsModel, about: About = "both", X_pending: Tensor | None = None
     ) -> None:
         _check(model, about)
         super().__init__(model=model)
@@ -119,7 +119,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
 
     def _rests(self) -> _Rest:
         """What is unknown given the data; made anew after the model is given other data."""
-        if self._rest is None or self._rest.source is not self.model.strategy():
+        if self._rest is None or self._rest.source is not self.model.conditioning():
             self._rest = _Rest(self.model, self.about)
         return self._rest
 
@@ -132,19 +132,19 @@ class _Rest:
         about: The adjustment in question.
     """
 
-    def __init__(self, model: AdjustedModel, about: About) -> None:
-        self.source = model.strategy()
+    def __init__(self, model: TermsModel, about: About) -> None:
+        self.source = model.conditioning()
         self.whole: Any = _posterior_covariance(model)
         others = {"rho": model.other_names, "delta": model.rho_names, "both": ()}[about]
         others = tuple(name for name in others if name in model.term_names)
         self.remaining = UnknownCovariance(model, others) if others else None
 
 
-def _posterior_covariance(model: AdjustedModel) -> Callable[[Tensor], Tensor]:
+def _posterior_covariance(model: TermsModel) -> Callable[[Tensor], Tensor]:
     """What the data leave unknown of f_a at transformed inputs."""
     if not isinstance(model, VariationalCKA):
         return UnknownCovariance(model)
-    return lambda inputs: model._joint(inputs, model._bases(inputs))[1]
+    return lambda inputs: model.conditioning().joint(model.at(inputs))[1]
 
 
 def _check(model: Any, about: str) -> None:
@@ -152,12 +152,12 @@ def _check(model: Any, about: str) -> None:
     if about not in get_args(About):
         raise ValueError(f"Unknown {about=}; expected 'rho', 'delta' or 'both'.")
     name = type(model).__name__
-    if isinstance(model, AdjustedModel) and not model.term_names:
+    if isinstance(model, TermsModel) and not model.term_names:
         raise TypeError(
             f"{type(model).__name__} has neither rho nor delta to learn about; what observations "
             "tell of parameters of the physics is not computed. CKA has both."
         )
-    if not isinstance(model, AdjustedModel) or "f" in model.term_names:
+    if not isinstance(model, TermsModel) or not model.rho_names:
         raise TypeError(
             f"Expected a model with rho or delta (CKA, RRA, ScaleGP, PhysicsMeanGP, BiasGP), got "
             f"{name}; for a model without them, take BoTorch's qNegIntegratedPosteriorVariance."
@@ -177,7 +177,7 @@ def _check(model: Any, about: str) -> None:
     if not set(model.rho_names if about == "rho" else ("delta",)) & set(model.term_names):
         other = "delta" if about == "rho" else "rho"
         raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
-    if about == "delta" and len(model._term_weights("delta")) > 1:
+    if about == "delta" and model.has_centre:
         raise ValueError(
             f"The {name} takes a centre from f_p (by default it is learnt), so that delta is not "
             "independent of rho a priori and its information has no closed form: ask about 'rho' "

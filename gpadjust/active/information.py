@@ -10,8 +10,8 @@ from torch import Tensor
 
 from gpadjust.gp import SumOfTerms
 from gpadjust.gp.gaussian import cholesky
-from gpadjust.models.cholesky_strategy import Factors, conditional_covariance
-from gpadjust.models.exact_gp_base import ExactGPBase
+from gpadjust.models.exact_conditioning import Factors, conditional_covariance
+from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.terms_model import TermsModel
 
 
@@ -32,17 +32,17 @@ class UnknownCovariance:
         names: The names of the terms. Default: all.
     """
 
-    def __init__(self, model: ExactGPBase, names: tuple[str, ...] | None = None) -> None:
-        strategy = model.strategy()
+    def __init__(self, model: TermsGP, names: tuple[str, ...] | None = None) -> None:
+        conditioning = model.conditioning()
         (self.train,) = model.train_inputs
         self.terms = [t for t in model.terms if names is None or t.name in names]
         self.constants = [term for term in self.terms if term.learns_mean]
         self.kernel = SumOfTerms(self.terms, known_means=True)
         self.has_kernel = any(term.kernel is not None for term in self.terms)
         if names is None and not self.constants:
-            self.factors = strategy.factors()
+            self.factors = conditioning.factors()
             return
-        covariance = strategy.noise_covariance()
+        covariance = torch.diag_embed(model.noise.at(self.train))
         if self.has_kernel:
             covariance = covariance + self.kernel.forward(self.train, self.train)
         self.factors = Factors.of(covariance, model.train_targets)
@@ -99,7 +99,7 @@ def information_gain(
         each of these, ``batch_shape x S``.
     """
     inputs = model.model_inputs(X)
-    (train,) = model.strategy().train_inputs
+    (train,) = model.conditioning().train_inputs
     batch_shape = torch.broadcast_shapes(inputs.shape[:-2], train.shape[:-2])
     inputs = inputs.expand(*batch_shape, *inputs.shape[-2:])
     noise = model.observation_noise(inputs).expand(inputs.shape[:-1])

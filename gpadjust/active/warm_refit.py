@@ -9,7 +9,7 @@ import torch
 
 from gpadjust.inference import fit as fit_model
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models import ExactGPBase
+from gpadjust.models import TermsGP
 
 
 def refit(model: Any, previous: Any, fit: Callable[[Any], Any] | None) -> None:
@@ -27,14 +27,14 @@ def refit(model: Any, previous: Any, fit: Callable[[Any], Any] | None) -> None:
 
 def parameter_values(model: Any) -> dict[str, Any]:
     """All parameters of a model as lists; none of one that no fit can begin from."""
-    if not isinstance(model, ExactGPBase) or model.num_samples is not None:
+    if not isinstance(model, TermsGP) or model.num_samples is not None:
         return {}
     return {name: parameter.tolist() for name, parameter in model.named_parameters()}
 
 
 def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
     """Give a model parameters, unless it has others; tell whether it was done."""
-    if not isinstance(model, ExactGPBase):
+    if not isinstance(model, TermsGP):
         return False
     named = dict(model.named_parameters())
     try:
@@ -52,7 +52,7 @@ def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
 
 def _alike(model: Any, previous: Any) -> bool:
     """Whether a warm start of one model from another makes sense."""
-    if type(model) is not type(previous) or not isinstance(model, ExactGPBase):
+    if type(model) is not type(previous) or not isinstance(model, TermsGP):
         return False
     if model.num_samples is not None or previous.num_samples is not None:
         return False

@@ -43,8 +43,7 @@ class PhysicsInUnits(Physics):
             PhysicsError: If the physics fails, or has several outputs.
         """
         raw = self.units.raw(X, self.reads)
-        # Not forward: an error's rows are then still those of X.
-        Y = self.inner._evaluate_rows(self.inner.rows_of(raw, *parameters))
+        Y = self.inner.of_rows(self.inner.read_rows(raw, *parameters))
         if Y.shape[-1] != 1:
             raise PhysicsError(
                 f"The physics {self.name!r} returned {Y.shape[-1]} columns for the metric "

@@ -17,7 +17,7 @@ from ax.generators.torch.botorch_modular.utils import ModelConfig
 
 from gpadjust.ax.parameter_physics import ParameterPhysics
 from gpadjust.ax.tell_physics import TellPhysics
-from gpadjust.models import CKA, AdjustedGP, ZeroMeanGP
+from gpadjust.models import CKA, TermsGP, ZeroMeanGP
 
 TRANSFORMS: list[type[Transform]] = [*MBM_X_trans, Derelativize, StandardizeY, TellPhysics]
 """Ax's transforms of parameters; of metrics shift and scale alone, as others would bend what f_p
@@ -27,7 +27,7 @@ says (``Winsorize``, ``BilogY``); and ``TellPhysics``."""
 def generator_kwargs(
     physics: Mapping[str, Any],
     *,
-    model: type[AdjustedGP] = CKA,
+    model: type[TermsGP] = CKA,
     model_options: Mapping[str, Any] | None = None,
     fit_options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def generator_kwargs(
 def generation_strategy(
     physics: Mapping[str, Any],
     *,
-    model: type[AdjustedGP] = CKA,
+    model: type[TermsGP] = CKA,
     model_options: Mapping[str, Any] | None = None,
     fit_options: Mapping[str, Any] | None = None,
     **options: Any,

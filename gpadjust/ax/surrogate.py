@@ -15,7 +15,7 @@ from botorch.utils.types import DEFAULT
 
 from gpadjust.ax.physics_in_units import PhysicsInUnits
 from gpadjust.inference import fit
-from gpadjust.models import AdjustedGP
+from gpadjust.models import TermsGP
 
 _PARTS = (
     "covar_module_class",
@@ -27,12 +27,12 @@ _PARTS = (
 
 def register() -> None:
     """Enter both functions where Ax looks for them."""
-    submodel_input_constructor.register(AdjustedGP)(model_inputs)
-    fit_botorch_model.register(AdjustedGP)(fit_model)
+    submodel_input_constructor.register(TermsGP)(model_inputs)
+    fit_botorch_model.register(TermsGP)(fit_model)
 
 
 def model_inputs(
-    botorch_model_class: type[AdjustedGP],
+    botorch_model_class: type[TermsGP],
     model_config: ModelConfig,
     dataset: SupervisedDataset,
     search_space_digest: SearchSpaceDigest,
@@ -77,7 +77,7 @@ def model_inputs(
     return botorch_model_class.construct_inputs(dataset, **model_config.model_options)
 
 
-def fit_model(model: AdjustedGP, mll_class: Any, mll_options: dict[str, Any] | None = None) -> None:
+def fit_model(model: TermsGP, mll_class: Any, mll_options: dict[str, Any] | None = None) -> None:
     """Fit a model by :func:`gpadjust.fit`, whose options are ``mll_options``."""
     fit(model, **(mll_options or {}))
 

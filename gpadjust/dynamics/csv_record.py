@@ -11,7 +11,7 @@ import torch
 
 from gpadjust.dynamics.control_steps import checked_step
 from gpadjust.dynamics.record import Record
-from gpadjust.models.csv_columns import CsvColumns
+from gpadjust.files import CsvColumns
 from gpadjust.states import StateSpec
 
 Column = TypeVar("Column", bound=str | None)

@@ -13,14 +13,11 @@ from gpadjust.dynamics.learnt import Learnt
 from gpadjust.dynamics.model_recipe import ModelRecipe
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
-from gpadjust.inference.fitting import Method, check_options
+from gpadjust.inference.fitting import check_options
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models import TermsModel, VariationalCKA
-from gpadjust.models.rra import NOT_SAMPLED, PaperRRA
-from gpadjust.models.variational_cka import NEVER_SAMPLED
+from gpadjust.models import TermsModel
 from gpadjust.states import StateSpec
 
-KEPT = ("method", "num_samples", "num_draws", "seed")  # options of later fits, too
 _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
 _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=15)
 
@@ -28,7 +25,12 @@ _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=15)
 class DynamicsFitOptions(FitOptions, total=False):
     """The options of :func:`gpadjust.fit` for dynamics, the method among them."""
 
-    method: Method | None
+    method: str | None
+
+
+def kept(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that later fits have, too: all but those of the first search."""
+    return {name: value for name, value in options.items() if name not in _REFIT}
 
 
 def checked_fit_options(
@@ -41,11 +43,10 @@ def checked_fit_options(
         )
     own: Any = {**(options or {})}
     method = own.pop("method", None)
-    for unsampled, why in ((PaperRRA, NOT_SAMPLED), (VariationalCKA, NEVER_SAMPLED)):
-        if issubclass(model, unsampled):
-            if method == "bayes":
-                raise ValueError(why)
-            method = method or "map"
+    if model.not_sampled:
+        if method == "bayes":
+            raise ValueError(model.not_sampled)
+        method = method or "map"
     check_options("bayes" if method is None else method, own)
     return {**(options or {})}
 
@@ -83,7 +84,7 @@ def fit_all(
         return Fitted(model, fit(model, **given), n)
     warm_start(model, previous.model)
     searches = n >= 2 * previous.searched_at
-    held: Any = {k: v for k, v in given.items() if k in KEPT}
+    held: Any = kept(given)
     with warnings.catch_warnings():
         # The next update goes on from where this one stops.
         warnings.simplefilter("ignore", OptimizationWarning)

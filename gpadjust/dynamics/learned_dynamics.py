@@ -11,11 +11,11 @@ from torch import Tensor
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
 from gpadjust.dynamics.incremental_fit import (
-    KEPT,
     DynamicsFitOptions,
     check_observed,
     checked_fit_options,
     fit_all,
+    kept,
 )
 from gpadjust.dynamics.learnt import Learnt, LearntState
 from gpadjust.dynamics.model_recipe import ModelRecipe
@@ -25,8 +25,8 @@ from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
-from gpadjust.models.adjusted_gp import PhysicsLike
 from gpadjust.models.sampled_functions import check_num_features
+from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.states import StateSpec
 
 _MEAN_ROWS = 256  # kernel rows of a mean: transitions times samples of the hyper-parameters
@@ -306,7 +306,7 @@ class LearnedDynamics(Dynamics):
         several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
         if self.physics is not None and self.physics.unknowns:
             several["unknowns"] = {name: repr(u) for name, u in self.physics.unknowns.items()}
-        kept = {k: v for k, v in self.fit_options.items() if k in KEPT and v is not None}
+        later = {k: v for k, v in kept(self.fit_options).items() if v is not None}
         return fingerprint(
             self,
             model=self.model_class,
@@ -314,7 +314,7 @@ class LearnedDynamics(Dynamics):
             target=self.targets.target,
             encode_angles=self.encode_angles,
             model_options=self.model_options,
-            **{"method": None, **kept},
+            **{"method": None, **later},
         )
 
     def state_dict(self) -> dict[str, Any]:

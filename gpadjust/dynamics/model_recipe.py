@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -19,6 +18,7 @@ from gpadjust.dynamics.physics_probes import PhysicsProbes
 from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
 from gpadjust.models import TermsModel
+from gpadjust.models.terms_gp import arguments_of
 from gpadjust.physics import Physics, as_physics
 
 _OWN = ("train_X", "train_Y", "train_Yvar", "physics", "input_transform")
@@ -144,7 +144,7 @@ def checked_options(
         found = f"an instance of {type(model).__name__}" if is_module else repr(model)
         raise TypeError(
             "Expected model as a class of gpadjust.models, such as CKA, PhysicsMeanGP or "
-            f"ZeroMeanGP, or one of your own on AdjustedGP; found {found}. Its arguments go into "
+            f"ZeroMeanGP, or one of your own on TermsGP; found {found}. Its arguments go into "
             "model_options."
         )
     name, takes = model.__name__, arguments_of(model)
@@ -176,22 +176,3 @@ def checked_options(
             "class that sets them itself."
         )
     return options
-
-
-def arguments_of(model: type) -> dict[str, bool]:
-    """The arguments of a class by name, and whether they are needed.
-
-    Where it passes on whatever else it is given, those of its base class are among them.
-    """
-    found: dict[str, bool] = {}
-    for owner in model.__mro__:
-        if "__init__" not in vars(owner):
-            continue
-        own = [*inspect.signature(vars(owner)["__init__"]).parameters.values()][1:]
-        needed = not found  # what a base class needs is given by the class
-        for each in own:
-            if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY):
-                found.setdefault(each.name, needed and each.default is each.empty)
-        if not any(each.kind is each.VAR_KEYWORD for each in own):
-            break
-    return found

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.physics import JoinedPhysics, ODEPhysics, Physics, as_physics
 from gpadjust.states import StateSpec
 

@@ -160,8 +160,8 @@ def smooth(
         ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
         >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
         >>> physics = ODEPhysics(spring, step=0.1, state_dim=2, unknowns=unknowns)
-        >>> t = 0.1 * torch.arange(100, dtype=torch.float64)
-        >>> position = (1.5 * t).cos() + 0.01 * torch.randn(100, dtype=torch.float64)
+        >>> t = 0.1 * torch.arange(50, dtype=torch.float64)
+        >>> position = (1.5 * t).cos() + 0.01 * torch.randn(50, dtype=torch.float64)
         >>> states = torch.stack([position, torch.full_like(t, torch.nan)], dim=-1)
         >>> spec = StateSpec(["x", "v"], ["u"])
         >>> records = Records(Record(t, states, torch.zeros_like(states[:, :1])), spec)

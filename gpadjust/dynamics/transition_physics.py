@@ -80,7 +80,7 @@ class TransitionTargets:
 class TransitionPhysics(Physics):
     r"""Turns f_p, which returns next states, into a physics of the targets.
 
-    Memo, batching and gradients are those of the physics itself. The values at the training
+    Memory, batching and gradients are those of the physics itself. The values at the training
     inputs can be given, so that a simulator need not run again when a model is loaded.
 
     Args:
@@ -89,7 +89,7 @@ class TransitionPhysics(Physics):
     """
 
     def __init__(self, physics: Physics, targets: TransitionTargets) -> None:
-        super().__init__(unknowns=physics.unknowns, memo=0, name=physics.name)
+        super().__init__(unknowns=physics.unknowns, name=physics.name)
         self.physics = physics
         self.targets = targets
         self.num_outputs = len(targets.predicted)
@@ -97,8 +97,7 @@ class TransitionPhysics(Physics):
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The targets that the physics stands for, ``N x m``."""
-        # Not forward: an error's rows are then still those of X.
-        return self._targets_of(self.physics._evaluate_rows, X, *parameters)
+        return self._targets_of(self.physics.of_rows, X, *parameters)
 
     def _targets_of(
         self, ask: Callable[[Tensor], Tensor], X: Tensor, *parameters: ParameterValues
@@ -109,8 +108,7 @@ class TransitionPhysics(Physics):
         states = X[:, :num_states]
         read = X[:, : num_states + targets.spec.action_dim]
         try:
-            self.physics._check_input(read)
-            following = ask(self.physics.rows_of(read, *parameters))
+            following = ask(self.physics.read_rows(read, *parameters))
         except PhysicsError as error:
             error.partial = None  # next states, which are no targets
             raise
@@ -141,29 +139,26 @@ class TransitionPhysics(Physics):
             self._known = known
 
     def forget(self) -> None:
-        """Empties the memo of the physics, too."""
-        super().forget()
+        """Forget what was given, and what the physics remembers."""
         self._known = RowMemo(self._known.capacity)
         self.physics.forget()
 
-    def _rows_anew(self, rows: Tensor) -> Tensor:
-        return self._targets_of(self.physics._rows_anew, *self._split(rows))
+    def of_rows(self, rows: Tensor) -> Tensor:
+        """As the base class, by the values that were given as far as they are."""
+        asks = torch.is_grad_enabled() and rows.requires_grad
+        if asks or not len(self._known) or self.unknowns or self._state():
+            return super().of_rows(rows)
+        return self._known.recall(rows, super().of_rows, learn=False)
 
-    def _recall(self, rows: Tensor) -> Tensor:
-        if not len(self._known) or self._state() or self.unknowns:
-            return super()._recall(rows)
-        slots = self._known.lookup(row_keys(rows))
-        new = slots < 0
-        if new.all():
-            return super()._recall(rows)
-        values = self._known.gather(slots.clamp_min(0)).to(rows)
-        if new.any():
-            try:
-                values[new] = super()._recall(rows[new])
-            except PhysicsError as error:
-                error.relocate((new.cumsum(0) - 1).masked_fill(~new, -1))
-                raise
-        return values
+    def fresh_rows(self, rows: Tensor) -> Tensor:
+        """As :meth:`of_rows`, as the physics says it whatever was given or is remembered."""
+        d = rows.shape[-1] - len(self.unknowns)
+        given = [self.unknowns.named(rows[:, d:])] if self.unknowns else []
+        return self._targets_of(self.physics.fresh_rows, rows[:, :d], *given)
+
+    def _state(self) -> list[Tensor]:
+        """What the physics depends on besides X, as far as torch knows."""
+        return [*self.parameters(), *self.buffers()]
 
     @contextmanager
     def restored_on_error(self) -> Iterator[None]:

@@ -2,9 +2,8 @@
 
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.physics_columns import AppendedPhysics, PhysicsInput
-from gpadjust.gp.physics_mean import PhysicsMean
-from gpadjust.gp.physics_scaled_kernel import PhysicsScaledKernel
-from gpadjust.gp.term import SumOfTerms, Term, TermsMean
+from gpadjust.gp.plain_gpytorch import PhysicsMean, PhysicsScaledKernel
+from gpadjust.gp.term import SumOfTerms, Term, TermsMean, Unit, WeightedSum
 
 __all__ = [
     "AppendedPhysics",
@@ -15,4 +14,6 @@ __all__ = [
     "SumOfTerms",
     "Term",
     "TermsMean",
+    "Unit",
+    "WeightedSum",
 ]

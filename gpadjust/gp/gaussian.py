@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from threading import Lock
 from typing import NamedTuple
 
 import torch
-from gpytorch.distributions import MultivariateNormal
-from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, Likelihood
-from linear_operator.operators import DiagLinearOperator
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 _limiting = Lock()  # held by the thread that limits those of other libraries
+_setting = Lock()  # held by the thread that sets PyTorch's number of threads
 _TRIES = 8  # each with ten times the nugget of the one before
+_controller = cache(ThreadpoolController)  # it lists the process's libraries, once
 _SMALL = 256  # points of a covariance up to which a second thread costs more than it brings
 
 
 def nugget(n: int) -> float:
     r"""The nugget of every factorised covariance of ``n`` points, :math:`\max(100 n, n^2)\epsilon`.
 
-    It is relative to the mean of the diagonal, and always there, in fits and in predictions alike.
-    With less, rounding errors would decide what a model without noise knows: they are of the order
-    of :math:`n \epsilon` of the prior variance, and the variance of a prediction is no smaller than
-    the nugget.
+    It is relative to the mean of the diagonal, in fits and in predictions alike. With less,
+    rounding errors, of the order of :math:`n \epsilon` of the prior variance, would decide what a
+    model without noise knows.
     """
     return max(100 * n, n**2) * torch.finfo(torch.float64).eps
 
@@ -39,8 +38,8 @@ def cholesky(
 
     Args:
         covariance: ``... x n x n``.
-        observed: Which targets there are, booleans that broadcast to ``... x n``. Those that are
-            missing become independent ones of variance 1. Default: all.
+        observed: Which targets there are, ``... x n``; the others become independent ones of
+            variance 1. Default: all.
         n: The number of points that the nugget is for. Default: that of the covariance.
 
     Returns:
@@ -59,7 +58,10 @@ def cholesky(
         covariance = covariance + torch.diag_embed((~observed).to(covariance))
     step = added
     for _ in range(_TRIES):
-        covariance = _add_diagonal(covariance, step)
+        if covariance.requires_grad or step.requires_grad:
+            covariance = covariance + torch.diag_embed(step.expand(covariance.shape[:-1]))
+        else:
+            covariance.diagonal(dim1=-1, dim2=-2).add_(step)
         chol, info = torch.linalg.cholesky_ex(covariance)
         failed = info > 0
         if not failed.any():
@@ -69,54 +71,36 @@ def cholesky(
     return torch.where(failed[..., None, None], identity, chol), failed
 
 
-def _add_diagonal(matrix: Tensor, values: Tensor) -> Tensor:
-    """Add ``... x 1`` or ``... x n`` to diagonals; in place where autograd does not look on."""
-    if matrix.requires_grad or values.requires_grad:
-        return matrix + torch.diag_embed(values.expand(matrix.shape[:-1]))
-    matrix.diagonal(dim1=-1, dim2=-2).add_(values)
-    return matrix
-
-
 def scaled(matrix: Tensor, factor: Tensor) -> Tensor:
     """Multiply a matrix, in place where its shape and autograd allow."""
     traced = torch.is_grad_enabled() and (matrix.requires_grad or factor.requires_grad)
-    shapes = zip(reversed(factor.shape), reversed(matrix.shape), strict=False)
+    shapes = zip(reversed(factor.shape), reversed(matrix.shape), strict=False)  # PyTorch's is slow
     fits = factor.dim() <= matrix.dim() and all(ours in (1, theirs) for ours, theirs in shapes)
-    expanded = not fits or 0 in matrix.stride()
-    return matrix * factor if traced or expanded else matrix.mul_(factor)
-
-
-def noise_variances(likelihood: Likelihood, inputs: Tensor, **kwargs: Tensor) -> Tensor:
-    """The noise of observations at transformed inputs ``... x n x d``, ``... x n``."""
-    nothing = torch.zeros_like(inputs[..., 0])
-    silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
-    noisy = likelihood(silent, [inputs], **kwargs)
-    return noisy.lazy_covariance_matrix.diagonal(dim1=-1, dim2=-2)
-
-
-def known_noise(likelihood: Likelihood) -> Tensor | None:
-    """The noise variances of the training targets, ``... x n``, if they are known."""
-    if type(likelihood) is not FixedNoiseGaussianLikelihood:
-        return None
-    return None if likelihood.second_noise_covar is not None else likelihood.noise
+    return matrix * factor if traced or not fits or 0 in matrix.stride() else matrix.mul_(factor)
 
 
 class LikelihoodValue(NamedTuple):
-    """Value and derivatives of a negative log likelihood; ``...`` is a batch of problems.
+    """Value and derivatives (None if not asked for) of a negative log likelihood of a batch."""
 
-    Attributes:
-        value: ``...``; infinite where the covariance has no Cholesky factor.
-        scale: The factor of the covariance that it is for, ``...``.
-        by_mean: Its derivatives by the mean, ``... x n``; None if not asked for.
-        by_covariance: Its derivatives by the covariance, ``... x n x n``; None likewise.
-        by_least_scale: Its derivative by the logarithm of ``least_scale``, ``...``; None likewise.
+    value: Tensor  # ...; infinite where the covariance has no Cholesky factor
+    scale: Tensor  # the factor of the covariance that it is for, ...
+    by_mean: Tensor | None = None  # ... x n
+    by_covariance: Tensor | None = None  # ... x n x n
+    by_least_scale: Tensor | None = None  # by the logarithm of `least_scale`, ...
+    coefficients: Tensor | None = None  # of the basis, ... x q; None without one
+
+
+def log_likelihood(residual: Tensor, covariance: Tensor) -> Tensor:
+    r"""The log density of ``... x n`` residuals under :math:`N(0, K)`, by the book.
+
+    It is algorithm 2.1 of Rasmussen and Williams (2006), of which :func:`negative_log_likelihood`
+    is the negative, but for the nugget, without basis, scale and trend.
     """
-
-    value: Tensor
-    scale: Tensor
-    by_mean: Tensor | None = None
-    by_covariance: Tensor | None = None
-    by_least_scale: Tensor | None = None
+    chol = torch.linalg.cholesky(covariance)
+    alpha = torch.cholesky_solve(residual.unsqueeze(-1), chol).squeeze(-1)
+    data_fit = -0.5 * (residual * alpha).sum(-1)
+    complexity = -chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
+    return data_fit + complexity - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
 
 
 def negative_log_likelihood(
@@ -136,12 +120,9 @@ def negative_log_likelihood(
     ``least_scale`` the factor s is at its optimum, :math:`s = r^T P r / n`, or at that least value
     if the optimum is below it; without one it is 1 (Rasmussen and Williams 2006, sec. 2.7, 5.4).
 
-    The derivative by the covariance is :math:`\tfrac12 (K^{-1} - \alpha \alpha^T / s)` with
-    :math:`\alpha = P r`, one inverse from the same factor.
-
-    A trend T adds :math:`\tfrac12 \log|T^T K^{-1} T|`, for s = 1: the coefficients of a regression
-    on T have the covariance :math:`(T^T K^{-1} T)^{-1}`, and all their sizes then cost the same.
-    The restricted likelihood (Harville 1974) has the same determinant, but no such coefficients.
+    Its derivative by the covariance is :math:`\tfrac12 (K^{-1} - \alpha \alpha^T / s)` with
+    :math:`\alpha = P r`. A trend T adds :math:`\tfrac12 \log|T^T K^{-1} T|`, for s = 1, as in the
+    restricted likelihood (Harville 1974): coefficients on T then cost the same at all their sizes.
 
     Args:
         residual: Targets less their mean, ``... x n``; NaN where there is no observation.
@@ -156,11 +137,10 @@ def negative_log_likelihood(
     n = observed.sum(-1).to(residual)
     everything = bool(observed.all())
     if not everything:
-        residual = residual.nan_to_num(nan=0.0)
-        basis = None if basis is None else basis * observed.unsqueeze(-1)
-        trend = None if trend is None else trend * observed.unsqueeze(-1)
+        residual, mask = residual.nan_to_num(nan=0.0), observed.unsqueeze(-1)
+        basis, trend = (None if each is None else each * mask for each in (basis, trend))
     chol, failed = cholesky(covariance, None if everything else observed)
-    alpha = torch.cholesky_solve(residual.unsqueeze(-1), chol)
+    alpha, coefficients = torch.cholesky_solve(residual.unsqueeze(-1), chol), None
     if basis is not None:
         basis = basis.expand(*chol.shape[:-1], basis.shape[-1])
         coefficients, _ = least_squares(chol, residual, basis)
@@ -179,9 +159,9 @@ def negative_log_likelihood(
         log_det = log_det + 2 * triangle.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1)
     value = 0.5 * (square / scale + n * (scale.log() + math.log(2 * math.pi)) + log_det)
     failed = failed | ~value.isfinite()
-    value = torch.where(failed, torch.full_like(value, math.inf), value)
+    value = value.masked_fill(failed, math.inf)
     if not derivatives:
-        return LikelihoodValue(value, scale)
+        return LikelihoodValue(value, scale, coefficients=coefficients)
     weight = alpha / scale.unsqueeze(-1)
     by_covariance = torch.cholesky_inverse(chol)
     by_covariance.view(-1, size, size).baddbmm_(
@@ -198,7 +178,7 @@ def negative_log_likelihood(
     diagonal.add_(share * observed)
     by_scale = None if least_scale is None else 0.5 * (n - square / scale)
     # LAPACK's matrices are stored by columns, ours by rows: mixing them would be slow.
-    return LikelihoodValue(value, scale, -weight, by_covariance.mT, by_scale)
+    return LikelihoodValue(value, scale, -weight, by_covariance.mT, by_scale, coefficients)
 
 
 def least_squares(chol: Tensor, residual: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
@@ -215,44 +195,51 @@ def least_squares(chol: Tensor, residual: Tensor, basis: Tensor) -> tuple[Tensor
     both = torch.cat([basis, residual.unsqueeze(-1)], dim=-1)
     white = torch.linalg.solve_triangular(chol, both, upper=False)
     # Through an orthogonal basis, for columns that are nearly collinear; the pseudo-inverse is
-    # for those that are so exactly, a physics that is constant, say.
-    inverse = torch.linalg.pinv(white[..., :-1], rtol=1e-10)
+    # for those that are so exactly, a physics that is constant, say, whatever their sizes.
+    size = torch.linalg.vector_norm(white[..., :-1], dim=-2, keepdim=True)
+    size = size.where(size > 0, torch.ones_like(size))
+    inverse = torch.linalg.pinv(white[..., :-1] / size, rtol=1e-10) / size.mT
     return (inverse @ white[..., -1:]).squeeze(-1), inverse @ inverse.mT
 
 
 @contextmanager
-def threads_for(num_points: int, others: bool = False) -> Iterator[None]:
-    """Let PyTorch use one thread for a small problem; the user's setting is restored after.
+def threads_for(num_points: int) -> Iterator[None]:
+    """Compute a small problem with one thread; the user's settings hold again after.
 
-    Threads that wait for each other at every small product spin, and take their time from whatever
-    else the machine does: on a busy one, a fit of twelve points can take a hundred times as long.
-
-    Args:
-        num_points: Number of points of the covariances.
-        others: Whether NumPy's and SciPy's libraries are limited, too, which takes longer.
+    On a busy machine, threads that wait for each other at every small product can make a fit of
+    twelve points take a hundred times as long. PyTorch is limited in the calling thread alone,
+    NumPy's and SciPy's libraries in the process, by the first thread that asks; in about 0.2 ms.
 
     Example:
         >>> import torch
-        >>> before = torch.get_num_threads()
         >>> with threads_for(12):
         ...     torch.get_num_threads()
         1
-        >>> torch.get_num_threads() == before
-        True
     """
-    before = torch.get_num_threads()
-    if num_points > _SMALL or (before == 1 and not others):
+    if num_points > _SMALL:
         yield
         return
+    with _setting:
+        # The first call in a thread sets its number, which the limits below put back, too.
+        before = torch.get_num_threads()
     with ExitStack() as stack:
-        if others and _limiting.acquire(blocking=False):
+        if _limiting.acquire(blocking=False):
             stack.callback(_limiting.release)
-            stack.enter_context(_controller().limit(limits=1))
-        stack.callback(torch.set_num_threads, before)
-        torch.set_num_threads(1)
+            stack.enter_context(_controller().limit(limits=1, user_api="blas"))
+        stack.callback(_set_own_threads, before)
+        _set_own_threads(1)
         yield
 
 
-@cache
-def _controller() -> ThreadpoolController:
-    return ThreadpoolController()
+def _set_own_threads(number: int) -> None:
+    """Set the number of threads that PyTorch uses in the calling thread alone."""
+    # PyTorch's own call also sets what new threads begin with; another thread sets that back.
+    with _setting:
+        if torch.get_num_threads() == number:
+            return
+        with ThreadPoolExecutor(1) as another:
+            common = another.submit(torch.get_num_threads).result()
+            try:
+                torch.set_num_threads(number)
+            finally:
+                another.submit(torch.set_num_threads, common)

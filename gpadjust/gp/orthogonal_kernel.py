@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any
 
 import torch
@@ -10,10 +9,12 @@ from gpytorch.kernels import Kernel
 from linear_operator import to_dense
 from torch import Size, Tensor
 
+from gpadjust.gp.kernels import CompositeKernel
+
 _ROUNDING = 1e-10  # of the variances along the directions
 
 
-class OrthogonalKernel(Kernel):
+class OrthogonalKernel(CompositeKernel):
     r"""The covariance of a function that is orthogonal to given directions at given points.
 
     With :math:`z_1, \dots, z_n` and directions :math:`G`, ``n x p``, it is that of
@@ -23,11 +24,10 @@ class OrthogonalKernel(Kernel):
 
     (Plumlee 2017). As the kernel of a model's delta, :func:`gpadjust.fit` takes the observed
     inputs for the points, and for the directions what the unknown parameters of the physics change
-    there, so that delta cannot do what they can. The parameters are then those with which the
-    physics describes the system *best* at these inputs, in the sense of least squares, each output
-    by itself, and their intervals are about this. A free delta, as of Kennedy and
-    O'Hagan (2001), leaves open how much of what a parameter does is delta's; its parameters are the
-    *true* ones as far as the prior of delta is right. Until there are directions it is k itself.
+    there. The parameters, and their intervals, are then about the physics that is *best* at these
+    inputs, in the sense of least squares, each output by itself. With a free delta (Kennedy and
+    O'Hagan 2001) they are the *true* ones as far as its prior is right. Until there are directions
+    it is k itself.
 
     Args:
         base_kernel: The kernel k.
@@ -39,9 +39,7 @@ class OrthogonalKernel(Kernel):
         >>> from gpadjust.physics import FunctionPhysics, Unknown
         >>> line = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1.0, sd=5.0)})
         >>> X = torch.linspace(0, 1, 17, dtype=torch.float64).unsqueeze(-1)
-        >>> model = PhysicsMeanGP(
-        ...     X, X + X * X, physics=line, covar_module=orthogonal_rbf
-        ... )
+        >>> model = PhysicsMeanGP(X, X + X * X, physics=line, covar_module=orthogonal_rbf)
     """
 
     points: Tensor
@@ -53,11 +51,6 @@ class OrthogonalKernel(Kernel):
         nothing = torch.zeros(*base_kernel.batch_shape, 0, 0, dtype=torch.float64)
         self.register_buffer("points", nothing)
         self.register_buffer("directions", nothing.clone())
-
-    @property
-    def is_stationary(self) -> bool:
-        """False, as it follows the points."""
-        return False
 
     @property
     def batch_shape(self) -> Size:
@@ -89,11 +82,8 @@ class OrthogonalKernel(Kernel):
 
     def along(self, x: Tensor) -> Tensor:
         """The covariance with what is zero, whitened: ``... x n x p``."""
-        return torch.linalg.solve_triangular(
-            self.factor(),
-            (to_dense(self.base_kernel(x, self.points)) @ self.directions).mT,
-            upper=False,
-        ).mT
+        cross = to_dense(self.base_kernel(x, self.points)) @ self.directions
+        return torch.linalg.solve_triangular(self.factor(), cross.mT, upper=False).mT
 
     def factor(self) -> Tensor:
         """The Cholesky factor of the covariance of what is zero, ``... x p x p``."""
@@ -103,24 +93,9 @@ class OrthogonalKernel(Kernel):
         identity = torch.eye(square.shape[-1]).to(square)
         return torch.linalg.cholesky(square + _ROUNDING * size.detach() * identity)
 
-    def __getitem__(self, index: Any) -> OrthogonalKernel:
-        """The kernel of a part of the batch."""
-        return self._with(self.base_kernel[index], lambda tensor: tensor[index])
-
-    def expand_batch(self, *sizes: Any) -> OrthogonalKernel:
-        """The kernel with its batch expanded to ``sizes``."""
-        shape = Size(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else Size(sizes)
-        base = self.base_kernel.expand_batch(shape)
-        return self._with(base, lambda tensor: tensor.expand(*shape, *tensor.shape[-2:]))
-
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         """Take points and directions, however many there are."""
         for name in ("points", "directions"):
             if f"{prefix}{name}" in state_dict:
                 setattr(self, name, torch.empty_like(state_dict[f"{prefix}{name}"]))
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-    def _with(self, base_kernel: Kernel, change: Any) -> OrthogonalKernel:
-        new = OrthogonalKernel(deepcopy(base_kernel))
-        new.points, new.directions = change(self.points), change(self.directions)
-        return new

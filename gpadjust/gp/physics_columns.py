@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import deepcopy
 from typing import Any
 
 import gpytorch
 import torch
 from botorch.models.transforms.input import InputTransform
 from torch import Tensor
-from torch.nn import Module, Parameter
+from torch.nn import Parameter
 
+from gpadjust.gp.kernels import Batched
 from gpadjust.physics import Physics
 
 
 class PhysicsInput(InputTransform):
     r"""Appends f_p to the inputs: :math:`X \mapsto [\text{base}(X), f_p(X)]`.
 
-    The physics always sees the user's raw ``X``, and is evaluated once; the user's own input
-    transform (``Normalize``, say) acts on the other columns. A mean and a kernel that read the
-    columns are then the whole prior, so that everything in BoTorch that bypasses a model's
-    ``forward`` is right as well.
-
-    Unknown parameters of the physics are at the values that were learnt, the guesses at first.
+    The physics sees the user's raw ``X``, once; the user's own input transform (``Normalize``, say)
+    acts on the other columns. A mean and a kernel that read the columns are then the whole prior,
+    for whatever in BoTorch bypasses a model's ``forward``, too.
 
     Args:
         physics: The physics f_p, ``... x n x d`` to ``... x n x k``; of several, side by side.
@@ -31,51 +27,50 @@ class PhysicsInput(InputTransform):
         base: The user's input transform, or none.
 
     Attributes:
-        coordinates: Where the unknown parameters are, ``(S) x p``, in coordinates that are standard
-            normal by their prior; only if there are any.
+        coordinates: The unknown parameters of the physics, if any, ``(S) x p``, in coordinates that
+            are standard normal by their prior. The guesses at first.
         draws: Draws from what is known of them, ``K x p``, in their units; likewise.
     """
 
-    draws: Tensor
-
     coordinates: Parameter
-    transform_on_train = True
-    transform_on_eval = True
-    transform_on_fantasize = True
+    draws: Tensor
+    transform_on_train = transform_on_eval = transform_on_fantasize = True
 
     def __init__(
         self, physics: Physics, num_inputs: int, base: InputTransform | None = None
     ) -> None:
         super().__init__()
         check_one_to_one(base)
-        self.physics = physics
-        self.num_inputs = num_inputs
-        self.base = base
-        unknowns = physics.unknowns
-        if unknowns:
+        self.physics, self.num_inputs, self.base = physics, num_inputs, base
+        if unknowns := physics.unknowns:
             start = unknowns.coordinates(unknowns.guess)
             self.register_parameter("coordinates", Parameter(start, requires_grad=False))
             self.register_buffer("draws", unknowns.guess.unsqueeze(0))
 
     def transform(self, X: Tensor) -> Tensor:
         """Map raw ``X`` (``... x n x d``) to ``... x n x (d' + k)``."""
-        self._check(X)
-        return self._append(X if self.base is None else self.base(X), self.values(X))
+        return self._append(X, self.values(X))
+
+    def preprocess_transform(self, X: Tensor) -> Tensor:
+        """As :meth:`transform`, with the base transform's own preprocessing."""
+        return self._append(X, self.values(X), preprocess=True)
 
     def values(self, X: Tensor) -> Tensor:
-        """What the physics says, ``... x n x k``, by what was learnt of its parameters."""
+        """Outputs of the physics, ``... x n x k``, by what was learnt of its parameters."""
+        self._check(X)
         unknowns = self.physics.unknowns
-        parameters = [unknowns.at(self.coordinates)] if unknowns else []
-        values: Tensor = self.physics(X, *parameters)
+        values: Tensor = self.physics(X, *([unknowns.at(self.coordinates)] if unknowns else []))
         return values
 
     def at(self, X: Tensor, coordinates: Tensor) -> Tensor:
-        """Like :meth:`transform`, with unknown parameters at other coordinates, ``... x p``.
+        """As :meth:`transform`, at other coordinates, ``... x p``; f_p is NaN where it fails."""
+        return self._append(X, self.physics.or_nan(X, self.physics.unknowns.at(coordinates)))
 
-        The columns of f_p are NaN in rows at which it fails.
-        """
-        values = self.physics.or_nan(X, self.physics.unknowns.at(coordinates))
-        return self._append(X if self.base is None else self.base(X), values)
+    def without_physics(self, X: Tensor) -> Tensor:
+        """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
+        self._check(X)
+        # The number of outputs is known: f_p was evaluated at the training inputs.
+        return self._append(X, X.new_zeros(self.physics.num_outputs or 0))
 
     def remember(self, coordinates: Tensor) -> dict[str, Tensor]:
         """Remember draws of the parameters at coordinates ``K x p``; return them by their names."""
@@ -83,43 +78,30 @@ class PhysicsInput(InputTransform):
         names = self.physics.unknowns.names
         return {f"physics.{name}": self.draws[:, i] for i, name in enumerate(names)}
 
-    def without_physics(self, X: Tensor) -> Tensor:
-        """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
-        self._check(X)
-        k = self.physics.num_outputs or 0  # it is known: f_p was evaluated at the training inputs
-        return self._append(X if self.base is None else self.base(X), X.new_zeros(k))
-
     def untransform(self, X: Tensor) -> Tensor:
         """Map ``... x n x (d' + k)`` back to raw ``... x n x d``."""
         inputs = X[..., : X.shape[-1] - (self.physics.num_outputs or 0)]
         return inputs if self.base is None else self.base.untransform(inputs)
 
-    def preprocess_transform(self, X: Tensor) -> Tensor:
-        """As :meth:`transform`, with the base transform's own preprocessing."""
-        self._check(X)
-        inputs = X if self.base is None else self.base.preprocess_transform(X)
-        return self._append(inputs, self.values(X))
-
     def equals(self, other: InputTransform) -> bool:
         """Whether ``other`` appends the same physics after an equal base transform."""
         if not isinstance(other, PhysicsInput) or self.physics is not other.physics:
             return False
-        if self.base is other.base:
-            return True
-        return self.base is not None and other.base is not None and self.base.equals(other.base)
+        ours, theirs = self.base, other.base
+        return ours is theirs or bool(ours and theirs and ours.equals(theirs))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         """Take draws of the parameters, however many there are."""
-        draws = state_dict.get(f"{prefix}draws")
-        if draws is not None and self.physics.unknowns:
-            self.draws = torch.empty_like(draws)
+        if self.physics.unknowns and f"{prefix}draws" in state_dict:
+            self.draws = torch.empty_like(state_dict[f"{prefix}draws"])
         super()._load_from_state_dict(state_dict, prefix, *args)
 
-    @staticmethod
-    def _append(inputs: Tensor, values: Tensor) -> Tensor:
+    def _append(self, X: Tensor, values: Tensor, preprocess: bool = False) -> Tensor:
         """Join columns; the base transform, or samples of parameters, may have added a batch."""
-        shape = torch.broadcast_shapes(inputs.shape[:-1], values.shape[:-1])
-        return torch.cat([inputs.expand(*shape, -1), values.expand(*shape, -1)], dim=-1)
+        if self.base is not None:
+            X = self.base.preprocess_transform(X) if preprocess else self.base(X)
+        shape = torch.broadcast_shapes(X.shape[:-1], values.shape[:-1])
+        return torch.cat([X.expand(*shape, -1), values.expand(*shape, -1)], dim=-1)
 
     def _check(self, X: Tensor) -> None:
         if not isinstance(X, Tensor) or X.dtype != torch.float64:
@@ -134,7 +116,9 @@ class PhysicsInput(InputTransform):
 
 
 def check_one_to_one(transform: InputTransform | None) -> None:
-    """Raise a ValueError for an input transform that makes several points of one."""
+    """Raise an error for what is no input transform, or makes several points of one."""
+    if transform is not None and not isinstance(transform, InputTransform):
+        raise TypeError(f"Expected input_transform to be one of BoTorch's, got {transform!r}.")
     if transform is not None and transform.is_one_to_many:
         raise ValueError(
             f"The input transform {type(transform).__name__} makes several points of one, which "
@@ -142,24 +126,24 @@ def check_one_to_one(transform: InputTransform | None) -> None:
         )
 
 
-class AppendedPhysics(gpytorch.Module):
+class AppendedPhysics(Batched, gpytorch.Module):
     r"""Reads f_p from a column that :class:`PhysicsInput` appended: the basis of a term.
 
     For output :math:`j` it returns :math:`(f_{p,j}(x) - c_j) / \text{scale}_j`, in the units of the
-    model's targets. The centre c is the offset, or unknown: the offset and a learnt number of
-    spreads. What the prior mean of the whole function is does not depend on an unknown centre, as
-    long as ``mean`` is that of the term.
+    model's targets. The centre c is the offset, or that and a learnt number of spreads, on which
+    the prior mean of the whole function does not depend as long as ``mean`` is that of the term.
 
     Args:
         num_inputs: Number ``d`` of input columns before the appended ones.
-        select: One column of ones and zeros for each output, ``batch_shape x (m) x 1 x k``: which
-            of the ``k`` appended columns is f_p of that output.
-        offset: ``batch_shape x (m) x 1``, in the user's units.
-        scale: Of the same shape.
-        spread: Of the same shape, for a centre that is learnt, or None.
-        mean: What f_p is multiplied by in the prior mean, of the same shape, if there is a spread.
+        select: Which of the ``k`` appended columns is f_p of an output, as ones and zeros,
+            ``batch_shape x (m) x 1 x k``.
+        offset: ``batch_shape x (m) x 1``, in the user's units, as the next three.
+        scale: Its scale.
+        spread: For a centre that is learnt, or None.
+        mean: What f_p is multiplied by in the prior mean, if there is a spread.
     """
 
+    prior_of_learnt = (0.0, 3.0)  # mean and standard deviation of the centre's prior, in spreads
     select: Tensor
     offset: Tensor
     scale: Tensor
@@ -187,9 +171,13 @@ class AppendedPhysics(gpytorch.Module):
             self.register_parameter("center", Parameter(torch.zeros_like(spread)))
 
     @property
-    def has_free_center(self) -> bool:
-        """Whether a fit may move the centre."""
-        return self.learns_center and self.center.requires_grad
+    def learnt(self) -> Parameter | None:
+        """The centre in spreads, if a fit may move it: the constant that the basis is affine in."""
+        return self.center if self.learns_center and self.center.requires_grad else None
+
+    def slope(self, x: Tensor) -> Tensor:
+        """The derivative of the basis by the centre in spreads, ``... x 1``."""
+        return -self.spread / self.scale
 
     @property
     def origin(self) -> Tensor:
@@ -228,44 +216,3 @@ class AppendedPhysics(gpytorch.Module):
             rounding = 8 * torch.finfo(values.dtype).eps * origin.abs()
             values = torch.where(values.abs() <= rounding, values - values.detach(), values)
         return values / self.scale
-
-    def map_batches(self, change: Callable[[Tensor], Tensor]) -> AppendedPhysics:
-        """A copy whose buffers are changed along their batch dimensions."""
-        new = deepcopy(self)
-        for name, buffer in self.named_buffers(recurse=False):
-            setattr(new, name, change(buffer))
-        if self.learns_center:
-            learnt = self.center.requires_grad
-            new.center = Parameter(change(self.center.detach()), requires_grad=learnt)
-        return new
-
-
-class CalledPhysics(Module):
-    """One output of a physics, called at the inputs that a mean or a kernel is given.
-
-    Args:
-        physics: The physics f_p; a plain torch function is wrapped.
-        output: Which of its outputs to use; may be left out when it has only one.
-    """
-
-    def __init__(self, physics: Physics, output: int | None = None) -> None:
-        super().__init__()
-        self.physics = physics
-        self.output = output
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return f_p at ``x`` (``... x n x d``) as ``... x n``."""
-        values: Tensor = self.physics(x)
-        if self.output is not None:
-            return values[..., self.output]
-        if values.shape[-1] != 1:
-            raise ValueError(
-                f"The physics '{self.physics.name}' has {values.shape[-1]} outputs; say with "
-                "`output=` which one this mean or kernel is about (one model, or one batch, "
-                "per output)."
-            )
-        return values.squeeze(-1)
-
-    def extra_repr(self) -> str:
-        """The settings that ``repr`` shows."""
-        return "" if self.output is None else f"output={self.output}"

@@ -2,42 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from copy import deepcopy
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Self
 
 import torch
 from gpytorch.kernels import Kernel
 from gpytorch.means import Mean
-from linear_operator import to_dense
 from torch import Size, Tensor
 from torch.nn import Module, ModuleList, Parameter
 
-from gpadjust.gp.stationary import exponents, rows_of, stationary_form
+from gpadjust.gp.gaussian import scaled
+from gpadjust.gp.kernels import (
+    AnyKernel,
+    Batched,
+    CompositeKernel,
+    Stationary,
+    ToPoints,
+    stationary_parts,
+)
 
 
-class Term(Module):
+class Unit(Enum):
+    """The unit of a term's Gaussian process, beside the model's targets.
+
+    The targets' transform scales and shifts them.
+    """
+
+    NONE = "none"  # a number, as a scaling of the physics is
+    DIFFERENCE = "difference"  # of targets: it is scaled
+    TARGET = "target"  # it is shifted, too: the bias of a model
+
+
+class Term(Batched):
     r"""A term :math:`b(x) g(x)` with :math:`g \sim GP(\bar g, k)`.
 
     The basis b is a column of the physics, or 1. The prior mean :math:`\bar g` is a constant:
     given, or unknown with the prior :math:`N(\bar g, \kappa)`, which adds :math:`\kappa` to the
-    kernel. With a vague :math:`\kappa`, as :func:`gpadjust.fit` sets it, that is universal
-    kriging (Rasmussen and Williams 2006, sec. 2.7).
-
-    All is in the units of the model's targets, after their transform.
+    kernel; vague, as :func:`gpadjust.fit` sets it, that is universal kriging (Rasmussen and
+    Williams 2006, sec. 2.7). All is in the units of the model's targets, after their transform.
 
     Args:
         name: What :meth:`~gpadjust.CKA.term` calls it: ``"rho"``, ``"delta"``.
         kernel: The kernel k on the leading input columns, or None for a g that is constant.
         num_inputs: How many columns these are.
-        basis: A module that maps all columns, ``... x n x (d + k)``, to b, ``... x n``; such as
-            :class:`~gpadjust.gp.AppendedPhysics`. None for 1.
+        basis: A module that maps all columns, ``... x n x (d + k)``, to b, ``... x n``, as
+            :class:`~gpadjust.gp.AppendedPhysics` does. None for 1.
         mean: The constant :math:`\bar g`, ``batch_shape x (m) x 1``.
-        mean_variance: Its prior variance :math:`\kappa` to begin with, of the same shape; None if
-            it is known.
+        mean_variance: Its prior variance :math:`\kappa` to begin with; None if it is known.
+        unit: The unit in which :meth:`~gpadjust.CKA.term` says g.
     """
 
     basis: Any  # a module or None; it has `map_batches`, which mypy cannot know of a Module
+    given_mean: Tensor  # which a sample that does without a physics has not
 
     def __init__(
         self,
@@ -47,13 +65,16 @@ class Term(Module):
         basis: Module | None,
         mean: Tensor,
         mean_variance: Tensor | None = None,
+        unit: Unit = Unit.DIFFERENCE,
     ) -> None:
         super().__init__()
         self.name = name
         self.kernel = kernel
         self.num_inputs = num_inputs
         self.basis = basis
+        self.unit = unit
         self.learns_mean = mean_variance is not None
+        self.register_buffer("given_mean", mean.clone())
         self.mean = Parameter(mean.clone(), requires_grad=False)
         variance = torch.zeros_like(mean) if mean_variance is None else mean_variance.clone()
         self.mean_variance = Parameter(variance, requires_grad=False)
@@ -64,10 +85,14 @@ class Term(Module):
         return self.kernel is None and not self.learns_mean
 
     @property
-    def moved_mean(self) -> Tensor | float:
-        """What the prior mean has beside that of g times the basis, ``... x 1``, or 0."""
-        moved: Tensor | float = getattr(self.basis, "moved_mean", 0.0)
-        return moved
+    def form(self) -> Stationary | AnyKernel | None:
+        """The kernel at the values that its parameters have."""
+        found = None if self.kernel is None else stationary_parts(self.kernel, self.num_inputs)
+        if found is None:
+            return None if self.kernel is None else AnyKernel(self.kernel)
+        base, outer, profile = found
+        scale = base.lengthscale.new_ones(()) if outer is None else outer.outputscale
+        return Stationary(base.lengthscale, scale, profile)
 
     def weights(self, x: Tensor) -> Tensor | None:
         """The basis at ``x`` (``... x n x (d + k)``) as ``... x n``, or None for 1."""
@@ -75,101 +100,131 @@ class Term(Module):
         return values
 
     def covariance(
-        self, x1: Tensor, x2: Tensor, diag: bool = False, known_mean: bool = False
+        self,
+        x1: Tensor,
+        x2: Tensor | None = None,
+        diag: bool = False,
+        known_mean: bool = False,
+        kernel: Tensor | None = None,
     ) -> Tensor:
         """The prior covariance of g, ``... x n x n'``, or its diagonal ``... x n``.
 
-        Args:
-            x1: ``... x n x (d + k)``.
-            x2: ``... x n' x (d + k)``.
-            diag: Whether only the diagonal is wanted, for ``x1 = x2``.
-            known_mean: Take the mean as known.
+        ``x1`` is ``... x n x (d + k)``, as ``x2``, which is None for ``x1``. With ``known_mean``,
+        kappa is zero; ``kernel`` is what the kernel is there, if it was computed already.
         """
-        constant = None
+        d, form = self.num_inputs, self.form if kernel is None else None
+        if kernel is not None:
+            total = kernel
+        elif form is None:
+            across = [] if diag else [(x1 if x2 is None else x2).shape[-2]]
+            total = x1.new_zeros(()).expand(*x1.shape[:-1], *across)
+        elif diag:
+            total = form.diagonal(x1[..., :d])
+        else:
+            total = form.covariance(x1[..., :d], None if x2 is None else x2[..., :d])
         if self.learns_mean and not known_mean:
-            constant = self.mean_variance if diag else self.mean_variance.unsqueeze(-1)
-        if self.kernel is None:
-            shape = x1.shape[:-1] if diag else (*x1.shape[:-1], x2.shape[-2])
-            zero = x1.new_zeros(()) if constant is None else constant
-            return zero.expand(torch.broadcast_shapes(shape, zero.shape))
-        d = self.num_inputs
-        result = self._closed_form(x1[..., :d], x2[..., :d], diag)
-        if result is None:
-            result = to_dense(self.kernel(x1[..., :d], x2[..., :d], diag=diag))
-        return result if constant is None else result + constant
+            total = total + (self.mean_variance if diag else self.mean_variance.unsqueeze(-1))
+        return total
 
-    def log_covariance_with(self, train: Tensor, origin: Tensor) -> Tensor | None:
-        r"""A matrix R that makes the logarithms of the kernel between any inputs and the data.
 
-        With :math:`\tilde x = x - o` they are :math:`[\tilde x, \tilde x^2, 1] \, R`, one product
-        for any inputs; without gradients to hyper-parameters.
+@dataclass(eq=False)
+class WeightedSum:
+    r"""A weighted sum of terms at inputs, :math:`\sum_t w_t(x) g_t(x)`: the one place that sums.
 
-        Args:
-            train: ``... x n x (d + k)``.
-            origin: :math:`o`, ``... x 1 x d``.
+    With the bases for weights it is the model's function; with one weight of 1, a term of it.
 
-        Returns:
-            ``... x (2 d + 1) x n``; None if the kernel is no scaled RBF kernel.
+    Args:
+        x: The inputs, ``... x n x (d + k)``.
+        parts: Terms and their weights, ``... x n`` (or what broadcasts to it), or None for 1.
+        shift: What the prior mean has beside that, ``... x 1``.
+    """
+
+    x: Tensor
+    parts: Sequence[tuple[Term, Tensor | None]]
+    shift: Tensor | float = 0.0
+    _prepared: dict[tuple[str, ...], ToPoints] = field(default_factory=dict, init=False)
+
+    def combine(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Sum values of the terms by their names, ``k x ... x n``, times weights, and the shift."""
+        total = torch.zeros_like(self.x[..., 0]) + self.shift
+        for term, weight in self.parts:
+            value = values[term.name]
+            total = total + (value if weight is None else weight * value)
+        return total
+
+    def mean(self) -> Tensor:
+        """The prior mean, ``... x n``."""
+        return self.combine({term.name: term.mean for term, _ in self.parts})
+
+    def variance(self, known_means: bool = False, data: WeightedSum | None = None) -> Tensor:
+        """The prior variances, ``... x n``; ``known_means`` and ``data`` as in :meth:`cross`."""
+        total, terms = torch.zeros_like(self.x[..., 0]), self._unknown(known_means)
+        forms = {} if data is None else data._prepare(terms).forms
+        for term, weight in terms:
+            known = forms[term.name].variance() if term.name in forms else None
+            part = term.covariance(self.x, None, True, known_means, known)
+            total = total + (part if weight is None else part * weight.square())
+        return total
+
+    def covariance(self, known_means: bool = False) -> Tensor:
+        """The prior covariance, ``... x n x n``."""
+        return self.cross(self, known_means)
+
+    def cross(self, other: WeightedSum, known_means: bool = False, is_data: bool = False) -> Tensor:
+        """The prior covariance with another sum of the same terms, ``... x n x n'``.
+
+        Terms that the other has not are independent of it; with ``known_means``, all kappa are
+        zero. Data remember, without gradient to them, what makes this fast when asked often.
         """
-        found = self._scaled_rbf()
-        if found is None:
-            return None
-        lengthscale, scale = (t.detach() for t in found)
-        z, half = rows_of(train[..., : self.num_inputs] - origin, lengthscale)
-        square = (-0.5 / lengthscale.square()).expand_as(z)
-        last = scale.log()[..., None, None] - half
-        return torch.cat([z / lengthscale, square, last], dim=-1).mT.contiguous()
+        theirs = {term.name: weight for term, weight in other.parts}
+        terms = [part for part in self._unknown(known_means) if part[0].name in theirs]
+        kernels = other._prepare(terms)(self.x) if is_data else {}
+        points = None if other is self else other.x
+        total: Tensor | None = None
+        for term, left in terms:
+            part = term.covariance(self.x, points, False, known_means, kernels.get(term.name))
+            for weight, dim in ((theirs[term.name], -2), (left, -1)):
+                part = part if weight is None else scaled(part, weight.unsqueeze(dim))
+            total = part if total is None else total + part
+        return self.x.new_zeros(*self.x.shape[:-1], other.x.shape[-2]) if total is None else total
 
-    def variance(self) -> Tensor | None:
-        """The prior variance of g, ``... x 1``, if it is the same everywhere; without gradient."""
-        constant = self.mean_variance.detach() if self.learns_mean else None
-        if self.kernel is None:
-            return constant
-        if stationary_form(self.kernel, self.num_inputs) is None:
-            return None
-        scale = self._parameters_of_form()[1].detach().unsqueeze(-1)
-        return scale if constant is None else scale + constant
+    def features(self, maps: Mapping[str, Module]) -> Tensor:
+        """Features of the terms, ``... x n x D_t`` by their names, times weights, side by side."""
+        weights = {term.name: weight for term, weight in self.parts}
+        phi = []
+        for name, each in maps.items():
+            features, weight = each(self.x), weights.get(name, self.x.new_zeros(1))
+            phi.append(features if weight is None else features * weight.unsqueeze(-1))
+        return side_by_side(phi)
 
-    def _closed_form(self, x1: Tensor, x2: Tensor, diag: bool) -> Tensor | None:
-        """A scaled RBF kernel, several times faster than through GPyTorch's modules."""
-        found = self._scaled_rbf()
-        if found is None:
-            return None
-        lengthscale, scale = found
-        if diag:
-            batch = torch.broadcast_shapes(x1.shape[:-2], scale.shape)
-            return scale.unsqueeze(-1).expand(*batch, x1.shape[-2])
-        origin = x1.detach().mean(-2, keepdim=True)
-        exponent = exponents(rows_of(x1 - origin, lengthscale), rows_of(x2 - origin, lengthscale))
-        if x1 is x2:
-            # The closest pairs come out as differences of large numbers, these known ones do not.
-            zero = torch.eye(x1.shape[-2], dtype=torch.bool, device=x1.device)
-            exponent = exponent.masked_fill(zero, 0.0)
-        return scale[..., None, None] * exponent.clamp_max(0.0).exp()
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is remembered, which can be made again."""
+        return {**vars(self), "_prepared": {}}
 
-    def _scaled_rbf(self) -> tuple[Tensor, Tensor] | None:
-        """As :meth:`_parameters_of_form`, of a scaled RBF kernel; None for any other."""
-        form = stationary_form(self.kernel, self.num_inputs)
-        return None if form is None or form.profile is not None else self._parameters_of_form()
+    def _unknown(self, known_means: bool) -> list[tuple[Term, Tensor | None]]:
+        return [
+            (term, weight)
+            for term, weight in self.parts
+            if term.kernel is not None or (term.learns_mean and not known_means)
+        ]
 
-    def _parameters_of_form(self) -> tuple[Tensor, Tensor]:
-        """Lengthscales ``... x 1 x d`` and outputscale ``...`` of a stationary kernel."""
-        kernel: Any = self.kernel
-        if hasattr(kernel, "outputscale"):
-            return kernel.base_kernel.lengthscale, kernel.outputscale
-        return kernel.lengthscale, kernel.lengthscale.new_ones(())
-
-    def map_batches(self, change: Callable[[Any], Any]) -> Term:
-        """A copy whose kernel and tensors are changed along their batch dimensions."""
-        new = deepcopy(self)
-        new.kernel = None if self.kernel is None else change(self.kernel)
-        new.basis = None if self.basis is None else self.basis.map_batches(change)
-        for name in ("mean", "mean_variance"):
-            setattr(new, name, Parameter(change(getattr(self, name).detach()), requires_grad=False))
-        return new
+    def _prepare(self, parts: Sequence[tuple[Term, Tensor | None]]) -> ToPoints:
+        names = tuple(term.name for term, _ in parts)
+        if names not in self._prepared:
+            forms = {t.name: t.form for t, _ in parts}
+            found = {name: form for name, form in forms.items() if isinstance(form, Stationary)}
+            num_inputs = max((t.num_inputs for t, _ in parts), default=0)
+            self._prepared[names] = ToPoints(found, self.x[..., :num_inputs])
+        return self._prepared[names]
 
 
-class SumOfTerms(Kernel):
+def side_by_side(parts: Sequence[Tensor]) -> Tensor:
+    """Join the last dimensions of features, ``... x n x D_t``, whose batches broadcast."""
+    shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    return torch.cat([part.expand(*shape, part.shape[-1]) for part in parts], dim=-1)
+
+
+class SumOfTerms(CompositeKernel):
     r"""The covariance :math:`\sum_t b_t(x)\,(k_t(x, x') + \kappa_t)\,b_t(x')` of a sum of terms.
 
     Args:
@@ -194,75 +249,43 @@ class SumOfTerms(Kernel):
         self.known_means = known_means
 
     @property
-    def is_stationary(self) -> bool:
-        """False, as the covariance follows the bases."""
-        return False
-
-    @property
     def batch_shape(self) -> Size:
         """The batch shape of the terms."""
         return torch.broadcast_shapes(*(term.mean.shape[:-1] for term in self.terms))
 
+    def at(self, x: Tensor, among: Collection[str] | None = None) -> WeightedSum:
+        """The sum of the terms (or those ``among``) times their bases at ``... x n x (d + k)``."""
+        terms = [term for term in self.terms if among is None or term.name in among]
+        shift: Any = 0.0
+        for term in terms:
+            shift = shift + getattr(term.basis, "moved_mean", 0.0)
+        return WeightedSum(x, [(term, term.weights(x)) for term in terms], shift)
+
+    def covariance(self, x: Tensor, known_means: bool = False) -> Tensor:
+        """Return ``... x n x n``; see :class:`WeightedSum`."""
+        return self.at(x).covariance(known_means)
+
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: Any) -> Tensor:
         """Return ``... x n x n'``, or its diagonal ``... x n`` without building the matrix."""
-        return self.covariance(x1, x2, diag, self.known_means)
-
-    def covariance(
-        self, x1: Tensor, x2: Tensor | None = None, diag: bool = False, known_means: bool = False
-    ) -> Tensor:
-        """As :meth:`forward`; with ``known_means``, all kappa are zero."""
-        if x2 is None or x2 is x1 or torch.equal(x1, x2):
-            x2 = x1
-        total: Tensor | None = None
-        for term in self.terms:
-            if term.kernel is None and (known_means or not term.learns_mean):
-                continue
-            part = term.covariance(x1, x2, diag, known_means)
-            if term.basis is not None:
-                b1 = term.basis(x1)
-                b2 = b1 if x2 is x1 else term.basis(x2)
-                # Dense scaling is faster here than a product of diagonal linear operators.
-                part = part * b1 * b2 if diag else part * b1.unsqueeze(-1) * b2.unsqueeze(-2)
-            total = part if total is None else total + part
-        if total is None:  # all is known
-            total = self.terms[0].covariance(x1, x2, diag, known_mean=True)
-        return total
+        left = self.at(x1)
+        if diag:
+            return left.variance(self.known_means)
+        same = x2 is x1 or torch.equal(x1, x2)
+        return left.cross(left if same else self.at(x2), self.known_means)
 
     def basis_of_means(self, x: Tensor) -> Tensor | None:
         """The bases of the terms whose means are unknown, ``... x n x q``, or None."""
-        one = torch.ones_like(x[..., 0])
         bases = [term.weights(x) for term in self.terms if term.learns_mean]
-        if not bases:
-            return None
-        columns = [one if basis is None else basis for basis in bases]
-        return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
+        columns = [torch.ones_like(x[..., 0]) if basis is None else basis for basis in bases]
+        return torch.stack(torch.broadcast_tensors(*columns), dim=-1) if columns else None
 
     def local_load_samples(self, samples_dict: Any, memo: Any, prefix: str) -> None:
         """GPyTorch's hook for Pyro's samples; the batch shape follows the terms."""
         super(Kernel, self).local_load_samples(samples_dict, memo, prefix)
 
-    def __getitem__(self, index: Any) -> SumOfTerms:
-        """The kernel of a part of the batch."""
-        if not self.batch_shape:
-            return self
-        index = index if isinstance(index, tuple) else (index,)
-        return self._map(lambda part: part[index])
-
-    def expand_batch(self, *sizes: Any) -> SumOfTerms:
-        """The kernel with its batch expanded to ``sizes``."""
-        shape = Size(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else Size(sizes)
-        lead = len(self.batch_shape)
-        return self._map(
-            lambda part: (
-                part.expand_batch(shape)
-                if isinstance(part, Kernel)
-                else part.expand(*shape, *part.shape[lead:])
-            )
-        )
-
-    def _map(self, change: Callable[[Any], Any]) -> SumOfTerms:
-        """A copy whose kernels and tensors are changed along their batch dimensions."""
-        return SumOfTerms([term.map_batches(change) for term in self.terms], self.known_means)
+    def map_batches(self, change: Callable[[Any], Any]) -> Self:
+        """A copy whose terms are changed along their batch dimensions."""
+        return type(self)([term.map_batches(change) for term in self.terms], self.known_means)
 
 
 class TermsMean(Mean):
@@ -274,13 +297,9 @@ class TermsMean(Mean):
 
     def __init__(self, covariance: SumOfTerms) -> None:
         super().__init__()
-        # Not as a submodule: the terms are the covariance's, and stand once in a state_dict.
-        self.__dict__["covariance"] = covariance
+        # In a tuple, no submodule: the terms are the covariance's, and stand once in a state_dict.
+        self._sum = (covariance,)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the mean at ``x`` (``... x n x (d + k)``) as ``... x n``."""
-        total = torch.zeros_like(x[..., 0])
-        for term in self.covariance.terms:
-            part = term.mean if term.basis is None else term.basis(x) * term.mean
-            total = total + part + term.moved_mean
-        return total
+        return self._sum[0].at(x).mean()

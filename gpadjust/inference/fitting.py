@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, TypedDict, Unpack, cast, overload
+from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, Unpack, overload
 
 import torch
 from botorch.models import ModelListGP
@@ -13,23 +13,14 @@ from botorch.utils.transforms import is_fully_bayesian
 
 from gpadjust.gp import AppendedPhysics
 from gpadjust.gp.gaussian import threads_for
-from gpadjust.inference.calibrated_fit import calibrate
-from gpadjust.inference.full_bayes import SampleResult, default_num_samples, sample
-from gpadjust.inference.log_parameters import shared_parameters
-from gpadjust.inference.map_fit import FitResult, Search, maximise
+from gpadjust.inference.bayes import SampleResult, default_num_samples, sample
+from gpadjust.inference.calibrate import calibrate
+from gpadjust.inference.optimise import FitResult, Search, maximise
 from gpadjust.inference.variational_fit import fit_variational
-from gpadjust.models import ExactGPBase, VariationalCKA
-from gpadjust.models.variational_cka import NEVER_SAMPLED
+from gpadjust.models import TermsGP, VariationalCKA
+from gpadjust.models.parameters import shared_parameters
 
-Method = Literal["bayes", "map"]
-
-# Least values of the options of each method.
-_SEARCH = {"num_starts": 1, "num_screened": 0, "max_iterations": 1, "seed": 0}
-_OPTIONS: dict[Method, dict[str, int]] = {
-    "map": _SEARCH,
-    "bayes": {**_SEARCH, "num_samples": 1, "num_draws": 16},
-}
-_OR_NONE = ("num_starts", "num_screened", "num_samples", "num_draws")
+Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA
 
 
 class FitOptions(TypedDict, total=False):
@@ -43,44 +34,60 @@ class FitOptions(TypedDict, total=False):
     num_draws: int | None
 
 
-@overload
-def fit(
-    model: BatchedMultiOutputGPyTorchModel,
-    method: None = ...,
-    **options: Unpack[FitOptions],
-) -> FitResult | SampleResult: ...
+class Method(NamedTuple):
+    """A way to fit.
+
+    Attributes:
+        run: Called with a model, a :class:`Search` and those of the method's own options that the
+            user gave; it changes the model, and leaves it as it was if it raises an error.
+        options: Least values of its own options, whole numbers, any of which may be None.
+    """
+
+    run: Callable[..., FitResult | SampleResult]
+    options: dict[str, int]
+
+
+def most_likely(model: Fittable, search: Search) -> FitResult:
+    """Bring a model to its most likely hyper-parameters."""
+    if isinstance(model, VariationalCKA):
+        return fit_variational(model, search)
+    if isinstance(model, TermsGP) and model.has_unknowns:
+        return calibrate(model, search).result
+    return maximise(model, search)
+
+
+METHODS = {
+    "map": Method(most_likely, {}),
+    "bayes": Method(sample, {"num_samples": 1, "num_draws": 16}),
+}
+"""All methods by name: one more is an entry, which a module of its own can make."""
+_SEARCH = {"num_starts": 1, "num_screened": 0, "max_iterations": 1, "seed": 0}  # least values
 
 
 @overload
-def fit(
-    model: BatchedMultiOutputGPyTorchModel, method: Literal["map"], **options: Unpack[FitOptions]
-) -> FitResult: ...
+def fit(model: Fittable, method: Literal["map"], **options: Unpack[FitOptions]) -> FitResult: ...
 
 
 @overload
 def fit(
-    model: BatchedMultiOutputGPyTorchModel, method: Literal["bayes"], **options: Unpack[FitOptions]
+    model: Fittable, method: Literal["bayes"], **options: Unpack[FitOptions]
 ) -> SampleResult: ...
 
 
 @overload
 def fit(
-    model: VariationalCKA,
-    method: Literal["map"] | None = ...,
-    **options: Unpack[FitOptions],
-) -> FitResult: ...
+    model: Fittable, method: None = ..., **options: Unpack[FitOptions]
+) -> FitResult | SampleResult: ...
 
 
 @overload
 def fit(
-    model: ModelListGP, method: Method | None = ..., **options: Unpack[FitOptions]
+    model: ModelListGP, method: str | None = ..., **options: Unpack[FitOptions]
 ) -> list[FitResult | SampleResult]: ...
 
 
 def fit(
-    model: BatchedMultiOutputGPyTorchModel | VariationalCKA | ModelListGP,
-    method: Method | None = None,
-    **options: Unpack[FitOptions],
+    model: Fittable | ModelListGP, method: str | None = None, **options: Unpack[FitOptions]
 ) -> FitResult | SampleResult | list[FitResult | SampleResult]:
     """Fit a model's hyper-parameters, in place: by sampling them, or to their most likely values.
 
@@ -95,9 +102,10 @@ def fit(
 
     *Unknown parameters of the physics*, which all outputs share, are learnt with all else, by
     either method: least squares from several starts, then by turns with the hyper-parameters, from
-    which they are integrated out near their most likely values. ``"bayes"`` then draws them by
-    importance sampling given each of some samples of the hyper-parameters: each sample that the
-    model holds has its own physics. ``model.physics_parameters`` is what is known of them.
+    which they are integrated out near their most likely values. ``"bayes"`` then draws them given
+    each of some samples of the hyper-parameters, by least squares of randomised targets (Bardsley
+    et al. 2014), and weights the pairs: each sample that the model holds has its own physics.
+    ``model.physics_parameters`` is what is known of them.
 
     ``"map"``: the most likely values. Random starts are screened in one batch beside the model's
     current parameters; L-BFGS then runs from the best of them, for all outputs in lockstep, on a
@@ -130,7 +138,8 @@ def fit(
             state is left alone. Of ``"bayes"`` only: ``num_samples`` that the model is to hold
             (default: 16, 8 with more than 40 points, 4 with more than 100; 16 if the physics has
             unknown parameters, and up to 256 of a model that has nothing else), and ``num_draws``
-            that they are chosen from (default: 1,024, down to 128 with more than 70 points).
+            that they are chosen from (default: 1,024, or 4,096 beside unknown parameters; down to
+            128 with more than 70 points).
 
     Returns:
         For ``"map"`` the likelihood reached and whether the optimiser converged, otherwise the
@@ -146,73 +155,81 @@ def fit(
 
     Warns:
         OptimizationWarning: If the optimiser did not converge.
-        SamplingWarning: If next to one draw has all the weight.
+        SamplingWarning: If few draws have all the weight.
         ParameterWarning: If the observations tell next to nothing of a parameter of the physics, or
             of a combination of some, or contradict its prior.
     """
-    given: dict[str, Any] = {**options}
     if isinstance(model, ModelListGP):
-        return _fit_list(model, method, given)
-    if isinstance(model, VariationalCKA):
-        check_options("map" if method is None else method, given)
-        if method == "bayes":
-            raise ValueError(NEVER_SAMPLED)
-        return fit_variational(model, Search(**given))
-    if not isinstance(model, BatchedMultiOutputGPyTorchModel):
+        return _fit_list(model, method, {**options})
+    if not isinstance(model, Fittable):
         raise TypeError(
             "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "
             f"ModelListGP of them, got {type(model).__name__}."
         )
-    if is_fully_bayesian(model) and not isinstance(model, ExactGPBase):
+    if is_fully_bayesian(model) and not isinstance(model, TermsGP):
         raise RuntimeError(
             f"The {type(model).__name__} holds samples of its hyper-parameters; build it anew, to "
             "fit it."
         )
     method = method or ("bayes" if _can_be_sampled(model) else "map")
-    check_options(method, given)
-    search = Search(**{name: given.pop(name) for name in _SEARCH if name in given})
-    with threads_for(model.train_targets.shape[-1], others=True), _without_samples(model):
+    own: dict[str, Any] = {**options}
+    check_options(method, own)
+    search = Search(**{name: own.pop(name) for name in _SEARCH if name in own})
+    with threads_for(model.train_targets.shape[-1]), _without_samples(model):
         try:
-            if method == "map":
-                return _most_likely(model, search)
-            if not isinstance(model, ExactGPBase):
-                raise TypeError(
-                    f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP "
-                    "is the plain Gaussian process."
-                )
-            return sample(model, search, **given)
+            result = METHODS[method].run(model, search, **own)
+            if isinstance(model, TermsGP):
+                model.was_fitted = True
+            return result
         finally:
             model.eval()
 
 
-def _most_likely(model: BatchedMultiOutputGPyTorchModel, search: Search) -> FitResult:
-    if isinstance(model, ExactGPBase) and model.has_unknowns:
-        return calibrate(model, search).result
-    return maximise(model, search)
+def check_options(method: str, options: dict[str, Any]) -> None:
+    """Raise what :func:`fit` raises of its options."""
+    if method not in METHODS:
+        raise ValueError(
+            f"Unknown method {method!r}; expected {' or '.join(map(repr, sorted(METHODS)))}."
+        )
+    least = {**_SEARCH, **METHODS[method].options}
+    for name, value in options.items():
+        if name not in least:
+            others = [other for other, each in METHODS.items() if name in each.options]
+            hint = (
+                f"it is one of method {others[0]!r}" if others else f"expected {', '.join(least)}"
+            )
+            raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
+        if value is None and Search._field_defaults.get(name) is None:
+            continue
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise TypeError(f"Expected {name} to be a whole number, got {value!r}.")
+        if value < least[name]:
+            raise ValueError(f"Expected {name} >= {least[name]}, got {value}.")
 
 
 def _fit_list(
-    models: ModelListGP, method: Method | None, options: dict[str, Any]
+    models: ModelListGP, method: str | None, options: dict[str, Any]
 ) -> list[FitResult | SampleResult]:
     """Fit the parts of a list; those that are sampled hold the same number of samples."""
-    sampled = [method == "bayes" or (method is None and _can_be_sampled(m)) for m in models.models]
-    for each in sampled:
-        check_options("bayes" if each else "map", options)
-    if any(sampled) and options.get("num_samples") is None:
+    methods = [method or ("bayes" if _can_be_sampled(m) else "map") for m in models.models]
+    for each in methods:
+        check_options(each, options)
+    if "bayes" in methods and options.get("num_samples") is None:
         most = max(part.train_targets.shape[-1] for part in models.models)
         options = {**options, "num_samples": default_num_samples(most)}
     results: list[FitResult | SampleResult] = []
-    for i, (part, sampling) in enumerate(zip(models.models, sampled, strict=True)):
-        own = {k: v for k, v in options.items() if sampling or k != "num_samples"}
+    for i, (part, each) in enumerate(zip(models.models, methods, strict=True)):
+        has_samples = "num_samples" in METHODS[each].options
+        own = {k: v for k, v in options.items() if has_samples or k != "num_samples"}
         own["seed"] = options.get("seed", 0) + i  # or their samples would be alike
-        result: Any = fit(part, "bayes" if sampling else "map", **own)
+        result: Any = fit(part, each, **own)
         results.append(result)
     return results
 
 
-def _can_be_sampled(model: BatchedMultiOutputGPyTorchModel) -> bool:
+def _can_be_sampled(model: Fittable) -> bool:
     """Whether a model can hold samples, and has something to sample."""
-    if not isinstance(model, ExactGPBase):
+    if not isinstance(model, TermsGP):
         return False
     try:
         model.check_can_be_sampled()
@@ -223,9 +240,9 @@ def _can_be_sampled(model: BatchedMultiOutputGPyTorchModel) -> bool:
 
 
 @contextmanager
-def _without_samples(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
+def _without_samples(model: Fittable) -> Iterator[None]:
     """Let a model go of the samples that it holds; it holds them again if there is an error."""
-    if not isinstance(model, ExactGPBase) or model.num_samples is None:
+    if not isinstance(model, TermsGP) or model.num_samples is None:
         yield
         return
     samples = {
@@ -235,30 +252,15 @@ def _without_samples(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
     }
     model.release_samples()
     with torch.no_grad():
-        for module in model.covar_module.modules():
-            if isinstance(module, AppendedPhysics) and module.has_free_center:
-                module.center.zero_()  # where a new model has it
+        for basis in model.covar_module.modules():
+            if isinstance(basis, AppendedPhysics) and basis.learnt is not None:
+                basis.learnt.zero_()  # where a new model has it
+        for term in model.terms:
+            if not term.learns_mean:
+                term.mean.copy_(term.given_mean)
     try:
         yield
     except BaseException:
         model.release_samples()
         model.hold_samples(samples)
         raise
-
-
-def check_options(method: str, options: dict[str, Any]) -> None:
-    """Raise what :func:`fit` raises of its options."""
-    known = _OPTIONS.get(cast(Method, method))
-    if known is None:
-        raise ValueError(f"Unknown method {method!r}; expected 'bayes' or 'map'.")
-    for name, value in options.items():
-        if name not in known:
-            of_other = name in _OPTIONS["bayes"]
-            hint = "it is one of method 'bayes'" if of_other else f"expected {', '.join(known)}"
-            raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
-        if value is None and name in _OR_NONE:
-            continue
-        if not isinstance(value, int) or isinstance(value, bool):
-            raise TypeError(f"Expected {name} to be a whole number, got {value!r}.")
-        if value < known[name]:
-            raise ValueError(f"Expected {name} >= {known[name]}, got {value}.")

@@ -11,7 +11,8 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from torch import Tensor
 
-from gpadjust.gp.gaussian import cholesky, threads_for
+from gpadjust.gp.gaussian import negative_log_likelihood, threads_for
+from gpadjust.gp.kernels import RBF, Stationary
 
 _BLOCKS = 64  # places where neighbours are compared
 _NEIGHBOURS = 256
@@ -35,6 +36,7 @@ class Unexplained(NamedTuple):
     noise: Tensor
 
 
+@torch.no_grad()
 def unexplained(inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: int) -> Unexplained:
     r"""Split residuals into a smooth part and noise, by the likelihood of groups of neighbours.
 
@@ -51,14 +53,12 @@ def unexplained(inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: i
         known: Known noise variances, ``(m) x n``, or None if they are to be found.
         seed: Seed of the places.
     """
-    rows = residuals.reshape(-1, residuals.shape[-1])
-    noises = (
-        [None] * len(rows) if known is None else [*known.expand_as(residuals).reshape(rows.shape)]
-    )
-    with threads_for(_NEIGHBOURS, others=True):
+    batch, n = residuals.shape[:-1], residuals.shape[-1]
+    rows = residuals.reshape(-1, n)
+    noises = [None] * len(rows) if known is None else known.expand_as(residuals).reshape(-1, n)
+    with threads_for(_NEIGHBOURS):
         found = [_of_one(inputs, r, noise, seed) for r, noise in zip(rows, noises, strict=True)]
     variance, lengths, noise = (torch.stack(each) for each in zip(*found, strict=True))
-    batch = residuals.shape[:-1]
     return Unexplained(
         variance.reshape(batch), lengths.reshape(*batch, 1, -1), noise.reshape(batch)
     )
@@ -67,7 +67,7 @@ def unexplained(inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: i
 def _of_one(
     inputs: Tensor, residuals: Tensor, known: Tensor | None, seed: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    seen = ~residuals.isnan()
+    seen, d = ~residuals.isnan(), inputs.shape[-1]
     inputs, residuals = inputs[seen], residuals[seen]
     known = None if known is None else known[seen]
     spread = inputs.std(0)
@@ -82,48 +82,35 @@ def _of_one(
     centres = torch.randperm(len(z), generator=generator)[: min(_BLOCKS, len(z) // k)].to(z.device)
     nearest = torch.cdist(z[centres], z).topk(k, largest=False).indices
     x, r = z[nearest], residuals[nearest] / size.sqrt()
+    x = x - x.mean(-2, keepdim=True)
     own = None if known is None else known[nearest] / size
 
     def objective(vector: np.ndarray) -> tuple[float, np.ndarray]:
         """The negative log likelihood of a residual, of logarithms of lengths, v and noise."""
-        p = torch.tensor(vector, dtype=torch.float64, device=x.device, requires_grad=True)
-        value = _negative_log_likelihood(x, r, p, own) / r.numel()
-        value.backward()
-        assert p.grad is not None
-        return value.item(), p.grad.cpu().numpy()
+        p = torch.as_tensor(vector).to(x).exp()
+        noise = p[d + 1].expand_as(r) if own is None else own
+        pairs = Stationary(p[:d].unsqueeze(0), p[d], RBF).pairs(x)
+        covariance = pairs.covariance + torch.diag_embed(noise)
+        found = negative_log_likelihood(r, covariance, derivatives=True)
+        assert found.by_covariance is not None
+        by_length, by_variance, _ = pairs.pull_back(found.by_covariance, None)
+        by_noise = found.by_covariance.diagonal(dim1=-1, dim2=-2).sum() * p[-1]
+        parts = [by_length.sum(0), by_variance.sum(0, True), by_noise.unsqueeze(0)]
+        gradient = torch.cat(parts)[: len(p)] / r.numel()
+        return float(found.value.sum()) / r.numel(), gradient.cpu().numpy()
 
-    d = x.shape[-1]
     tiny, most = math.log(_LEAST_SHARE), math.log(4.0)
     bounds = [tuple(map(math.log, _LENGTHS))] * d + [(tiny, most)] * (1 if known is not None else 2)
-    starts = [[math.log(length)] * d + [math.log(0.3)] for length in (0.5, 2.0)]
-    starts = [s if known is not None else [*s, math.log(0.7)] for s in starts]
+    starts = [[math.log(length)] * d + [math.log(0.3), math.log(0.7)] for length in (0.5, 2.0)]
+    starts = [start[: len(bounds)] for start in starts]
     runs = [minimize(objective, s, jac=True, method="L-BFGS-B", bounds=bounds) for s in starts]
     best = min(runs, key=lambda run: float(run.fun))
-    without = _noise_alone(r, own)
-    gain = (without - float(best.fun)) * r.numel()
-    if 2 * gain <= chi2.isf(_CHANCE, d + 1):
+    alone = r.square().mean().expand_as(r) if own is None else own
+    without = 0.5 * (r.square() / alone + (2 * math.pi * alone).log()).mean()
+    if 2 * (float(without) - float(best.fun)) * r.numel() <= chi2.isf(_CHANCE, d + 1):
         return torch.zeros_like(size), spread, whole
-    p = torch.as_tensor(best.x, dtype=torch.float64, device=x.device).exp()
+    p = torch.as_tensor(best.x).to(x).exp()
     noise = p[d + 1] if own is None else own.mean()
     # Groups that are narrow beside the lengthscales do not tell v, but the residuals' size does.
     variance = p[d].minimum((1 - noise).clamp_min(0.0))
     return size * variance, p[:d] * spread, whole if known is not None else size * noise
-
-
-def _negative_log_likelihood(x: Tensor, r: Tensor, p: Tensor, known: Tensor | None) -> Tensor:
-    """Of groups ``b x k x d`` with residuals ``b x k``, at logarithms of the parameters."""
-    d = x.shape[-1]
-    z = x / p[:d].exp()
-    z = z - z.mean(-2, keepdim=True)
-    half = 0.5 * z.square().sum(-1)
-    exponent = (z @ z.mT - half.unsqueeze(-1) - half.unsqueeze(-2)).clamp_max(0.0)
-    noise = p[d + 1].exp().expand_as(r) if known is None else known
-    chol, _ = cholesky(p[d].exp() * exponent.exp() + torch.diag_embed(noise))
-    white = torch.linalg.solve_triangular(chol, r.unsqueeze(-1), upper=False)
-    return 0.5 * white.square().sum() + chol.diagonal(dim1=-1, dim2=-2).log().sum()
-
-
-def _noise_alone(r: Tensor, known: Tensor | None) -> float:
-    """The same of a residual without the smooth part, at the most likely noise."""
-    noise = r.square().mean().expand_as(r) if known is None else known
-    return float(0.5 * (r.square() / noise + noise.log()).mean())

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics
-from gpadjust.models import ExactGPBase, TermsModel, VariationalCKA
-from gpadjust.models.hyperparameters import constraint_of, is_rho, kernels_of, kind_of
+from gpadjust.models import TermsGP, TermsModel, VariationalCKA
+from gpadjust.models.parameters import hyperparameters
 
 
 def warm_start(model: TermsModel, previous: TermsModel) -> None:
@@ -24,34 +24,32 @@ def warm_start(model: TermsModel, previous: TermsModel) -> None:
         model: The model to start, changed in place.
         previous: The model with the hyper-parameters, of other data.
     """
-    if isinstance(model, VariationalCKA) and isinstance(previous, VariationalCKA):
-        model, previous = model.start, previous.start
-    unitless = [path for path, _, _, basis in kernels_of(model) if is_rho(basis)]
-    if previous.num_samples is not None:
+    if isinstance(previous, TermsGP) and previous.num_samples is not None:
         previous = _mean_of_samples(previous)
-    ratio = 2 * (previous._units()[1] / model._units()[1]).log().squeeze(-1)  # ... x (m)
+    ratio = 2 * (previous.units()[1] / model.units()[1]).log().squeeze(-1)  # ... x (m)
     source = dict(previous.named_parameters())
     with torch.no_grad():
         if model.has_unknowns and previous.has_unknowns:
             model.train()  # its inputs are then transformed again
             model.input_transform.coordinates.copy_(previous.input_transform.coordinates)
-        for name, parameter in model.named_parameters():
-            if not parameter.requires_grad:
+        for row in hyperparameters(model):
+            if not row.raw.requires_grad:
                 continue
-            value: Tensor = source[name]
-            constraint = constraint_of(model, name)
-            basis = model.get_submodule(name.rpartition(".")[0])
-            earlier = previous.get_submodule(name.rpartition(".")[0])
-            if isinstance(basis, AppendedPhysics) and isinstance(earlier, AppendedPhysics):
-                value = basis.center_at(earlier.origin)
-            follows = kind_of(name) in ("outputscale", "noise") and constraint is not None
-            if follows and not any(name.startswith(f"{path}.") for path in unitless):
+            value: Any = source[row.name]
+            if isinstance(row.owner, AppendedPhysics) and row.kind == "constant":
+                earlier: Any = previous.get_submodule(row.name.rpartition(".")[0])
+                value = row.owner.center_at(earlier.origin)
+            if row.kind in ("outputscale", "noise"):
                 factor = ratio[(..., *[None] * (value.dim() - ratio.dim()))].exp()
-                value = constraint.inverse_transform(constraint.transform(value) * factor)
-            parameter.copy_(value)
+                value = row.constraint.inverse_transform(row.parameter(value) * factor)
+            row.raw.copy_(value)
+    if isinstance(model, VariationalCKA):
+        model.forget()
+        if model.has_unknowns:
+            model.ask_physics()
 
 
-def _mean_of_samples(model: ExactGPBase) -> ExactGPBase:
+def _mean_of_samples(model: TermsGP) -> TermsGP:
     """A copy with the means of the raw parameters that a model holds samples of."""
     held = dict(model.named_parameters())
     model = deepcopy(model)

@@ -12,26 +12,47 @@ from gpytorch.likelihoods.noise_models import FixedGaussianNoise
 from torch import Size, Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp import AppendedPhysics, OrthogonalKernel
+from gpadjust.gp import AppendedPhysics, OrthogonalKernel, Term
 
 HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
     "`model.release_samples()` keeps the first."
 )
+_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term)  # modules whose buffers have the batch
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
-    """Make a model a batch of itself, one for each sample; see :meth:`ExactGPBase.hold_samples`."""
+    """Make a model a batch of itself, one for each sample; see :meth:`TermsGP.hold_samples`."""
     (num_samples,) = {len(values) for values in samples.values()}
-    _change(model, lambda tensor: tensor.expand(num_samples, *tensor.shape).clone())
+    _change(model, lambda tensor: tensor.expand(num_samples, *tensor.shape).clone(), num_samples)
     match_parameters(model)
     named = dict(model.named_parameters())
     with torch.no_grad():
         for name, values in samples.items():
             named[name].copy_(values.reshape(named[name].shape))
     transform_training_inputs(model)
-    model.num_samples = num_samples
-    model._is_fully_bayesian = model._is_ensemble = True
+
+
+def release_samples(model: Any) -> None:
+    """Reverse :func:`hold_samples`, with the first sample; see :meth:`TermsGP.release_samples`."""
+    if model.train_targets.dim() > len(model._aug_batch_shape) + 1:
+        raise RuntimeError(
+            "A model of fantasies cannot let go of its samples; take the model that they were made "
+            "of."
+        )
+    _change(model, lambda tensor: tensor[0], None)
+    if model.has_unknowns:
+        _set_coordinates(model, model.input_transform.coordinates.flatten())
+
+
+def take_samples(model: Any, index: Tensor, as_mixture: bool = False) -> Any:
+    """A copy whose batch is some of the samples, maybe repeated.
+
+    To BoTorch it is a plain batch, or a fully Bayesian model of these samples, ``as_mixture``.
+    """
+    model = deepcopy(model)
+    _change(model, lambda tensor: tensor[index], len(index) if as_mixture else None)
+    return model
 
 
 def transform_training_inputs(model: Any) -> None:
@@ -56,44 +77,8 @@ def _set_coordinates(model: Any, coordinates: Tensor) -> None:
     model.input_transform.coordinates = Parameter(coordinates.detach(), requires_grad=False)
 
 
-def release_samples(model: Any) -> None:
-    """Reverse :func:`hold_samples`: keep the first sample; see `ExactGPBase.release_samples`."""
-    if model.train_targets.dim() > len(model._aug_batch_shape) + 1:
-        raise RuntimeError(
-            "A model of fantasies cannot let go of its samples; take the model that they were made "
-            "of."
-        )
-    fixed = getattr(model.likelihood, "noise_covar", None)
-    if isinstance(fixed, FixedGaussianNoise) and fixed.noise.dim() > len(model._aug_batch_shape):
-        # The samples share the noise of the training data, but not that of later observations.
-        fixed.noise = fixed.noise[0]
-    _change(model, lambda tensor: tensor[0])
-    if model.has_unknowns:
-        _set_coordinates(model, model.input_transform.coordinates.flatten())
-    model.num_samples = None
-    model._is_fully_bayesian = model._is_ensemble = False
-
-
-def take_samples(model: Any, index: Tensor, as_mixture: bool = False) -> Any:
-    """A copy whose batch is some of the samples, maybe repeated.
-
-    To BoTorch it is a plain batch, or a fully Bayesian model of these samples, ``as_mixture``.
-    """
-    model = deepcopy(model)
-    fixed = getattr(model.likelihood, "noise_covar", None)
-    if isinstance(fixed, FixedGaussianNoise) and (
-        not as_mixture or fixed.noise.dim() > len(model._aug_batch_shape)
-    ):
-        # The samples share the noise of the training data, but not that of later observations.
-        shape = (*model._aug_batch_shape, fixed.noise.shape[-1])
-        fixed.noise = fixed.noise.expand(shape)[index]
-    _change(model, lambda tensor: tensor[index])
-    model.num_samples = len(index) if as_mixture else None
-    model._is_fully_bayesian = model._is_ensemble = as_mixture
-    return model
-
-
-def _change(model: Any, change: Callable[[Tensor], Tensor]) -> None:
+@torch.no_grad()
+def _change(model: Any, change: Callable[[Tensor], Tensor], num_samples: int | None) -> None:
     """Change the leading dimensions of all that a model has for each of its batches."""
     outputs = model._aug_batch_shape
 
@@ -101,25 +86,27 @@ def _change(model: Any, change: Callable[[Tensor], Tensor]) -> None:
         return change(torch.empty(shape, device="meta")).shape
 
     model.eval()
-    for path, module in model.named_modules():
-        if path.partition(".")[0] not in ("covar_module", "likelihood"):
-            continue
+    for module in (*model.covar_module.modules(), *model.likelihood.modules()):
         if isinstance(module, Kernel) and module._batch_shape[: len(outputs)] == outputs:
             module._batch_shape = changed(module._batch_shape)
-        if isinstance(module, AppendedPhysics | OrthogonalKernel | RFFKernel):
-            for name, buffer in list(module.named_buffers(recurse=False)):
-                setattr(module, name, change(buffer))
-        for name, parameter in list(module.named_parameters(recurse=False)):
+        if isinstance(module, FixedGaussianNoise) and model.num_samples is not None:
+            noise, of_each = module.noise, (*outputs, module.noise.shape[-1])
+            # Samples share the noise of the training data, but not that of later observations.
+            shared = num_samples is not None and noise.dim() < len(of_each)
+            module.noise = noise if shared else change(noise.expand(of_each))
+        for name, buffer in [*module.named_buffers(recurse=False)] * isinstance(module, _BATCHED):
+            setattr(module, name, change(buffer))
+        for name, parameter in [*module.named_parameters(recurse=False)]:
             if parameter.shape[: len(outputs)] == outputs:
-                learnt = parameter.requires_grad
-                setattr(module, name, Parameter(change(parameter.detach()), requires_grad=learnt))
+                new = Parameter(change(parameter), requires_grad=parameter.requires_grad)
+                setattr(module, name, new)
     if model.has_unknowns:
         _set_coordinates(model, change(model.input_transform.coordinates))
-    with torch.no_grad():
-        model.train_inputs = tuple(change(t) for t in model.train_inputs)
-        if model._original_train_inputs is not None:
-            model._original_train_inputs = change(model._original_train_inputs)
-        model.train_targets = change(model.train_targets)
+    model.train_inputs = tuple(change(t) for t in model.train_inputs)
+    if model._original_train_inputs is not None:
+        model._original_train_inputs = change(model._original_train_inputs)
+    model.train_targets = change(model.train_targets)
     model._input_batch_shape = changed(model._input_batch_shape)
     model._aug_batch_shape = changed(outputs)
-    model.prediction_strategy = None
+    model.prediction_strategy, model.num_samples = None, num_samples
+    model._is_fully_bayesian = model._is_ensemble = num_samples is not None

@@ -14,9 +14,8 @@ from gpadjust.physics import Unknown
 class PhysicsParameters(Mapping[str, Tensor]):
     """The posterior of the unknown parameters of a physics, as draws.
 
-    It maps names to their draws, ``K`` each. After a point fit (``"map"``), and in a model that was
-    not fitted, there is one, the value itself. What is learnt by conditioning on further
-    observations leaves them as they are, like hyper-parameters.
+    It maps names to their draws, ``K`` each: one, the value itself, after a point fit (``"map"``)
+    or before any. Conditioning on further observations leaves them as they are.
 
     Args:
         unknowns: The parameters.
@@ -26,10 +25,8 @@ class PhysicsParameters(Mapping[str, Tensor]):
         >>> import torch
         >>> from gpadjust import CalibratedPhysics, fit
         >>> from gpadjust.physics import FunctionPhysics, Unknown
-        >>> law = FunctionPhysics(
-        ...     lambda t, p: 0.5 * p.g * t[:, 0] ** 2,
-        ...     unknowns={"g": Unknown(9.0, sd=1.0, unit="m/s²")},
-        ... )
+        >>> g = Unknown(9.0, sd=1.0, unit="m/s²")
+        >>> law = FunctionPhysics(lambda t, p: 0.5 * p.g * t[:, 0] ** 2, unknowns={"g": g})
         >>> t = torch.linspace(0.1, 1, 8, dtype=torch.float64).unsqueeze(-1)
         >>> model = CalibratedPhysics(t, 0.5 * 9.81 * t**2, physics=law)
         >>> result = fit(model)
@@ -76,10 +73,7 @@ class PhysicsParameters(Mapping[str, Tensor]):
         return self.draws.std(0, correction=0)
 
     def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
-        """Lower and upper ends of the central intervals, ``p`` each.
-
-        Args:
-            level: The probability that one holds, between 0 and 1.
+        """Lower and upper ends of the central intervals of probability ``level``, ``p`` each.
 
         Raises:
             ValueError: If ``level`` is not between 0 and 1.
@@ -97,9 +91,8 @@ class PhysicsParameters(Mapping[str, Tensor]):
         for i, (name, unknown) in enumerate(self.unknowns.items()):
             interval = f"{low[i]:.4g} to {high[i]:.4g}"
             rows.append((name, f"{self.mean[i]:.4g}", interval, unknown.prior_text, unknown.unit))
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = (
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in rows
+        padded = (
+            [cell.ljust(max(map(len, column))) for cell in column]
+            for column in zip(*rows, strict=True)
         )
-        return "\n".join(lines)
+        return "\n".join("  ".join(row).rstrip() for row in zip(*padded, strict=True))

@@ -1,23 +1,20 @@
-"""Posteriors whose variances and joint samples are right however small they are."""
+"""Posteriors whose variances and joint samples are right at any size of the targets."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from botorch.posteriors import GPyTorchPosterior, Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM, GaussianMixturePosterior
 from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
-from gpytorch.settings import min_variance
 from linear_operator import to_dense
 from linear_operator.operators import (
     BlockDiagLinearOperator,
     DenseLinearOperator,
-    LinearOperator,
     TriangularLinearOperator,
 )
-from torch import Tensor
+from torch import Size, Tensor
 
 _JITTER = (1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)  # of correlations
 
@@ -54,40 +51,50 @@ def correlation_root(covariance: Tensor) -> Tensor:
     return root * sd.masked_fill(known, 0.0).unsqueeze(-1)
 
 
-class ScaleFreePosterior(GPyTorchPosterior):
-    """A posterior whose variances have no absolute minimum, as GPyTorch's have (1e-10)."""
+class ScaleFreeNormal(MultivariateNormal):
+    """GPyTorch's distribution, without its least variance (1e-10) and the warning of it."""
 
     @property
     def variance(self) -> Tensor:
-        """The posterior variance, ``batch_shape x q x m``."""
-        return _variance(self.distribution)
+        """The variances, in the shape of the mean."""
+        variance = self.lazy_covariance_matrix.diagonal(dim1=-1, dim2=-2).clamp_min(0.0)
+        return variance.reshape(variance.shape[:-1] + self._event_shape)
+
+
+class ScaleFreeMultitaskNormal(MultitaskMultivariateNormal, ScaleFreeNormal):
+    """The same of several outputs."""
+
+
+class ScaleFreePosterior(GPyTorchPosterior):
+    """A posterior whose variances and draws are right at any size."""
 
     @classmethod
     def of_outputs(cls, mean: Tensor, covariance: Tensor, has_outputs: bool) -> ScaleFreePosterior:
         """Of independent outputs: moments ``... x (m) x q`` and ``... x (m) x q x q``."""
         operator = PosteriorCovariance(covariance)
         if not has_outputs:
-            return cls(MultivariateNormal(mean, operator))
+            return cls(ScaleFreeNormal(mean, operator))
         blocks = BlockDiagLinearOperator(operator, block_dim=-3)
-        return cls(MultitaskMultivariateNormal(mean.mT, blocks, interleaved=False))
+        return cls(ScaleFreeMultitaskNormal(mean.mT, blocks, interleaved=False))
 
     @classmethod
     def transformed(cls, posterior: Posterior) -> Posterior:
-        """What a posterior transform made, free of scale again."""
+        """The posterior that a posterior transform made, free of scale again."""
         if type(posterior) is not GPyTorchPosterior:
             return posterior
         old = posterior.distribution
-        if isinstance(old, MultitaskMultivariateNormal):
-            return cls(old)
         covariance = PosteriorCovariance(to_dense(old.lazy_covariance_matrix))
-        return cls(MultivariateNormal(old.mean, covariance))
+        if isinstance(old, MultitaskMultivariateNormal):
+            return cls(ScaleFreeMultitaskNormal(old.mean, covariance, False, old._interleaved))
+        return cls(ScaleFreeNormal(old.mean, covariance))
 
 
 class HyperparameterMixture(GaussianMixturePosterior):
-    """BoTorch's posterior of a fully Bayesian model, with variances right however small.
+    """BoTorch's posterior of a fully Bayesian model, right at any size of the targets.
 
-    Its moments are those of the components, ``batch_shape x S x q x m``; ``mixture_mean``,
-    ``mixture_variance`` and ``quantile`` are those of the mixture, ``batch_shape x q x m``.
+    To BoTorch its moments and draws are those of the components, ``batch_shape x S x q x m``;
+    ``mixture_mean``, ``mixture_variance``, ``mixture_covariance_matrix`` and ``quantile`` are those
+    of the mixture.
 
     Args:
         components: The posterior of a model that holds samples, with their dimension third from
@@ -95,18 +102,107 @@ class HyperparameterMixture(GaussianMixturePosterior):
     """
 
     def __init__(self, components: GPyTorchPosterior) -> None:
-        with min_variance(double_value=0.0):
-            super().__init__(components.distribution)
-        self._variance = components.variance
+        super().__init__(components.distribution)
+        self.components = components
 
     @property
     def mixture_variance(self) -> Tensor:
         """The variance of the mixture, ``batch_shape x q x m``."""
         return mixture_moments(self._mean, self._variance)[1]
 
+    @property
+    def mixture_covariance_matrix(self) -> Tensor:
+        """The covariance of the mixture, ``batch_shape x (m q) x (m q)``: output by output."""
+        mean: Tensor = self.distribution.loc  # ... x S x (m q)
+        deviation = mean - mean.mean(-2, keepdim=True)
+        spread = deviation.mT @ deviation / mean.shape[-2]
+        return self.distribution.covariance_matrix.mean(-3) + spread
+
+    def quantile(self, value: Tensor) -> Tensor:
+        """The mixture's quantiles, ``(b) x batch_shape x q x m``.
+
+        Args:
+            value: The level, or ``b`` of them.
+
+        Raises:
+            ValueError: If a level is not between 0 and 1.
+        """
+        if value.numel() > 1:
+            return torch.stack([self.quantile(level) for level in value])
+        level = float(value)
+        if not 0 < level < 1:
+            raise ValueError(f"Expected levels of quantiles between 0 and 1, got {level:.3g}.")
+        return mixture_quantile(self._mean, self._variance, level)
+
+
+class MarginalMixture(HyperparameterMixture):
+    """A mixture whose moments, densities and draws are those of the whole throughout.
+
+    Shapes are ``batch_shape x q x m``, without the dimension of the components.
+    """
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean, ``batch_shape x q x m``."""
+        mean: Tensor = self.mixture_mean
+        return mean
+
+    @property
+    def variance(self) -> Tensor:
+        """The variance, ``batch_shape x q x m``."""
+        return self.mixture_variance
+
+    @property
+    def covariance_matrix(self) -> Tensor:
+        """The covariance, ``batch_shape x (m q) x (m q)``: output by output."""
+        return self.mixture_covariance_matrix
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """The joint log density of values at all points and outputs, ``... x q x m``: ``...``."""
+        away = value.mT.flatten(-2).unsqueeze(-2) - self.distribution.loc  # ... x S x (m q)
+        root = correlation_root(self.distribution.covariance_matrix)
+        white = torch.linalg.solve_triangular(root, away.unsqueeze(-1), upper=False).squeeze(-1)
+        log_size = root.diagonal(dim1=-1, dim2=-2).log() + 0.5 * math.log(2 * math.pi)
+        each = -(0.5 * white.square() + log_size).sum(-1)
+        return each.logsumexp(-1) - math.log(each.shape[-1])
+
+    def entropy(self) -> Tensor:
+        """Raise an error: that of a mixture has no closed form."""
+        raise NotImplementedError(
+            "The entropy of a mixture has no closed form; `mixed=False` has that of each sample."
+        )
+
+    def density(self, value: Tensor) -> Tensor:
+        """The probability density at values ``b``, ``(b) x batch_shape x q x m``."""
+        return self.components.density(value).mean(MCMC_DIM)
+
+    def rsample(self, sample_shape: Size | None = None) -> Tensor:
+        """Draws, ``sample_shape x batch_shape x q x m``, each from a component at random."""
+        drawn = self.components.rsample(sample_shape)
+        shape = (*drawn.shape[:MCMC_DIM], 1, 1, 1)
+        which = torch.randint(drawn.shape[MCMC_DIM], shape, device=drawn.device)
+        return _taken(drawn, which)
+
+    def rsample_from_base_samples(self, sample_shape: Size, base_samples: Tensor) -> Tensor:
+        """Draws for BoTorch's samplers, from one component after the other."""
+        drawn = self.components.rsample_from_base_samples(sample_shape, base_samples)
+        which = torch.arange(sample_shape.numel(), device=drawn.device) % drawn.shape[MCMC_DIM]
+        return _taken(drawn, which.reshape(*sample_shape, *[1] * (drawn.dim() - len(sample_shape))))
+
+    def _extended_shape(self, sample_shape: Size = Size()) -> Size:  # noqa: B008
+        return sample_shape + self.mean.shape
+
+
+def _taken(drawn: Tensor, which: Tensor) -> Tensor:
+    """One component of each of the draws ``... x S x q x m``."""
+    which = which.expand(*drawn.shape[:MCMC_DIM], 1, *drawn.shape[MCMC_DIM + 1 :])
+    return drawn.gather(MCMC_DIM, which).squeeze(MCMC_DIM)
+
 
 def mixture_moments(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance ``... x q x m`` of mixtures of components ``... x S x q x m``."""
+    if mean.shape[MCMC_DIM] == 1:
+        return mean.squeeze(MCMC_DIM), variance.squeeze(MCMC_DIM)
     # Not as a difference of second moments, which cancels.
     spread = (mean - mean.mean(MCMC_DIM, keepdim=True)).square().mean(MCMC_DIM)
     return mean.mean(MCMC_DIM), variance.mean(MCMC_DIM) + spread
@@ -122,24 +218,3 @@ def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
         below = torch.special.ndtr((middle.unsqueeze(MCMC_DIM) - mean) / sd).mean(MCMC_DIM) < level
         low, high = torch.where(below, middle, low), torch.where(below, high, middle)
     return (low + high) / 2
-
-
-def mixture_interval(
-    components: Callable[[], tuple[Tensor, Tensor]], level: float
-) -> tuple[Tensor, Tensor]:
-    """Lower and upper ends of the central intervals of mixtures, ``... x q x m`` each."""
-    if not isinstance(level, float) or not 0 < level < 1:
-        raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
-    parts = components()
-    return mixture_quantile(*parts, (1 - level) / 2), mixture_quantile(*parts, (1 + level) / 2)
-
-
-def _variance(distribution: MultivariateNormal) -> Tensor:
-    covariance: LinearOperator = distribution.lazy_covariance_matrix
-    variance = covariance.diagonal(dim1=-1, dim2=-2).clamp_min(0.0)
-    if not isinstance(distribution, MultitaskMultivariateNormal):
-        return variance.unsqueeze(-1)
-    q, m = distribution.event_shape
-    if distribution._interleaved:
-        return variance.unflatten(-1, (q, m))
-    return variance.unflatten(-1, (m, q)).mT

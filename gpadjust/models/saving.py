@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,10 +13,10 @@ import torch
 from gpadjust.gp import PhysicsInput
 from gpadjust.models.stacked import StackedGP
 from gpadjust.models.terms_model import TermsModel
-from gpadjust.physics import JoinedPhysics, as_physics
+from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 def save(model: TermsModel | StackedGP, path: str | Path) -> None:
@@ -28,37 +30,65 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
         model: The model.
         path: The file, which ``torch.load`` reads with ``weights_only=True``.
 
+    Warns:
+        UserWarning: If another program cannot import the physics, so that :func:`load` asks for it:
+            a lambda, or a function of a script.
+
     Raises:
-        TypeError: If it is no model of this library.
-        ValueError: If its class is not in its module, or it is a subset of a model's outputs.
+        TypeError: If it is no model of this library, or the path none.
+        ValueError: If its class is not in its module, it is a subset of a model's outputs, or the
+            path is a folder, or in none that exists.
 
     Example:
         >>> import tempfile, torch
         >>> from gpadjust import CKA, load, save
+        >>> from torch.nn.functional import silu
         >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-        >>> model = CKA(X, 2 * X.sin() + X, physics=lambda X: X.sin())
+        >>> model = CKA(X, 2 * silu(X) + X, physics=silu)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(model, f"{folder}/model.pt")
-        ...     again = load(f"{folder}/model.pt", physics=lambda X: X.sin())
+        ...     again = load(f"{folder}/model.pt")
         >>> torch.equal(again.posterior(X).mean, model.posterior(X).mean)
         True
     """
-    content: dict[str, Any]
-    if isinstance(model, StackedGP):
-        content = {
-            "format": _FORMAT,
-            "models": {name: _content(part) for name, part in model.made_of.items()},
-            "weights": torch.tensor([*model.weights.values()], dtype=torch.float64),
-            "num_components": model.num_samples,
-        }
-    else:
-        content = _content(model)
-    part = Path(f"{path}.part")
-    torch.save(content, part)
-    part.replace(path)
+    if not isinstance(path, str | Path):
+        raise TypeError(f"Expected path as the name of a file, got {path!r}.")
+    path = Path(path)
+    if path.is_dir() or not path.parent.is_dir():
+        what = "a folder; name a file in it" if path.is_dir() else "in a folder that does not exist"
+        raise ValueError(f"The path {str(path)!r} is {what}.")
+    content = content_of(model)
+    models = content["models"].values() if "models" in content else [content]
+    names = [name for each in models for name in (each["physics"] or {}).values()]
+    if any(name is None or name.startswith("__main__:") for name in names):
+        asked = {"physics", *(name for each in models for name in each["missing"])}
+        warnings.warn(
+            f"The physics of {path.name} is a lambda, or of the running script, so that other "
+            "programs cannot import it. They give it again, "
+            f"load(path, {', '.join(f'{name}=...' for name in sorted(asked))}).",
+            stacklevel=2,
+        )
+    part = path.with_name(f"{path.name}.part")
+    try:
+        torch.save(content, part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
-def _content(model: TermsModel) -> dict[str, Any]:
+def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
+    """What a file holds of a model; the errors are those of :func:`save`."""
+    if not isinstance(model, StackedGP):
+        return _content(model)
+    return {
+        "format": _FORMAT,
+        "models": {name: _content(part) for name, part in model.made_of.items()},
+        "weights": torch.tensor([*model.weights.values()], dtype=torch.float64),
+        "num_components": model.num_samples,
+    }
+
+
+def _content(model: Any) -> dict[str, Any]:
     """What a file holds of a model of one structure."""
     if not isinstance(model, TermsModel):
         raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
@@ -67,15 +97,14 @@ def _content(model: TermsModel) -> dict[str, Any]:
         raise ValueError(f"{name} cannot be imported again: define the class in a module.")
     missing, physics, f_p, names = [*model.objects], None, None, []
     transform: Any = getattr(model, "input_transform", None)
+    data: Any = model.data()
     if isinstance(transform, PhysicsInput):
         given: Any = transform.physics
         several = isinstance(given, JoinedPhysics)
         names = [*given.names] if several else [given.name]
         parts = zip(given.names, given.parts, strict=True) if several else [("", given)]
         physics = {name: import_path(part) for name, part in parts}
-        if None in physics.values():
-            missing.append("physics")
-        data: Any = model.data()
+        missing += ["physics"] * (None in physics.values())
         with torch.no_grad():
             f_p = transform.values(data["train_X"])
         if f_p.shape[-1] != model.num_outputs * len(physics):
@@ -88,17 +117,20 @@ def _content(model: TermsModel) -> dict[str, Any]:
         "physics": physics,
         "physics_names": names,
         "physics_values": f_p,
-        "data": model.data(),
+        "data": data,
         "names": [list(model.input_names), list(model.output_names)],
-        "state": model.state_dict(),
+        "was_fitted": getattr(model, "was_fitted", True),
+        "learnt": [name for name, p in model.named_parameters() if p.requires_grad],
+        "state": {name: v for name, v in model.state_dict().items() if "_prior." not in name},
     }
 
 
 def load(path: str | Path, **objects: Any) -> Any:
     """Load a model that :func:`save` wrote.
 
-    The classes of model and physics are imported by the names in the file, which runs the code of
-    their modules: open files that you trust only.
+    A physics that is not given is imported by its name in the file, which runs the code of its
+    module: open files that you trust only. The class is of this library, or of a module that you
+    have imported.
 
     Args:
         path: The file.
@@ -110,8 +142,9 @@ def load(path: str | Path, **objects: Any) -> Any:
         The model, an :class:`~gpadjust.models.TermsModel` or a :class:`~gpadjust.StackedGP`.
 
     Raises:
-        ValueError: If it is no such file, if objects are missing, or a physics cannot be imported
-            or is another than the model was built with.
+        ValueError: If it is no such file, or damaged; if objects are missing, or given though the
+            file holds them; if the module of the class was not imported; or if a physics cannot be
+            imported or is another than the model was built with.
     """
     try:
         content = torch.load(path, weights_only=True)
@@ -123,16 +156,95 @@ def load(path: str | Path, **objects: Any) -> Any:
         raise ValueError(
             f"{path} is not a model that this version of gpadjust saved; expected format {_FORMAT}."
         )
-    if "models" not in content:
-        return _model(path, content, objects)
-    models = {
-        name: _model(path, each, _own(each, objects)) for name, each in content["models"].items()
-    }
-    return StackedGP(models, content["weights"], content["num_components"])
+    try:
+        return _loaded(content, objects)
+    except PhysicsError:
+        raise
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    except Exception as error:
+        found = f"({type(error).__name__}: {error})"
+        raise ValueError(f"{path} is damaged, or what was given is wrong {found}.") from error
+
+
+def _loaded(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel | StackedGP:
+    """What a file holds, with what is given beside it."""
+    stacked = "models" in content
+    models = content["models"] if stacked else {"": content}
+    known = {name for each in models.values() for name in each["missing"]}
+    known |= {"physics"} if any(each["physics"] for each in models.values()) else set()
+    if objects.keys() - known:
+        raise ValueError(
+            f"it does not take {', '.join(sorted(objects.keys() - known))}, but only what the file "
+            f"could not hold: {', '.join(sorted(known)) or 'nothing'}."
+        )
+    built = {name: _model(each, objects) for name, each in models.items()}
+    if stacked:
+        return StackedGP(built, content["weights"], content["num_components"])
+    return built[""]
+
+
+def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
+    """The model of one structure."""
+    missing = [name for name in content["missing"] if name not in objects]
+    if missing:
+        given = ", ".join(f"{name}=..." for name in missing)
+        raise ValueError(
+            f"the file could not hold {' and '.join(missing)}: give what the model was built with, "
+            f"load(path, {given})."
+        )
+    module, _, name = content["class"].partition(":")
+    model_class = getattr(sys.modules.get(module), name, None)  # nothing is imported for it
+    if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
+        way = "has no such model" if module in sys.modules else "was not imported: do so first"
+        raise ValueError(f"it is of the class {content['class']}, but the module {module!r} {way}.")
+    own = _own(content, objects)
+    if content["physics"] is not None and "physics" not in own:
+        parts = {name: _named_physics(path) for name, path in content["physics"].items()}
+        own["physics"] = parts[""] if "" in parts else as_physics(parts)
+    model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
+    priors = {name: v for name, v in model.state_dict().items() if "_prior." in name}
+    model.load_state_dict(content["state"] | priors)
+    learnt = {*content["learnt"]}
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(name in learnt)
+    expected: Any = content["physics_values"]
+    if expected is not None:
+        with torch.no_grad():
+            found = model.input_transform.values(content["data"]["train_X"])
+        tiny = 1e-9 * expected.abs().amax(-2, keepdim=True)
+        if found.shape != expected.shape or bool(
+            ((found - expected).abs() > 1e-6 * expected.abs() + tiny).any()
+        ):
+            raise ValueError(
+                "it was saved with another physics: its values at the training inputs differ. "
+                "Give the one that the model was built with (of several, in the same order), with "
+                "the same priors of unknown parameters."
+            )
+    model.input_names, model.output_names = (tuple(names) for names in content["names"])
+    model.was_fitted = content["was_fitted"]
+    return model.eval()
+
+
+def _named_physics(path: str) -> Physics:
+    """The physics of a file by its import path, not called yet; none is of Python itself."""
+    physics = None if _is_of_python(path) else physics_from_path(path)
+    owner = getattr(getattr(physics, "function", None), "__module__", None)
+    if physics is None or _is_of_python(owner or ""):
+        raise ValueError(
+            f"it names {path} as its physics, a function of Python itself; give the physics, "
+            "load(path, physics=...), if you trust the file."
+        )
+    return physics
+
+
+def _is_of_python(path: str) -> bool:
+    """Whether an import path begins in Python's standard library."""
+    return path.partition(":")[0].partition(".")[0] in sys.stdlib_module_names
 
 
 def _own(content: dict[str, Any], objects: dict[str, Any]) -> dict[str, Any]:
-    """Those of the objects that a model of a mixture is built with."""
+    """Those of the objects that a model is built with."""
     own = {name: each for name, each in objects.items() if name in content["missing"]}
     if "physics" not in objects or content["physics"] is None:
         return own
@@ -140,35 +252,3 @@ def _own(content: dict[str, Any], objects: dict[str, Any]) -> dict[str, Any]:
     if isinstance(physics, JoinedPhysics) and len(names) == 1 and names[0] in physics.names:
         return {**own, "physics": physics.parts[physics.names.index(names[0])]}
     return {**own, "physics": physics}
-
-
-def _model(path: str | Path, content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
-    """The model of one structure that a file holds."""
-    missing = [name for name in content["missing"] if name not in objects]
-    if missing:
-        given = ", ".join(f"{name}=..." for name in missing)
-        raise ValueError(
-            f"{path} could not hold {' and '.join(missing)}: give what the model was built with, "
-            f"load(path, {given})."
-        )
-    module, _, name = content["class"].partition(":")
-    model_class = getattr(import_module(module), name, None)
-    if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
-        raise ValueError(f"{path} is of {content['class']}, which is no model of gpadjust.")
-    if content["physics"] is not None and "physics" not in objects:
-        parts = {name: physics_from_path(path) for name, path in content["physics"].items()}
-        objects["physics"] = parts[""] if "" in parts else as_physics(parts)
-    model: TermsModel = model_class(**content["data"], **{**content["options"], **objects})
-    model.load_state_dict(content["state"])
-    expected: Any = content["physics_values"]
-    if expected is not None:
-        with torch.no_grad():
-            found = model.input_transform.values(content["data"]["train_X"])
-        if found.shape != expected.shape or not torch.allclose(found, expected, rtol=1e-6):
-            raise ValueError(
-                f"{path} was saved with another physics: its values at the training inputs differ. "
-                "Give the one that the model was built with (of several, in the same order), with "
-                "the same priors of unknown parameters."
-            )
-    model.input_names, model.output_names = (tuple(names) for names in content["names"])
-    return model.eval()

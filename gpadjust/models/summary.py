@@ -8,9 +8,8 @@ import torch
 from botorch.models.transforms.input import Normalize
 from torch import Tensor
 
-from gpadjust.gp import AppendedPhysics, PhysicsInput, Term
-from gpadjust.gp.gaussian import negative_log_likelihood, noise_variances
-from gpadjust.models.hyperparameters import KINDS, is_rho, kind_of, typical_sizes
+from gpadjust.gp import AppendedPhysics, PhysicsInput, Unit
+from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
 _ROUNDING = 1e-12  # of a term's unit
 _NEAR = 1.01  # times a bound is at the bound
@@ -41,35 +40,27 @@ def summary(model: Any) -> str:
     return "\n".join(lines)
 
 
-def log_likelihood(model: Any) -> Tensor:
-    """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
-    strategy, scale = model.strategy(), model._units()[1].squeeze(-1)
-    residual = model.train_targets - strategy.train_prior_dist.mean
-    value = negative_log_likelihood(residual, strategy.noisy_covariance(model.covar_module)).value
-    return -value - (~residual.isnan()).sum(-1) * scale.log()
-
-
 def _lines(model: Any) -> list[str]:
     """What there is to say of one output."""
-    scale, sizes = model._units()[1].squeeze(-1), typical_sizes(model)
-    evidence, value = model._evidence()
+    scale, rows = model.units()[1].squeeze(-1), hyperparameters(model)
+    evidence, value = model.log_evidence()
     lines = [f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
-    for i, term in enumerate(model.terms):
-        variance = term.variance()
+    for term in model.terms:
+        variance = None if term.form is None else term.form.variance()
         if variance is not None and (variance < _ROUNDING**2).all():
             lines.append(f"  {term.name}: none")
             continue
-        unit = torch.ones_like(scale) if is_rho(term.basis) else scale
-        mean = model.term_mean(term.name) if hasattr(model, "term_mean") else 0.0
+        unit = torch.ones_like(scale) if term.unit is Unit.NONE else scale
+        mean = model.term_mean(term.name)
         mean = mean if abs(mean) > _ROUNDING * float(unit.flatten()[0]) else 0.0
         lines.append(f"  {term.name}: {'learnt ' * term.learns_mean}mean {mean:.4g}")
         if isinstance(term.basis, AppendedPhysics) and term.basis.learns_center:
             lines.append(f"    centre {_text(term.basis.origin)}")
-        lines += _of_term(model, term, f"covar_module.terms.{i}.kernel", unit, sizes)
-    name = "likelihood.noise_covar.raw_noise"
-    noise = noise_variances(model.likelihood, model.train_inputs[0]).mean(-1)
-    sd = _text(noise.sqrt() * scale)
-    return [*lines, f"  noise: sd {sd}{_at_bound(noise, 'noise', sizes.get(name))}"]
+        own = set() if term.kernel is None else {*map(id, term.kernel.parameters())}
+        lines += _of_kernel(model, [row for row in rows if id(row.raw) in own], unit)
+    noise = model.noise.at(model.train_inputs[0]).mean(-1)
+    at = [_at_bound(noise, row.limits()) for row in rows if row.kind == "noise"]
+    return [*lines, f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}"]
 
 
 def _of_physics(model: Any) -> list[str]:
@@ -86,50 +77,46 @@ def _of_physics(model: Any) -> list[str]:
     return lines
 
 
-def _of_term(
-    model: Any, term: Term, path: str, unit: Tensor, sizes: dict[str, Tensor]
-) -> list[str]:
+def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str]:
     """A line for each hyper-parameter of a term's kernel."""
     lines: list[str] = []
-    kernel: Any = term.kernel
-    for name, _ in [] if kernel is None else kernel.named_parameters():
-        module, _, leaf = name.rpartition(".")
-        kind, size = kind_of(leaf), sizes.get(f"{path}.{name}")
-        value: Tensor = getattr(kernel.get_submodule(module), kind)
-        if kind == "outputscale":
-            lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, kind, size)}")
-        elif kind == "lengthscale":
-            for j, (column, length) in enumerate(_columns(model, value.shape[-1])):
-                part = value[..., j]
-                at = _at_bound(part, kind, None if size is None else size[..., j])
-                lines.append(f"    lengthscale of {column}: {_text(part * length)}{at}")
+    for row in rows:
+        value = row.parameter(row.raw)
+        limits = row.limits() if row.is_log else []
+        if row.kind in ("outputscale", "scaling"):
+            lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, limits)}")
+        elif row.kind == "lengthscale":
+            for j, (column, length) in enumerate(_columns(model, value.shape[-1], row.owner)):
+                at = _at_bound(value[..., j], [limit[..., j] for limit in limits])
+                lines.append(f"    lengthscale{column}: {_text(value[..., j] * length)}{at}")
         else:
-            lines.append(f"    {kind} {_text(value)}")
+            lines.append(f"    {row.leaf.removeprefix('raw_')} {_text(value)}")
     return lines
 
 
-def _columns(model: Any, number: int) -> list[tuple[str, float]]:
-    """The names of a kernel's inputs, and what a length of one is in the user's units."""
+def _columns(model: Any, number: int, kernel: Any) -> list[tuple[str, float]]:
+    """What the lengthscales of a kernel are of, and what a length of one is in the user's units."""
     base: Any = getattr(model, "input_transform", None)
-    base = getattr(base, "base", base)
-    if number == len(model.input_names):
-        if isinstance(base, Normalize):
-            lengths = base.coefficient.flatten()[-number:].tolist()
-            return list(zip(model.input_names, lengths, strict=True))
-        if base is None:
-            return [(name, 1.0) for name in model.input_names]
-    if hasattr(base, "column_names"):
-        names = base.column_names(model.input_names)
-        if len(names) == number:
-            return [(name, 1.0) for name in names]
-    return [(f"transformed input {i + 1}", 1.0) for i in range(number)]
+    base, names = getattr(base, "base", base), model.input_names
+    lengths = [1.0] * len(names)
+    if isinstance(base, Normalize):
+        lengths = base.coefficient.flatten()[-len(names) :].tolist()
+    elif hasattr(base, "column_names"):
+        names = base.column_names(names)
+        lengths = [1.0] * len(names)
+    elif base is not None:
+        names = [f"transformed input {i + 1}" for i in range(number)]
+    read = [*range(len(names))] if kernel.active_dims is None else kernel.active_dims.tolist()
+    if number != len(read) or max(read) >= len(names):  # of all that it reads, or of a part of them
+        return [("" if number == 1 else f" {i + 1}", 1.0) for i in range(number)]
+    return [(f" of {names[i]}", lengths[i]) for i in read]
 
 
-def _at_bound(value: Tensor, kind: str, size: Tensor | None) -> str:
-    """A remark on a value at the bounds of a search."""
-    if size is None:
+def _at_bound(value: Tensor, limits: list[Tensor]) -> str:
+    """A remark on a value at the ends of a search, which are given by their logarithms."""
+    if not limits:
         return ""
-    low, high = (bound * size.flatten()[0] for bound in KINDS[kind].bounds)
+    low, high = (limit.flatten()[0].exp() for limit in limits)
     middle = value.flatten().median()
     if middle <= _NEAR * low:
         return " (at its lower bound)"

@@ -1,75 +1,76 @@
-"""What a model that is a sum of terms predicts, however it learnt it."""
+"""What a model that is a sum of terms says, whatever its data say of them."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
 from inspect import signature
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
-from botorch.acquisition.objective import PosteriorTransform
-from botorch.models.model import Model
-from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.utils.datasets import SupervisedDataset
-from gpytorch.likelihoods import FixedNoiseGaussianLikelihood
-from linear_operator import to_dense
+from gpytorch.settings import detach_test_caches
 from torch import Tensor
 from torch.nn import Module
 
-from gpadjust.gp import PhysicsInput, SumOfTerms, Term
-from gpadjust.gp.gaussian import noise_variances, threads_for
-from gpadjust.models.cholesky_strategy import Weights
-from gpadjust.models.posteriors import (
-    HyperparameterMixture,
-    ScaleFreePosterior,
-    mixture_interval,
-    mixture_moments,
-)
-from gpadjust.models.sampled_functions import SampledFunctions, draw_functions, mean_functions
-from gpadjust.models.summary import log_likelihood, summary, title
+from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
+from gpadjust.gp.noise import Noise
+from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.physics_parameters import PhysicsParameters
+from gpadjust.models.predictive_model import PredictiveModel, given_noise
+from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions, check_number
+from gpadjust.models.summary import summary, title
 from gpadjust.models.training_data import ArrayLike, check_columns, to_tensor
+from gpadjust.physics import Physics
 
 
-class Prediction(NamedTuple):
-    """Marginal predictions, as :meth:`~gpadjust.CKA.predict` returns them.
+class Conditioning(Protocol):
+    """What the data of a model say of its terms."""
 
-    Args:
-        mean: Posterior means, ``batch_shape x q x m``, in the units of the targets.
-        variance: Posterior variances, ``batch_shape x q x m``, in their square.
-    """
+    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Posterior means and variances of a weighted sum at each point, ``... x q``."""
+        ...
 
-    mean: Tensor
-    variance: Tensor
+    def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Posterior means ``... x q`` and covariances ``... x q x q`` of a weighted sum."""
+        ...
 
 
-class TermsModel(Model):
-    r"""A BoTorch model of a sum of terms, :math:`f(x) = \sum_t b_t(x) g_t(x)`: its predictions.
+class TermsModel(PredictiveModel):
+    r"""A model of a sum of terms, :math:`f(x) = \sum_t b_t(x) g_t(x)`, and of each of them.
 
-    All of them are those of a weighted sum of the terms, of which a ``strategy`` knows what the
-    data say (:class:`~gpadjust.models.cholesky_strategy.CholeskyStrategy`). It is the base of exact
-    models and of variational ones, beside BoTorch's own of each.
+    All predictions are those of a weighted sum of the terms, of which :meth:`conditioning` knows
+    what the data say. It is the base of exact models and of sparse ones, beside BoTorch's own of
+    each.
+
+    In an adjusted physics :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)` the terms that scale
+    a physics are the rhos; with a centre c, :math:`f_p - c` is what they scale, and :math:`\delta =
+    \delta_0 - \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`.
 
     Attributes:
         covar_module: The covariance of the sum, which holds the terms.
         num_samples: The number of samples of the hyper-parameters that :func:`~gpadjust.fit` drew,
             or None.
-        input_names: The names of the inputs.
-        output_names: The names of the outputs.
         train_targets: Targets in the model's units, ``batch_shape x (m) x n``; NaN where one is
             missing.
+        data_arguments: The names of the constructor's arguments that hold data, or are made of
+            them; :meth:`data` has them.
+        options: The other arguments that the model was built with, as far as a file can hold them.
+        objects: The names of those that it cannot hold.
+        not_sampled: Why hyper-parameters of the class cannot be sampled; empty if they can.
     """
 
+    not_sampled: ClassVar[str] = ""
+    data_arguments: ClassVar[tuple[str, ...]] = ("train_X", "train_Y", "train_Yvar")
     covar_module: SumOfTerms
-    num_samples: int | None = None
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
+    input_transform: Any
+    likelihood: Any
     train_inputs: Any
     train_targets: Tensor
-    likelihood: Any
-    strategy: Any
+    options: dict[str, Any]
+    objects: list[str]
     _num_outputs: int
     _aug_batch_shape: Any
 
@@ -78,15 +79,29 @@ class TermsModel(Model):
         model = super().__new__(cls)
         names = [*signature(cls.__init__).parameters][1:]
         every = {**dict(zip(names, args, strict=False)), **options}
-        every = {n: v for n, v in every.items() if not n.startswith(("train_", "low_", "physics"))}
+        if callable(variances := every.get("train_Yvar")) and not isinstance(variances, Tensor):
+            raise TypeError("Got a function as train_Yvar: did you mean physics=...?")
+        every = {n: v for n, v in every.items() if n not in (*cls.data_arguments, "physics")}
         # Others than plain values are told by name alone, or they would have to pickle.
-        model.__dict__["options"] = {n: v for n, v in every.items() if _is_plain(v)}
-        model.__dict__["objects"] = [n for n, v in every.items() if not _is_plain(v)]
+        model.options = {n: v for n, v in every.items() if _is_plain(v)}
+        model.objects = [n for n, v in every.items() if not _is_plain(v)]
         return model
 
     def __repr__(self) -> str:
         """One line; :meth:`summary` says more."""
         return title(self)
+
+    def conditioning(self) -> Any:
+        """What the data say of the terms, a :class:`Conditioning`; made if it is not there."""
+        raise NotImplementedError
+
+    def data(self) -> dict[str, Tensor | None]:
+        """The data that the model could be built on: raw inputs, targets and known variances."""
+        raise NotImplementedError
+
+    def log_evidence(self) -> tuple[str, Tensor | None]:
+        """What says how well the model explains its data, and how much it is, ``... x (m)``."""
+        raise NotImplementedError
 
     def summary(self) -> str:
         """What the model has learnt, as a text in the user's units.
@@ -98,9 +113,10 @@ class TermsModel(Model):
         """
         return summary(self)
 
-    def _evidence(self) -> tuple[str, Tensor | None]:
-        """What says how well the model explains its data, and how much it is, ``... x (m)``."""
-        return "log likelihood", log_likelihood(self)
+    @property
+    def noise(self) -> Noise:
+        """The noise of observations."""
+        return Noise(self.likelihood)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -109,46 +125,84 @@ class TermsModel(Model):
         return terms
 
     @property
+    def term_names(self) -> tuple[str, ...]:
+        """The names of the terms that are unknown, for :meth:`term`."""
+        return tuple(term.name for term in self.terms if not term.is_known)
+
+    @property
+    def rho_names(self) -> tuple[str, ...]:
+        """The names of the terms that scale a physics, one for each physics."""
+        return tuple(t.name for t in self.terms if t.unit is Unit.NONE)
+
+    @property
+    def other_names(self) -> tuple[str, ...]:
+        """The names of the other terms: delta, and those of a structure of your own."""
+        return tuple(t.name for t in self.terms if t.unit is not Unit.NONE)
+
+    @property
+    def has_centre(self) -> bool:
+        """Whether a centre is taken from f_p, so that delta is not independent of rho a priori."""
+        return bool(self._centred())
+
+    @property
+    def physics(self) -> Physics:
+        """The physics f_p; of several, all of them side by side."""
+        physics: Physics = self.input_transform.physics
+        return physics
+
+    @property
     def has_unknowns(self) -> bool:
         """Whether its physics has unknown parameters."""
         transform = getattr(self, "input_transform", None)
         return isinstance(transform, PhysicsInput) and bool(transform.physics.unknowns)
 
     @property
-    def term_names(self) -> tuple[str, ...]:
-        """The names of the terms that are unknown, for :meth:`term`."""
-        return tuple(term.name for term in self.terms if not term.is_known)
+    def physics_parameters(self) -> PhysicsParameters:
+        """What the model knows of the unknown parameters of the physics.
 
-    def posterior(
-        self,
-        X: ArrayLike,
-        output_indices: list[int] | None = None,
-        observation_noise: bool | Tensor = False,
-        posterior_transform: PosteriorTransform | None = None,
-    ) -> Posterior:
-        """The joint posterior at raw ``X`` (``batch_shape x q x d``); see BoTorch.
-
-        Variances that are given as ``observation_noise`` are in the square of the user's units.
+        Raises:
+            ValueError: If the physics has none.
         """
-        if output_indices is not None and list(output_indices) != list(range(self.num_outputs)):
-            subset = self.subset_output(list(output_indices))
-            return subset.posterior(X, None, observation_noise, posterior_transform)
-        inputs = self.model_inputs(X)
-        mean, covariance = self._joint(inputs, self._bases(inputs))
-        noise = self._noise(inputs, observation_noise)
-        if noise is not None:
-            covariance = covariance + torch.diag_embed(noise.expand(mean.shape))
-        posterior = self._as_posterior(mean, covariance, *self._units())
-        if posterior_transform is None:
-            return posterior
-        return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))
+        return PhysicsParameters.of(self.input_transform if self.has_unknowns else None)
 
-    def term(self, name: str, X: ArrayLike) -> Posterior:
-        """The posterior of a term's Gaussian process; its basis is not evaluated.
+    def rho(self, X: ArrayLike, physics: str | int | None = None, mixed: bool = True) -> Posterior:
+        r"""The posterior of the scaling :math:`\rho` at ``X``, ``q x m``; f_p is not evaluated.
+
+        After the default fit rho and delta apart are far less certain than their sum: observations
+        are of the sum alone, and how much of it is rho's depends on centre and sizes, which few
+        data tell.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            physics: Which of several physics, by its name or number.
+            mixed: As in :meth:`term`.
+
+        Returns:
+            A posterior over ``batch_shape x q x m``, without units.
+
+        Raises:
+            ValueError: If the model has no such rho.
+        """
+        return self.term(self.rho_name(physics), X, mixed)
+
+    def delta(self, X: ArrayLike, mixed: bool = True) -> Posterior:
+        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`.
+
+        Like rho it is far less certain than their sum.
+        """
+        return self.term("delta", X, mixed)
+
+    def term(self, name: str, X: ArrayLike, mixed: bool = True) -> Posterior:
+        """The posterior of a term's Gaussian process, ``q x m``; its basis is not evaluated.
+
+        It has no graph unless ``X`` asks for one.
 
         Args:
             name: One of ``term_names``.
             X: Raw inputs, ``batch_shape x q x d``.
+            mixed: Of a model that holds ``S`` samples of its hyper-parameters: whether moments and
+                draws are those of the mixture, ``... x q x m``; else they are those of each sample,
+                ``... x S x q x m``, as :meth:`posterior` has them for BoTorch.
 
         Returns:
             A posterior over ``batch_shape x q x m``: of a rho without units, else in those of the
@@ -157,119 +211,97 @@ class TermsModel(Model):
         Raises:
             ValueError: If there is no such term.
         """
-        weights, inputs = self._term_weights(name), self.model_inputs(X, with_basis=False)
-        return self._as_posterior(*self._joint(inputs, weights), *self._term_units(name))
+        term = self._unknown_term(name)
+        with self._graph_for(X):
+            inputs = self.model_inputs(X, with_basis=False)
+            mean, covariance = self.conditioning().joint(self._at(term, inputs))
+            shift, scale = self.units(term.unit)
+            covariance = covariance * scale.square().unsqueeze(-1)
+            return self.as_posterior(mean * scale + shift, covariance, mixed)
 
-    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
-        """Predict each point by itself, without the covariances between them.
+    def rho_name(self, physics: str | int | None = None) -> str:
+        """The name of the term that scales a physics, which is given by name or number."""
+        names = self.rho_names
+        if not names:
+            raise ValueError(f"{type(self).__name__} has no rho, as it has no physics.")
+        short = [name.removeprefix("rho_") for name in names]
+        if physics is None and len(names) == 1:
+            return names[0]
+        if isinstance(physics, int) and -len(names) <= physics < len(names):
+            return names[physics]
+        if physics in (*names, *short):
+            return names[(*names, *short).index(physics) % len(names)]
+        raise ValueError(
+            f"Expected physics to be one of {', '.join(short)}, or a number from 0 to "
+            f"{len(names) - 1}, got {physics!r}."
+        )
 
-        The mean and variance of ``posterior(X)``, from factors of the training covariance that are
-        kept until the model is trained or given other data: much faster for many points, with
-        memory linear in their number. Differentiable in ``X`` as far as f_p is. Of a model that
-        holds samples of its hyper-parameters, the mean and variance of the mixture.
+    def term_mean(self, name: str, output: int = 0) -> float:
+        """The prior mean of a term, to which it falls back far from the data.
+
+        Of a model that holds samples of its hyper-parameters, or a batch, that of the first.
+        """
+        (term,) = (t for t in self.terms if t.name == name)
+        shift, scale = self.units(term.unit)
+        mean = self._at(term, self.train_inputs[0][..., :1, :]).mean()
+        return float((mean * scale + shift).reshape(-1, self.num_outputs)[0, output])
+
+    def fallback(self, X: ArrayLike) -> Tensor:
+        """What the model says where there are no data: its prior mean, such as f_p itself.
+
+        Weights of the physics that are unknown (``rho_mean="learn"``) are those it began with, 1,
+        or least squares of several; after a point fit they are its estimates.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
-            observation_noise: Whether to predict observations instead of the function; or their
-                noise variances, ``batch_shape x q x m``, in the square of the user's units.
 
         Returns:
-            The mean and the variance, ``batch_shape x q x m`` each, in the user's units.
-
-        Raises:
-            TypeError: If ``X`` is not float64.
-            ValueError: If ``X`` has not the columns that the model was built on.
-            PhysicsError: If the physics fails at ``X``.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust import CKA
-            >>> train_X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-            >>> model = CKA(train_X, train_X.sin(), physics=lambda X: X)
-            >>> mean, variance = model.predict(torch.rand(1000, 1, dtype=torch.float64))
-            >>> mean.shape
-            torch.Size([1000, 1])
+            ``batch_shape x q x m``, in the units of the targets.
         """
-        mean, variance = self.components(X, observation_noise)
-        if self.num_samples is None:
-            return Prediction(mean.squeeze(MCMC_DIM), variance.squeeze(MCMC_DIM))
-        return Prediction(*mixture_moments(mean, variance))
+        inputs = self.model_inputs(X)
+        shift, scale = self.units()
+        # The same for all samples of hyper-parameters but for rounding.
+        values = self.outputs_last(self.at(inputs).mean() * scale + shift)
+        return values if self.num_samples is None else values.mean(MCMC_DIM)
 
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances for each sample of the hyper-parameters, ``... x S x q x m``."""
-        inputs = self.model_inputs(X)
-        with threads_for(self.train_targets.shape[-1]):
-            mean, variance = self._marginals(inputs, self._bases(inputs))
-        noise = self._noise(inputs, observation_noise)
-        variance = variance if noise is None else variance + noise
-        # Fantasies share their variances.
-        mean, variance = torch.broadcast_tensors(mean, variance)
-        shift, scale = self._units()
-        mean, variance = (
-            self._outputs_last(each) for each in (mean * scale + shift, variance * scale.square())
-        )
+        with self._graph_for(X):
+            inputs = self.model_inputs(X)
+            mean, variance = self.conditioning().marginals(self.at(inputs))
+            shift, scale = self.units()
+            mean, variance = mean * scale + shift, variance * scale.square()
+            noise = self._noise(inputs, observation_noise)
+            if noise is not None:  # given variances are in the user's units
+                unit = scale.square() if observation_noise is True else 1.0
+                variance = variance + noise * unit
+            # Fantasies share their variances.
+            mean, variance = (
+                self.outputs_last(each) for each in torch.broadcast_tensors(mean, variance)
+            )
         if self.num_samples is None:
             mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
         return mean, variance
 
-    def _outputs_last(self, values: Tensor) -> Tensor:
-        """From ``... x (m) x q`` to ``... x q x m``."""
-        return values.mT if self._num_outputs > 1 else values.unsqueeze(-1)
-
-    def _outputs_first(self, values: Tensor) -> Tensor:
-        """From ``... x q x m`` to ``... x (m) x q``."""
-        return values.mT if self._num_outputs > 1 else values.squeeze(-1)
-
-    def interval(
-        self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
+    def joint_moments(
+        self, X: ArrayLike, observation_noise: bool | Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The central interval at each point by itself.
+        """Means ``... x (S) x (m) x q`` and covariances ``... x (S) x (m) x q x q``."""
+        inputs = self.model_inputs(X)
+        mean, covariance = self.conditioning().joint(self.at(inputs))
+        noise = self._noise(inputs, observation_noise)
+        if noise is not None:
+            covariance = covariance + torch.diag_embed(noise.expand(mean.shape))
+        shift, scale = self.units()
+        return mean * scale + shift, covariance * scale.square().unsqueeze(-1)
 
-        Args:
-            X: Raw inputs, ``batch_shape x q x d``.
-            level: The probability that it holds, between 0 and 1.
-            observation_noise: As in :meth:`predict`.
-
-        Returns:
-            Lower and upper ends, ``batch_shape x q x m`` each, in the user's units.
-
-        Raises:
-            ValueError: If ``level`` is not between 0 and 1.
-        """
-        return mixture_interval(lambda: self.components(X, observation_noise), level)
-
-    def sample_functions(
-        self, num_functions: int, seed: int | None = None, num_features: int = 1024
-    ) -> Module:
-        """Draw functions from the posterior, to be called anywhere.
-
-        Of a model that holds samples of its hyper-parameters, the functions are spread over these.
-
-        Args:
-            num_functions: Number ``k`` of functions.
-            seed: Seed of the draw. Default: go on with PyTorch's generator.
-            num_features: Number of random features that stand for each kernel, an even one. The
-                more, the nearer is the functions' spread to the posterior's standard deviation;
-                the time of a call is linear in it.
-
-        Returns:
-            A module that maps raw ``... x q x d`` to ``k x ... x q x m`` in the user's units.
-            Later fits of the model leave it as it is.
-
-        Raises:
-            ValueError: If a number is not a positive whole one.
-            NotImplementedError: If BoTorch knows no features of a kernel of yours.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust import CKA
-            >>> train_X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-            >>> model = CKA(train_X, train_X.sin(), physics=lambda X: X)
-            >>> functions = model.sample_functions(3, seed=0)
-            >>> functions(torch.rand(5, 1, dtype=torch.float64)).shape
-            torch.Size([3, 5, 1])
-        """
-        return draw_functions(self, num_functions, seed, num_features)
+    def draw_functions(self, num_functions: int, num_features: int) -> Module:
+        """The functions of :meth:`sample_functions`, spread over samples of hyper-parameters."""
+        if self.num_samples is None:
+            return self._functions_of_batches(num_functions, num_features)
+        order = torch.randperm(self.num_samples)
+        each = take_samples(self, order[torch.arange(num_functions) % self.num_samples])
+        return FunctionPerBatch(each._functions_of_batches(1, num_features))
 
     def mean_functions(self, most: int | None = None) -> Module:
         """The posterior mean, as a function to be called anywhere: faster than ``predict``.
@@ -286,15 +318,26 @@ class TermsModel(Model):
         Raises:
             ValueError: If ``most`` is no whole number of at least 1.
         """
-        return mean_functions(self, most)
+        if most is not None:
+            check_number(most, "most")
+        self.eval()
+        if self.num_samples is None:
+            return self._mean_functions_of_batches()
+        taken = self.num_samples if most is None else min(most, self.num_samples)
+        each = take_samples(self, torch.arange(taken) * self.num_samples // taken)
+        return FunctionPerBatch(each._mean_functions_of_batches())
 
-    def _mean_functions(self) -> Module:
-        """The functions of :meth:`mean_functions`, for each batch of the model."""
+    def _functions_of_batches(self, num_functions: int, num_features: int) -> SampledFunctions:
+        """Functions drawn for each batch of the model."""
+        return SampledFunctions.by_matheron(self, num_functions, num_features)
+
+    def _mean_functions_of_batches(self) -> SampledFunctions:
+        """The posterior mean of each batch of the model."""
         return SampledFunctions.mean(self)
 
-    def _draw_functions(self, num_functions: int, num_features: int) -> Module:
-        """The functions of :meth:`sample_functions`, for each batch of the model."""
-        return SampledFunctions.by_matheron(self, num_functions, num_features)
+    def at(self, inputs: Tensor) -> WeightedSum:
+        """The function itself at transformed inputs, ``... x n x (d + k)``."""
+        return self.covar_module.at(inputs)
 
     def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
         """What the terms read, ``... x (S) x (1) x q x (d + k)``, of raw ``X``, ``... x q x d``.
@@ -312,7 +355,11 @@ class TermsModel(Model):
             )
         X = X if self.num_samples is None else X.unsqueeze(MCMC_DIM)
         X = X.unsqueeze(-3) if self._num_outputs > 1 else X
-        inputs = self.transform_inputs(X) if with_basis else self._inputs_without_basis(X)
+        transform = getattr(self, "input_transform", None)
+        if isinstance(transform, PhysicsInput) and not with_basis:
+            inputs = transform.without_physics(X)
+        else:
+            inputs = self.transform_inputs(X)
         if inputs.shape[-1] != self.train_inputs[0].shape[-1]:
             raise ValueError(
                 f"Expected X with the {len(self.input_names)} columns that the model was built on, "
@@ -330,114 +377,75 @@ class TermsModel(Model):
                 "`model(model.transform_inputs(X))`."
             )
 
-    def _inputs_without_basis(self, X: Tensor) -> Tensor:
-        return self.transform_inputs(X)
+    def observation_noise(self, inputs: Tensor) -> Tensor:
+        """The noise variances of observations at transformed inputs, ``... x (m) x q`` or 1.
 
-    def _term_weights(self, name: str, or_known: bool = False) -> Weights:
-        """A user's term as a weighted sum of the model's; of an unknown one if not said."""
-        found = [t for t in self.terms if t.name == name and (or_known or not t.is_known)]
+        Of a model with known noise, the mean of that of its observations.
+        """
+        if self.noise.is_known:
+            return self.noise.typical(self.measured())
+        return self.noise.at(inputs)
+
+    def measured(self) -> Tensor:
+        """Which training targets are measurements of the function, ``... x (m) x n`` booleans."""
+        return ~self.train_targets.isnan()
+
+    def units(self, unit: Unit = Unit.TARGET) -> tuple[Tensor, Tensor]:
+        """Shift and scale from the model's units to the user's, ``... x (m) x 1``."""
+        transform = getattr(self, "outcome_transform", None)
+        if transform is None:
+            zero = self.train_inputs[0].new_zeros(*self._aug_batch_shape, 1)
+            return zero, torch.ones_like(zero)
+        shift, scale = self.outputs_first(transform.means), self.outputs_first(transform.stdvs)
+        shift = shift if unit is Unit.TARGET else torch.zeros_like(shift)
+        return shift, torch.ones_like(scale) if unit is Unit.NONE else scale
+
+    def outputs_last(self, values: Tensor) -> Tensor:
+        """From ``... x (m) x q`` to ``... x q x m``."""
+        return values.mT if self._num_outputs > 1 else values.unsqueeze(-1)
+
+    def outputs_first(self, values: Tensor) -> Tensor:
+        """From ``... x q x m`` to ``... x (m) x q``."""
+        return values.mT if self._num_outputs > 1 else values.squeeze(-1)
+
+    def _unknown_term(self, name: str) -> Term:
+        found = [term for term in self.terms if term.name == name and not term.is_known]
         if not found:
             raise ValueError(
                 f"{type(self).__name__} has no unknown term {name!r}; it has "
                 f"{', '.join(map(repr, self.term_names))}."
             )
-        return [(found[0], None)]
+        return found[0]
 
-    def _term_units(self, name: str) -> tuple[Tensor, Tensor]:
-        """Shift and scale from the model's units of a term to the user's."""
-        shift, scale = self._units()
-        return torch.zeros_like(shift), scale
+    def _at(self, term: Term, inputs: Tensor) -> WeightedSum:
+        """A term in the user's meaning at transformed inputs: a bias has no centres beside it."""
+        parts: list[tuple[Term, Tensor | None]] = [(term, None)]
+        shift: Tensor | float = 0.0
+        for other in self._centred() if term.unit is Unit.TARGET else ():
+            parts.append((other, -other.basis.origin / other.basis.scale))
+            shift = shift + other.basis.moved_mean
+        return WeightedSum(inputs, parts, shift)
 
-    def _bases(self, inputs: Tensor) -> Weights:
-        """The function itself as a weighted sum of the terms."""
-        return [(term, term.weights(inputs)) for term in self.terms]
-
-    def _joint(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
-        """Mean ``... x (m) x q`` and covariance of a weighted sum of terms, in model units."""
-        q = inputs.shape[-2]
-        strategy, prior = self.strategy(), inputs.new_zeros(q, q)
-        for term, weight in weights:
-            if not term.is_known:
-                part = term.covariance(inputs, inputs)
-                if weight is not None:
-                    part = part * weight.unsqueeze(-1) * weight.unsqueeze(-2)
-                prior = prior + part
-        cross = strategy.cross_covariance(inputs, weights)
-        mean = strategy.exact_predictive_mean(self._prior_mean(inputs, weights), cross)
-        covariance = to_dense(strategy.exact_predictive_covar(prior, cross))
-        return mean, covariance.expand(*mean.shape, mean.shape[-1])
-
-    def _marginals(self, inputs: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
-        """As :meth:`_joint`, with the variances only."""
-        return self.strategy().marginals(inputs, weights, self._prior_mean(inputs, weights))
-
-    @staticmethod
-    def _prior_mean(inputs: Tensor, weights: Weights) -> Tensor:
-        """The prior mean of a weighted sum of terms, ``... x (m) x q``."""
-        parts = [
-            term.mean if weight is None else weight * term.mean + term.moved_mean
-            for term, weight in weights
-        ]
-        total: Tensor = sum(parts, torch.zeros_like(inputs[..., 0]))
-        return total
-
-    def observation_noise(self, inputs: Tensor) -> Tensor:
-        """The noise variances of observations at transformed inputs, ``... x (m) x q`` or 1."""
-        if isinstance(self.likelihood, FixedNoiseGaussianLikelihood):
-            return self._typical_noise()
-        return noise_variances(self.likelihood, inputs)
+    def _centred(self) -> list[Term]:
+        """The terms from whose physics a centre is taken."""
+        scaled = [term for term in self.terms if isinstance(term.basis, AppendedPhysics)]
+        return [t for t in scaled if t.basis.learns_center or t.basis.offset.any()]
 
     def _noise(self, inputs: Tensor, observation_noise: bool | Tensor) -> Tensor | None:
-        """Noise variances ``... x (m) x q`` of observations, in model units, or None for none."""
+        """Noise variances ``... x (m) x q``, as given or in model units; None for none."""
         if observation_noise is False:
             return None
-        if isinstance(observation_noise, Tensor):
-            given = observation_noise
-            given = given if self.num_samples is None else given.unsqueeze(MCMC_DIM)
-            expected = (inputs.shape[-2], self.num_outputs)
-            if given.dim() < 2 or any(
-                have not in (1, want) for have, want in zip(given.shape[-2:], expected, strict=True)
-            ):
-                raise ValueError(
-                    "Expected observation_noise as True, False, or variances of shape ... x "
-                    f"{expected[0]} x {expected[1]}, got shape {tuple(observation_noise.shape)}."
-                )
-            given = self._outputs_first(given)
-            # In the user's units; those that BoTorch makes fantasies with are in the model's.
-            return given if fantasize_flag.on() else given / self._units()[1].square()
-        if observation_noise is not True:
-            raise TypeError(
-                "Expected observation_noise as True, False, or a tensor of variances, got "
-                f"{observation_noise!r}; known noise belongs to the model (train_Yvar)."
-            )
-        return self.observation_noise(inputs)
+        if observation_noise is True:
+            return self.observation_noise(inputs)
+        given = given_noise(observation_noise, inputs.shape[-2], self.num_outputs)
+        given = given if self.num_samples is None else given.unsqueeze(MCMC_DIM)
+        return self.outputs_first(given)
 
-    def _typical_noise(self) -> Tensor:
-        """The mean of the known noise of the observations, ``... x (m) x 1``."""
-        observed = ~self.train_targets.isnan()
-        noise = self.likelihood.noise * observed
-        return noise.sum(-1, keepdim=True) / observed.sum(-1, keepdim=True)
-
-    def _units(self) -> tuple[Tensor, Tensor]:
-        """Shift and scale from model units to the user's, ``... x (m) x 1``."""
-        transform = getattr(self, "outcome_transform", None)
-        if transform is None:
-            zero = self.train_targets.new_zeros(*self._aug_batch_shape, 1)
-            return zero, torch.ones_like(zero)
-        return self._outputs_first(transform.means), self._outputs_first(transform.stdvs)
-
-    def _as_posterior(
-        self, mean: Tensor, covariance: Tensor, shift: Tensor, scale: Tensor
-    ) -> Posterior:
-        """The posterior of independent outputs in the user's units."""
-        mean, covariance = mean * scale + shift, covariance * scale.square().unsqueeze(-1)
-        posterior = ScaleFreePosterior.of_outputs(mean, covariance, self._num_outputs > 1)
-        return posterior if self.num_samples is None else HyperparameterMixture(posterior)
-
-    @property
-    def num_mcmc_samples(self) -> int | None:
-        """``num_samples``, under BoTorch's name."""
-        return self.num_samples
+    def _graph_for(self, X: ArrayLike) -> torch.set_grad_enabled:
+        """Make a graph only where inputs ask for one."""
+        asks = isinstance(X, Tensor) and X.requires_grad
+        asks = asks or self.train_inputs[0].requires_grad or detach_test_caches.off()
+        return torch.set_grad_enabled(torch.is_grad_enabled() and asks)
 
     @classmethod
     def construct_inputs(cls, training_data: SupervisedDataset, **options: Any) -> dict[str, Any]:
@@ -448,11 +456,11 @@ class TermsModel(Model):
             options: Further arguments of the model: the physics and all others.
 
         Raises:
-            ValueError: If Ax calls this with a physics, without :mod:`gpadjust.ax`, which tells a
-                physics what Ax did to inputs and targets.
+            ValueError: With a physics where Ax is loaded and :mod:`gpadjust.ax` is not, which tells
+                a physics what Ax does to inputs and targets.
         """
-        caller = sys._getframe(1).f_globals.get("__name__", "")
-        if caller.startswith("ax.") and options.get("physics") is not None:
+        loaded = "ax" in sys.modules and "gpadjust.ax" not in sys.modules
+        if loaded and options.get("physics") is not None:
             raise ValueError(
                 "Ax transforms parameters and metrics before a model sees them, so that this "
                 "physics would be asked in other units than its own. Import gpadjust.ax, and make "

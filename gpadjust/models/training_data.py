@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import date, time, timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,17 @@ from torch import Tensor
 
 ArrayLike = Any
 """A float64 tensor, or a NumPy array or pandas DataFrame of numbers."""
+
+# What NumPy would turn into numbers: its kinds of arrays, types of objects, and the way out.
+_NO_NUMBERS: dict[str, tuple[str, tuple[type, ...], str]] = {
+    "text": ("SU", (str, bytes), "convert numbers in text with `.astype(float)`, drop other text"),
+    "complex numbers": ("c", (complex, np.complexfloating), "give both parts, or take `.real`"),
+    "dates or times": (
+        "mM",
+        (date, time, timedelta, np.datetime64, np.timedelta64),
+        "convert them to seconds since the first with `(t - t.min()) / np.timedelta64(1, 's')`",
+    ),
+}
 
 
 class TrainingData(NamedTuple):
@@ -49,69 +61,104 @@ def training_data(
         TypeError: If one of them is neither a float64 tensor nor an array or frame of numbers.
         ValueError: If shapes disagree, there are fewer than 2 points, or values are not finite.
     """
-    input_names, output_names = column_names(train_X), column_names(train_Y)
-    X, Y = to_tensor(train_X, f"{prefix}_X"), to_tensor(train_Y, f"{prefix}_Y")
-    for name, tensor in ((f"{prefix}_X", X), (f"{prefix}_Y", Y)):
+    name_X, name_Y = f"{prefix}_X", f"{prefix}_Y"
+    X, Y = to_tensor(train_X, name_X), to_tensor(train_Y, name_Y)
+    for name, tensor in ((name_X, X), (name_Y, Y)):
         if tensor.dim() < 2:
             raise ValueError(
                 f"Expected {name} with at least 2 dimensions (points x columns), got shape "
                 f"{tuple(tensor.shape)}; add a column with `{name}.reshape(-1, 1)`."
             )
+    shapes = f"got {name_X} of shape {tuple(X.shape)} and {name_Y} of shape {tuple(Y.shape)}."
     if X.shape[:-1] != Y.shape[:-1]:
-        raise ValueError(
-            f"Expected {prefix}_X (batch_shape x n x d) and {prefix}_Y (batch_shape x n x m) to "
-            f"agree in all but the last dimension, got {tuple(X.shape)} and {tuple(Y.shape)}."
-        )
+        raise ValueError(f"Expected inputs and targets to agree in all but the last size, {shapes}")
     if X.shape[-1] < 1 or Y.shape[-1] < 1:
-        raise ValueError(
-            f"Expected at least one input column and one output column, got {prefix}_X of shape "
-            f"{tuple(X.shape)} and {prefix}_Y of shape {tuple(Y.shape)}."
-        )
+        raise ValueError(f"Expected at least one input column and one output column, {shapes}")
     if X.shape[-2] < 2:
         raise ValueError(
-            f"Expected at least 2 points in {prefix}_X, got {X.shape[-2]}: with fewer there "
-            "is nothing to learn a scale from. Use the physics alone until there are two."
+            f"Expected at least 2 points in {name_X}, got {X.shape[-2]}: with fewer there is "
+            "nothing to learn a scale from. Use the physics alone until there are two."
         )
-    check_finite(X, f"{prefix}_X")
-    check_observed(Y, f"{prefix}_Y")
+    check_finite(X, name_X)
+    check_observed(Y, name_Y)
     seldom = (~Y.isnan()).sum(-2) < 2
     if seldom.any():
-        where = sorted({int(index[-1]) for index in seldom.nonzero()})
         raise ValueError(
-            f"Expected at least 2 observations of each output, but {prefix}_Y has fewer in "
-            f"column(s) {where}; leave these out."
+            f"Expected at least 2 observations of each output, but {name_Y} has fewer in "
+            f"column(s) {_last(seldom)}; leave these out."
         )
     Yvar = None if train_Yvar is None else _variances(train_Yvar, Y, f"{prefix}_Yvar")
-    names = input_names or default_names("x", X.shape[-1])
-    return TrainingData(X, Y, Yvar, names, output_names or default_names("y", Y.shape[-1]))
+    names = column_names(train_X) or default_names("x", X.shape[-1])
+    return TrainingData(X, Y, Yvar, names, column_names(train_Y) or default_names("y", Y.shape[-1]))
+
+
+def new_observations(
+    X: ArrayLike, Y: ArrayLike, input_names: tuple[str, ...], num_outputs: int
+) -> tuple[Tensor, Tensor]:
+    """Further observations of a model as tensors ``... x k x d`` and ``... x k x m``, checked.
+
+    Raises:
+        TypeError: If one of them is not float64.
+        ValueError: If shapes disagree, ``X`` is not finite, or a row of ``Y`` holds nothing.
+    """
+    check_columns(X, input_names)
+    X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
+    check_finite(X, "X")
+    rows = X.dim() > 1 and Y.dim() > 1 and X.shape[-2] == Y.shape[-2]
+    if not rows or Y.shape[-1] != num_outputs:
+        raise ValueError(
+            f"Expected X of shape ... x k x {len(input_names)} and Y of shape ... x k x "
+            f"{num_outputs}, with a row for each point, got {tuple(X.shape)} and {tuple(Y.shape)}."
+        )
+    check_observed(Y, "Y")
+    return X, Y
 
 
 def to_tensor(values: ArrayLike, name: str) -> Tensor:
     """Take a float64 tensor as it is, and make one of a NumPy array or a DataFrame.
 
     Raises:
-        TypeError: If it is something else, or holds something else than numbers.
+        TypeError: If it is something else, or holds something else than real numbers: text (which
+            NumPy would read), complex numbers (cut to their real parts), dates or times
+            (nanoseconds).
+        ValueError: If values are masked.
     """
     if isinstance(values, Tensor):
+        if values.is_complex():
+            raise TypeError(_not_numbers(name, "complex numbers"))
         if values.dtype != torch.float64:
             raise TypeError(
                 f"Expected {name} in float64, got {values.dtype}: Cholesky factors of these "
                 f"kernels fail in lower precision. Convert it with `{name}.double()`."
             )
         return values
-    if isinstance(values, np.ndarray) or hasattr(values, "to_numpy"):
-        array = values if isinstance(values, np.ndarray) else values.to_numpy()
-        try:
-            return torch.as_tensor(np.array(array, dtype=np.float64))
-        except (TypeError, ValueError) as error:
-            raise TypeError(
-                f"Expected {name} to hold numbers only, but {error}. Select the numeric columns, "
-                "and encode or drop the others."
-            ) from error
-    raise TypeError(
-        f"Expected {name} to be a torch tensor, a NumPy array or a DataFrame, got "
-        f"{type(values).__name__}; convert it with `torch.tensor({name}, dtype=torch.float64)`."
-    )
+    array = values.to_numpy() if hasattr(values, "to_numpy") else values
+    if not isinstance(array, np.ndarray):
+        raise TypeError(
+            f"Expected {name} to be a torch tensor, a NumPy array or a DataFrame, got "
+            f"{type(values).__name__}; convert it with `torch.tensor({name}, dtype=torch.float64)`."
+        )
+    if np.ma.is_masked(array):
+        raise ValueError(
+            f"Expected {name} without masked values, found {np.ma.count_masked(array)}. Leave "
+            "their rows out; targets that were not measured are NaN, which "
+            f"`{name}.filled(np.nan)` makes them."
+        )
+    found = {type(each) for each in array.flat} if array.dtype.kind == "O" else set()
+    for what, (kinds, types, _) in _NO_NUMBERS.items():
+        if array.dtype.kind in kinds or any(issubclass(each, types) for each in found):
+            raise TypeError(_not_numbers(name, what))
+    try:
+        return torch.as_tensor(np.array(array, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"Expected {name} to hold numbers only, but {error}. Select the numeric columns, and "
+            "encode or drop the others."
+        ) from error
+
+
+def _not_numbers(name: str, found: str) -> str:
+    return f"Expected {name} to hold numbers only, found {found}: {_NO_NUMBERS[found][2]}."
 
 
 def column_names(values: ArrayLike) -> tuple[str, ...] | None:
@@ -143,46 +190,49 @@ def check_finite(tensor: Tensor, name: str) -> None:
 def check_observed(Y: Tensor, name: str) -> None:
     """As :func:`check_finite`, but NaN is a missing value; a row of them is an error."""
     _check_rows(Y.isinf().any(-1), name, "to be finite, found infinity")
-    nothing = Y.isnan().all(-1)
-    _check_rows(nothing, name, "to hold an observation in each row, found nothing but NaN")
+    expected = "to hold an observation in each row, found nothing but NaN"
+    _check_rows(Y.isnan().all(-1), name, expected)
 
 
 def check_noise(noise: object, Y: Tensor) -> None:
     """Raise an error unless ``noise`` holds variances of the new observations ``Y``."""
     expected = f"Expected noise as a float64 tensor of variances of Y's shape {tuple(Y.shape)}, got"
+    way = "of one variance, `torch.full_like(Y, variance)`"
     if not isinstance(noise, Tensor) or noise.dtype != torch.float64:
         found = f"a tensor in {noise.dtype}" if isinstance(noise, Tensor) else repr(noise)
-        raise TypeError(f"{expected} {found}; of one variance, `torch.full_like(Y, variance)`.")
+        raise TypeError(f"{expected} {found}; {way}.")
     if noise.shape[-2:] != Y.shape[-2:]:
-        raise ValueError(
-            f"{expected} shape {tuple(noise.shape)}; of one variance, `torch.full_like(Y, "
-            "variance)`."
-        )
+        raise ValueError(f"{expected} shape {tuple(noise.shape)}; {way}.")
     if (~(noise.isfinite() & (noise >= 0)) & ~Y.isnan()).any():
         raise ValueError("Expected noise (variances) to be finite and not negative.")
 
 
 def _check_rows(bad: Tensor, name: str, expected: str) -> None:
     if bad.any():
-        rows = sorted({int(index[-1]) for index in bad.nonzero()})
-        shown = ", ".join(str(row) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
+        rows = _last(bad)
+        shown = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
         raise ValueError(
             f"Expected {name} {expected} in {len(rows)} of {bad.shape[-1]} rows (row {shown}); "
             "remove these points."
         )
 
 
+def _last(marked: Tensor) -> list[int]:
+    """Where in the last dimension something is marked."""
+    return sorted({int(index[-1]) for index in marked.nonzero()})
+
+
 def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Tensor:
     """Known variances of the shape of ``Y``; their mean where there is no observation."""
     if isinstance(values, int | float | list | tuple):
-        values = torch.tensor(values, dtype=torch.float64)
+        values = torch.tensor(values, dtype=torch.float64, device=Y.device)
     given = to_tensor(values, name)
     if given.shape != Y.shape and given.shape not in ((), (1,), Y.shape[-1:]):
         raise ValueError(
             f"Expected {name} (known variances) as one number, {Y.shape[-1]} numbers (one for each "
             f"output), or of the targets' shape {tuple(Y.shape)}, got {tuple(given.shape)}."
         )
-    variances = given.expand(Y.shape).where(~Y.isnan(), torch.full_like(Y, torch.nan))
+    variances = given.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
     check_finite(variances, name)
     if (variances < 0).any():
@@ -205,12 +255,8 @@ def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
 
     BoTorch's default takes shift and scale from the targets. A model with physics wants the scale
     of the residual, so that a good physics does not push the noise under the likelihood's floor,
-    and no shift, so that :math:`\rho` keeps its meaning.
-
-    Args:
-        Y: Targets, ``batch_shape x n x m``.
-        mean: The prior mean at the training inputs, of the same shape. Where it meets the targets
-            but for rounding, the scale is a millionth of theirs (or 1 if they are zero).
+    and no shift, so that :math:`\rho` keeps its meaning. Where the prior mean meets the targets but
+    for rounding, the scale is a millionth of theirs (or 1 if they are zero).
     """
 
     def rms(values: Tensor) -> Tensor:
@@ -225,7 +271,7 @@ def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Stand
     """The user's outcome transform with shift and scale estimated from the targets.
 
     Raises:
-        ValueError: If it is not a shift and scale of each output.
+        ValueError: If it is not a shift and scale of each output, or of another number of them.
     """
     if transform is None:
         return None
@@ -237,5 +283,10 @@ def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Stand
             "log(y), say, take the logarithm of both train_Y and the physics."
         )
     transform.train()
-    transform(Y, X=X)
+    try:
+        transform(Y, X=X)
+    except RuntimeError as error:
+        raise ValueError(
+            f"The outcome transform does not fit train_Y of shape {tuple(Y.shape)}: {error}"
+        ) from error
     return transform.eval()

@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any, Literal, NoReturn, Self
+from functools import partial
+from typing import Any, Literal, NoReturn, Self, Unpack
 
 import torch
-from botorch.models.approximate_gp import ApproximateGPyTorchModel
-from botorch.models.transforms.input import InputTransform
-from botorch.models.transforms.outcome import Standardize
-from botorch.utils.types import DEFAULT, _DefaultType
-from gpytorch.distributions import MultivariateNormal
-from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, Likelihood
+from botorch.models.gpytorch import GPyTorchModel
+from botorch.sampling.pathwise.paths import SamplePath
+from botorch.sampling.pathwise.posterior_samplers import DrawMatheronPaths
+from gpytorch.likelihoods import FixedNoiseGaussianLikelihood
 from torch import Size, Tensor
+from torch.nn import Buffer
 
-from gpadjust.gp import SumOfTerms, Term, TermsMean
-from gpadjust.models.adjusted_gp import KernelLike, Means, PhysicsLike
-from gpadjust.models.adjusted_model import AdjustedModel
-from gpadjust.models.cholesky_strategy import Weights
-from gpadjust.models.cka import CKA
-from gpadjust.models.hyperparameters import scaled_rbf
-from gpadjust.models.inducing_values import InducingGP, InducingStrategy, batch_of
+from gpadjust.gp import Term, TermsMean, Unit, WeightedSum
+from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models.sampled_functions import check_number
+from gpadjust.models.sparse_conditioning import SparseConditioning
+from gpadjust.models.structures import CKA
+from gpadjust.models.term_builder import (
+    Center,
+    KernelLike,
+    Kernels,
+    Means,
+    ModelOptions,
+    PhysicsLike,
+    TermBuilder,
+)
+from gpadjust.models.terms_gp import TermsGP
+from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
+from gpadjust.physics.base import whole_number
 
 _SEARCHED = 1000  # observations that an exact model of some takes
 NOTHING = -60.0
 """The logarithm of a variance that is none."""
-NEVER_SAMPLED = (
-    "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many observations tell "
-    "its hyper-parameters, which are not sampled."
-)
 
 
-class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
+class VariationalCKA(TermsModel, GPyTorchModel):
     r"""Co-kriging adjustment with inducing points, for up to some 100,000 observations.
 
     The model is that of :class:`~gpadjust.CKA`, :math:`f_a(x) = \rho(x) f_p(x) + \delta(x)`, of
@@ -46,13 +51,9 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
     :meth:`delta` have it in their variance.
 
     :func:`gpadjust.fit` finds hyper-parameters, points and the optimal distribution, in closed form
-    from all observations. It is also one of BoTorch's ``ApproximateGPyTorchModel``: ``model`` and
-    ``likelihood``, in units after ``outcome_transform``, can be trained by minibatches with
-    GPyTorch's ``VariationalELBO``.
-
-    Intervals are those of the most likely hyper-parameters, which so many observations tell. It
-    cannot be conditioned on further observations, which ``fantasize`` and look-ahead acquisition
-    functions want; the others take it.
+    from all observations. Intervals are those of the most likely hyper-parameters, which so many
+    observations tell. It cannot be conditioned on further observations, which ``fantasize`` and
+    look-ahead acquisition functions want; the others take it.
 
     The arguments and errors are those of :class:`~gpadjust.CKA`, for one data set, and:
 
@@ -62,10 +63,14 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         seed: Seed of which observations are searched and where inducing points begin.
 
     Attributes:
-        model: GPyTorch's variational model of one batch element per output, in model units.
+        inducing_points: Transformed inputs, ``(m) x M x (d + k)``.
+        inducing_mean: The mean of the whitened values there, ``(m) x M``; before a fit the prior's.
+        inducing_root: A lower root of their covariance, ``(m) x M x M``.
         rest: The term of what the inducing points cannot show.
         evidence: The lower bound of the log marginal likelihood that the last fit reached, ``(m)``,
             in model units; NaN before a fit.
+        search_rows: The numbers of the observations that an exact model is searched with; None of a
+            subset of a model's outputs, which is not fitted.
 
     Raises:
         ValueError: As :class:`~gpadjust.CKA`; and for a batch of data sets.
@@ -83,6 +88,13 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         >>> rho, delta = model.rho(train_X[:3]), model.delta(train_X[:3])
     """
 
+    not_sampled = (
+        "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many observations "
+        "tell its hyper-parameters, which are not sampled."
+    )
+    _conditioning: SparseConditioning | None = None
+    _has_transformed_inputs = True
+
     def __init__(
         self,
         train_X: ArrayLike,
@@ -91,15 +103,13 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         *,
         physics: PhysicsLike,
         num_inducing: int = 1000,
-        rho_covar_module: KernelLike | Sequence[KernelLike] | None = None,
+        rho_covar_module: Kernels = None,
         delta_covar_module: KernelLike | None = None,
         rho_mean: Means | None = None,
         delta_mean: float | Literal["learn"] = 0.0,
-        center: float | Tensor | Literal["mean", "learn"] = "learn",
-        likelihood: Likelihood | None = None,
-        outcome_transform: Standardize | _DefaultType | None = DEFAULT,
-        input_transform: InputTransform | None = None,
+        center: Center = "learn",
         seed: int = 0,
+        **options: Unpack[ModelOptions],
     ) -> None:
         data = training_data(train_X, train_Y, train_Yvar)
         if data.X.dim() > 2:
@@ -108,57 +118,66 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
                 "model of each."
             )
         check_number(num_inducing, "num_inducing")
-        rows = _some_of_each_output(data, seed)
-        noise = None if data.Yvar is None else data.Yvar[rows]
-        # An exact model of some rows: it makes the terms, and is where a fit begins.
-        start = CKA(
-            data.X[rows],
-            data.Y[rows],
-            noise,
+        order, searched = _some_of_each_output(data.Y, seed)
+        rows = order[:searched]
+        # An exact model of some rows makes terms, units and noise.
+        some = CKA(
+            *(None if given is None else given[rows] for given in data[:3]),
             physics=physics,
             rho_covar_module=rho_covar_module,
             delta_covar_module=delta_covar_module,
             rho_mean=rho_mean,
             delta_mean=delta_mean,
             center=center,
-            likelihood=likelihood,
-            outcome_transform=outcome_transform,
-            input_transform=input_transform,
+            **options,
         )
-        with torch.no_grad():
-            columns = start.input_transform(data.X)
-        order = torch.cat([rows, _others(rows, len(data.X))])
-        points = columns[order[: min(num_inducing, len(order))]]
-        m = data.Y.shape[-1]
-        super().__init__(
-            InducingGP(start.covar_module, batch_of(start.covar_module, points)),
-            start.likelihood,
-            m,
-        )
-        self.input_transform = start.input_transform
-        if hasattr(start, "outcome_transform"):
-            self.outcome_transform = start.outcome_transform
-        self._num_outputs, self._aug_batch_shape = m, Size([m] if m > 1 else [])
-        self.rest = _rest(start.terms[-1].num_inputs, self._aug_batch_shape)
+        if some.noise.selection(some.train_inputs[0]) is not None:
+            raise ValueError(
+                f"Expected a likelihood with one variance, got {type(some.likelihood).__name__}; "
+                "CKA takes those with several."
+            )
+        super().__init__()
+        self.covar_module, self.likelihood = some.covar_module, some.likelihood
+        self.input_transform = some.input_transform
+        if hasattr(some, "outcome_transform"):
+            self.outcome_transform = some.outcome_transform
         self.input_names, self.output_names = data.input_names, data.output_names
-        self.__dict__["start"] = start  # its modules are registered here
-        self._original_train_inputs, self._has_transformed_inputs = data.X, True
-        self._hold_data(columns, self._outputs_first(data.Y))
-        self._take(columns, data.Y, data.Yvar)
-        self.register_buffer("evidence", torch.full_like(self.train_targets[..., 0], torch.nan))
+        self._num_outputs, self._aug_batch_shape = some._num_outputs, some._aug_batch_shape
+        d, zero = some.terms[-1].num_inputs, data.X.new_zeros(*self._aug_batch_shape, 1)
+        kernel = scaled_rbf(d, self._aug_batch_shape).to(zero).requires_grad_(False)
+        kernel.raw_outputscale.fill_(NOTHING)
+        self.rest = Term("rest", kernel, d, None, zero)
+        # The data move with the model, and are no part of its state.
+        held = partial(Buffer, persistent=False)
+        self._X: Tensor = held(data.X)
+        self._Y: Tensor = held(data.Y)
+        self._Yvar: Tensor | None = None if data.Yvar is None else held(data.Yvar)
+        self._columns: Tensor = held(data.X)
+        self.search_rows: Tensor | None = held(rows)
+        self.ask_physics()
+        self._scale_known_noise()
+        points = self._columns[order[:num_inducing]].expand(*zero.shape[:-1], -1, -1).clone()
+        self.inducing_points: Tensor = Buffer(points)
+        self.inducing_mean: Tensor = Buffer(torch.zeros_like(points[..., 0]))
+        self.inducing_root: Tensor = Buffer(torch.diag_embed(torch.ones_like(points[..., 0])))
+        self.evidence: Tensor = Buffer(torch.full_like(zero[..., 0], torch.nan))
         self.eval()
 
     @property
-    def covar_module(self) -> SumOfTerms:  # type: ignore[override]
-        """The covariance of what the inducing points can show."""
-        covariance: SumOfTerms = self.model.covar_module
-        return covariance
+    def train_inputs(self) -> tuple[Tensor]:
+        """Transformed inputs with columns of f_p, ``n x (d + k)``."""
+        return (self._columns,)
+
+    @property
+    def train_targets(self) -> Tensor:  # type: ignore[override]
+        """Targets in model units, ``(m) x n``; NaN where one is missing."""
+        shift, scale = self.units()
+        return (self.outputs_first(self._Y) - shift) / scale
 
     @property
     def mean_module(self) -> TermsMean:
         """The prior mean."""
-        mean: TermsMean = self.model.mean_module
-        return mean
+        return TermsMean(self.covar_module)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -170,178 +189,154 @@ class VariationalCKA(AdjustedModel, ApproximateGPyTorchModel):
         """The names of the terms that are unknown; the rest, which is in delta, goes without."""
         return tuple(name for name in super().term_names if name != self.rest.name)
 
-    @property
-    def batch_shape(self) -> Size:
-        """Empty: it is a model of one data set."""
-        return Size()
+    def at(self, inputs: Tensor) -> WeightedSum:
+        """As the base class, with the rest."""
+        return self._with_rest(super().at(inputs))
 
-    def forward(self, X: Tensor) -> MultivariateNormal:
-        """Evaluate the variational model: at raw ``X`` in train mode, else at transformed inputs.
+    def _at(self, term: Term, inputs: Tensor) -> WeightedSum:
+        found = super()._at(term, inputs)
+        return self._with_rest(found) if term.unit is Unit.TARGET else found
 
-        Raises:
-            ValueError: If ``X`` is raw in eval mode.
-        """
-        if not self.training:
-            self.check_transformed(X)
-        return super().forward(X)
+    def _with_rest(self, f: WeightedSum) -> WeightedSum:
+        return WeightedSum(f.x, [*f.parts, (self.rest, None)], f.shift)
 
-    def strategy(self) -> InducingStrategy:
+    def conditioning(self) -> SparseConditioning:
         """What is remembered of the inducing values to predict from; made if it is not there."""
-        if self.model.strategy is None:
-            self.model.strategy = InducingStrategy(self.model, self.likelihood)
-        strategy: InducingStrategy = self.model.strategy
-        return strategy
+        known = self._conditioning
+        if known is None or known.train_inputs[0] is not self.inducing_points:  # as after `.to`
+            known = self._conditioning = SparseConditioning(
+                self.inducing_points, self.inducing_mean, self.inducing_root, self.covar_module
+            )
+        return known
 
     def forget(self) -> None:
         """Forget what predictions are made of, after a change of parameters."""
-        self.model.strategy = None
+        self._conditioning = None
+
+    def _revert_to_original_inputs(self) -> None:
+        """BoTorch's hook for train mode: inputs stay transformed, predictions are forgotten."""
+        self.forget()
 
     def ask_physics(self) -> None:
         """Ask the physics about the training inputs again, by what was learnt of its parameters."""
-        if self.start is not None:
-            self.start.train()  # its inputs are then transformed again
         with torch.no_grad():
-            columns = self.input_transform(self._original_train_inputs)
-        self._hold_data(columns, self.train_targets)
+            self._columns = self.input_transform(self._X)
+
+    def exact(self, with_physics: bool = False) -> TermsGP:
+        """An exact model of the rows that are searched, in this model's units.
+
+        It has the same terms and learnt noise, so that a fit of the one is a fit of the other;
+        with the physics, also the input transform and its parameters.
+
+        Raises:
+            ValueError: If this is a subset of a model's outputs.
+        """
+        rows, noise = self.search_rows, self.noise.known
+        if rows is None:
+            raise ValueError("Expected a whole model: a subset of a model's outputs is not fitted.")
+        X, transform = self._columns, None
+        if with_physics:
+            X, transform = self._X, self.input_transform
+        Y = self.outputs_last(self.train_targets)[rows]
+        Yvar = None if noise is None else self.outputs_last(noise)[rows]
+        data = TrainingData(X[rows], Y, Yvar, self.input_names, self.output_names)
+        likelihood = self.likelihood if noise is None else None
+        made = TermBuilder(data, transform, None, self.rest.num_inputs, likelihood)
+        made.given.append(self.covar_module)
+        return TermsGP(made, [*self.covar_module.terms])
 
     def data(self) -> dict[str, Tensor | None]:
-        """The data that the model could be built on: raw inputs, targets and known variances."""
-        shift, scale = self._units()
-        noise: Tensor | None = None
-        if isinstance(self.likelihood, FixedNoiseGaussianLikelihood):
-            noise = self._outputs_last(self.likelihood.noise * scale.square())
-        targets = self._outputs_last(self.train_targets * scale + shift)
-        return {"train_X": self._original_train_inputs, "train_Y": targets, "train_Yvar": noise}
+        """The data that the model was built on: raw inputs, targets and known variances."""
+        return {"train_X": self._X, "train_Y": self._Y, "train_Yvar": self._Yvar}
+
+    def _scale_known_noise(self) -> None:
+        """Bring known variances into the model's units."""
+        if self._Yvar is not None:
+            noise = self.outputs_first(self._Yvar) / self.units()[1].square()
+            self.likelihood = FixedNoiseGaussianLikelihood(noise)
 
     def load_state_dict(
-        self, state_dict: Any, strict: bool = True, keep_transforms: bool = False, **kwargs: Any
+        self, state_dict: Mapping[str, Any], strict: bool = True, **options: Any
     ) -> Any:
         """Load parameters and inducing values; the data are those that the model has."""
-        data: Any = self.data()
-        before = {n: tensor.clone() for n, tensor in self.input_transform.state_dict().items()}
-        keys = super().load_state_dict(state_dict, strict, keep_transforms=False, **kwargs)
-        self._take(self.train_inputs[0], data["train_Y"], data["train_Yvar"])
+        before = deepcopy(self.input_transform.state_dict())
+        keys = super().load_state_dict(state_dict, strict, keep_transforms=False, **options)
+        self._scale_known_noise()
         after = self.input_transform.state_dict()
-        if any(not torch.equal(tensor, before[name]) for name, tensor in after.items()):
+        if not all(torch.equal(tensor, before[name]) for name, tensor in after.items()):
             self.ask_physics()
-        self.model.variational_strategy._clear_cache()
         self.forget()
         return keys
 
     def subset_output(self, idcs: list[int]) -> Self:
         """Subset the model along the outputs. It predicts, but is not to be fitted again."""
-        m = self.num_outputs
-        if not idcs or any(not isinstance(i, int) or not -m <= i < m for i in idcs):
-            raise ValueError(
-                f"Expected numbers of outputs from 0 to {m - 1} (one at least), got {idcs}."
-            )
-        if m == 1:
-            return deepcopy(self)
-        kept = [i % m for i in idcs]
+        kept, new = self.checked_outputs(idcs), deepcopy(self)
+        if self.num_outputs == 1:
+            return new
         index: Any = kept if len(kept) > 1 else kept[0]
-        known: Any = self.model.variational_strategy.variational_distribution
-        root = self.strategy().root
-        new = deepcopy(self)
-        new.model = InducingGP(self.covar_module[index], self.model.inducing_points[index].clone())
-        new.model.hold(known.mean[index], root[index])
+        new.covar_module = self.covar_module[index]
         new.rest = self.rest.map_batches(lambda part: part[index])
-        new.likelihood = deepcopy(self.likelihood)
-        _keep_noise(new.likelihood, index)
+        for name in ("inducing_points", "inducing_mean", "inducing_root", "evidence"):
+            setattr(new, name, getattr(self, name)[index])
+        for parameter in new.likelihood.parameters():
+            if parameter.shape[:1] == self._aug_batch_shape:
+                parameter.data = parameter.data[index]
         if hasattr(self, "outcome_transform"):
             new.outcome_transform = self.outcome_transform.subset_output(kept)
-        new._num_outputs = new._desired_num_outputs = len(kept)
-        new._aug_batch_shape = Size([len(kept)] if len(kept) > 1 else [])
-        new.output_names = tuple(self.output_names[i] for i in kept)
-        new._hold_data(self.train_inputs[0], self.train_targets[index])
-        new.evidence = self.evidence[index]
-        new.__dict__["start"] = None
+        new._num_outputs, new._aug_batch_shape = len(kept), new.covar_module.batch_shape
+        new.output_names, new.search_rows = tuple(self.output_names[i] for i in kept), None
+        new._Y, new._Yvar = self._Y[:, kept], None if self._Yvar is None else self._Yvar[:, kept]
+        new._scale_known_noise()
         return new.eval()
 
     def condition_on_observations(self, X: Tensor, Y: Tensor, **kwargs: Any) -> NoReturn:
         """Refuse: inducing values that are optimal for further data are another fit."""
-        self._refuse_conditioning()
-
-    def fantasize(self, X: Tensor, sampler: Any, **kwargs: Any) -> NoReturn:
-        """Refuse, as :meth:`condition_on_observations`."""
-        self._refuse_conditioning()
-
-    def _refuse_conditioning(self) -> NoReturn:
         raise NotImplementedError(
             "VariationalCKA cannot be conditioned on further observations, which fantasies and "
             "look-ahead acquisition functions need: build it of all data and fit it again (a warm "
             "start of few iterations will do), or take an exact CKA of some thousand."
         )
 
-    def _take(self, columns: Tensor, Y: Tensor, Yvar: Tensor | None) -> None:
-        """Take transformed inputs, targets and known variances, ``n x m`` in the user's units."""
-        shift, scale = self._units()
-        self._hold_data(columns, (self._outputs_first(Y) - shift) / scale)
-        if Yvar is not None:
-            noise = self._outputs_first(Yvar) / scale.square()
-            self.likelihood = FixedNoiseGaussianLikelihood(noise, learn_additional_noise=False)
+    def fantasize(self, X: Tensor, sampler: Any, **kwargs: Any) -> NoReturn:
+        """Refuse, as :meth:`condition_on_observations`."""
+        self.condition_on_observations(X, X)
 
-    def _hold_data(self, columns: Tensor, targets: Tensor) -> None:
-        self.train_inputs, self.train_targets = (columns,), targets
-        # Where GPyTorch's closures look for the data of a variational model.
-        self.model.train_inputs, self.model.train_targets = self.train_inputs, targets
-
-    def _bases(self, inputs: Tensor) -> Weights:
-        return [(term, term.weights(inputs)) for term in self.terms]
-
-    def _term_weights(self, name: str, or_known: bool = False) -> Weights:
-        weights = super()._term_weights(name, or_known)
-        return [*weights, (self.rest, None)] if name == "delta" else weights
-
-    def _evidence(self) -> tuple[str, Tensor | None]:
+    def log_evidence(self) -> tuple[str, Tensor | None]:
+        """The lower bound that the last fit reached, in the user's units, ``(m)``."""
         if self.evidence.isnan().any():
             return "not fitted", None
-        scale = self._units()[1].squeeze(-1)
         count = (~self.train_targets.isnan()).sum(-1)
-        return "evidence lower bound", self.evidence - count * scale.log()
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the data with the model."""
-        new = super()._apply(fn, recurse)
-        self._original_train_inputs = fn(self._original_train_inputs)
-        self._hold_data(fn(self.train_inputs[0]), fn(self.train_targets))
-        if self.start is not None:
-            self.start._apply(fn)
-        self.forget()
-        return new
+        return "evidence lower bound", self.evidence - count * self.units()[1].squeeze(-1).log()
 
 
-def _some_of_each_output(data: TrainingData, seed: int) -> Tensor:
-    """Numbers of some rows, with observations of each output among them."""
-    generator = torch.Generator().manual_seed(seed)
-    order = torch.randperm(len(data.X), generator=generator)
-    observed = ~data.Y.isnan().cpu()[order]
-    rank = observed.cumsum(0)
-    taken = (observed & (rank <= max(2, _SEARCHED // data.Y.shape[-1]))).any(-1)
-    first = order[taken]
-    return torch.cat([first, order[~taken]])[: max(_SEARCHED, len(first))]
+def _some_of_each_output(Y: Tensor, seed: int) -> tuple[Tensor, int]:
+    """Row numbers in a random order, and how many of the first have observations of each output."""
+    generator = torch.Generator().manual_seed(whole_number("seed", seed))
+    order = torch.randperm(len(Y), generator=generator).to(Y.device)
+    observed = ~Y.isnan()[order]
+    taken = (observed & (observed.cumsum(0) <= max(2, _SEARCHED // Y.shape[-1]))).any(-1)
+    return torch.cat([order[taken], order[~taken]]), max(_SEARCHED, int(taken.sum()))
 
 
-def _others(rows: Tensor, n: int) -> Tensor:
-    """The numbers of all other rows."""
-    taken = torch.zeros(n, dtype=torch.bool)
-    taken[rows] = True
-    return (~taken).nonzero().squeeze(-1)
+class _Paths(SamplePath):
+    """Functions from the posterior as BoTorch's sample paths, of a sample shape."""
+
+    def __init__(self, functions: Any, shape: Size) -> None:
+        super().__init__()
+        self.functions, self.shape = functions, shape
+
+    def forward(self, X: Tensor, **kwargs: Any) -> Tensor:
+        """From raw ``... x q x d``, whose batch meets the sample shape, to ``... x (m) x q``."""
+        lead, (q, d) = torch.broadcast_shapes(X.shape[:-2], self.shape), X.shape[-2:]
+        own = X.expand(*lead, q, d).reshape(-1, self.shape.numel(), q, d)
+        values = self.functions.each(own.transpose(0, 1).flatten(1, 2))
+        values = values.unflatten(1, (-1, q)).transpose(0, 1).reshape(*lead, q, -1)
+        return values.mT if self.functions.has_outputs else values.squeeze(-1)
+
+    def set_ensemble_as_batch(self, ensemble_as_batch: bool) -> None:
+        """Nothing: there is no ensemble."""
 
 
-def _rest(num_inputs: int, batch_shape: Size) -> Term:
-    """A term of short-ranged variations, none to begin with."""
-    kernel = scaled_rbf(num_inputs, batch_shape).double()
-    kernel.requires_grad_(False)
-    kernel.raw_outputscale.fill_(NOTHING)
-    zero = torch.zeros(*batch_shape, 1, dtype=torch.float64)
-    return Term("rest", kernel, num_inputs, None, zero)
-
-
-def _keep_noise(likelihood: Any, index: Any) -> None:
-    """Keep the noise of some outputs."""
-    noise = likelihood.noise_covar
-    name = "noise" if isinstance(likelihood, FixedNoiseGaussianLikelihood) else "raw_noise"
-    values = getattr(noise, name)
-    values = values.detach()[index]
-    kept = values if name == "noise" else torch.nn.Parameter(values)
-    setattr(noise, name, kept)
+@DrawMatheronPaths.register(VariationalCKA)  # type: ignore[untyped-decorator, unused-ignore]
+def _draw_paths(model: VariationalCKA, *, sample_shape: Size, **options: Any) -> _Paths:
+    return _Paths(model.sample_functions(sample_shape.numel()), sample_shape)

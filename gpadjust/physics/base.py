@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from operator import index
-from typing import Any, ClassVar, Self, SupportsIndex
+from typing import Any, Self, SupportsIndex
 
 import torch
 from torch import Size, Tensor
 
-from gpadjust.physics.carrier import pack, unpack
-from gpadjust.physics.error import PhysicsError
-from gpadjust.physics.finite_difference import central_difference, value_and_central_difference
-from gpadjust.physics.memo import RowMemo
+from gpadjust.physics.error import PhysicsError, described
+from gpadjust.physics.gradient import central_difference
 from gpadjust.physics.unknown import ParameterValues, Unknown, Unknowns
 
 
@@ -23,19 +21,12 @@ class Physics(torch.nn.Module, ABC):
     r"""The crude model :math:`f_p : \mathbb{R}^d \to \mathbb{R}^m` of a system.
 
     A subclass says in ``evaluate`` what the outputs of some rows are; calling the physics adds
-    batch shapes, the choice of columns, checks, and a memo.
+    batch shapes, the choice of columns, and checks. It must be deterministic.
 
-    - *Memo.* A result that needs no gradient is remembered, and each distinct row is evaluated
-      once: fitting a GP asks for the same rows at every step. The memo is dropped when a parameter
-      or buffer of the physics changes. It cannot see other changes, such as a plain attribute:
-      call ``forget()`` after those. A physics must therefore be deterministic. Looking a row up
-      costs about a quarter of a microsecond; switch the memo off for a function that is cheaper.
-      Threads may share a physics if what it calls allows that.
     - *Unknown parameters.* ``unknowns`` names them and says what is known of them beforehand; then
       ``evaluate`` is given their values, one for each row, and a model of the physics learns them
       by :func:`gpadjust.fit` (other fits leave them at the guesses). Called without parameters the
       physics takes their guesses.
-    - *Gradients.* A result that needs a gradient, in X or in a parameter, is evaluated anew.
     - *Copies.* A deep copy of a physics without parameters and buffers is the physics itself, so
       that a simulator's handle outlives the copies that GP libraries make of their models.
 
@@ -43,7 +34,6 @@ class Physics(torch.nn.Module, ABC):
         unknowns: The unknown parameters by name, such as ``{"mass": Unknown(1.0, factor=1.5)}``.
         inputs: The columns of X that the physics reads, in its order; negative ones count from
             the end. Default: all.
-        memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: the class's.
 
     Attributes:
@@ -51,8 +41,8 @@ class Physics(torch.nn.Module, ABC):
         unknowns: The unknown parameters, ``p`` of them.
 
     Raises:
-        TypeError: If ``inputs`` holds something else than whole numbers, or ``memo`` is none.
-        ValueError: If ``inputs`` is empty or ``memo`` is negative.
+        TypeError: If ``inputs`` holds something else than whole numbers.
+        ValueError: If ``inputs`` is empty.
 
     Example:
         >>> class Drag(Physics):
@@ -64,32 +54,24 @@ class Physics(torch.nn.Module, ABC):
                 [-2.0000]])
     """
 
-    # The attributes that hold the user's callables, and whether a pickle may go without them.
-    _callables: ClassVar[tuple[str, ...]] = ()
-    _callables_may_be_lost: ClassVar[bool] = False
-    _shape_hint = "For a constant return X.new_full((X.shape[0],), value)."
-
     def __init__(
         self,
         *,
         unknowns: Mapping[str, Unknown] | None = None,
         inputs: Sequence[int] | None = None,
-        memo: int = 100_000,
         name: str | None = None,
     ) -> None:
         super().__init__()
         self.unknowns = Unknowns(unknowns)
-        if whole_number("memo", memo) < 0:
-            raise ValueError(f"memo must be a number of rows, 0 for no memo; found {memo}.")
+        self._p = len(unknowns or ())
         self.inputs = None if inputs is None else column_numbers(inputs)
         self.name = type(self).__name__ if name is None else name
         self.num_outputs: int | None = None
-        self._memo = RowMemo(memo)
         self._warned: set[str] = set()
 
     @abstractmethod
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The outputs of some rows, without memo and checks.
+        """The outputs of some rows, without checks.
 
         Args:
             X: ``N x d``, the columns ``inputs`` only, ``N >= 1``.
@@ -119,16 +101,18 @@ class Physics(torch.nn.Module, ABC):
                 parameters are not of that shape.
             PhysicsError: If the physics fails, or returns something else than finite outputs.
         """
-        self._check_input(X)
-        columns = self._columns(_without_copies(X))
-        shape = X.shape[:-1]
-        if self.unknowns or parameters is not None:
+        columns, shape = self.read(X), X.shape[:-1]
+        # Of the copies of an expanded leaf, each has a gradient of its own.
+        for dim in range(0 if X.requires_grad and X.is_leaf else X.dim() - 1):
+            if shape[dim] > 1 and X.stride(dim) == 0:
+                columns = columns.narrow(dim, 0, 1)
+        if self._p or parameters is not None:
             values = self._checked_parameters(parameters, X)
             shape = Size((*torch.broadcast_shapes(X.shape[:-2], values.shape[:-1]), X.shape[-2]))
             columns = _beside(columns, values)
         rows = columns.reshape(-1, columns.shape[-1])
         try:
-            Y = self._evaluate_rows(rows)
+            Y = self.of_rows(rows)
         except PhysicsError as error:
             if error.inputs is None:
                 numbers = torch.arange(len(rows)).reshape(columns.shape[:-1])
@@ -140,7 +124,7 @@ class Physics(torch.nn.Module, ABC):
         return Y.reshape(*columns.shape[:-1], m).expand(*shape, m)
 
     def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """As calling it, without memo and gradient, NaN in rows at which the physics fails.
+        """As calling it, without gradient, NaN in rows at which the physics fails.
 
         Args:
             X: As there.
@@ -150,9 +134,8 @@ class Physics(torch.nn.Module, ABC):
             PhysicsError: If it does not say where it fails, or fails everywhere before its number
                 of outputs is known.
         """
-        self._check_input(X)
         with torch.no_grad():
-            columns = _beside(self._columns(X), self._checked_parameters(parameters, X))
+            columns = _beside(self.read(X), self._checked_parameters(parameters, X))
             blocks = columns.reshape(1, -1, columns.shape[-1])
             found = [self._where_it_works(blocks[0])]
             if isinstance(found[0], PhysicsError):
@@ -166,58 +149,8 @@ class Physics(torch.nn.Module, ABC):
             values = [failed if isinstance(Y, PhysicsError) else Y for Y in found]
         return torch.cat(values).reshape(*columns.shape[:-1], self.num_outputs)
 
-    def forget(self) -> None:
-        """Empties the memo; call it after a change that the physics cannot see."""
-        # A new memo: what other threads are evaluating right now ends in the old one.
-        self._memo = RowMemo(self._memo.capacity)
-
-    def extra_repr(self) -> str:
-        """The settings that ``repr`` shows."""
-        return (
-            f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}, "
-            f"memo={self._memo.capacity}"
-        )
-
-    def __copy__(self) -> Self:
-        """A shallow copy, which is no pickle: it keeps a function that cannot be pickled."""
-        copy = type(self).__new__(type(self))
-        copy.__dict__.update(self.__dict__)
-        return copy
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """The physics itself if it has no parameters and buffers, else a copy, its memo empty."""
-        if not self._state():
-            return self
-        copy = type(self).__new__(type(self))
-        memo[id(self)] = copy
-        copy.__dict__.update(deepcopy(self.__dict__, memo))
-        return copy
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The state for a pickle; callables without a name travel with cloudpickle only."""
-        lost = self._callables_may_be_lost
-        return {
-            name: pack(value, self.name, name, may_be_lost=lost)
-            if name in self._callables
-            else value
-            for name, value in self.__dict__.items()
-        }
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Takes the state of a pickle."""
-        super().__setstate__({name: unpack(value) for name, value in state.items()})
-
-    def rows_of(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """What one of several physics reads of rows ``N x d`` and of the parameters of all."""
-        columns = self._columns(X)
-        own = [parameters[0][name].unsqueeze(-1) for name in self.unknowns]
-        return torch.cat([columns, *own], dim=-1) if own else columns
-
-    def _state(self) -> list[Tensor]:
-        """What the outputs depend on besides X, as far as torch knows."""
-        return [*self.parameters(), *self.buffers()]
-
-    def _check_input(self, X: Tensor) -> None:
+    def read(self, X: Tensor) -> Tensor:
+        """The columns of ``X`` (``... x n x d``) that the physics reads, checked."""
         if not torch.is_tensor(X) or not X.is_floating_point():
             found = X.dtype if torch.is_tensor(X) else type(X).__name__
             raise TypeError(
@@ -229,17 +162,107 @@ class Physics(torch.nn.Module, ABC):
                 f"Physics {self.name!r} takes X of shape batch_shape x n x d; found "
                 f"{tuple(X.shape)}. For a single point use X.unsqueeze(0)."
             )
+        if self.inputs is None:
+            return X
         d = X.shape[-1]
-        absent = [i for i in self.inputs or () if not -d <= i < d]
+        absent = [i for i in self.inputs if not -d <= i < d]
         if absent:
             raise ValueError(
                 f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X of shape "
                 f"{tuple(X.shape)} has {d} column(s), so there is no column {absent}. Pass X with "
                 "all its columns, or correct inputs."
             )
+        return X[..., list(self.inputs)]
 
-    def _columns(self, X: Tensor) -> Tensor:
-        return X if self.inputs is None else X[..., list(self.inputs)]
+    def read_rows(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
+        """Rows for :meth:`of_rows`, of rows ``N x d`` and parameters of several physics."""
+        own = [parameters[0][name].unsqueeze(-1) for name in self.unknowns]
+        return torch.cat([self.read(X), *own], dim=-1)
+
+    def of_rows(self, rows: Tensor) -> Tensor:
+        """The outputs ``N x m`` of rows ``N x (d + p)``, the columns it reads and its parameters.
+
+        They have a graph as far as the rows or the parameters of the module ask for one. The rows
+        that an error names are these.
+        """
+        if len(rows) == 0:
+            if self.num_outputs is None:
+                raise PhysicsError(
+                    f"Physics {self.name!r} was given no rows before its number of outputs was "
+                    "known; call it on at least one row first."
+                )
+            return rows.new_empty(0, self.num_outputs)
+        Y = self._checked_rows(rows)
+        if not torch.is_grad_enabled():
+            return Y
+        if rows.requires_grad and not Y.requires_grad:
+            self._warn_once(
+                f"No gradient flows through physics {self.name!r}: X requires grad, its outputs "
+                "do not. Wrap the function as BlackBoxPhysics(function) for finite differences; "
+                "ignore this if the outputs do not depend on X."
+            )
+        if not Y.requires_grad or rows.requires_grad:
+            return Y
+        if any(p.requires_grad for p in self.parameters()):
+            return Y
+        self._warn_once(
+            f"Physics {self.name!r} depends on a tensor that requires grad but is not one of "
+            "its parameters; it is taken as a constant. To learn it, make it a parameter of a "
+            "torch.nn.Module and pass that module; else call requires_grad_(False) on it."
+        )
+        return Y.detach()
+
+    def fresh_rows(self, rows: Tensor) -> Tensor:
+        """As :meth:`of_rows`, evaluated whatever is remembered."""
+        return self._checked_rows(rows)
+
+    def _checked_rows(self, rows: Tensor) -> Tensor:
+        """Evaluate all rows, and check the outputs: ``N x m``, finite, of the rows' dtype."""
+        try:
+            if self._p:
+                d = rows.shape[-1] - self._p
+                Y = self.evaluate(rows[:, :d], self.unknowns.named(rows[:, d:]))
+            else:
+                Y = self.evaluate(rows)
+        except PhysicsError as error:
+            if error.partial is not None:
+                error.partial = self._shaped(error.partial, len(rows)).to(rows)
+            raise
+        except Exception as error:
+            raise PhysicsError(
+                f"Physics {self.name!r} raised {described(error)}."
+                f"{self._arguments_hint(error)} The call was for {len(rows)} row(s):",
+                range(len(rows)),
+            ) from error
+        Y = self._shaped(Y, len(rows)).to(rows)
+        # A finite sum has finite terms only, and is the faster look.
+        if not Y.detach().sum().isfinite():
+            bad = (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
+            if bad:
+                raise PhysicsError(
+                    f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} "
+                    "row(s), expected finite numbers. Mend the physics there, or keep such inputs "
+                    "out:",
+                    bad,
+                    partial=Y.detach(),
+                )
+        return Y
+
+    def forget(self) -> None:
+        """Forget what is remembered of rows, if anything is."""
+
+    def extra_repr(self) -> str:
+        """The settings that ``repr`` shows."""
+        return f"name={self.name!r}, inputs={self.inputs}, num_outputs={self.num_outputs}"
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """The physics itself if it has no parameters and buffers, else a copy."""
+        if not [*self.parameters(), *self.buffers()]:
+            return self
+        copy = type(self).__new__(type(self))
+        memo[id(self)] = copy
+        copy.__dict__.update(deepcopy(self.__dict__, memo))
+        return copy
 
     def _checked_parameters(self, parameters: Tensor | None, X: Tensor) -> Tensor:
         """Values of the unknown parameters, ``... x p``."""
@@ -255,44 +278,12 @@ class Physics(torch.nn.Module, ABC):
             )
         return parameters.to(X)
 
-    def _evaluate_rows(self, rows: Tensor) -> Tensor:
-        if len(rows) == 0:
-            if self.num_outputs is None:
-                raise PhysicsError(
-                    f"Physics {self.name!r} was given no rows before its number of outputs was "
-                    "known; call it on at least one row first."
-                )
-            return rows.new_empty(0, self.num_outputs)
-        if torch.is_grad_enabled() and (
-            rows.requires_grad or any(p.requires_grad for p in self.parameters())
-        ):
-            return self._differentiate(rows)
-        return self._recall(rows)
-
-    def _differentiate(self, rows: Tensor) -> Tensor:
-        """``N x m`` outputs with their autograd graph."""
-        return self._call(rows)
-
-    def _recall(self, rows: Tensor) -> Tensor:
-        """``N x m`` outputs without a graph, from the memo as far as it knows them."""
-        return self._current_memo(rows).recall(rows, self._call_without_graph)
-
-    def _current_memo(self, rows: Tensor) -> RowMemo:
-        # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
-        # The empty tensor stands for the dtype and device of what is remembered.
-        state = [*self._state(), rows.new_empty(0)]
-        memo = self._memo
-        if len(state) != len(memo.state) or not all(map(_same, state, memo.state)):
-            # A new one: a thread that still evaluates in the old state keeps the old memo.
-            memo = self._memo = RowMemo(memo.capacity, state)
-        return memo
-
     def _where_it_works(self, rows: Tensor) -> Tensor | PhysicsError:
         """``N x m`` outputs, NaN where the physics fails; its error if there is nothing else."""
-        working = torch.ones(len(rows), dtype=torch.bool)
+        working = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
         while True:
             try:
-                Y = self._rows_anew(rows[working])
+                Y = self.fresh_rows(rows[working])
             except PhysicsError as error:
                 if error.partial is None:
                     if not error.rows:
@@ -306,95 +297,47 @@ class Physics(torch.nn.Module, ABC):
             values[working] = Y.where(Y.isfinite().all(-1, keepdim=True), torch.nan)
             return values
 
-    def _rows_anew(self, rows: Tensor) -> Tensor:
-        """``N x m`` outputs, whatever is remembered."""
-        return self._call(rows)
+    def jacobian(
+        self, rows: Tensor, step: Tensor | None = None, with_values: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Outputs and their Jacobian by differences in X, zero for parameters, in a single call.
 
-    def _slope(self, rows: Tensor, step: Tensor | None = None) -> Tensor:
-        """The Jacobian ``N x m x (d + p)`` by central differences in X, zero for the parameters."""
-        d = rows.shape[1] - len(self.unknowns)
-        slope = central_difference(self._along_columns(rows), rows[:, :d], step)
-        return torch.nn.functional.pad(slope, (0, len(self.unknowns)))
+        Returns:
+            ``N x m``, or nothing (``0 x m``) if values are not asked for, and ``N x m x (d + p)``.
+        """
+        d, also, kept = rows.shape[1] - self._p, rows if with_values else rows[:0], []
+        parameters = rows[:, d:].repeat_interleave(d, dim=0).repeat(2, 1)
 
-    def _value_and_slope(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The outputs and, as by :meth:`_slope`, the Jacobian, in one call."""
-        d = rows.shape[1] - len(self.unknowns)
-        values, slope = value_and_central_difference(self._along_columns(rows), rows[:, :d])
-        return values, torch.nn.functional.pad(slope, (0, len(self.unknowns)))
+        def moved(X: Tensor) -> Tensor:
+            Y = self.fresh_rows(torch.cat([also, torch.cat([X, parameters], dim=-1)]))
+            kept.append(Y[: len(also)])
+            return Y[len(also) :]
 
-    def _along_columns(self, rows: Tensor) -> Callable[[Tensor], Tensor]:
-        """The outputs at rows of X moved as finite differences do it, each with its parameters."""
-        if not self.unknowns:
-            return self._call
-        d = rows.shape[1] - len(self.unknowns)
-        values = rows[:, d:]
-        every = torch.cat([values, values.repeat_interleave(d, dim=0).repeat(2, 1)])
-        return lambda moved: self._call(torch.cat([moved, every[-len(moved) :]], dim=-1))
-
-    def _call_without_graph(self, rows: Tensor) -> Tensor:
-        Y = self._call(rows)
-        if Y.requires_grad:
-            self._warn_once(
-                f"Physics {self.name!r} depends on a tensor that requires grad but is not one of "
-                "its parameters; it is taken as a constant. To learn it, make it a parameter of a "
-                "torch.nn.Module and pass that module; else call requires_grad_(False) on it."
-            )
-        return Y.detach()
-
-    def _call(self, rows: Tensor) -> Tensor:
-        """Evaluates all rows and checks the result: ``N x m``, finite, of the rows' dtype."""
-        try:
-            Y = self.evaluate(*self._split(rows))
-        except PhysicsError as error:
-            if error.partial is not None:
-                error.partial = self._check_shape(error.partial, len(rows)).to(rows)
-            raise
-        except Exception as error:
-            raise PhysicsError(
-                f"Physics {self.name!r} raised {type(error).__name__}: {str(error).rstrip('.')}."
-                f"{self._arguments_hint(error)} The call was for {len(rows)} row(s):",
-                range(len(rows)),
-            ) from error
-        Y = self._check_shape(Y, len(rows)).to(rows)
-        # A finite sum has finite terms only, and is the faster look.
-        finite = Y.detach().sum().isfinite()
-        bad = [] if finite else (~Y.isfinite().all(-1)).nonzero().flatten().tolist()
-        if bad:
-            raise PhysicsError(
-                f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} row(s), "
-                "expected finite numbers. Mend the physics there, or keep such inputs out:",
-                bad,
-                partial=Y.detach(),
-            )
-        return Y
+        slope = central_difference(moved, rows[:, :d], step)
+        return kept[0], torch.nn.functional.pad(slope, (0, self._p))
 
     def _arguments_hint(self, error: Exception) -> str:
         """What to do where a function was called with the wrong number of arguments."""
         if not isinstance(error, TypeError) or "positional argument" not in str(error):
             return ""
-        if self.unknowns:
+        if self._p:
             return (
                 " The values of its unknown parameters, p, are its last argument: p."
                 f"{self.unknowns.names[0]} is one for each row."
             )
         return " Parameters that are to be learnt are named as unknowns={'mass': Unknown(...)}."
 
-    def _split(self, rows: Tensor) -> tuple[Any, ...]:
-        """Rows ``N x (d + p)`` as the arguments of ``evaluate``."""
-        if not self.unknowns:
-            return (rows,)
-        d = rows.shape[-1] - len(self.unknowns)
-        return rows[:, :d], self.unknowns.named(rows[:, d:])
-
-    def _check_shape(self, Y: Tensor, n: int) -> Tensor:
+    def _shaped(self, Y: Tensor, n: int) -> Tensor:
+        """Outputs as ``n x m``, if they are that or ``n``."""
         expected = f"a real tensor of shape ({n}, m) or ({n},), one row per row of X"
         if not torch.is_tensor(Y) or Y.is_complex():
             found = Y.dtype if torch.is_tensor(Y) else type(Y).__name__
             raise PhysicsError(f"Physics {self.name!r} returned {found}, expected {expected}.")
         if Y.dim() not in (1, 2) or len(Y) != n or Y.shape[-1] == 0:
             raise PhysicsError(
-                f"Physics {self.name!r} returned shape {tuple(Y.shape)}, expected {expected}. "
-                f"{self._shape_hint}"
+                f"Physics {self.name!r} returned shape {tuple(Y.shape)}, expected {expected}. For "
+                "a constant return X.new_full((X.shape[0],), value); for a function of a single "
+                "row take BlackBoxPhysics(function, batched=False)."
             )
         Y = Y.unsqueeze(-1) if Y.dim() == 1 else Y
         if self.num_outputs is None:
@@ -412,26 +355,12 @@ class Physics(torch.nn.Module, ABC):
             warnings.warn(message, UserWarning, stacklevel=2)
 
 
-def _without_copies(X: Tensor) -> Tensor:
-    # Of the copies of an expanded leaf, each has a gradient of its own.
-    if X.requires_grad and X.is_leaf:
-        return X
-    for dim in range(X.dim() - 1):
-        if X.shape[dim] > 1 and X.stride(dim) == 0:
-            X = X.narrow(dim, 0, 1)
-    return X
-
-
 def _beside(columns: Tensor, values: Tensor) -> Tensor:
     """Rows ``... x n x d`` and, at the end of each, values ``... x p``."""
     batch = torch.broadcast_shapes(columns.shape[:-2], values.shape[:-1])
     rows = columns.expand(*batch, *columns.shape[-2:])
     values = values.unsqueeze(-2).expand(*rows.shape[:-1], values.shape[-1])
     return torch.cat([rows, values], dim=-1)
-
-
-def _same(a: Tensor, b: Tensor) -> bool:
-    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
 
 
 def whole_number(name: str, value: SupportsIndex) -> int:

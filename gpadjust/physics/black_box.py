@@ -10,9 +10,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gpadjust.physics.base import Physics
-from gpadjust.physics.error import PhysicsError
-from gpadjust.physics.external_call import ExternalCall
+from gpadjust.physics.base import Physics, whole_number
+from gpadjust.physics.error import PhysicsError, described
+from gpadjust.physics.gradient import ExternalCall
+from gpadjust.physics.memo import RowMemo
 from gpadjust.physics.row_calls import call_rows, real_array
 from gpadjust.physics.unknown import ParameterValues, Unknown
 
@@ -30,9 +31,11 @@ class BlackBoxPhysics(Physics):
     or any other backend of joblib, a cluster's included. Rows that succeed are remembered even
     when others fail.
 
-    A pickle holds the function if it can be pickled; cloudpickle takes lambdas, too. If not, as
-    with a handle of a running simulator, the loaded physics still answers the rows in its memo; for
-    new ones set ``physics.function`` again.
+    A result is remembered, and each distinct row is evaluated once: fitting a model, predicting and
+    differentiating ask for the same rows again. The memory is dropped when a parameter or buffer of
+    the physics changes, or dtype and device of the inputs; it cannot see other changes, such as a
+    plain attribute: call ``forget()`` after those. Threads may share a physics if what it calls
+    allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
@@ -63,10 +66,6 @@ class BlackBoxPhysics(Physics):
         tensor([[2.0000, 0.0000]], dtype=torch.float64)
     """
 
-    _callables = ("function", "gradient")
-    _callables_may_be_lost = True
-    _shape_hint = "For a function of a single row pass batched=False."
-
     def __init__(
         self,
         function: NumpyFunction,
@@ -90,7 +89,10 @@ class BlackBoxPhysics(Physics):
         if steps.size == 0 or not (np.isfinite(steps) & (steps > 0)).all():
             raise ValueError(f"fd_step must be positive, in the units of X; found {fd_step}.")
         name = name or getattr(function, "__name__", type(function).__name__)
-        super().__init__(unknowns=unknowns, inputs=inputs, memo=memo, name=name)
+        if whole_number("memo", memo) < 0:
+            raise ValueError(f"memo must be a number of rows, 0 for no memo; found {memo}.")
+        super().__init__(unknowns=unknowns, inputs=inputs, name=name)
+        self._memo, self._remembered_for = RowMemo(memo), list[Tensor]()
         self.function = function
         self.batched = batched
         self.gradient = gradient
@@ -135,7 +137,7 @@ class BlackBoxPhysics(Physics):
         if errors:
             first = next(iter(errors.values()))
             raise PhysicsError(
-                f"Physics {self.name!r} raised {type(first).__name__}: {first}, in the first of "
+                f"Physics {self.name!r} raised {described(first)}, in the first of "
                 f"{len(errors)} failed row(s) of {len(rows)}. Mend the function there, or keep "
                 "such inputs out; the other rows are done:",
                 errors,
@@ -143,9 +145,10 @@ class BlackBoxPhysics(Physics):
             ) from first
         return Y
 
-    def _differentiate(self, rows: Tensor) -> Tensor:
-        if not rows.requires_grad:
-            return self._recall(rows)
+    def of_rows(self, rows: Tensor) -> Tensor:
+        """As the base class, by the memory and with the gradient that was asked for."""
+        if not torch.is_grad_enabled() or not rows.requires_grad or len(rows) == 0:
+            return self._recall(rows.detach())
         if self.gradient is None:
             self._warn_once(
                 f"No gradient flows through physics {self.name!r}, which has gradient=None, "
@@ -153,22 +156,40 @@ class BlackBoxPhysics(Physics):
                 "optimize_acqf(..., options={'with_grad': False}), or choose "
                 "gradient='finite-difference'."
             )
-            return self._recall(rows)
-        d = rows.shape[1] - len(self.unknowns)
+            return self._recall(rows.detach())
+        d = rows.shape[1] - self._p
         if self.fd_step is not None and np.size(self.fd_step) not in (1, d):
             raise ValueError(
                 f"fd_step of physics {self.name!r} has {np.size(self.fd_step)} entries, expected "
                 f"1 or {d}, one for each column that the function reads."
             )
-        return ExternalCall.apply(rows, self._recall, self._jacobian)
+        return ExternalCall.apply(rows, self._recall, self._slope)
 
-    def _jacobian(self, rows: Tensor) -> Tensor:
+    def forget(self) -> None:
+        """Empty the memory; call it after a change that the physics cannot see."""
+        # A new memo: what other threads are evaluating right now ends in the old one.
+        self._memo = RowMemo(self._memo.capacity)
+
+    def _recall(self, rows: Tensor) -> Tensor:
+        """``N x m`` outputs, from the memory as far as it knows them."""
+        if not self._memo.capacity or len(rows) == 0:
+            return super().of_rows(rows)
+        # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.
+        state = [*self.parameters(), *self.buffers(), rows.new_empty(0)]
+        before = self._remembered_for
+        if len(before) != len(state) or not all(map(_same, before, state)):
+            self._remembered_for = [tensor.detach().clone() for tensor in state]
+            self.forget()
+        return self._memo.recall(rows, super().of_rows)
+
+    def _slope(self, rows: Tensor) -> Tensor:
+        """The Jacobian, ``N x m x (d + p)``."""
         if callable(self.gradient):
             return self._user_jacobian(self.gradient, rows)
-        n, d = len(rows), rows.shape[1] - len(self.unknowns)
+        n, d = len(rows), rows.shape[1] - self._p
         step = None if self.fd_step is None else torch.tensor(self.fd_step, dtype=torch.float64)
         try:
-            return self._slope(rows.double().cpu(), step).to(rows)
+            return self.jacobian(rows.double().cpu(), step)[1].to(rows)
         except PhysicsError as error:
             if error.inputs is None:
                 error.rows = tuple(sorted({i // d % n for i in error.rows}))
@@ -180,23 +201,27 @@ class BlackBoxPhysics(Physics):
             raise
 
     def _user_jacobian(self, gradient: NumpyFunction, rows: Tensor) -> Tensor:
+        d = rows.shape[1] - self._p
+        given = [self.unknowns.named(rows[:, d:]).numpy()] if self._p else []
         try:
-            X, *parameters = self._split(rows)
-            J = real_array(gradient(_to_numpy(X), *(p.numpy() for p in parameters)))
+            J = real_array(gradient(_to_numpy(rows[:, :d]), *given))
         except PhysicsError:
             raise
         except Exception as error:
             raise PhysicsError(
                 f"The gradient of physics {self.name!r} raised {type(error).__name__}: {error}."
             ) from error
-        expected = (len(rows), self.num_outputs, X.shape[1])
+        expected = (len(rows), self.num_outputs, d)
         if J.shape != expected or not np.isfinite(J).all():
             raise PhysicsError(
                 f"The gradient of physics {self.name!r} returned a Jacobian of shape {J.shape}, "
                 f"expected shape N x m x d = {expected} and finite numbers."
             )
-        J = np.pad(J, ((0, 0), (0, 0), (0, len(self.unknowns))))
-        return torch.from_numpy(J).to(rows)
+        return torch.from_numpy(np.pad(J, ((0, 0), (0, 0), (0, self._p)))).to(rows)
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
 
 
 def _to_numpy(X: Tensor) -> NDArray[np.float64]:

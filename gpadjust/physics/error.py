@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 _SHOWN = 5
+_LONGEST = 500  # characters of what a subprocess wrote
 
 
 class PhysicsError(RuntimeError):
@@ -60,3 +61,11 @@ class PhysicsError(RuntimeError):
         if len(self.rows) > _SHOWN:
             lines.append(f"  and {len(self.rows) - _SHOWN} more")
         return "\n".join(lines)
+
+
+def described(error: Exception) -> str:
+    """The type and message of an error, and the end of what a subprocess wrote to stderr."""
+    written = getattr(error, "stderr", None)
+    text = written.decode(errors="replace") if isinstance(written, bytes) else str(written or "")
+    said = f"; it wrote: {text.strip()[-_LONGEST:]}" if text.strip() else ""
+    return f"{type(error).__name__}: {str(error).rstrip('.')}{said}"

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
-from gpadjust.physics.module_parameters import call_with, check_module
 from gpadjust.physics.unknown import ParameterValues, Unknown
 
 AnyPhysics = Physics | Callable[[Tensor], Tensor]
@@ -26,15 +25,12 @@ class FunctionPhysics(Physics):
             of a ``torch.nn.Module`` that require gradients, as those of a network, are brought to
             their most likely values with the GP's hyper-parameters.
         unknowns: Unknown parameters by name; their values are then the function's second argument,
-            ``N`` each: ``lambda X, p: p.mass * X[:, 0]``. Or names of parameters of the module that
-            the function is, a number each.
+            ``N`` each: ``lambda X, p: p.mass * X[:, 0]``.
         inputs: The columns of X that the function reads. Default: all.
-        memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: the function's.
 
     Raises:
         TypeError: If ``function`` is not callable.
-        ValueError: If ``function`` is a module that has only some of the unknown parameters.
 
     Example:
         >>> import torch
@@ -44,67 +40,45 @@ class FunctionPhysics(Physics):
                 [690.]], dtype=torch.float64)
     """
 
-    _callables = ("function",)
-
     def __init__(
         self,
         function: Callable[..., Tensor],
         *,
         unknowns: Mapping[str, Unknown] | None = None,
         inputs: Sequence[int] | None = None,
-        memo: int = 100_000,
         name: str | None = None,
     ) -> None:
         if not callable(function):
             raise TypeError(f"function must be callable; found {type(function).__name__}.")
         name = name or getattr(function, "__name__", type(function).__name__)
-        super().__init__(unknowns=unknowns, inputs=inputs, memo=memo, name=name)
-        if self.unknowns:
-            check_module(function, self.unknowns)
+        super().__init__(unknowns=unknowns, inputs=inputs, name=name)
         self.function = function
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The function's outputs.
-
-        Args:
-            X: ``N x d``.
-            parameters: Those that are unknown, if there are any.
-
-        Returns:
-            ``N x m`` or ``N``, as the function gives them.
+        """The function's outputs, ``N x m`` or ``N``, of rows ``N x d`` (and parameters).
 
         Raises:
             PhysicsError: If the function computes with NumPy.
         """
-        use_black_box = (
+        try:
+            Y = self.function(X, *parameters)
+            if not isinstance(Y, np.ndarray | np.generic):
+                return Y
+            cause = None
+        except RuntimeError as error:
+            if "Can't call numpy() on Tensor that requires grad" not in str(error):
+                raise
+            cause = error
+        raise PhysicsError(
             f"Physics {self.name!r} computes with NumPy, expected torch; wrap the function as "
             "BlackBoxPhysics(function)."
-        )
-        try:
-            Y = call_with(self.function, X, *parameters) if parameters else self.function(X)
-        except RuntimeError as error:
-            if "Can't call numpy() on Tensor that requires grad" in str(error):
-                raise PhysicsError(use_black_box) from error
-            raise
-        if isinstance(Y, np.ndarray | np.generic):
-            raise PhysicsError(use_black_box)
-        return Y
-
-    def _differentiate(self, rows: Tensor) -> Tensor:
-        Y = super()._differentiate(rows)
-        if rows.requires_grad and not Y.requires_grad:
-            self._warn_once(
-                f"No gradient flows through physics {self.name!r}: X requires grad, its outputs "
-                "do not. Wrap the function as BlackBoxPhysics(function) for finite differences; "
-                "ignore this if the outputs do not depend on X."
-            )
-        return Y
+        ) from cause
 
 
 class JoinedPhysics(Physics):
     """Several physics of the same inputs, their outputs side by side.
 
-    Each part reads its own columns of X and keeps its own memo and gradient; it is asked once per
+    Each part reads its own columns of X, and has its own memory and gradient; it is asked once per
     call.
 
     Args:
@@ -140,7 +114,7 @@ class JoinedPhysics(Physics):
             raise ValueError("There is no physics to join; give at least one.")
         given = [*physics.values()] if isinstance(physics, Mapping) else [*physics]
         parts = [as_physics(part) for part in given]
-        super().__init__(unknowns=_in_common(parts), memo=0, name=name)
+        super().__init__(unknowns=_in_common(parts), name=name)
         self.names = _names([*physics] if isinstance(physics, Mapping) else None, parts)
         for part, origin, own in zip(parts, given, self.names, strict=True):
             if part is not origin:  # a wrapper of ours
@@ -148,20 +122,24 @@ class JoinedPhysics(Physics):
         self.parts = torch.nn.ModuleList(parts)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The outputs of the parts, each by its own memo.
-
-        Args:
-            X: ``N x d``.
-            parameters: Those that are unknown to some part, if there are any.
-
-        Returns:
-            ``N x (k m)``, those of the first part first.
+        """The outputs ``N x (k m)`` of the parts, those of the first part first.
 
         Raises:
             PhysicsError: If a part fails, or the parts differ in their number of outputs.
         """
-        # Not forward: an error's rows are then still those of X.
-        return self._of_parts(lambda part, rows: part._evaluate_rows(rows), X, *parameters)
+        return self._of_parts(lambda part, own: part.of_rows(own), X, *parameters)
+
+    def of_rows(self, rows: Tensor) -> Tensor:
+        """As the base class; checks, memory and gradients are the parts'."""
+        d = rows.shape[-1] - self._p
+        given = [self.unknowns.named(rows[:, d:])] if self._p else []
+        return self._of_parts(lambda part, own: part.of_rows(own), rows[:, :d], *given)
+
+    def fresh_rows(self, rows: Tensor) -> Tensor:
+        """As :meth:`of_rows`, whatever the parts remember."""
+        d = rows.shape[-1] - self._p
+        given = [self.unknowns.named(rows[:, d:])] if self._p else []
+        return self._of_parts(lambda part, own: part.fresh_rows(own), rows[:, :d], *given)
 
     def _of_parts(
         self, ask: Callable[[Physics, Tensor], Tensor], X: Tensor, *parameters: ParameterValues
@@ -169,9 +147,8 @@ class JoinedPhysics(Physics):
         """What each part is asked of its rows, side by side."""
         outputs = []
         for name, part in zip(self.names, cast(Iterable[Physics], self.parts), strict=True):
-            part._check_input(X)
             try:
-                outputs.append(ask(part, part.rows_of(X, *parameters)))
+                outputs.append(ask(part, part.read_rows(X, *parameters)))
             except PhysicsError as error:
                 error.partial = None  # outputs of this part alone
                 if name != part.name:
@@ -189,20 +166,13 @@ class JoinedPhysics(Physics):
         return Y
 
     def forget(self) -> None:
-        """Empties the memos of the parts."""
+        """Forget what the parts remember."""
         for part in cast(Iterable[Physics], self.parts):
             part.forget()
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""
         return f"name={self.name!r}, names={self.names}, num_outputs={self.num_outputs}"
-
-    def _evaluate_rows(self, rows: Tensor) -> Tensor:
-        # Checks, memo and gradients are the parts'.
-        return self.evaluate(*self._split(rows))
-
-    def _rows_anew(self, rows: Tensor) -> Tensor:
-        return self._of_parts(lambda part, own: part._rows_anew(own), *self._split(rows))
 
 
 def as_physics(physics: AnyPhysics | Parts) -> Physics:
@@ -219,7 +189,7 @@ def as_physics(physics: AnyPhysics | Parts) -> Physics:
 
     Example:
         >>> as_physics(torch.sin)
-        FunctionPhysics(name='sin', inputs=None, num_outputs=None, memo=100000)
+        FunctionPhysics(name='sin', inputs=None, num_outputs=None)
         >>> as_physics([torch.sin, torch.cos]).names
         ('sin', 'cos')
     """

@@ -33,8 +33,8 @@ def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
     path = _path_of(physics)
     if path or type(physics) is not FunctionPhysics:
         return path
-    plain = FunctionPhysics(physics.function)
-    return _path_of(physics.function) if _settings(plain) == _settings(physics) else None
+    is_plain = physics.inputs is None and not physics.unknowns
+    return _path_of(physics.function) if is_plain else None
 
 
 def physics_from_path(path: str) -> Physics:
@@ -73,15 +73,11 @@ def physics_from_path(path: str) -> Physics:
         raise ValueError(f"The path {path!r} does not name a physics: {error}") from error
 
 
-def _settings(physics: FunctionPhysics) -> tuple[Any, ...]:
-    return physics.inputs, physics._memo.capacity
-
-
 def _path_of(thing: Any) -> str | None:
     owners = [thing]
     if isinstance(thing, Physics):
         for part in thing.modules():
-            owners += [part, *map(vars(part).get, getattr(part, "_callables", ()))]
+            owners += [part, *filter(callable, vars(part).values())]
     for owner in owners:
         module = sys.modules.get(getattr(owner, "__module__", None) or "")
         # Only functions and classes know their names.

@@ -12,8 +12,7 @@ from torchdiffeq import odeint
 
 from gpadjust.physics.base import Physics, whole_number
 from gpadjust.physics.error import PhysicsError
-from gpadjust.physics.external_call import ExternalCall
-from gpadjust.physics.module_parameters import call_with, check_module
+from gpadjust.physics.gradient import ExternalCall
 from gpadjust.physics.unknown import ParameterValues, Unknown
 
 FIXED_STEP = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams")
@@ -44,13 +43,11 @@ class ODEPhysics(Physics):
         max_steps: The most steps that an adaptive method tries within ``step``.
         difference: Whether the output is the change of the state instead of the new state.
         unknowns: Unknown parameters of the equation by name, its third argument:
-            ``lambda state, action, p: ... p.mass ...``. Or names of parameters of the module that
-            ``rhs`` is, a number each.
+            ``lambda state, action, p: ... p.mass ...``.
         gradient: Where the gradient in X comes from: ``"autograd"``, or ``"finite-difference"``,
             central differences in a single call, which is several times faster if there are many
             substeps, with first derivatives only.
         inputs: The columns of X that hold state and action, in this order. Default: all.
-        memo: The most rows to remember; 0 switches the memo off.
         name: The name in messages. Default: that of ``rhs``.
 
     Raises:
@@ -65,8 +62,6 @@ class ODEPhysics(Physics):
         tensor([[0.3679],
                 [1.0000]], dtype=torch.float64)
     """
-
-    _callables = ("rhs",)
 
     def __init__(
         self,
@@ -83,7 +78,6 @@ class ODEPhysics(Physics):
         unknowns: Mapping[str, Unknown] | None = None,
         gradient: Literal["autograd", "finite-difference"] = "autograd",
         inputs: Sequence[int] | None = None,
-        memo: int = 100_000,
         name: str | None = None,
     ) -> None:
         if not callable(rhs):
@@ -107,8 +101,7 @@ class ODEPhysics(Physics):
                 f"Unknown gradient {gradient!r}; use 'autograd' or 'finite-difference'."
             )
         name = name or getattr(rhs, "__name__", type(rhs).__name__)
-        super().__init__(unknowns=unknowns, inputs=inputs, memo=memo, name=name)
-        check_module(rhs, self.unknowns)
+        super().__init__(unknowns=unknowns, inputs=inputs, name=name)
         self.rhs = rhs
         self.step = float(step)
         self.state_dim = state_dim
@@ -143,7 +136,7 @@ class ODEPhysics(Physics):
         state, action = X[:, : self.state_dim], X[:, self.state_dim :]
 
         def derivative(t: Tensor, state: Tensor) -> Tensor:
-            rate = call_with(self.rhs, state, action, *parameters)
+            rate = self.rhs(state, action, *parameters)
             if not torch.is_tensor(rate) or rate.shape != state.shape or rate.is_complex():
                 found: object = type(rate).__name__
                 if torch.is_tensor(rate):
@@ -180,21 +173,25 @@ class ODEPhysics(Physics):
             ) from error
         return path[-1] - state if self.difference else path[-1]
 
-    def _differentiate(self, rows: Tensor) -> Tensor:
-        by_autograd = self.gradient == "autograd" or not rows.requires_grad
-        if by_autograd or any(p.requires_grad for p in self.parameters()):
-            return super()._differentiate(rows)
+    def of_rows(self, rows: Tensor) -> Tensor:
+        """As the base class, with the gradient in X by differences if that was asked for."""
+        by_differences = self.gradient == "finite-difference" and torch.is_grad_enabled()
+        by_differences = by_differences and rows.requires_grad
+        if not by_differences or any(p.requires_grad for p in self.parameters()):
+            return super().of_rows(rows)
 
         with torch.no_grad():
             try:
                 # In one call, as what it costs grows slowly with the rows.
-                values, slope = self._value_and_slope(rows.detach())
-            except PhysicsError:
-                values, slope = self._recall(rows.detach()), None  # which rows they are
+                values, slope = self.jacobian(rows.detach(), with_values=True)
+            except PhysicsError:  # which rows they are, or that only those beside them failed
+                values, found = super().of_rows(rows.detach()), None
+            else:
+                found = slope
 
         def jacobian(rows: Tensor) -> Tensor:
             with torch.no_grad():
-                return self._slope(rows) if slope is None else slope
+                return self.jacobian(rows)[1] if found is None else found
 
         return ExternalCall.apply(rows, lambda _: values, jacobian)
 

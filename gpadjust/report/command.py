@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gpadjust.inference import fit
-from gpadjust.models import CKA, ExactGPBase
+from gpadjust.models import CKA, TermsGP
 from gpadjust.report.csv_data import CsvData, names_of, noise_variances, pairs, read_csv
 from gpadjust.report.named_physics import NamedPhysics, named_physics
 from gpadjust.report.numbers import listed, plural
@@ -84,7 +84,7 @@ def _comparing(command: Sequence[str]) -> str:
 
 def _fitted(
     arguments: Namespace, data: CsvData, physics: NamedPhysics, variances: list[float] | None
-) -> Comparison | ExactGPBase:
+) -> Comparison | TermsGP:
     X, Y, f_p = data.X, data.Y, physics.physics
     if arguments.fit == "compare":
         return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.models.csv_columns import LARGEST, CsvColumns
+from gpadjust.files import LARGEST, CsvColumns
 from gpadjust.report.numbers import listed, name_and_unit, plural
 
 _HINT = (

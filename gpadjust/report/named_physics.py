@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.models.csv_columns import LARGEST
+from gpadjust.files import LARGEST
 from gpadjust.physics import BlackBoxPhysics, Physics, PhysicsError, as_physics
 from gpadjust.physics.array_physics import array_physics
 from gpadjust.report.csv_data import CsvData

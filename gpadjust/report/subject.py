@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.gp import PhysicsInput
-from gpadjust.models import AR1, AdjustedGP, ExactGPBase, StackedGP, VariationalCKA
+from gpadjust.models import AR1, StackedGP, TermsGP, VariationalCKA
 from gpadjust.physics import JoinedPhysics, Physics
 from gpadjust.validation import Comparison, LeaveOneOut, leave_one_out
 from gpadjust.validation.leave_one_out import observations
@@ -29,7 +29,7 @@ class Adjusted(NamedTuple):
     """
 
     structure: str
-    model: AdjustedGP
+    model: TermsGP
     output: int
     weight: float
 
@@ -48,7 +48,7 @@ class Subject:
         adjusted: For each output what is shown of rho and delta; None if no physics is adjusted.
     """
 
-    model: ExactGPBase | StackedGP
+    model: TermsGP | StackedGP
     comparison: Comparison | None
     X: Tensor
     Y: Tensor
@@ -104,7 +104,7 @@ class Subject:
             curves = physics_curves(shown.model)
             return [(name, column(f_p(X), output)) for name, f_p in curves]
 
-    def _models(self) -> Iterator[ExactGPBase]:
+    def _models(self) -> Iterator[TermsGP]:
         if self.comparison is not None:
             yield from self.comparison.models.values()
         elif isinstance(self.model, StackedGP):
@@ -132,12 +132,12 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
             "VariationalCKA has no leave-one-out predictions, expected a model that has: report "
             "on `gpadjust.compare` of some hundred of its rows."
         )
-    if not isinstance(model, ExactGPBase | StackedGP):
+    if not isinstance(model, TermsGP | StackedGP):
         raise TypeError(
             "Expected a fitted model of gpadjust, a StackedGP, or a Comparison (which `compare` "
             f"makes), got {type(thing).__name__}."
         )
-    if isinstance(model, ExactGPBase):
+    if isinstance(model, TermsGP):
         if model.batch_shape and model.num_samples is None:
             raise ValueError(
                 f"Expected a model of one data set, got one of batch_shape "
@@ -161,10 +161,10 @@ def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
 
 
 def _adjusted(
-    model: ExactGPBase | StackedGP, comparison: Comparison | None, output: int
+    model: TermsGP | StackedGP, comparison: Comparison | None, output: int
 ) -> Adjusted | None:
     """The structure of most weight that adjusts a physics, of what predicts an output."""
-    candidates: list[tuple[str, ExactGPBase, int, float]]
+    candidates: list[tuple[str, TermsGP, int, float]]
     if comparison is not None:
         ranked = [*comparison.table.values()][output]
         candidates = [
@@ -177,6 +177,6 @@ def _adjusted(
     else:
         candidates = [(type(model).__name__, model, output, 1.0)]
     for name, each, j, weight in candidates:
-        if isinstance(each, AdjustedGP) and each.rho_names:
+        if isinstance(each, TermsGP) and each.rho_names:
             return Adjusted(name, each, j, weight)
     return None

@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 
-from gpadjust.models import ExactGPBase, StackedGP, save
+from gpadjust.models import StackedGP, TermsGP
+from gpadjust.models.saving import content_of
 from gpadjust.report.page import page
 from gpadjust.report.provenance import Origin
 from gpadjust.report.subject import Subject, subject_of
@@ -17,7 +18,7 @@ from gpadjust.validation import Comparison
 
 
 def report(
-    model: ExactGPBase | StackedGP | Comparison,
+    model: TermsGP | StackedGP | Comparison,
     file: str | Path = "report.html",
     *,
     title: str | None = None,
@@ -112,8 +113,8 @@ def write(
         part, model_part = Path(folder, path.name), Path(folder, model_path.name)
         saved: tuple[str, Any] | str
         try:
-            save(subject.model, model_part)
-            saved = (model_path.name, torch.load(model_part, weights_only=True))
+            saved = (model_path.name, content_of(subject.model))
+            torch.save(saved[1], model_part)
         except (TypeError, ValueError) as error:
             saved = str(error)
         title = title or f"Report on {', '.join(subject.outputs)}"

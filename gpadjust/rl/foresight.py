@@ -9,7 +9,7 @@ from torch import Tensor
 from gpadjust.control import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics
 from gpadjust.dynamics.trajectory_scores import typical_change
-from gpadjust.models import AdjustedModel
+from gpadjust.models import TermsModel
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.recorded_episodes import RecordedEpisodes
 from gpadjust.validation.trust import trust
@@ -73,6 +73,6 @@ def _overrides(dynamics: Dynamics, states: Tensor, actions: Tensor) -> float:
     if not isinstance(dynamics, LearnedDynamics):
         return float("nan")
     model = dynamics.model
-    if not isinstance(model, AdjustedModel) or not model.rho_names:
+    if not isinstance(model, TermsModel) or not model.rho_names:
         return float("nan")
     return float(trust(model, dynamics.targets.inputs(states, actions)).data.mean())

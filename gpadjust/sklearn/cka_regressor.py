@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from inspect import Parameter, signature
 from numbers import Integral
 from typing import Any, Literal, Self
 
@@ -21,22 +20,21 @@ from gpadjust.inference import FitResult, SampleResult, fit
 from gpadjust.models import (
     CKA,
     RRA,
-    AdjustedModel,
     CalibratedPhysics,
     PhysicsMeanGP,
     PhysicsParameters,
     ScaleGP,
+    TermsModel,
     VariationalCKA,
     ZeroMeanGP,
 )
+from gpadjust.models.terms_gp import arguments_of
 from gpadjust.models.training_data import column_names
-from gpadjust.physics import Physics
 from gpadjust.physics.array_physics import array_physics
-from gpadjust.physics.carrier import pack, unpack
 
 Array = NDArray[np.float64]
 
-MODELS: dict[str, type[AdjustedModel]] = {
+MODELS: dict[str, type[TermsModel]] = {
     "cka": CKA,
     "rra": RRA,
     "physics_mean": PhysicsMeanGP,
@@ -76,7 +74,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             CKA of :math:`f_p = 0` is.
         model: ``"cka"``, ``"variational"`` (of very many rows), ``"rra"``, ``"physics_mean"``,
             ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (which leaves the physics out, to
-            compare with), or a class: a subclass of :class:`~gpadjust.models.AdjustedModel`.
+            compare with), or a class: a subclass of :class:`~gpadjust.models.TermsModel`.
         fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`. None: the library's
             calibrated default, full Bayes where the model can have it.
         model_options: Further arguments of the model, such as ``{"delta_mean": "learn"}``, or
@@ -106,7 +104,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         (1,)
     """
 
-    model_: AdjustedModel
+    model_: TermsModel
     fit_result_: FitResult | SampleResult
     physics_parameters_: PhysicsParameters
 
@@ -114,7 +112,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         physics: Any = None,
         *,
-        model: str | type[AdjustedModel] = "cka",
+        model: str | type[TermsModel] = "cka",
         fit_method: Literal["bayes", "map"] | None = None,
         model_options: dict[str, Any] | None = None,
         fit_options: dict[str, Any] | None = None,
@@ -235,34 +233,19 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             draws = draws[torch.randperm(len(draws))[:n_samples]]
         return _array(draws.permute(1, 2, 0), dim=1)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The state for a pickle; a physics without a name travels with cloudpickle only."""
-        state: dict[str, Any] = super().__getstate__()
-        if not isinstance(self.physics, Physics):
-            name = getattr(self.physics, "__name__", type(self.physics).__name__)
-            packed = pack(self.physics, name, "function", may_be_lost=False)
-            state = {**state, "physics": packed}  # not in place: it may be the object's own
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Takes the state of a pickle."""
-        super().__setstate__({**state, "physics": unpack(state["physics"])})
-
-    def _build(self, X: Array, Y: Array) -> AdjustedModel:
+    def _build(self, X: Array, Y: Array) -> TermsModel:
         """The model that the parameters say."""
         model_class = MODELS.get(self.model) if isinstance(self.model, str) else self.model
-        if not isinstance(model_class, type) or not issubclass(model_class, AdjustedModel):
+        if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
             raise ValueError(
                 f"Expected model as one of {', '.join(map(repr, MODELS))}, or a subclass of "
-                f"gpadjust.models.AdjustedModel, got {self.model!r}."
+                f"gpadjust.models.TermsModel, got {self.model!r}."
             )
         if self.physics is None and model_class is CKA:
             model_class = ZeroMeanGP
         options = deepcopy(self.model_options or {})
-        parameters = signature(model_class).parameters
-        known = [name for name in parameters if name not in _NO_OPTIONS]
-        takes_any = any(p.kind is Parameter.VAR_KEYWORD for p in parameters.values())
-        wrong = [n for n in options if n in _NO_OPTIONS or not (takes_any or n in known)]
+        known = [name for name in arguments_of(model_class) if name not in _NO_OPTIONS]
+        wrong = [name for name in options if name not in known]
         if wrong:
             raise ValueError(
                 f"{model_class.__name__} takes no {', '.join(wrong)} in model_options; expected "

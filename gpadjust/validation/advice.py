@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from botorch.posteriors.fully_bayesian import MCMC_DIM
 from torch import Tensor
 
-from gpadjust.inference.full_bayes import LEAST_POWER
-from gpadjust.inference.log_parameters import shared_parameters
-from gpadjust.models import ExactGPBase
+from gpadjust.models import TermsGP
+from gpadjust.models.parameters import shared_parameters
 from gpadjust.validation.gain import Gain, physics_gain
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, difference, sign_of
@@ -22,9 +20,9 @@ _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
 
 def advice(
     structures: Sequence[Structure],
-    models: dict[str, ExactGPBase],
+    models: dict[str, TermsGP],
     left_out: dict[str, LeaveOneOut],
-    power: dict[str, Tensor],
+    converged: dict[str, Tensor],
     table: dict[str, list[Candidate]],
     X: Tensor,
 ) -> list[str]:
@@ -34,7 +32,7 @@ def advice(
         structures: What was fitted.
         models: The models by the names of their structures.
         left_out: Their leave-one-out predictions.
-        power: That of the importance weights of their samples, ``m`` each.
+        converged: Whether their samples are of the posterior, ``m`` each.
         table: The rankings, by the names of the outputs.
         X: Training inputs, ``n x d``.
     """
@@ -46,7 +44,7 @@ def advice(
         fewest = min(fewest, len(density[rows[0].structure]))
         found = [_best(rows), *_gains(by_name, [row.structure for row in rows], density)]
         found += _preferred(models[rows[0].structure], X, j)
-        found += _unsampled(rows, power, j)
+        found += _unsampled(rows, converged, j)
         sentences += [where + sentence for sentence in found]
     if fewest < ENOUGH and len(models) > 1:
         sentences.append(
@@ -130,10 +128,10 @@ def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -
     return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
 
 
-def _unsampled(rows: list[Candidate], power: dict[str, Tensor], output: int) -> list[str]:
+def _unsampled(rows: list[Candidate], converged: dict[str, Tensor], output: int) -> list[str]:
     """Which of the structures that count are known by draws that are not of their posterior."""
     names = [row.structure for row in rows if row.weight > _COUNTS]
-    low = [name for name in names if power[name][output] < LEAST_POWER]
+    low = [name for name in names if not converged[name][output]]
     if not low:
         return []
     return [
@@ -142,7 +140,7 @@ def _unsampled(rows: list[Candidate], power: dict[str, Tensor], output: int) -> 
     ]
 
 
-def _preferred(model: ExactGPBase, X: Tensor, output: int) -> list[str]:
+def _preferred(model: TermsGP, X: Tensor, output: int) -> list[str]:
     """Which physics a model of several relies on, and where."""
     names = getattr(model, "rho_names", ())
     if len(names) < 2:
@@ -171,7 +169,7 @@ def _preferred(model: ExactGPBase, X: Tensor, output: int) -> list[str]:
     return sentences
 
 
-def _mean_of(model: ExactGPBase, term: str, X: Tensor) -> Tensor:
+def _mean_of(model: TermsGP, term: str, X: Tensor) -> Tensor:
     """The posterior mean of a term, ``n x m``."""
     mean: Tensor = model.term(term, X).mean
-    return mean if model.num_samples is None else mean.mean(MCMC_DIM)
+    return mean

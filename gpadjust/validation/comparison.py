@@ -16,12 +16,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gpadjust.gp.gaussian import threads_for
+from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
-from gpadjust.inference.full_bayes import SamplingWarning
-from gpadjust.inference.log_parameters import shared_parameters
-from gpadjust.models import ExactGPBase, StackedGP
-from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.models import StackedGP, TermsGP
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.parameters import shared_parameters
+from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
 from gpadjust.physics import as_physics
 from gpadjust.validation.advice import advice, gains
@@ -65,7 +65,7 @@ class Comparison:
             of.
     """
 
-    models: dict[str, ExactGPBase]
+    models: dict[str, TermsGP]
     stacked: StackedGP
     table: dict[str, list[Candidate]]
     advice: list[str]
@@ -85,7 +85,7 @@ class Comparison:
         return names.pop() if clear and len(names) == 1 else STACKED
 
     @property
-    def recommended(self) -> ExactGPBase | StackedGP:
+    def recommended(self) -> TermsGP | StackedGP:
         """The fitted model of the structure that is clearly best, otherwise the stacked one."""
         return self.models.get(self.chosen, self.stacked)
 
@@ -211,9 +211,9 @@ def compare(
             "the data sets of a batch one by one."
         )
     found = candidates(asked, as_physics(physics), len(data.X))
-    models: dict[str, ExactGPBase] = {}
+    models: dict[str, TermsGP] = {}
     left_out: dict[str, LeaveOneOut] = {}
-    power: dict[str, Tensor] = {}
+    converged: dict[str, Tensor] = {}
     for structure, part in tqdm(found, disable=not progress, unit="structure"):
         try:
             model = structure.build(
@@ -225,7 +225,7 @@ def compare(
             )
             with (
                 warnings.catch_warnings(record=True) as caught,
-                threads_for(len(data.X), others=True),
+                threads_for(len(data.X)),
             ):
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
@@ -242,13 +242,13 @@ def compare(
             raise
         for each in caught:
             warnings.warn(f"{structure.name}: {each.message}", each.category, stacklevel=2)
-        power[structure.name] = result.power.flatten()
+        converged[structure.name] = result.converged.flatten()
         models[structure.name] = _thinned(model, _HELD)
     by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))
     stacked = StackedGP(models, _weights(models, by_output), _HELD)
     fitted = [structure for structure, _ in found]
-    sentences = advice(fitted, models, left_out, power, table, data.X)
+    sentences = advice(fitted, models, left_out, converged, table, data.X)
     gain = gains(fitted, left_out, table)
     return Comparison(models, stacked, table, sentences, gain, left_out)
 
@@ -265,16 +265,16 @@ def _can_be_left_out(data: TrainingData) -> bool:
     return len(data.X) <= _FEW and int(observed.min()) >= LEAST
 
 
-def _thinned(model: ExactGPBase, number: int) -> ExactGPBase:
+def _thinned(model: TermsGP, number: int) -> TermsGP:
     """A model that holds some of its samples."""
     if model.num_samples is None or model.num_samples <= number:
         return model
     index = torch.linspace(0, model.num_samples - 1, number).round().long()
-    thinned: ExactGPBase = take_samples(model, index, as_mixture=True)
+    thinned: TermsGP = take_samples(model, index, as_mixture=True)
     return thinned
 
 
-def _weights(models: dict[str, ExactGPBase], by_output: list[list[Candidate]]) -> Tensor:
+def _weights(models: dict[str, TermsGP], by_output: list[list[Candidate]]) -> Tensor:
     """The weights of the tables, ``K x m``, in the order of the models."""
     named = [{row.structure: row.weight for row in rows} for rows in by_output]
     weights = [[own[name] for own in named] for name in models]

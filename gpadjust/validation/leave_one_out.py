@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,9 +16,9 @@ from botorch.utils.transforms import is_fully_bayesian
 from linear_operator import to_dense
 from torch import Tensor
 
-from gpadjust.gp.gaussian import noise_variances
-from gpadjust.models import ExactGPBase, StackedGP, VariationalCKA
-from gpadjust.models.cholesky_strategy import Factors
+from gpadjust.gp.noise import Noise
+from gpadjust.models import StackedGP, TermsGP, VariationalCKA
+from gpadjust.models.exact_conditioning import Factors
 from gpadjust.models.stacked import Part
 from gpadjust.validation import scores
 
@@ -143,7 +143,7 @@ def leave_one_out(
         )
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
-        mean, variance = model.left_out() if isinstance(model, ExactGPBase) else _targets(model)
+        mean, variance = model.left_out() if isinstance(model, TermsGP) else _targets(model)
         Y, mean, variance = (
             _outputs_last(model, t)[..., rows, :] for t in (model.train_targets, mean, variance)
         )
@@ -189,7 +189,7 @@ def mixture_of(
     return centre.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
 
 
-def _mixture_of(parts: list[Part]) -> LeaveOneOut:
+def _mixture_of(parts: Iterable[Part]) -> LeaveOneOut:
     """Of the mixture of several models of one output."""
     each = [leave_one_out(part.model) for part in parts]
     mean, variance, density = (
@@ -208,7 +208,9 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
     Of an :class:`~gpadjust.AR1` those of the high level; of a batch the first.
     """
     if isinstance(model, ModelListGP | StackedGP):
-        models = model.models if isinstance(model, ModelListGP) else [g[0] for g in model.groups]
+        models = (
+            model.models if isinstance(model, ModelListGP) else [p[0].model for p in model.parts]
+        )
         parts = [observations(part) for part in models]
         return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
     if isinstance(model, VariationalCKA):
@@ -224,11 +226,11 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
 
 
 def _targets(model: Any) -> tuple[Tensor, Tensor]:
-    """As :meth:`~gpadjust.models.ExactGPBase.left_out`, for models of other libraries."""
+    """As :meth:`~gpadjust.models.TermsGP.left_out`, for models of other libraries."""
     inputs, y = model.train_inputs[0], model.train_targets
     covariance = to_dense(model.covar_module(inputs))
     residual = y - model.mean_module(inputs).expand(covariance.shape[:-1])
-    noise = noise_variances(model.likelihood, inputs)
+    noise = Noise(model.likelihood).at(inputs)
     factors = Factors.of(covariance + torch.diag_embed(noise.expand(residual.shape)), residual)
     variance = factors.squared_columns().reciprocal()
     return y - factors.alpha * variance, variance
@@ -241,7 +243,7 @@ def _measurements(model: Any) -> tuple[Tensor, slice]:
     inputs = inputs if raw is None else raw
     if model.num_outputs > 1:
         inputs = inputs[..., 0, :, :]
-    return model.measured_rows(inputs) if isinstance(model, ExactGPBase) else (inputs, slice(None))
+    return model.measured_rows(inputs) if isinstance(model, TermsGP) else (inputs, slice(None))
 
 
 def _outputs_last(model: Any, values: Tensor) -> Tensor:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
-from gpadjust.models import CKA, CalibratedPhysics, ExactGPBase, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.models.adjusted_gp import PhysicsLike
+from gpadjust.models import CKA, CalibratedPhysics, PhysicsMeanGP, TermsGP, ZeroMeanGP
+from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.physics import JoinedPhysics, Physics
 
 STACKED = "stacked"  # what a comparison calls the mixture of all structures
@@ -28,7 +28,7 @@ class Structure(NamedTuple):
     """
 
     name: str
-    build: Callable[..., ExactGPBase]
+    build: Callable[..., TermsGP]
     unknowns: int = 0
     uses_physics: bool = True
     adjusts: bool = True
@@ -36,7 +36,7 @@ class Structure(NamedTuple):
     calibrates: bool = False
 
 
-def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> ExactGPBase:
+def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> TermsGP:
     return ZeroMeanGP(*data, **options)
 
 

@@ -10,7 +10,7 @@ import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
-from gpadjust.models import AdjustedModel, StackedGP
+from gpadjust.models import StackedGP, TermsModel
 from gpadjust.models.training_data import ArrayLike, to_tensor
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.scores import check_level
@@ -65,7 +65,7 @@ class Trust:
 
 
 def trust(
-    model: AdjustedModel, X: ArrayLike = None, *, level: float = 0.95, num_points: int = 512
+    model: TermsModel, X: ArrayLike = None, *, level: float = 0.95, num_points: int = 512
 ) -> Trust:
     r"""Tell where a model's predictions rest on the physics, on the data, or on neither.
 
@@ -85,7 +85,7 @@ def trust(
     The share of the points with *data* is the share of the predictions that override the physics.
     It does not depend on units: w and D are taken to be at least a thousandth of the standard
     deviation of the targets, as less makes no difference to speak of. Of several physics
-    :math:`f_p` is their weighted sum, as of :meth:`~gpadjust.models.AdjustedModel.fallback`.
+    :math:`f_p` is their weighted sum, as of :meth:`~gpadjust.models.TermsModel.fallback`.
 
     Args:
         model: A model with a physics, such as :class:`~gpadjust.CKA`; that of
@@ -121,7 +121,7 @@ def trust(
             "rest on; take one of the models that it was made of, such as "
             "comparison.models['CKA']."
         )
-    if not isinstance(model, AdjustedModel) or not model.rho_names:
+    if not isinstance(model, TermsModel) or not model.rho_names:
         raise TypeError(
             f"Expected a model with a physics that it could trust, such as CKA, got "
             f"{type(model).__name__}; of LearnedDynamics pass its `model`."

@@ -18,7 +18,7 @@ LABELS = {
     "long": "16 times as many draws",
 }
 _PAIRS = ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
-# Name in mf2, observations per input, noise in standard deviations of the truth.
+# Name of the pair, observations per input, noise in standard deviations of the truth.
 ROWS: tuple[tuple[str, int, float], ...] = (
     *((pair, per_input, 0.0) for pair in _PAIRS for per_input in (5, 10)),
     ("forrester", 5, 0.0),
@@ -57,7 +57,6 @@ class Calibration(Experiment):
 
     name: ClassVar[str] = "calibration"
     key: ClassVar[tuple[str, ...]] = ("problem", "per_input", "noise", "method", "seed")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "mf2")
 
     def tasks(self) -> list[Task]:
         """Each method on each data set."""

@@ -17,8 +17,8 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from gpadjust.inference import objective, priors
-from gpadjust.models.hyperparameters import KINDS, RHO_VARIANCE
+from gpadjust.inference import targets
+from gpadjust.models.parameters import KINDS
 from paper.calibration import ROWS, Calibration
 
 OTHERS: tuple[tuple[str, int, float], ...] = (
@@ -70,16 +70,13 @@ LEADS = {
 @contextmanager
 def taken(lead: Lead) -> Iterator[None]:
     """Let full Bayes have the priors of a lead for a while."""
+    of_lead = {**lead._asdict(), "scaling": lead.rho}
     kinds = {
-        kind: replace(KINDS[kind], prior=getattr(lead, kind))
-        for kind in ("lengthscale", "outputscale", "noise")
+        kind: replace(KINDS[kind], prior=of_lead[kind])
+        for kind in ("lengthscale", "outputscale", "scaling", "noise")
     }
-    least = objective._LEAST if lead.trend else 10**9
-    with (
-        patch.dict(KINDS, kinds),
-        patch.object(priors, "RHO_VARIANCE", replace(RHO_VARIANCE, prior=lead.rho)),
-        patch.object(objective, "_LEAST", least),
-    ):
+    least = targets._LEAST if lead.trend else 10**9
+    with patch.dict(KINDS, kinds), patch.object(targets, "_LEAST", least):
         yield
 
 

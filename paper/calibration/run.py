@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gpadjust import CKA, StackedGP, compare, fit
 from gpadjust.inference import SamplingWarning
-from gpadjust.models import ExactGPBase
+from gpadjust.models import TermsGP
 from gpadjust.physics import Physics
 from gpadjust.validation import score
 from paper.calibration import PUMP, Calibration, Method
@@ -73,7 +73,7 @@ def run(
     }
 
 
-def scored(model: ExactGPBase | StackedGP, data: Data, seed: int) -> dict[str, Tensor]:
+def scored(model: TermsGP | StackedGP, data: Data, seed: int) -> dict[str, Tensor]:
     """Errors of the mean against the truth; density and coverage of new observations; ``m`` each.
 
     Args:
@@ -104,7 +104,7 @@ def scored(model: ExactGPBase | StackedGP, data: Data, seed: int) -> dict[str, T
 
 
 def of_pair(name: str, per_input: int, noise: float, num_test: int, seed: int) -> Data:
-    """Observations of a pair of mf2, with noise in standard deviations of the truth."""
+    """Observations of a pair of functions, with noise in standard deviations of the truth."""
     problem = pair(name)
     X, Y = observations(problem, per_input * problem.d, seed)
     test_X = problem.sobol(num_test, seed=0)
@@ -142,7 +142,7 @@ def pump(n: int, seed: int) -> Data:
     return Data(X, Y, physics, test_X, curve(test_X, 0.55, 0.15), noise)
 
 
-def fitted(data: Data, method: Method) -> tuple[ExactGPBase | StackedGP, bool]:
+def fitted(data: Data, method: Method) -> tuple[TermsGP | StackedGP, bool]:
     """A model fitted by a method, and whether it said that its draws are not of the posterior."""
     if method == "compare":
         return compare(data.X, data.Y, data.physics).recommended, False

@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 import gpadjust
+from paper.common.commit import commit_of
 from paper.common.experiment import Experiment, Record, Table, Task
 from paper.common.runs_file import RunsFile
 from paper.common.tables import aligned, as_document, settings_table
@@ -30,6 +31,7 @@ class Refused(ValueError):  # noqa: N818 - it is no error of the program
 
 RUNS = "runs.jsonl"
 TABLES = "tables.md"
+_ROOT = Path(__file__).parents[2]
 
 
 def runs_file(experiment: Experiment) -> RunsFile:
@@ -91,14 +93,13 @@ def run_missing(experiment: Experiment) -> None:
     for task, record in done.items():
         if task[:-1] in kinds:
             check_settings(file.path, task, record["settings"], _described(experiment, task[:-1]))
-    made_by = versions(experiment.packages)
-    others = {task for task, record in done.items() if _by_others(record, made_by)}
+    others = {task for task, record in done.items() if _by_others(record, experiment)}
     missing = [task for task in tasks if task not in done]
     if others and experiment.other_versions == "replace":
         missing = [task for task in tasks if task not in done or task in others]
     elif others and missing and experiment.other_versions == "refuse":
         task = next(iter(others))
-        differ = _by_others(done[task], made_by)
+        differ = _by_others(done[task], experiment)
         raise Refused(
             f"{file.path} has runs of other versions: {differ}. Pass --other-versions keep to add "
             "to them, --other-versions replace to run them again, or another --out."
@@ -120,25 +121,30 @@ def run_missing(experiment: Experiment) -> None:
 def run_one(experiment: Experiment, task: Task) -> Task:
     """Run a task and add it to the file; return it."""
     torch.set_num_threads(1)
-    file, made_by = runs_file(experiment), versions(experiment.packages)
+    file = runs_file(experiment)
     unfinished = experiment.out / "unfinished" / _title(task)
     unfinished.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(f"{unfinished}.lock")
     with lock:  # a worker may outlive a call that was killed
         before = file.read().get(task)
-        if before is None or _by_others(before, made_by):
-            found = experiment.run(*task, unfinished=unfinished)
-            described = _described(experiment, task[:-1])
+        if before is None or _by_others(before, experiment):
             named = dict(zip(experiment.key, task, strict=True))
-            file.append({**named, "settings": described, "versions": made_by, **rounded(found)})
+            made_by = {
+                "settings": _described(experiment, task[:-1]),
+                "versions": versions(experiment.packages),
+                "commit": commit_of(_ROOT),  # it does not decide whether a task is run again
+            }
+            found = experiment.run(*task, unfinished=unfinished)
+            file.append({**named, **made_by, **rounded(found)})
         Path(lock.lock_file).unlink(missing_ok=True)
     return task
 
 
-def _by_others(record: Record, made_by: Mapping[str, str]) -> str:
-    """In which versions a run differs, of those that it tells; empty if in none."""
-    found = record["versions"]
-    return differences(found, {name: made_by.get(name, "not there") for name in found})
+def _by_others(record: Record, experiment: Experiment) -> str:
+    """In which version of a package that is still used a run differs; empty if in none."""
+    now = versions(experiment.packages)
+    found = {name: was for name, was in record["versions"].items() if name in experiment.packages}
+    return differences(found, {name: now.get(name, "not there") for name in found})
 
 
 def check_settings(

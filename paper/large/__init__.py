@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from paper.common.experiment import Experiment, Task
 
 PROBLEMS = ("hartmann6", "links")
-LEARNERS = ("variational", "exact", "minibatches")
+LEARNERS = ("variational", "exact")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +26,6 @@ class Settings:
     """inducing points"""
     num_test: int = 3000
     """points at which functions are compared"""
-    minutes: float = 5.0
-    """of training by minibatches"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,16 +41,14 @@ class Large(Experiment):
 
     name: ClassVar[str] = "large"
     key: ClassVar[tuple[str, ...]] = ("problem", "learner", "observations", "seed")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "mf2")
 
     def tasks(self) -> list[Task]:
         """The models with inducing points first."""
-        variational, exact, minibatches = LEARNERS
+        variational, exact = LEARNERS
         settings, first = self.settings, self.seeds[0]
         return [
             *((p, variational, settings.many, seed) for seed in self.seeds for p in PROBLEMS),
             *((p, exact, n, seed) for n in settings.some for seed in self.seeds for p in PROBLEMS),
-            (PROBLEMS[0], minibatches, settings.many, first),
             (PROBLEMS[0], exact, settings.most, first),
         ]
 
@@ -62,6 +58,5 @@ class Large(Experiment):
         own = {
             "variational": ("num_inducing", "num_test"),
             "exact": ("num_test",),
-            "minibatches": ("num_inducing", "num_test", "minutes"),
         }
         return {name: settings[name] for name in own[kind[1]]}

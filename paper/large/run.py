@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gpytorch.mlls import VariationalELBO
-from torch import Tensor
 
 from gpadjust import CKA, VariationalCKA, fit
 from paper.common.experiment import Record
@@ -17,7 +15,6 @@ from paper.large import Large
 from paper.large.problem import Data, draw
 
 _TEST = 10_000  # added to the seed
-_BATCH = 1024
 
 
 def run(
@@ -37,15 +34,11 @@ def run(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             model: Any = CKA(data.X, data.Y, physics=data.physics)
-        fit(model)
     else:
         model = VariationalCKA(
             data.X, data.Y, physics=data.physics, num_inducing=settings.num_inducing
         )
-        if learner == "variational":
-            fit(model)
-        else:
-            _by_minibatches(model, data, 60 * settings.minutes, seed)
+    fit(model)
     found = {"seconds": time.perf_counter() - begin, **_scores(model, test)}
     if learner == "variational":
         rest = model.rest.kernel.outputscale.sqrt() * model.outcome_transform.stdvs.flatten()
@@ -71,24 +64,3 @@ def _scores(model: Any, test: Data) -> Record:
         "coverage": inside.mean(0).tolist(),
         "width": width.tolist(),
     }
-
-
-def _by_minibatches(model: VariationalCKA, data: Data, seconds: float, seed: int) -> None:
-    """Train all parameters by Adam, as GPyTorch's tutorials do, from where the exact fit ends."""
-    begin = time.perf_counter()
-    fit(model.start, "map")
-    model.model.place(model.model.inducing_points.clone())
-    inner: Any = model.model
-    mll = VariationalELBO(model.likelihood, inner, num_data=len(data.X))
-    optimiser = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], lr=0.01)
-    columns: Tensor = inner.train_inputs[0]
-    targets: Tensor = inner.train_targets
-    generator = torch.Generator().manual_seed(seed)
-    model.train()
-    while time.perf_counter() - begin < seconds:
-        rows = torch.randint(len(columns), (_BATCH,), generator=generator)
-        optimiser.zero_grad()
-        loss = -mll(inner(columns[rows]), targets[..., rows]).sum()
-        loss.backward()
-        optimiser.step()
-    model.eval()

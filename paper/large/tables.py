@@ -13,7 +13,6 @@ from paper.large import LEARNERS, PROBLEMS, Large
 _WHAT = {
     "variational": "VariationalCKA, `fit`",
     "exact": "CKA, `fit`",
-    "minibatches": "VariationalCKA, Adam on minibatches",
 }
 _OUTPUTS = {"hartmann6": ("",), "links": (", first", ", second")}
 

@@ -34,16 +34,16 @@ class Multifidelity(Experiment):
     """data sets; the number is the seed"""
     out: Path = Path("results/multifidelity")
     pairs: tuple[str, ...] = PAIRS
-    """problems of mf2"""
+    """of ``paper.multifidelity.functions``"""
     methods: tuple[Method, ...] = METHODS
     settings: Settings = field(default_factory=Settings)
 
     name: ClassVar[str] = "multifidelity"
     key: ClassVar[tuple[str, ...]] = ("pair", "per_input", "method", "seed")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "smt", "mf2")
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "smt")
 
     def check(self) -> None:
-        """Whether mf2 has the pairs."""
+        """Raise a ValueError for a pair that is not there."""
         from paper.multifidelity.problem import pair
 
         for name in self.pairs:

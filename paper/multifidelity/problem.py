@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,11 +12,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from gpadjust import BlackBoxPhysics
-
-with warnings.catch_warnings():
-    # Importing mf2 makes setuptools warn that a module which mf2 asks for is on its way out.
-    warnings.filterwarnings("ignore", "pkg_resources is deprecated", UserWarning)
-    import mf2
+from paper.multifidelity.functions import FUNCTIONS
 
 
 @dataclass(frozen=True)
@@ -25,7 +20,7 @@ class Pair:
     """A function of high fidelity, the truth, and one of low fidelity, the physics.
 
     Attributes:
-        name: The name in mf2.
+        name: The name in ``FUNCTIONS``.
         high: Maps ``N x d`` to ``N``.
         low: Likewise.
         bounds: Lower and upper bounds of the inputs, ``2 x d``.
@@ -58,26 +53,16 @@ class Pair:
         return self.scaled(SobolEngine(self.d, scramble=True, seed=seed).draw(n).double())
 
 
-def names() -> list[str]:
-    """The problems of mf2 that are such pairs."""
-    return sorted(
-        name
-        for name, value in vars(mf2).items()
-        if isinstance(value, mf2.MultiFidelityFunction)
-        and {"high", "low"} <= set(value.fidelity_names)
-    )
-
-
 def pair(name: str) -> Pair:
-    """The pair of mf2 with a given name.
+    """The pair of a given name.
 
     Raises:
         ValueError: If there is none.
     """
-    if name not in names():
-        raise ValueError(f"mf2 has no pair {name!r}; it has {', '.join(names())}")
-    problem = getattr(mf2, name)
-    return Pair(name, problem.high, problem.low, torch.from_numpy(problem.bounds))
+    if name not in FUNCTIONS:
+        raise ValueError(f"There is no pair {name!r}; there are {', '.join(FUNCTIONS)}.")
+    of = FUNCTIONS[name]
+    return Pair(name, of.high, of.low, torch.tensor([of.lower, of.upper], dtype=torch.float64))
 
 
 def observations(pair: Pair, n: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -49,7 +49,7 @@ class Optimisation(Experiment):
 
     name: ClassVar[str] = "optimisation"
     key: ClassVar[tuple[str, ...]] = ("problem", "learner", "seed")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "ax-platform", "mf2")
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "ax-platform")
 
     def check(self) -> None:
         """Raise an ImportError if Ax is not there."""

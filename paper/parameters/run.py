@@ -16,8 +16,8 @@ from torch import Size, Tensor
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.gp import PhysicsScaledKernel
 from gpadjust.inference import ParameterWarning, SamplingWarning
-from gpadjust.models import ExactGPBase, orthogonal_rbf
-from gpadjust.models.hyperparameters import scaled_rbf
+from gpadjust.models import TermsGP, orthogonal_rbf
+from gpadjust.models.parameters import scaled_rbf
 from gpadjust.validation import rmse
 from paper.common.experiment import Record
 from paper.parameters import Parameters
@@ -29,7 +29,7 @@ def growing(num_inputs: int, batch_shape: Size) -> Kernel:
     return PhysicsScaledKernel(scaled_rbf(num_inputs, batch_shape), lambda X: X[..., :1] ** 3)
 
 
-_BUILD: Mapping[str, Callable[..., ExactGPBase]] = {
+_BUILD: Mapping[str, Callable[..., TermsGP]] = {
     "physics": CalibratedPhysics,
     "free": PhysicsMeanGP,
     "orthogonal": partial(PhysicsMeanGP, covar_module=orthogonal_rbf),

@@ -90,7 +90,6 @@ def as_physics(equation: Any, settings: Settings) -> ODEPhysics:
         step=ARM_TIME_STEP,
         state_dim=4,
         substeps=settings.substeps,
-        memo=0,
         name="torque_arm",
         gradient="finite-difference",
     )

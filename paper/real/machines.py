@@ -75,7 +75,6 @@ class Machine:
             "step": STEP,
             "state_dim": self.spec.state_dim,
             "substeps": SUBSTEPS,
-            "memo": 0,
             "name": self.rates.__name__,
         }
 

@@ -59,7 +59,7 @@ class Structures(Experiment):
 
     name: ClassVar[str] = "structures"
     key: ClassVar[tuple[str, ...]] = ("problem", "size", "noise", "model", "seed")
-    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "mf2", "opensim")
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "opensim")
 
     def check(self) -> None:
         """Raise a ValueError for an unknown problem, an ImportError if OpenSim is missing."""

@@ -17,7 +17,7 @@ from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.dynamics.transition_scores import score_transitions
 from gpadjust.inference import SampleResult, SamplingWarning
-from gpadjust.models import ExactGPBase
+from gpadjust.models import TermsGP
 from paper.calibration import PUMP
 from paper.calibration.run import Data, of_pair, pump, scored
 from paper.common.experiment import Record
@@ -51,20 +51,20 @@ def run(
 
 def _of_function(data: Data, name: Model, seed: int) -> Record:
     """Scores of each output, as those of calibration."""
-    (model, power), found = _timed(lambda: _fitted(data, name))
+    (model, sizes), found = _timed(lambda: _fitted(data, name))
     scores = scored(model, data, seed)
     return {
         "N": len(data.X),
         **_scores(scores["nrmse"], scores["nlpd"], scores["coverage"]),
-        "power": power,
+        "effective_size": sizes,
         **found,
     }
 
 
-def _fitted(data: Data, name: Model) -> tuple[ExactGPBase, list[float]]:
+def _fitted(data: Data, name: Model) -> tuple[TermsGP, list[float]]:
     given = {} if name == "gp" else {"physics": data.physics}
     model = getattr(gpadjust, CLASSES[name])(data.X, data.Y, **given)
-    return model, _power(fit(model))
+    return model, _sizes(fit(model))
 
 
 def _of_system(data: System, name: Model) -> Record:
@@ -84,7 +84,7 @@ def _of_system(data: System, name: Model) -> Record:
     return {
         "N": len(data.train.states),
         **_scores(scores.rmse / sd, scores.nlpd - sd.log(), scores.coverage),
-        "power": _power(dynamics.fit_result),
+        "effective_size": _sizes(dynamics.fit_result),
         **found,
     }
 
@@ -103,9 +103,9 @@ def _scores(nrmse: Tensor, nlpd: Tensor, coverage: Tensor) -> Record:
     }
 
 
-def _power(result: Any) -> list[float]:
-    """That of the importance weights of each output."""
-    return result.power.reshape(-1).tolist() if isinstance(result, SampleResult) else []
+def _sizes(result: Any) -> list[float]:
+    """The effective sample size of the draws of each output."""
+    return result.effective_size.reshape(-1).tolist() if isinstance(result, SampleResult) else []
 
 
 def _timed(fitted: Callable[[], _Fitted]) -> tuple[_Fitted, Record]:

@@ -23,7 +23,7 @@ _CELL = ["problem", "size", "noise"]
 
 def load(records: Sequence[Record]) -> pd.DataFrame:
     """A row for each run."""
-    left = ("settings", "versions", "each", "power")
+    left = ("settings", "versions", "each", "power", "effective_size")
     return pd.DataFrame([{k: v for k, v in r.items() if k not in left} for r in records])
 
 

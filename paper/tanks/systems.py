@@ -74,7 +74,7 @@ def physics(structure: str, values: Mapping[str, float] | None = None) -> ODEPhy
     """The next levels, with unknown parameters, or these."""
     fixed: dict[str, Any] = {**FIXED[structure], **(values or {})}
     unknowns = {name: known for name, known in UNKNOWNS.items() if name not in fixed}
-    options: dict[str, Any] = {"step": STEP, "state_dim": 2, "substeps": 4, "memo": 0}
+    options: dict[str, Any] = {"step": STEP, "state_dim": 2, "substeps": 4}
     if not unknowns:
         return ODEPhysics(lambda x, u: rates(x, u, fixed), name=structure, **options)
     return ODEPhysics(

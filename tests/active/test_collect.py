@@ -74,7 +74,7 @@ class TestMeasuring:
         options = {"num_restarts": 2, "raw_samples": 16}
         result = collect(**laboratory(budget=10, fit=None, optimizer_options=options))
         grid = torch.cartesian_prod(*(torch.linspace(*b, 9, dtype=torch.float64) for b in bounds.T))
-        error = (result.model.posterior(grid).mean - truth(grid)).abs().max()
+        error = (result.model.predict(grid).mean - truth(grid)).abs().max()
         assert error < 0.1 * truth(grid).std()
 
     def test_the_seed_decides(self, laboratory):

@@ -53,7 +53,7 @@ def test_what_it_remembers_outlives_models():
         calls.append(len(x1))
         return x1
 
-    physics = ParameterPhysics(f_p)
+    physics = ParameterPhysics(BlackBoxPhysics(f_p))
     rows = torch.rand(4, 1, dtype=torch.float64)
     for each in (physics, deepcopy(physics), physics):
         each.of(("x1",))(rows)

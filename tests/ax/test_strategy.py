@@ -105,7 +105,7 @@ def test_cross_validation_leaves_each_trial_out(fit_options):
         units = adapter(ours).transforms["StandardizeY"]
         mean = model.left_out()[0].flatten()
         by_arm = {r.observed.arm_name: r.predicted for r in results}
-        shift, scale = model._units()
+        shift, scale = model.units()
         for i, name in enumerate(sorted(by_arm)):
             m = (mean[i] * scale + shift).item() * units.Ystd["output"] + units.Ymean["output"]
             index = by_arm[name].metric_signatures.index("output")

@@ -1,5 +1,7 @@
 """What a physics is asked, and the units in which it answers, whatever Ax transforms."""
 
+import sys
+
 import pytest
 import torch
 from ax.adapter.registry import Cont_X_trans, Generators, MBM_X_trans, Mixed_transforms, Y_trans
@@ -211,6 +213,7 @@ def test_a_plain_model_config_says_what_is_missing():
 def test_without_this_room_it_is_an_error_too(monkeypatch):
     own = ax_surrogate._submodel_input_constructor_base
     monkeypatch.setattr(ax_surrogate, "submodel_input_constructor", own)
+    monkeypatch.delitem(sys.modules, "gpadjust.ax")
     config = {"input_transform_classes": None}
     with pytest.raises(ValueError, match=r"other units than its own. Import gpadjust.ax"):
         adapter(experiment(), Recorded(), [*MBM_X_trans, *Y_trans], config)

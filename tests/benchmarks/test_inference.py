@@ -10,7 +10,7 @@ from botorch.optim.closures import get_loss_closure_with_grads
 from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gpadjust import CKA, fit
-from gpadjust.inference.objective import Objective
+from gpadjust.inference.targets import LogLikelihood
 
 
 def crude(X):
@@ -24,10 +24,10 @@ def test_step(benchmark, record_ratio, uniform, other):
     X = uniform(500, 6)
     Y = (1 + 0.3 * X[:, :1]) * crude(X) + X[:, :4].square()
     model = CKA(X, Y + 0.01 * torch.randn(500, 4, dtype=torch.float64), physics=crude)
-    objective = Objective(model)
+    objective = LogLikelihood(model)
     point = objective.parameters.current()
     with torch.no_grad():
-        _, covariance = objective._distribution(objective.parameters.unflatten(point))
+        _, covariance, *_ = objective.distribution(objective.parameters.unflatten(point))
     mll = ExactMarginalLogLikelihood(model.likelihood, model)
     step = get_loss_closure_with_grads(
         mll, {name: p for name, p in mll.named_parameters() if p.requires_grad}
@@ -100,7 +100,6 @@ def test_full_bayes(benchmark, record_ratio, uniform, n):
 @pytest.mark.parametrize("row", [("currin", 5), ("hartmann6", 5), ("branin", 100)])
 def test_default_beside_map(benchmark, record_ratio, row, points):
     """On data sets of paper/calibration: fitting, or predicting at so many points."""
-    pytest.importorskip("mf2")
     from paper.calibration.run import fitted, of_pair
 
     sets = [of_pair(*row, 0.0, 10, seed) for seed in range(3 if row[0] == "branin" else 5)]

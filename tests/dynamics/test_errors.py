@@ -9,7 +9,7 @@ from botorch.models import SingleTaskGP
 
 from gpadjust import CKA, RRA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.models import AdjustedGP, PaperRRA
+from gpadjust.models import PaperRRA, TermsGP
 from gpadjust.physics import FunctionPhysics, PhysicsError
 
 SPEC = StateSpec(["x", "v"], ["a"])
@@ -281,7 +281,7 @@ def test_rows_of_a_failing_physics_are_those_that_were_asked_for(learnt):
     def physics(X):
         return push(X).where(X[:, 2:] < 1.5, torch.nan) if broken else push(X)
 
-    physics = FunctionPhysics(physics, memo=0)
+    physics = FunctionPhysics(physics)
     dynamics = learnt(physics)
     states, actions, _ = transitions()  # known
     states, actions = states.repeat(2, 1), actions.repeat(2, 1)
@@ -298,7 +298,7 @@ def test_rows_of_a_failing_physics_are_those_that_were_asked_for(learnt):
 
 def test_an_integrated_state_hides_no_failure():
     spec = StateSpec(["x", "v"], ["a"], integrated={"x": "v"}, step=0.1)
-    physics = FunctionPhysics(lambda X: push(X).where(X[:, 2:] < 2.1, torch.nan), memo=0)
+    physics = FunctionPhysics(lambda X: push(X).where(X[:, 2:] < 2.1, torch.nan))
     states, actions, _ = transitions()
     velocity = states[:, 1:] + 0.1 * actions
     following = torch.cat([states[:, :1] + 0.05 * (states[:, 1:] + velocity), velocity], -1)
@@ -318,7 +318,7 @@ def test_an_integrated_state_hides_no_failure():
         ({"model": ZeroMeanGP}, TypeError, "ZeroMeanGP takes no physics.*model=CKA"),
         ({"model": "CKA"}, TypeError, "class of gpadjust.models.*found 'CKA'"),
         ({"model": SingleTaskGP}, TypeError, "class of gpadjust.models"),
-        ({"model": AdjustedGP}, ValueError, "needs rho, delta besides"),
+        ({"model": TermsGP}, TypeError, "TermsGP takes no physics"),
         ({"model_options": [1]}, TypeError, r"dictionary of arguments of CKA, found \[1\]"),
         ({"model_options": {"seed": 1}}, ValueError, "CKA does not take 'seed'.*rho_mean"),
         ({"model_options": {"train_X": 1}}, ValueError, "may not hold 'train_X'"),

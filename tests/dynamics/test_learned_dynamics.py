@@ -7,9 +7,8 @@ import torch
 
 from gpadjust import CKA, ScaleGP, ZeroMeanGP
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.gp import Term
-from gpadjust.models import AdjustedGP, Adjustment
-from gpadjust.models.hyperparameters import scaled_rbf
+from gpadjust.models import TermBuilder, TermsGP
+from gpadjust.models.parameters import scaled_rbf
 from gpadjust.physics import ODEPhysics
 from gpadjust.validation import trust
 
@@ -177,19 +176,17 @@ def test_model_sees_the_physics_of_the_user(cart_pole_system, make):
     assert dynamics.model.physics.physics is system.crude
 
 
-class WavyCKA(AdjustedGP):
+class WavyCKA(TermsGP):
     """A structure of a user's: CKA with a term more."""
 
-    def __init__(self, train_X, train_Y, train_Yvar=None, *, physics, waves=1, **options):
-        def more_terms(num_inputs, batch_shape, scale):
-            kernels = [scaled_rbf(num_inputs, batch_shape) for _ in range(waves)]
-            zero = torch.zeros_like(scale)
-            return [Term(f"wave_{i}", k, num_inputs, None, zero) for i, k in enumerate(kernels)]
-
-        adjustment = Adjustment(scaled_rbf, None), Adjustment(scaled_rbf, 0.0)
-        super().__init__(
-            train_X, train_Y, train_Yvar, physics, *adjustment, more_terms=more_terms, **options
+    def __init__(
+        self, train_X, train_Y, train_Yvar=None, *, physics, waves=1, center="learn", **options
+    ):
+        make = TermBuilder.of_adjustment(
+            train_X, train_Y, train_Yvar, physics=physics, center=center, **options
         )
+        terms = [make.term(f"wave_{i}", scaled_rbf) for i in range(waves)]
+        super().__init__(make, [*make.rhos(), make.delta(), *terms])
 
 
 def test_a_model_of_the_user(cart_pole_system):
@@ -212,7 +209,7 @@ def test_a_model_of_the_user(cart_pole_system):
     assert torch.equal(one.predict(states, actions).mean, other.predict(states, actions).mean)
     with pytest.raises(RuntimeError, match=r"model_options is .*waves.* in the state"):
         dynamics(model_options={}).load_state_dict(one.state_dict())
-    with pytest.raises(ValueError, match=r"WavyCKA does not take 'wave'.* waves, rho, delta"):
+    with pytest.raises(ValueError, match=r"WavyCKA does not take 'wave'.* waves, center"):
         dynamics(model_options={"wave": 2})
 
 

@@ -370,7 +370,7 @@ def test_a_record_takes_tensors_arrays_and_frames(kind):
     )
     parts = frame["t"], frame[["x"]], frame[["u"]]
     if kind != "frame":
-        parts = [part.to_numpy() for part in parts]
+        parts = [part.to_numpy(copy=True) for part in parts]
     if kind == "tensor":
         parts = [torch.tensor(part).double() for part in parts]
     record = Record(*parts, segments=frame["part"])

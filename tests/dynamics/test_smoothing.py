@@ -139,6 +139,7 @@ def test_noise_process_noise_parameters_and_states_are_found():
         assert 0.85 < (errors.abs() < 1.96 * sd).double().mean() <= 1
 
 
+@pytest.mark.slow
 def test_parameters_are_not_biased_by_noise_in_the_inputs():
     """Single steps from noisy states find less decay in more noise; free runs do not."""
     decay = FunctionPhysics(lambda X, p: p.a * X[:, 0] + X[:, 1],
@@ -230,6 +231,7 @@ def test_a_model_learns_from_draws_segment_by_segment():
     assert likely[1] < 0.8 * drawn[1]
 
 
+@pytest.mark.slow
 def test_a_state_that_one_record_lacks_starts_about_where_it_is_in_others():
     truth, actions = simulated(0)
     level = torch.tensor([0.0, 300.0])  # far from zero
@@ -301,6 +303,7 @@ def test_states_that_do_not_settle_are_told():
         smooth(Records(measured(truth, actions), SPEC), spring(), max_rounds=2)
 
 
+@pytest.mark.slow
 def test_small_process_noise_fits_free_runs_from_several_starts():
     """Of a spring that is too stiff by a priori factors, and only seen every fifth time."""
     truth, actions = simulated(3, scatter=torch.zeros(2))

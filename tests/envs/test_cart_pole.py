@@ -80,7 +80,7 @@ def test_power_of_force_and_friction_changes_the_energy(states_and_forces):
 @pytest.mark.parametrize("seconds", [3, pytest.param(10, marks=pytest.mark.slow)])
 def test_energy_is_conserved_without_damping(seconds):
     equation = CartPoleEquation(0.5, 0.5, 0.6, 0.0)
-    physics = ODEPhysics(equation, step=0.1, state_dim=4, substeps=50, memo=0)
+    physics = ODEPhysics(equation, step=0.1, state_dim=4, substeps=50)
     state = torch.tensor([[0.0, 2.0, 0.3, 1.0], [0.0, 0.1, 0.0, 0.0]], dtype=torch.float64)
     energy = equation.energy(state)
     for _ in range(10 * seconds):

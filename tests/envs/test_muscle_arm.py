@@ -401,6 +401,7 @@ def test_frame_shows_how_active_each_muscle_is(frame, muscle):
     assert count(half.astype(int), np.mean([BLUE, RED], axis=0)) > 30
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_and_no_log_is_written(tmp_path):
     code = (
         "import sys, gymnasium, gpadjust.envs, numpy as np\n"

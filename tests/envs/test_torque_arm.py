@@ -86,7 +86,7 @@ def test_equation_and_energy_are_those_of_the_lagrangian(mechanics, states_and_a
 
 def test_energy_is_conserved_for_2_s_without_damping_and_torque(states_and_actions):
     equation = replace(OTHER_ARM, damping=0.0)
-    physics = ODEPhysics(equation, step=0.2, state_dim=4, substeps=200, memo=0)
+    physics = ODEPhysics(equation, step=0.2, state_dim=4, substeps=200)
     state = states_and_actions(3)[0]
     energy = equation.energy(state)
     for _ in range(10):

@@ -14,9 +14,9 @@ from torch.distributions import MultivariateNormal
 
 from gpadjust import AR1, CKA, RRA, BiasGP, FitResult, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
 from gpadjust.gp.gaussian import nugget
-from gpadjust.inference import map_fit
+from gpadjust.inference import optimise
 from gpadjust.models import PaperRRA
-from gpadjust.models.hyperparameters import LogInterval
+from gpadjust.models.parameters import LogInterval
 
 QUICK = {"num_screened": 16, "num_starts": 2}
 
@@ -186,7 +186,7 @@ class TestManyPoints:
     @pytest.mark.slow
     def test_it_is_as_good_as_a_search_on_all(self, problem, monkeypatch):
         found = fit(problem(), "map").log_likelihood
-        monkeypatch.setattr(map_fit, "_MANY", 1000)
+        monkeypatch.setattr(optimise, "_MANY", 1000)
         assert (found >= fit(problem(), "map").log_likelihood - 0.1).all()
 
     def test_it_is_never_worse_than_the_start(self, problem):

@@ -5,6 +5,8 @@ import torch
 from botorch.exceptions.warnings import OptimizationWarning
 
 from gpadjust import CKA, compare, fit
+from gpadjust.inference import FitResult, fitting
+from gpadjust.inference.targets import LogLikelihood
 
 QUICK = {"num_screened": 16, "num_starts": 2}
 
@@ -70,6 +72,37 @@ class TestBadInput:
         after = [p for p in model.parameters() if p.requires_grad]
         assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
         assert not model.training
+
+
+class TestMethodsOfOnesOwn:
+    """A method is an entry of a table: a function of a model and its options."""
+
+    @pytest.fixture(autouse=True)
+    def nudge(self, monkeypatch):
+        def nudge(model, search, steps=1):
+            target = LogLikelihood(model)
+            vectors, reached = target.parameters.current(), []
+            for _ in range(steps or 1):
+                value, gradient = target.value_and_gradient(vectors)
+                reached.append(-value[0])
+                vectors = target.parameters.clipped(vectors - 1e-3 * gradient)
+            target.assign(vectors[0])
+            return FitResult(-target(vectors)[0], torch.stack(reached).isfinite().all(0))
+
+        monkeypatch.setitem(fitting.METHODS, "nudge", fitting.Method(nudge, {"steps": 1}))
+
+    def test_it_is_called(self, model):
+        start = -LogLikelihood(model)(LogLikelihood(model).parameters.current())[0]
+        result = fit(model, "nudge", steps=3)
+        assert (result.log_likelihood > start).all()
+        assert not model.training
+        assert model.is_fitted
+
+    def test_its_options_are_checked(self, model):
+        with pytest.raises(ValueError, match="Expected steps >= 1, got 0"):
+            fit(model, "nudge", steps=0)
+        with pytest.raises(ValueError, match=r"'map' has no option 'steps'; it is one .* 'nudge'"):
+            fit(model, "map", steps=2)
 
 
 class TestSeed:

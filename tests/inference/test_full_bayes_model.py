@@ -23,7 +23,7 @@ def matern(m):
 
 def partial_sum(m):
     batch = Size([m]) if m > 1 else Size()
-    first = ScaleKernel(RBFKernel(active_dims=[0], batch_shape=batch), batch_shape=batch)
+    first = ScaleKernel(RBFKernel(active_dims=[1], batch_shape=batch), batch_shape=batch)
     return first + ScaleKernel(MaternKernel(nu=1.5, batch_shape=batch), batch_shape=batch)
 
 
@@ -77,13 +77,14 @@ def test_posteriors(case, uniform, close, shape):
         expected = [single.posterior(Z, observation_noise=noise) for single in singles]
         check(model.posterior(Z, observation_noise=noise), expected, close)
     for name in {"rho", "delta"} & {*model.term_names}:
-        check(model.term(name, Z), [single.term(name, Z) for single in singles], close)
-    for noise in (False, True, uniform(*shape, m)):
-        per_point = noise.unsqueeze(-2) if isinstance(noise, torch.Tensor) else noise
-        expected = model.posterior(Z.unsqueeze(-2), observation_noise=per_point)
+        check(model.term(name, Z, mixed=False), [single.term(name, Z) for single in singles], close)
+    for noise in (False, True):
+        expected = model.posterior(Z.unsqueeze(-2), observation_noise=noise)
         mean, variance = model.predict(Z, observation_noise=noise)
         close(mean, expected.mixture_mean.squeeze(-2))
         close(variance, expected.mixture_variance.squeeze(-2))
+    given = uniform(*shape, m)
+    close(model.predict(Z, given).variance, model.predict(Z).variance + given)
 
 
 class TestObservations:

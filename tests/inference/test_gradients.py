@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
-from gpadjust.inference.objective import Objective
-from gpadjust.inference.target_distribution import ModuleDistribution
+from gpadjust.gp.noise import Noise
+from gpadjust.inference.targets import ByModules, LogLikelihood, StationaryTerms, Target
 
 D = 2
 SEEDS = st.integers(0, 2**31)
@@ -38,11 +38,20 @@ def kernel(smoothness, ard, batch=()):
     return ScaleKernel(base, batch_shape=shape).double()
 
 
-def assert_equal_to_autograd(model, seed, spread=0.5, tolerance=1e-6, **options):
-    by_hand = Objective(model, **options)
-    reference = Objective(model, autograd=True, **options)
-    assert not isinstance(by_hand._distribution, ModuleDistribution)
-    assert isinstance(reference._distribution, ModuleDistribution)
+def assert_equal_to_autograd(
+    model, seed, spread=0.5, tolerance=1e-6, kind=LogLikelihood, rows=None
+):
+    by_hand, reference = kind(model, rows), kind(model, rows)
+    assert isinstance(by_hand.distribution, StationaryTerms)
+    kept = slice(None) if rows is None else rows
+    noise = Noise(model.likelihood).known
+    reference.distribution = ByModules(
+        model,
+        reference.parameters,
+        model.transform_inputs(model.train_inputs[0])[..., kept, :],
+        None if noise is None else noise[..., kept],
+        kind.random_means,
+    )
     generator = torch.Generator().manual_seed(seed)
     current = by_hand.parameters.current()
     noise = torch.randn(3, *current.shape[1:], generator=generator, dtype=torch.float64)
@@ -55,6 +64,9 @@ def assert_equal_to_autograd(model, seed, spread=0.5, tolerance=1e-6, **options)
     error = (gradient - expected).abs() / size.clamp_min(1.0)
     assert error.max() < tolerance
     torch.testing.assert_close(by_hand(vectors), values, rtol=1e-10, atol=1e-10)
+
+
+BOUNDS = torch.tensor([[0.0] * D, [1.0] * D], dtype=torch.float64)
 
 
 def of(cls, **options):
@@ -71,6 +83,7 @@ MODELS = {
     "two physics": lambda X, Y, m: CKA(
         X, Y, physics=[physics(m), lambda X: X[..., :1] + physics(m)(X).sin()], center="mean"
     ),
+    "AR1": of(AR1, num_low=8, bounds=BOUNDS),
     "rho mean alone": of(PhysicsMeanGP, rho_mean="learn"),
 }
 
@@ -108,14 +121,14 @@ def test_one_parameter_alone(free):
     assert_equal_to_autograd(model, free)
 
 
-@pytest.mark.parametrize("marginal", [False, True])
+@pytest.mark.parametrize("kind", [LogLikelihood, Target])
 @pytest.mark.parametrize("rows", [None, [0, 2, 3, 5, 7, 8]])
 @pytest.mark.parametrize("name", ["CKA", "both means", "known noise", "two physics"])
-def test_missing_targets_and_some_rows(name, marginal, rows):
+def test_missing_targets_and_some_rows(name, kind, rows):
     X, Y = draw(3, m=2)
     Y[2, 0] = Y[5:7, 1] = torch.nan
     rows = None if rows is None else torch.tensor(rows)
-    assert_equal_to_autograd(MODELS[name](X, Y, 2), 3, marginal=marginal, rows=rows)
+    assert_equal_to_autograd(MODELS[name](X, Y, 2), 3, kind=kind, rows=rows)
 
 
 @pytest.mark.parametrize("smoothness", [None, 0.5, 1.5, 2.5], ids=["RBF", "1/2", "3/2", "5/2"])
@@ -133,8 +146,8 @@ def test_near_duplicate_inputs(smoothness, gap):
 @pytest.mark.parametrize("offset", [1e3, 1e6])
 def test_inputs_far_from_zero(offset):
     X, Y = draw(0)
-    near = Objective(ZeroMeanGP(X, Y))
-    far = Objective(ZeroMeanGP(X + offset, Y))
+    near = LogLikelihood(ZeroMeanGP(X, Y))
+    far = LogLikelihood(ZeroMeanGP(X + offset, Y))
     for a, b in zip(
         near.value_and_gradient(near.parameters.current()),
         far.value_and_gradient(near.parameters.current()),
@@ -143,20 +156,18 @@ def test_inputs_far_from_zero(offset):
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)
 
 
-BOUNDS = torch.tensor([[0.0] * D, [1.0] * D], dtype=torch.float64)
 OTHERS = {
     "periodic": of(CKA, delta_covar_module=ScaleKernel(PeriodicKernel()).double()),
     "product": of(CKA, delta_covar_module=(RBFKernel() * RBFKernel()).double()),
     "active_dims": of(CKA, delta_covar_module=RBFKernel(active_dims=[0]).double()),
     "RRA": of(RRA, num_features=8),
-    "AR1": of(AR1, num_low=8, bounds=BOUNDS),
 }
 
 
 @pytest.mark.parametrize("name", list(OTHERS))
 def test_other_forms_fall_back_to_autograd(name):
-    objective = Objective(OTHERS[name](*draw(0), 1))
-    assert isinstance(objective._distribution, ModuleDistribution)
+    objective = LogLikelihood(OTHERS[name](*draw(0), 1))
+    assert isinstance(objective.distribution, ByModules)
     _, gradient = objective.value_and_gradient(objective.parameters.current())
     assert gradient.isfinite().all()
     assert gradient.abs().max() > 0

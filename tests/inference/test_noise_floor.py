@@ -5,7 +5,7 @@ import torch
 
 from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
 from gpadjust.inference.warm_start import warm_start
-from gpadjust.models.hyperparameters import KINDS
+from gpadjust.models.parameters import KINDS
 
 pytestmark = pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
 QUICK = {"num_screened": 32, "num_starts": 4}

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
-from gpadjust.inference.objective import Objective
+from gpadjust.gp.gaussian import log_likelihood, negative_log_likelihood, nugget
+from gpadjust.inference.targets import LogLikelihood, LogPosterior, Target
 from gpadjust.models import PaperRRA
-from gpadjust.models.hyperparameters import KINDS
+from gpadjust.models.parameters import KINDS
 
 
 def crude(X):
@@ -132,7 +133,7 @@ def assert_gradient(objective, vectors):
 
 
 def test_it_is_gpytorchs_likelihood(model):
-    objective = Objective(model, marginal=True)
+    objective = Target(model)
     vectors = neighbours(objective)
     values = objective(vectors)
     assert values.shape == (3, objective.parameters.num_problems)
@@ -144,9 +145,9 @@ def test_it_is_gpytorchs_likelihood(model):
         torch.testing.assert_close(value, expected, rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("marginal", [False, True])
-def test_its_gradient_is_that_of_finite_differences(model, marginal):
-    objective = Objective(model, marginal=marginal)
+@pytest.mark.parametrize("kind", [LogLikelihood, Target, LogPosterior])
+def test_its_gradient_is_that_of_finite_differences(model, kind):
+    objective = kind(model)
     assert_gradient(objective, neighbours(objective, 2))
 
 
@@ -154,15 +155,15 @@ def test_rows_are_those_of_a_model_of_them(XY):
     X, Y = XY
     rows = torch.tensor([0, 2, 3, 6, 8])
     options = {"physics": crude, "outcome_transform": None, "center": 0.0}
-    part = Objective(CKA(X, Y, **options), marginal=True, rows=rows)
-    alone = Objective(CKA(X[rows], Y[rows], **options), marginal=True)
+    part = Target(CKA(X, Y, **options), rows=rows)
+    alone = Target(CKA(X[rows], Y[rows], **options))
     vectors = neighbours(alone)
     torch.testing.assert_close(part(vectors), alone(vectors), rtol=1e-9, atol=1e-9)
 
 
 def test_a_covariance_that_is_not_positive_definite_is_infinitely_bad(XY):
     X = XY[0][:, :1]
-    objective = Objective(CKA(X, crude(X), torch.full_like(X, 1e-6), physics=crude), marginal=True)
+    objective = Target(CKA(X, crude(X), torch.full_like(X, 1e-6), physics=crude))
     vectors = objective.parameters.current().repeat(2, 1, 1)
     vectors[1] = 800.0
     values, gradient = objective.value_and_gradient(vectors)
@@ -182,7 +183,7 @@ class TestConcentration:
     def test_a_common_factor_of_the_variances_makes_no_difference(self, name, seed, factor):
         generator = torch.Generator().manual_seed(seed)
         X = torch.rand(9, 2, generator=generator, dtype=torch.float64)
-        objective = Objective(BUILD[name](X, 1.5 * crude(X) + X.flip(-1)))
+        objective = LogLikelihood(BUILD[name](X, 1.5 * crude(X) + X.flip(-1)))
         assert objective.concentrated
         variances = objective.parameters.variances
         point = objective.parameters.current()
@@ -197,11 +198,11 @@ class TestConcentration:
 
     @pytest.mark.parametrize("name", ["known noise", "prior", "other priors", "learnt physics"])
     def test_it_is_not_for_models_with_a_scale_of_their_own(self, XY, name):
-        assert not Objective(BUILD[name](*XY)).concentrated
+        assert not LogLikelihood(BUILD[name](*XY)).concentrated
 
     def test_it_is_the_marginal_likelihood_at_the_best_scale(self, XY):
         model = BUILD["CKA"](*XY)
-        concentrated, marginal = Objective(model), Objective(model, marginal=True)
+        concentrated, marginal = LogLikelihood(model), Target(model)
         point, variances = concentrated.parameters.current(), concentrated.parameters.variances
         best, values = concentrated.at_best_scale(point)
         torch.testing.assert_close(values, concentrated(point), rtol=1e-12, atol=1e-12)
@@ -216,7 +217,7 @@ class TestConcentration:
             for term in model.terms:  # well conditioned without noise
                 term.kernel.base_kernel.raw_lengthscale.fill_(-2.5)
             model.likelihood.noise_covar.raw_noise.fill_(-20.0)
-        objective, marginal = Objective(model), Objective(model, marginal=True)
+        objective, marginal = LogLikelihood(model), Target(model)
         parameters, point = objective.parameters, objective.parameters.current()
         bound = parameters.lower - log_scale(objective, point).unsqueeze(-1) - excess
         point = torch.where(parameters.noise > 0, bound, point)
@@ -232,8 +233,8 @@ class TestConcentration:
 
 class TestVectors:
     def test_packing_is_undone(self, model):
-        parameters = Objective(model).parameters
-        vectors = neighbours(Objective(model))
+        parameters = LogLikelihood(model).parameters
+        vectors = neighbours(LogLikelihood(model))
         assert torch.equal(parameters.flatten(parameters.unflatten(vectors)), vectors)
         parameters.assign(vectors[1])
         torch.testing.assert_close(parameters.current()[0], vectors[1], rtol=1e-12, atol=1e-12)
@@ -244,7 +245,7 @@ class TestVectors:
                 if parameter.requires_grad:
                     change = 30.0 * torch.randn_like(parameter)
                     parameter += change.abs() if "noise" in name else change
-        parameters = Objective(model).parameters
+        parameters = LogLikelihood(model).parameters
         drawn = parameters.draw(50, torch.Generator().manual_seed(0))
         assert drawn.isfinite().all()
         for vectors in (parameters.current(), drawn):
@@ -267,7 +268,7 @@ class TestVagueTrend:
             model = BUILD[name](X, Y)
         else:
             model = CKA(X, Y, physics=physics)
-        objective = Objective(model, marginal=True, vague_trend=True)
+        objective = LogPosterior(model)
         vector = objective.parameters.current() + 0.2
         _, gradient = objective.value_and_gradient(vector)
         step = 1e-5 * torch.eye(vector.shape[-1], dtype=torch.float64).unsqueeze(1)
@@ -281,24 +282,27 @@ class TestVagueTrend:
         model.terms[1].kernel.base_kernel.lengthscale = 100.0
         model.likelihood.noise = 1e-2
 
-        def slope(**options):
-            objective = Objective(model, marginal=True, **options)
+        def slope(kind):
+            objective = kind(model)
             values = []
             for variance in (1e5, 1e7):
                 model.terms[1].kernel.outputscale = variance
-                values.append(objective(objective.parameters.current()).item())
+                vector = objective.parameters.current()
+                # Without what a density of logarithms has beside.
+                logs = vector.sum() if objective.of_logs else 0.0
+                values.append((objective(vector) + logs).item())
             return (values[1] - values[0]) / math.log(100)
 
         # Level and slope cost half a logarithm of the variance each.
-        assert slope() == pytest.approx(1.0, abs=0.05)
-        assert slope(vague_trend=True) == pytest.approx(0.0, abs=0.05)
+        assert slope(Target) == pytest.approx(1.0, abs=0.05)
+        assert slope(LogPosterior) == pytest.approx(0.0, abs=0.05)
 
     def test_a_variance_that_cannot_make_the_trend_is_ruled_out(self):
         X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
         model = ZeroMeanGP(X, 1 + X)
         model.terms[0].kernel.base_kernel.lengthscale = 10.0
         model.likelihood.noise = 1e-6
-        objective, values = Objective(model, marginal=True, vague_trend=True), []
+        objective, values = LogPosterior(model), []
         for variance in (1e-4, 1e3):
             model.terms[0].kernel.outputscale = variance
             values.append(objective(objective.parameters.current()).item())
@@ -316,7 +320,7 @@ class TestVagueTrend:
         if inputs == "constant where observed":
             X[:7, 1] = 0.3
             Y = torch.cat([Y, Y.masked_fill((torch.arange(12) >= 7).unsqueeze(-1), math.nan)], -1)
-        objective = Objective(ZeroMeanGP(X, Y), marginal=True, vague_trend=True)
+        objective = LogPosterior(ZeroMeanGP(X, Y))
         assert_gradient(objective, neighbours(objective, 1))
 
     def test_units_of_the_inputs_make_no_difference(self):
@@ -324,6 +328,24 @@ class TestVagueTrend:
         Y, values = X[:, :1].sin() + X[:, 1:], []
         for unit in (1.0, 1e7):
             units = torch.tensor([unit, 1.0])
-            objective = Objective(ZeroMeanGP(X * units, Y), marginal=True, vague_trend=True)
-            values.append(objective(objective.parameters.current()))
+            objective = LogPosterior(ZeroMeanGP(X * units, Y))
+            vector = objective.parameters.current()
+            # The density of a logarithm has no units.
+            logs = vector.sum(-1)
+            values.append(objective(vector) + logs)
         torch.testing.assert_close(values[0], values[1], rtol=1e-6, atol=1e-6)
+
+
+def test_it_is_the_textbooks(XY):
+    model = BUILD["known noise"](*XY)
+    target, inputs = Target(model), model.transform_inputs(model.train_inputs[0])
+    with torch.no_grad():
+        covariance = model.covar_module(inputs).to_dense() + torch.diag_embed(model.noise.known)
+        residual = model.train_targets - model.mean_module(inputs)
+        added = nugget(len(XY[0])) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1)
+        identity = torch.eye(len(XY[0]), dtype=torch.float64)
+        expected = log_likelihood(residual, covariance + added[:, None, None] * identity)
+        value = target(target.parameters.current())[0]
+    torch.testing.assert_close(-value, expected, rtol=1e-12, atol=1e-12)
+    fast = negative_log_likelihood(residual, covariance.clone()).value
+    torch.testing.assert_close(-fast, expected, rtol=1e-12, atol=1e-12)

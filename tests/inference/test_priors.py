@@ -10,7 +10,7 @@ from torch.distributions import LogNormal, Normal
 
 from gpadjust import CKA
 from gpadjust.inference import register_priors
-from gpadjust.inference.objective import Objective
+from gpadjust.inference.targets import LogPosterior, Target
 
 
 def priors(model):
@@ -73,7 +73,7 @@ def test_objective_is_gpytorchs_log_posterior(build, data, shuffle, kind, num_ou
     model = build(kind, *data(num_outputs=num_outputs))
     register_priors(model)
     shuffle(model)
-    objective = Objective(model, marginal=True)
+    objective = Target(model)
     model.train()
     inputs = model.train_inputs[0]
     likelihood = model.likelihood(model(inputs), model.transform_inputs(inputs))
@@ -92,8 +92,9 @@ def test_potential_has_the_jacobian_of_the_logarithm(data, crude_physics, prior)
         X, Y, center=0.0, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel
     )
     register_priors(model)
-    objective = Objective(model, marginal=True)
-    of_logs = Objective(model, marginal=True, of_logs=True)
+    objective = Target(model)
+    of_logs = LogPosterior(model)
+    of_logs._trend = None
     potential = of_logs.value_and_gradient
     settings = objective.parameters.current() + 0.1
     value, gradient = potential(settings)
@@ -102,3 +103,16 @@ def test_potential_has_the_jacobian_of_the_logarithm(data, crude_physics, prior)
     step = 1e-5 * torch.eye(settings.shape[-1], dtype=torch.float64).unsqueeze(-2)
     numeric = (potential(settings + step)[0] - potential(settings - step)[0]) / 2e-5
     torch.testing.assert_close(gradient[0, 0], numeric[:, 0], rtol=1e-5, atol=1e-5)
+
+
+def test_two_priors_of_one_parameter_both_count(data, crude_physics):
+    X, Y = data()
+    model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1])
+    kernel = model.terms[0].kernel
+    values = []
+    for i, prior in enumerate([LogNormalPrior(0.1, 0.7), LogNormalPrior(-2.0, 0.3)]):
+        kernel.register_prior(f"prior_{i}", prior, "outputscale")
+        target = Target(model)
+        values.append(target(target.parameters.current()))
+    added = LogNormalPrior(-2.0, 0.3).log_prob(kernel.outputscale.detach())
+    torch.testing.assert_close(values[1] - values[0], -added.reshape(1, 1))

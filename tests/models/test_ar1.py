@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from botorch.models.transforms import Normalize
 
-from gpadjust import AR1
+from gpadjust import AR1, fit
 
 
 @pytest.fixture
@@ -143,3 +144,28 @@ def test_known_noise_of_a_prediction_is_the_high_levels(
     Z = uniform(4, 2, high=2.0, seed=3)
     added = model.posterior(Z, observation_noise=True).variance - model.posterior(Z).variance
     torch.testing.assert_close(added, Yvar.mean().expand_as(added))
+
+
+@pytest.mark.parametrize("Yvar", [None, 0.01])
+def test_low_values_that_are_missing(uniform, crude_physics, close, Yvar):
+    X, low_X, Z = (uniform(n, 2, high=2.0, seed=n) for n in (7, 11, 5))
+    Y, low_Y = crude_physics(X)[:, :1].cos(), crude_physics(low_X)[:, :1]
+    fewer = AR1(X, Y, Yvar, low_X=low_X[1:], low_Y=low_Y[1:])
+    both = low_Y.expand(-1, 2).clone()
+    both[0, 1] = torch.nan
+    two = AR1(X, Y.expand(-1, 2), Yvar, low_X=low_X, low_Y=both)
+    close(two.outcome_transform.stdvs[..., 1], fewer.outcome_transform.stdvs[..., 0])
+    for model in (two, fewer):
+        fit(model, "map")
+    torch.testing.assert_close(two.predict(Z).mean[:, 1:], fewer.predict(Z).mean, rtol=1e-4, atol=0)
+
+
+def test_what_a_transform_learnt_stays(uniform, crude_physics):
+    X, low_X, Z = uniform(7, 1), uniform(11, 1, seed=1), 3 + uniform(2, 1, seed=2)
+    low_Y, Y = low_X.sin(), X.sin() + X
+    model = AR1(X, Y, low_X=low_X, low_Y=low_Y, input_transform=Normalize(1))
+    model = model.condition_on_observations(Z, Z.sin() + Z)
+    before = model.predict(Z)
+    model.train()
+    model.eval()
+    torch.testing.assert_close(model.predict(Z).mean, before.mean)

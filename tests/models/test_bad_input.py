@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from botorch.models.transforms import Log
+from botorch.models.transforms import Log, Normalize, Standardize
 from botorch.models.transforms.input import AppendFeatures
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
-from gpytorch.likelihoods import GaussianLikelihood
+from gpytorch.likelihoods import BernoulliLikelihood, GaussianLikelihood
 
 from gpadjust import AR1, CKA, BlackBoxPhysics, PhysicsError, ScaleGP
 
@@ -19,7 +19,7 @@ def XY(data):
 NAN, INF = float("nan"), float("inf")
 # What is done to inputs, targets and variances of nine points; the error, and what it says.
 BAD_DATA = [
-    (lambda X, Y: (X, Y[:8]), ValueError, r"agree in all but the last.*\(9, 2\) and \(8, 1\)"),
+    (lambda X, Y: (X, Y[:8]), ValueError, r"agree in all but the last.*\(9, 2\).*\(8, 1\)"),
     (lambda X, Y: (X.expand(2, 9, 2), Y), ValueError, "to agree in all but the last"),
     (lambda X, Y: (X, Y[:, 0]), ValueError, r"train_Y with at least 2 dim.*reshape\(-1, 1\)"),
     (lambda X, Y: (X, Y[:, :0]), ValueError, "one input column and one output column"),
@@ -56,11 +56,23 @@ def test_data(build, kind, XY):
             cls(*change(*XY), **(options if kind != "ZeroMeanGP" else {}))
 
 
+def test_a_function_in_the_place_of_variances(build, kind, XY):
+    for physics in ({}, {} if kind == "ZeroMeanGP" else {"physics": lambda X: X.sum(-1)}):
+        with pytest.raises(TypeError, match="a function as train_Yvar: did you mean physics="):
+            type(build(kind, *XY))(*XY, lambda X: X.sum(-1), **physics)
+
+
 def test_an_output_that_is_hardly_observed(build, kind, data):
     X, Y = data(num_outputs=2)
     Y[1:, 1] = torch.nan
     with pytest.raises(ValueError, match=r"at least 2 observations .* column\(s\) \[1\]"):
         build(kind, X, Y)
+
+
+def test_a_likelihood_of_one_output_for_two(data):
+    X, Y = data(num_outputs=2)
+    with pytest.raises(ValueError, match=r"batch_shape \(2,\), one for each output"):
+        CKA(X, Y, physics=lambda X: X, likelihood=GaussianLikelihood().double())
 
 
 @pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "RRA"])
@@ -146,6 +158,29 @@ BAD_OPTIONS = [
         for upper in ([1.0, -1.0], [1.0, INF], [1.0, NAN])
     ),
     ("AR1", {"num_low": 1}, ValueError, "num_low >= 2 samples of f_p, got 1"),
+    ("AR1", {"num_low": 2.5}, TypeError, r"num_low must be a whole number; found 2\.5"),
+    *(
+        (kind, {"seed": seed}, TypeError, f"seed must be a whole number; found {seed!r}")
+        for kind in ("AR1", "RRA", "RRA-paper")
+        for seed in ("a", 1.5)
+    ),
+    *(
+        (kind, {"input_transform": "x"}, TypeError, "to be one of BoTorch's, got 'x'")
+        for kind in ("CKA", "ZeroMeanGP", "RRA", "AR1")
+    ),
+    *(
+        (kind, {"input_transform": Normalize(3)}, ValueError, "input transform does not fit inp")
+        for kind in ("CKA", "ZeroMeanGP", "RRA", "AR1")
+    ),
+    *(
+        (kind, {"outcome_transform": Standardize(3)}, ValueError, "outcome transform does not fit")
+        for kind in ("CKA", "ZeroMeanGP", "RRA", "AR1")
+    ),
+    *(
+        (kind, {"likelihood": likelihood}, TypeError, "Gaussian likelihood of GPyTorch, got")
+        for kind in ("CKA", "ZeroMeanGP", "RRA")
+        for likelihood in ("x", BernoulliLikelihood())
+    ),
 ]
 
 

@@ -7,7 +7,7 @@ import torch
 from botorch.models.transforms import Normalize
 from botorch.sampling import SobolQMCNormalSampler
 
-from gpadjust.models.cholesky_strategy import batched_product
+from gpadjust.models.exact_conditioning import batched_product
 
 
 def sampler(num_fantasies):
@@ -165,8 +165,15 @@ def test_bad_observations(data, build, kind):
             model.condition_on_observations(wrong.expand(2, 2), Y[:2])
     with pytest.raises(ValueError, match="with a row for each"):
         model.condition_on_observations(X[:2], Y[:3])
-    with pytest.raises(ValueError, match="Expected Y with 1 columns"):
+    with pytest.raises(ValueError, match=r"Y of shape \.\.\. x k x 1"):
         model.condition_on_observations(X[:2], Y[:2].expand(2, 2))
     known = build(kind, X, Y, 0.1)
     with pytest.raises(ValueError, match="pass `noise`"):
         known.condition_on_observations(X[:1], Y[:1])
+
+
+def test_noise_that_is_learnt_is_not_given(data, build, kind):
+    X, Y = data()
+    model = build(kind, X, Y)
+    with pytest.raises(ValueError, match="The model learns its noise"):
+        model.condition_on_observations(X[:1], Y[:1], noise=torch.full_like(Y[:1], 0.1))

@@ -1,10 +1,10 @@
 """Models from BoTorch's datasets."""
 
-import inspect
-
 import pytest
 import torch
 from botorch.utils.datasets import SupervisedDataset
+
+from gpadjust.models.terms_gp import arguments_of
 
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
@@ -38,6 +38,6 @@ def test_every_option_is_taken(data, build, kind):
     model, names = build(kind, X, Y), {"feature_names": ["a", "b"], "outcome_names": ["y"]}
     dataset = SupervisedDataset(X, Y, **names)
     data_names = {"self", "train_X", "train_Y", "train_Yvar"}
-    options = dict.fromkeys(inspect.signature(type(model)).parameters.keys() - data_names)
+    options = dict.fromkeys(arguments_of(type(model)).keys() - data_names)
     arguments = type(model).construct_inputs(dataset, **options)
     assert arguments.keys() == options.keys() | {"train_X", "train_Y"}

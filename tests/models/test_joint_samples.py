@@ -1,8 +1,14 @@
 """Joint samples have the moments of their posterior, whatever its size, and gradients."""
 
+import math
+
 import pytest
 import torch
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
+from botorch.sampling import IIDNormalSampler, SobolQMCNormalSampler
+from torch.distributions import MultivariateNormal
+
+from gpadjust.models.posteriors import MarginalMixture, ScaleFreePosterior
 
 DRAWS = 20_000
 KINDS = ["CKA", "RRA", "PhysicsMeanGP", "ScaleGP", "ZeroMeanGP", "AR1"]
@@ -71,17 +77,31 @@ def test_scalarized_outputs(model_of, uniform, kind, noisy):
     assert ((samples.std(0) / sd - 1).abs() < 0.03).all()
 
 
+@pytest.fixture
+def held(model_of, uniform):
+    """`held(kind, noisy, m)` is a model of three samples of its hyper-parameters, and inputs."""
+
+    def held(kind, noisy=True, num_outputs=1):
+        model, X = model_of(kind, noisy, 1e3, num_outputs)
+        learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
+        spread = 0.3 * torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
+        model.hold_samples({n: torch.stack([p + s for s in spread]) for n, p in learnt.items()})
+        return model, torch.cat([X[:3], uniform(9, 2, high=2.0, seed=1)])
+
+    return held
+
+
 @pytest.mark.parametrize("kind", ["CKA", "RRA"])
 @pytest.mark.parametrize("noisy", [True, False], ids=["noisy", "exact"])
-def test_a_mixture_over_hyper_parameters(model_of, uniform, kind, noisy):
-    model, X = model_of(kind, noisy, 1e3)
-    learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
-    spread = 0.3 * torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
-    model.hold_samples({n: torch.stack([p + s for s in spread]) for n, p in learnt.items()})
-    Z = torch.cat([X[:3], uniform(9, 2, high=2.0, seed=1)])
-    for method in (model.posterior, model.rho, model.delta):
+def test_a_mixture_over_hyper_parameters(held, kind, noisy):
+    model, Z = held(kind, noisy)
+    for ask in (
+        model.posterior,
+        lambda Z: model.rho(Z, mixed=False),
+        lambda Z: model.delta(Z, mixed=False),
+    ):
         with torch.no_grad():
-            posterior = method(Z)
+            posterior = ask(Z)
             samples = posterior.rsample(torch.Size([DRAWS]))
         assert samples.shape == (DRAWS, 3, 12, 1)
         for draws, variance in (
@@ -89,3 +109,97 @@ def test_a_mixture_over_hyper_parameters(model_of, uniform, kind, noisy):
             (samples.flatten(0, 1), posterior.mixture_variance),
         ):
             assert ((draws.std(0) / variance.sqrt() - 1).abs() < 0.03).all()
+
+
+class TestMixed:
+    """rho and delta, whose samples are mixed: moments, draws and densities of the whole."""
+
+    @pytest.mark.parametrize("num_outputs", [1, 2])
+    @pytest.mark.parametrize("sampler", [None, IIDNormalSampler, SobolQMCNormalSampler])
+    def test_draws_have_the_moments(self, held, num_outputs, sampler):
+        model, Z = held("CKA", True, num_outputs)
+        torch.manual_seed(0)
+        for ask in (model.rho, model.delta):
+            with torch.no_grad():
+                posterior, each = ask(Z), ask(Z, mixed=False)
+                draws = posterior.rsample(torch.Size([DRAWS]))
+                if sampler is not None:
+                    draws = sampler(torch.Size([DRAWS]), seed=0)(posterior)
+                assert draws.shape == (DRAWS, 12, num_outputs)
+                assert posterior.mean.shape == posterior.variance.shape == (12, num_outputs)
+                torch.testing.assert_close(posterior.mean, each.mean.mean(0))
+                second = (each.variance + each.mean.square()).mean(0)
+                torch.testing.assert_close(posterior.variance, second - posterior.mean.square())
+                covariance = posterior.mixture_covariance_matrix
+            sd = posterior.variance.mT.flatten().sqrt()
+            torch.testing.assert_close(covariance.diagonal().sqrt(), sd)
+            assert torch.equal(posterior.covariance_matrix, covariance)
+            draws = draws.mT.flatten(1)
+            standard = (draws - posterior.mean.mT.flatten()) / sd
+            assert (standard.mean(0).abs() < 0.04).all()
+            correlation = covariance / sd.outer(sd)
+            assert ((standard.mT @ standard / DRAWS - correlation).abs() < 0.06).all()
+
+    def test_draws_are_of_one_sample_each(self, held):
+        """Far apart from the others, each draw is of one of them at all points."""
+        model, Z = held("CKA")
+        with torch.no_grad():
+            posterior = model.rho(Z)
+            far = torch.tensor([-1e3, 0.0, 1e3], dtype=torch.float64).reshape(3, 1)
+            normal = posterior.components.distribution
+            components = ScaleFreePosterior.of_outputs(
+                normal.mean + far, normal.covariance_matrix, False
+            )
+            draws = MarginalMixture(components).rsample(torch.Size([600])).squeeze(-1)
+        near = (draws / 1e3).round()
+        assert (near == near[:, :1]).all()
+        assert all(150 < (near[:, 0] == k).sum() < 250 for k in (-1, 0, 1))
+
+    @pytest.mark.parametrize("num_outputs", [1, 2])
+    def test_joint_density(self, held, num_outputs):
+        model, Z = held("CKA", True, num_outputs)
+        with torch.no_grad():
+            posterior = model.delta(Z[::6])
+            values = posterior.rsample(torch.Size([4]))
+            found = posterior.log_prob(values)
+            normal = posterior.components.distribution
+            roots = [torch.linalg.cholesky(each) for each in normal.covariance_matrix]
+            parts = [
+                MultivariateNormal(mean, scale_tril=root).log_prob(values.mT.flatten(1))
+                for mean, root in zip(normal.loc, roots, strict=True)
+            ]
+        expected = torch.stack(parts).logsumexp(0) - math.log(len(parts))
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-2)
+        with pytest.raises(NotImplementedError, match="mixed=False"):
+            posterior.entropy()
+
+    def test_density_is_the_slope_of_the_quantiles(self, held):
+        posterior = held("CKA")[0].rho(held("CKA")[1])
+        levels = torch.tensor([0.3, 0.3001], dtype=torch.float64)
+        low, high = posterior.quantile(levels)
+        for i in range(len(low)):
+            density = posterior.density((low[i] + high[i]).squeeze() / 2)[i]
+            torch.testing.assert_close(density * (high - low)[i] / 1e-4, torch.ones(1).double())
+
+    def test_batches(self, held):
+        model, Z = held("CKA", True, 2)
+        posterior = model.rho(Z.reshape(4, 3, 2))
+        assert posterior.rsample(torch.Size([5])).shape == (5, 4, 3, 2)
+        assert SobolQMCNormalSampler(torch.Size([5]))(posterior).shape == (5, 4, 3, 2)
+        torch.testing.assert_close(posterior.mean.flatten(0, 1), model.rho(Z).mean)
+
+
+@pytest.mark.parametrize("num_outputs", [1, 2])
+def test_no_variance_is_rounded_up(model_of, uniform, num_outputs):
+    """GPyTorch's own distribution has variances of at least 1e-10, with a warning (an error)."""
+    model, _ = model_of("CKA", True, 1e-9, num_outputs)
+    Z = uniform(5, 2)
+    with torch.no_grad():
+        for posterior in (model.posterior(Z), model.posterior(Z, [0])):
+            variance = posterior.distribution.variance
+            assert variance.max() < 1e-15
+            torch.testing.assert_close(
+                variance.reshape(posterior.variance.shape), posterior.variance
+            )
+            low, high = posterior.distribution.confidence_region()
+            assert (high - low).max() < 1e-6

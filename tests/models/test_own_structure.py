@@ -7,26 +7,21 @@ import torch
 from gpytorch.kernels import PeriodicKernel, ScaleKernel
 
 from gpadjust import fit
-from gpadjust.gp import Term
-from gpadjust.models import AdjustedGP, Adjustment
-from gpadjust.models.hyperparameters import scaled_rbf
+from gpadjust.models import TermBuilder, TermsGP
 
 
-def season(num_inputs, batch_shape, scale):
-    """A periodic term of the first input."""
+def season(num_inputs, batch_shape):
+    """A periodic kernel of the first input."""
     base = PeriodicKernel(batch_shape=batch_shape, active_dims=(0,)).double()
     base.period_length = 0.5
     base.raw_period_length.requires_grad_(False)
-    kernel = ScaleKernel(base, batch_shape=batch_shape).double()
-    return [Term("season", kernel, num_inputs, None, torch.zeros_like(scale))]
+    return ScaleKernel(base, batch_shape=batch_shape).double()
 
 
-class Seasonal(AdjustedGP):
+class Seasonal(TermsGP):
     def __init__(self, train_X, train_Y, train_Yvar=None, *, physics, **options):
-        rho, delta = Adjustment(scaled_rbf, None), Adjustment(scaled_rbf, 0.0)
-        super().__init__(
-            train_X, train_Y, train_Yvar, physics, rho, delta, more_terms=season, **options
-        )
+        make = TermBuilder.of_adjustment(train_X, train_Y, train_Yvar, physics=physics, **options)
+        super().__init__(make, [*make.rhos(), make.delta(), make.term("season", season)])
 
 
 def physics(X):
@@ -73,4 +68,4 @@ def test_it_is_a_model_like_others(problem, shuffle, same, close):
     learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
     before = model.term("season", Z).variance
     model.hold_samples({n: torch.stack([p, p + 0.2]) for n, p in learnt.items()})
-    close(model.term("season", Z).variance[0], before)
+    close(model.term("season", Z, mixed=False).variance[0], before)

@@ -1,4 +1,4 @@
-"""How often the physics is evaluated: once for each distinct row."""
+"""How often the physics is evaluated: a simulator once a row, a formula once a call."""
 
 from collections import Counter
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from botorch.sampling import SobolQMCNormalSampler
 
-from gpadjust import FunctionPhysics, fit
+from gpadjust import BlackBoxPhysics, FunctionPhysics, fit
 
 
 @pytest.fixture
@@ -33,7 +33,8 @@ def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs,
     counting.num_outputs = num_outputs
     X, Y = data(num_outputs=num_outputs)
     Z, new_X = uniform(4, 2, seed=1), uniform(2, 2, seed=2)
-    model = build(kind, X, Y, physics=counting)
+    simulator = BlackBoxPhysics(lambda x: counting(torch.from_numpy(x)).numpy())
+    model = build(kind, X, Y, physics=simulator)
     fit(model, "map", num_screened=8, num_starts=1)
     with torch.no_grad():
         model.posterior(Z)
@@ -54,7 +55,7 @@ def test_each_row_is_evaluated_once(data, build, uniform, counting, num_outputs,
 @pytest.mark.parametrize("kind", PHYSICAL)
 def test_each_call_evaluates_it_once(data, build, uniform, counting, kind):
     X, Y = data()
-    model = build(kind, X, Y, physics=FunctionPhysics(counting, memo=0)).eval()
+    model = build(kind, X, Y, physics=FunctionPhysics(counting)).eval()
     functions = model.sample_functions(3)
     model.posterior(X)
     counting.rows.clear()

@@ -9,8 +9,9 @@ from botorch.models.transforms import Normalize
 from botorch.sampling.pathwise import draw_kernel_feature_paths, draw_matheron_paths
 from gpytorch.kernels import ConstantKernel, RBFKernel, RFFKernel, ScaleKernel
 
+from gpadjust import CKA
 from gpadjust.gp import Term
-from gpadjust.models.sampled_functions import TermFeatures
+from gpadjust.gp.features import TermFeatures
 
 
 def test_moments(data, build, costly_kind, num_outputs, uniform):
@@ -39,6 +40,49 @@ def test_paths_meet_exact_data(data, build, kind, num_outputs):
     model = build(kind, X, Y, 2e-5 * Y.square().mean(0).expand_as(Y), **options)
     values = model.sample_functions(5, seed=0)(X)
     torch.testing.assert_close(values, Y.expand_as(values), rtol=0, atol=0.1)
+
+
+class TestWithoutNoise:
+    """The nugget of the covariance is noise to the posterior, and to functions drawn from it."""
+
+    def spread(self, model, Z):
+        """Of functions, in standard deviations of the posterior."""
+        with torch.no_grad():
+            values, (mean, variance) = model.sample_functions(1000, 0, 8192)(Z), model.predict(Z)
+        assert (variance.sqrt() < 2e-4).all()
+        assert ((values.mean(0) - mean).abs() < 0.2 * variance.sqrt()).all()
+        return values.std(0) / variance.sqrt()
+
+    @pytest.fixture
+    def model(self, uniform, num_outputs):
+        X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        Y = torch.cat([2 * (6 * X).sin() + X, (5 * X).cos()], -1)[:, :num_outputs]
+        model = CKA(X, Y, physics=lambda X: (6 * X).sin().expand(-1, num_outputs))
+        with torch.no_grad():
+            model.likelihood.noise_covar.raw_noise.fill_(-25.0)
+            for term in model.terms:
+                term.kernel.base_kernel.raw_lengthscale.fill_(1.5)
+                term.kernel.raw_outputscale.fill_(8.0)  # of which the nugget is a share
+        return model.eval()
+
+    Z = torch.linspace(0.05, 0.95, 7, dtype=torch.float64).unsqueeze(-1)
+
+    def test_spread(self, model):
+        assert ((self.spread(model, self.Z) - 1).abs() < 0.1).all()
+
+    def test_after_further_observations(self, model):
+        more = self.Z[[1, 4]] + 0.03
+        model = model.condition_on_observations(more, model.posterior(more).mean.detach())
+        assert ((self.spread(model, self.Z) - 1).abs() < 0.2).all()
+
+
+def test_points_for_other_functions(data, build, kind, uniform):
+    model = build(kind, *data())
+    functions = model.sample_functions(3, seed=0)
+    assert functions.each(uniform(3, 4, 2)).shape == (3, 4, 1)
+    for shape in ((2, 4, 2), (4, 2), (1, 3, 4, 2)):
+        with pytest.raises(ValueError, match=r"each of 3 functions, 3 x q x d, got shape"):
+            functions.each(uniform(*shape))
 
 
 def test_shapes_and_seed(data, build, kind, num_outputs, uniform):

@@ -1,11 +1,16 @@
 """Models as files."""
 
+import sys
+import warnings
+
 import pytest
 import torch
 from botorch.models.transforms import Normalize
+from gpytorch.kernels import MaternKernel, ScaleKernel
 from torch.nn.functional import relu, silu
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, StackedGP, ZeroMeanGP, load, save
+from gpadjust.inference import register_priors
 from gpadjust.physics import as_physics
 
 
@@ -19,6 +24,24 @@ def problem(uniform):
     Y = relu(X) * 1.2 + X.square()
     Y[2, 1] = torch.nan
     return X, Y, uniform(5, 2, seed=1)
+
+
+class Gained(CKA):
+    """A structure of one's own, with an option whose name begins as that of the physics."""
+
+    def __init__(self, train_X, train_Y, train_Yvar=None, *, physics, physics_gain=1.0, low=0.0):
+        def gained(X):
+            return physics_gain * physics(X) + low
+
+        super().__init__(train_X, train_Y, train_Yvar, physics=gained)
+
+
+def saved(model, path):
+    """Save a model of a physics that has no name, without the warning of it."""
+    with pytest.warns(
+        UserWarning, match=r"other programs cannot import it.*load\(path, .*physics="
+    ):
+        save(model, path)
 
 
 def same(model, other, Z):
@@ -70,7 +93,7 @@ def test_what_has_no_name_is_given_again(uniform, path):
     X, Y, Z = problem(uniform)
     options = {"physics": lambda X: relu(X), "input_transform": Normalize(2)}
     model = CKA(X, Y, **options)
-    save(model, path)
+    saved(model, path)
     with pytest.raises(ValueError, match="could not hold input_transform and physics"):
         load(path)
     same(model, load(path, **options), Z)
@@ -111,18 +134,54 @@ def test_a_state_of_another_model_changes_nothing(uniform):
 def test_whether_it_is_fitted_is_known_of_a_loaded_model(uniform, path):
     X, Y, _ = problem(uniform)
     model = CKA(X, Y, physics=relu)
-    save(model, path)
-    assert not model.is_fitted
-    assert not load(path).is_fitted
-    with torch.no_grad():
-        model.likelihood.noise_covar.raw_noise += 0.1
-    save(model, path)
-    assert model.is_fitted
-    assert load(path).is_fitted
+    for expected in (False, True):
+        model.was_fitted = expected  # as `fit` says it
+        save(model, path)
+        assert load(path).is_fitted == expected
+        assert model.subset_output([0]).is_fitted == expected
+        save(StackedGP({"CKA": model}, [[1.0, 1.0]]), path)
+        assert load(path).made_of["CKA"].is_fitted == expected
     known = CKA(X, Y, physics=relu)
     for parameter in known.parameters():
         parameter.requires_grad_(False)
     assert known.is_fitted  # as nothing is to be learnt
+
+
+@pytest.mark.parametrize("name", ["low_covar_module", "delta_covar_module"])
+def test_a_kernel_is_given_again(uniform, path, name):
+    """A kernel of AR1's low level is no datum of it, and came back as another."""
+    X, Y, Z = problem(uniform)
+
+    def kernel(num_inputs, batch_shape):
+        base = MaternKernel(0.5, ard_num_dims=num_inputs, batch_shape=batch_shape)
+        return ScaleKernel(base, batch_shape=batch_shape).double()
+
+    model = AR1(X, Y, physics=relu, low_X=X + 0.1, **{name: kernel})
+    save(model, path)
+    with pytest.raises(ValueError, match=f"could not hold {name}"):
+        load(path)
+    same(model, load(path, **{name: kernel}), Z)
+    save(AR1(X, Y, physics=relu, low_X=X + 0.1), path)
+    with pytest.raises(ValueError, match=rf"model\.pt: it does not take {name}, but .*: nothing"):
+        load(path, **{name: kernel})
+
+
+def test_options_of_a_structure_of_your_own(uniform, path):
+    X, Y, Z = problem(uniform)
+    model = Gained(X, Y, physics=relu, physics_gain=3.0, low=1.0)
+    saved(model, path)
+    assert torch.load(path, weights_only=True)["options"] == {"physics_gain": 3.0, "low": 1.0}
+    same(model, load(path, physics=relu), Z)
+
+
+def test_known_noise_of_later_observations(uniform, path):
+    X, Y, Z = problem(uniform)
+    model = CKA(X, Y, 0.01, physics=relu)
+    named = {n: p for n, p in model.named_parameters() if p.requires_grad}
+    model.hold_samples({n: torch.stack([p.detach(), p.detach() + 0.5]) for n, p in named.items()})
+    model = model.condition_on_observations(Z, relu(Z), noise=torch.full_like(Z, 0.3))
+    save(model, path)
+    same(model, load(path), Z)
 
 
 def test_a_stacked_model_comes_back(uniform, path):
@@ -147,7 +206,7 @@ def test_a_stacked_model_of_several_physics_is_given_those_without_a_name(unifor
     }
     models |= {"of all": CKA(X, Y, physics=parts), "none": ZeroMeanGP(X, Y)}
     stacked = StackedGP(models, torch.full((4, 2), 0.25).double())
-    save(stacked, path)
+    saved(stacked, path)
     with pytest.raises(ValueError, match="could not hold physics"):
         load(path)
     same(load(path, physics=parts), stacked, Z)
@@ -160,7 +219,163 @@ def test_files_that_are_no_models(path):
     with pytest.raises(ValueError, match="is not a model that gpadjust saved"):
         load(path)
     torch.save({"format": 99}, path)
-    with pytest.raises(ValueError, match="expected format 1"):
+    with pytest.raises(ValueError, match="expected format 2"):
         load(path)
     with pytest.raises(TypeError, match="Expected a model of gpadjust, got Linear"):
         save(torch.nn.Linear(1, 1), path)
+
+
+def test_paths_that_are_no_files(uniform, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = ZeroMeanGP(*problem(uniform)[:2])
+    for path, error, says in (
+        (None, TypeError, "Expected path as the name of a file, got None"),
+        (3, TypeError, "name of a file, got 3"),
+        (tmp_path, ValueError, "is a folder; name a file in it"),
+        ("", ValueError, "is a folder"),
+        (tmp_path / "none" / "model.pt", ValueError, "in a folder that does not exist"),
+    ):
+        with pytest.raises(error, match=says):
+            save(model, path)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_nothing_is_left_of_a_file_that_could_not_be_written(uniform, path, monkeypatch):
+    model = ZeroMeanGP(*problem(uniform)[:2])
+    save(model, path)
+    before = path.read_bytes()
+
+    def full(content, part):
+        part.write_bytes(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space"):
+        save(model, path)
+    assert [*path.parent.iterdir()] == [path]
+    assert path.read_bytes() == before
+
+
+def test_a_physics_of_a_script_is_told_of(uniform, path, monkeypatch):
+    X, Y, Z = problem(uniform)
+    main = sys.modules["__main__"]
+    monkeypatch.setattr(main, "script_physics", lambda X: relu(X), raising=False)
+    function = main.script_physics
+    function.__module__, function.__qualname__ = "__main__", "script_physics"
+    model = CKA(X, Y, physics=function)
+    saved(model, path)
+    same(model, load(path), Z)  # by the same script
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save(CKA(X, Y, physics=relu), path)
+
+
+class TestFilesOfStrangers:
+    @pytest.fixture
+    def content(self, uniform, path):
+        """`content(**changes)` is the path of a file of a model with these parts changed."""
+        X, Y, _ = problem(uniform)
+        save(CKA(X, Y, physics=relu), path)
+        held = torch.load(path, weights_only=True)
+
+        def content(**changes):
+            torch.save({**held, **changes}, path)
+            return path
+
+        content.held = held
+        return content
+
+    @pytest.fixture
+    def planted(self, tmp_path, monkeypatch):
+        """A module that leaves a trace when it is imported, and when it is called."""
+        trace = tmp_path / "trace"
+        (tmp_path / "planted_module.py").write_text(
+            f"from pathlib import Path\nfrom os import _exit\n"
+            f"trace = Path({str(trace)!r})\ntrace.touch()\n"
+            "class X:\n    def __init__(self, *args):\n        trace.write_text('called')\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        yield trace
+        sys.modules.pop("planted_module", None)
+
+    def test_a_class_of_no_module_that_was_imported(self, content, planted):
+        with pytest.raises(ValueError, match="module 'planted_module' was not imported: do so"):
+            load(content(**{"class": "planted_module:X"}))
+        assert not planted.exists()
+        for name in ("gpadjust.models.structures:None", "builtins:dict", "torch.nn:Linear"):
+            with pytest.raises(ValueError, match=r"model\.pt: .*has no such model"):
+                load(content(**{"class": name}))
+
+    def test_a_physics_that_is_given_is_not_imported(self, content, planted):
+        path = content(physics={"": "planted_module:X"})
+        assert load(path, physics=relu).num_outputs == 2
+        assert not planted.exists()
+
+    @pytest.mark.parametrize(
+        "name",
+        ["builtins:exit", "os:_exit", "torch:os._exit", "planted_module:_exit", "planted_module:X"],
+    )
+    def test_what_is_no_physics_is_not_called(self, content, planted, name):
+        with pytest.raises(
+            ValueError, match=r"model\.pt: .*(a function of Python itself|not name a physics)"
+        ):
+            load(content(physics={"": name}))
+        assert not planted.exists() or not planted.read_text()
+
+    PARTS = ("class", "options", "missing", "physics", "physics_values", "data", "names", "state")
+
+    @pytest.mark.parametrize("part", PARTS)
+    def test_damaged_parts(self, content, part):
+        """One that is left out or wrong is an error with the file's name, or does no harm."""
+        path = content()
+        torch.save({name: each for name, each in content.held.items() if name != part}, path)
+        with pytest.raises(ValueError, match=r"model\.pt is damaged.*KeyError"):
+            load(path)
+        refused = 0
+        for wrong in (None, 3, "x", [3], {"x": 3}, {"train_X": 1}, torch.ones(2)):
+            try:
+                load(content(**{part: wrong}))
+            except ValueError as error:
+                refused += "model.pt" in str(error)
+        assert refused > 3
+
+    def test_a_stacked_model(self, uniform, path):
+        X, Y, _ = problem(uniform)
+        save(StackedGP({"zero": ZeroMeanGP(X, Y)}, [[1.0, 1.0]]), path)
+        held = torch.load(path, weights_only=True)
+        for name in ("models", "weights", "num_components"):
+            for wrong in (None, 3.5, "x", [3], {}, {"x": 3}):
+                torch.save({**held, name: wrong}, path)
+                with pytest.raises(ValueError, match=r"model\.pt"):
+                    load(path)
+
+    def test_what_is_given_beside_the_file(self, content, uniform):
+        for given in ({"foo": 1}, {"train_Y": uniform(8, 2)}, {"center": 0.0}):
+            with pytest.raises(
+                ValueError, match=rf"does not take {next(iter(given))}, but only.*physics"
+            ):
+                load(content(), **given)
+        with pytest.raises(ValueError, match=r"model\.pt is damaged, or what was given is wrong"):
+            load(content(), physics=3.0)
+
+
+def test_what_a_fit_may_move_comes_back(uniform, path):
+    X, Y, Z = problem(uniform)
+    model = CKA(X, Y, physics=relu)
+    model.likelihood.noise = 0.5
+    model.likelihood.noise_covar.raw_noise.requires_grad_(False)
+    register_priors(model)
+    save(model, path)
+    again = load(path)
+    same(model, again, Z)
+    learnt = [{n for n, p in m.named_parameters() if p.requires_grad} for m in (model, again)]
+    assert learnt[0] == learnt[1]
+
+
+def test_a_physics_of_small_units_is_compared(uniform, path):
+    X, Y, _ = problem(uniform)
+    model = CKA(X, 1e-10 * Y, physics=lambda X: 1e-10 * relu(X))
+    saved(model, path)
+    with pytest.raises(ValueError, match="saved with another physics"):
+        load(path, physics=lambda X: 3e-10 * relu(X))
+    load(path, physics=lambda X: 1e-10 * relu(X))

@@ -97,7 +97,7 @@ def test_each_is_evaluated_once_a_call(uniform, cls):
             counts[f.__name__] += len(X)
             return f(X)
 
-        return FunctionPhysics(physics, memo=0, name=f.__name__)
+        return FunctionPhysics(physics, name=f.__name__)
 
     model = cls(X, Y, physics=[counted(swing), counted(drift)]).eval()
     functions = model.sample_functions(2)

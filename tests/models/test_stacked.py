@@ -141,6 +141,8 @@ def test_functions_are_spread_over_the_components(models, weights, Z):
     mean, variance = stacked.predict(Z)
     assert ((values.mean(0) - mean).abs() < 0.3 * variance.sqrt()).all()
     assert functions(Z.expand(3, -1, -1)).shape == (400, 3, 5, 2)
+    with pytest.raises(ValueError, match=r"each of 400 functions, 400 x q x d"):
+        functions.each(Z.expand(3, -1, -1))
     few = stacked.sample_functions(1, seed=0)
     assert torch.equal(few(Z), stacked.sample_functions(1, seed=0)(Z))
 
@@ -186,7 +188,9 @@ def test_conditioning_with_known_noise(data, Z, holds_samples):
         stacked = stacked.condition_on_observations(Z[row], new_Y[row], noise=noise)
     for ours, theirs in zip(stacked.predict(X, True), model.predict(X, True), strict=True):
         torch.testing.assert_close(ours, theirs)
-    assert stacked.subset_output([1]).groups[0][0].data()["train_Yvar"].max() == pytest.approx(0.3)
+    assert stacked.subset_output([1]).parts[0][0].model.data()["train_Yvar"].max() == pytest.approx(
+        0.3
+    )
     torch.testing.assert_close(leave_one_out(stacked).mean, leave_one_out(model).mean)
     with pytest.raises(ValueError, match="pass `noise`"):
         stacked.condition_on_observations(Z, new_Y)
@@ -252,12 +256,26 @@ def test_bad_input(data, models, weights, Z):
         (models, weights[:1], "weights of shape"),
         (models, -weights, "not negative"),
         (models, weights / 2, "1 in all"),
-        ({**models, "mean": PhysicsMeanGP(X[1:], Y[1:], physics=f_p)}, weights, "the same data"),
-        ({**models, "mean": PhysicsMeanGP(X + 1, Y, physics=f_p)}, weights, "the same data"),
-        ({**models, "mean": PhysicsMeanGP(X, 2 * Y, physics=f_p)}, weights, "the same data"),
+        (
+            {**models, "mean": PhysicsMeanGP(X[1:], Y[1:], physics=f_p)},
+            weights,
+            "the same points and outputs",
+        ),
+        (
+            {**models, "mean": PhysicsMeanGP(X + 1, Y, physics=f_p)},
+            weights,
+            "the same points and outputs",
+        ),
+        (
+            {**models, "mean": PhysicsMeanGP(X, 2 * Y, physics=f_p)},
+            weights,
+            "the same points and outputs",
+        ),
     ):
         with pytest.raises(ValueError, match=says):
             StackedGP(given, share)
+    with pytest.raises(TypeError, match=r"models by name.*got a list"):
+        StackedGP([*models.values()], weights)
     with pytest.raises(TypeError, match="got a Linear as 'mean'"):
         StackedGP({**models, "mean": torch.nn.Linear(1, 1)}, weights)
     with pytest.raises(TypeError, match="Expected weights as a tensor or lists"):

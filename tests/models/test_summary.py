@@ -5,6 +5,7 @@ import re
 import pytest
 import torch
 from botorch.models.transforms import Normalize
+from gpytorch.kernels import RBFKernel, ScaleKernel
 from torch.distributions import MultivariateNormal, Normal
 
 from gpadjust import (
@@ -19,6 +20,7 @@ from gpadjust import (
     ZeroMeanGP,
     fit,
 )
+from gpadjust.models.parameters import hyperparameters
 
 
 def crude(X):
@@ -120,3 +122,20 @@ def test_parameters_of_the_physics():
     text = model.summary()
     assert re.search(r"slope: 1\.\d+ \(1\.\d+ to \d\.\d+\) m/s\n", text)
     assert re.search(r"rest: 1\.0\d* \(1.* to 1\.\d+\), at the bound 1\n", text)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_a_kernel_that_reads_some_inputs(uniform, normalize):
+    X = uniform(9, 3) * torch.tensor([1.0, 10.0, 1000.0])
+    ranges = X.amax(0) - X.amin(0)
+    kernel = ScaleKernel(RBFKernel(ard_num_dims=2, active_dims=(2, 0))).double()
+    options = {"input_transform": Normalize(3)} if normalize else {}
+    model = CKA(X, X[:, :1], physics=lambda X: X[:, 1:2], delta_covar_module=kernel, **options)
+    rows = [row for row in hyperparameters(model) if row.kind == "lengthscale"]
+    typical = torch.ones(2).double() if normalize else ranges[[2, 0]]
+    torch.testing.assert_close(rows[-1].size.flatten(), typical)
+    kernel.base_kernel.lengthscale = 0.5 * typical
+    text = model.summary().split("delta:")[1]
+    for i in (2, 0):
+        assert f"lengthscale of x{i + 1}: {0.5 * ranges[i]:.4g}" in text
+    assert "lengthscale of x2" not in text

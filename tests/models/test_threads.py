@@ -4,9 +4,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from threadpoolctl import threadpool_info, threadpool_limits
-
-from gpadjust.gp.gaussian import threads_for
 
 # With known noise and without.
 CASES = [("CKA", 2, True), ("RRA", 1, False)]
@@ -41,20 +38,3 @@ def test_answers_are_those_of_one_thread(data, build, kind, uniform, num_outputs
             for actual, right in zip(answers, expected[i % 4], strict=True):
                 torch.testing.assert_close(actual.detach(), right)
         fresh.train()
-
-
-def test_limits_that_overlap_are_lifted():
-    def libraries():
-        return {each["filepath"]: each["num_threads"] for each in threadpool_info()}
-
-    with threadpool_limits(limits=2):
-        before = libraries()
-        first, second = threads_for(12, others=True), threads_for(12, others=True)
-        first.__enter__()
-        limited = libraries()
-        assert set(limited.values()) == {1}
-        second.__enter__()
-        first.__exit__(None, None, None)
-        second.__exit__(None, None, None)
-        torch.set_num_threads(2)  # its own is one of each thread, and here there is one only
-        assert libraries() == before

@@ -171,3 +171,17 @@ class TestForrester:
     def test_at_length(self, forrester, factor, limit):
         errors = [self.error(forrester, seed, factor) for seed in range(20)]
         assert statistics.mean(errors) <= limit
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6, 1e8])
+def test_a_constant_of_both_makes_no_difference(uniform, offset):
+    X, Y = problem(uniform)
+    model = PhysicsMeanGP(
+        X,
+        Y + offset,
+        physics=lambda X: crude(X)[..., :1] + offset,
+        rho_mean="learn",
+        delta_mean="learn",
+    )
+    fit(model, "map", **QUICK)
+    assert model.term_mean("rho") == pytest.approx(3.0, abs=0.4)

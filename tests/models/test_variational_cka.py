@@ -10,17 +10,18 @@ from botorch.acquisition import UpperConfidenceBound
 from botorch.acquisition.knowledge_gradient import qKnowledgeGradient
 from botorch.acquisition.logei import qLogExpectedImprovement, qLogNoisyExpectedImprovement
 from botorch.acquisition.objective import ScalarizedPosteriorTransform
-from botorch.fit import fit_gpytorch_mll
+from botorch.acquisition.thompson_sampling import PathwiseThompsonSampling
 from botorch.models import ModelListGP
-from botorch.models.approximate_gp import ApproximateGPyTorchModel
 from botorch.models.transforms import Normalize
 from botorch.optim import optimize_acqf
 from botorch.sampling import SobolQMCNormalSampler
-from gpytorch.mlls import VariationalELBO
+from botorch.sampling.pathwise import draw_matheron_paths
+from torch import Size
 
 from gpadjust import CKA, StackedGP, VariationalCKA, compare, fit, load, save
-from gpadjust.inference.collapsed_bound import CollapsedBound, observations
-from gpadjust.models.summary import log_likelihood
+from gpadjust.inference.collapsed_bound import CollapsedBound, Observations
+from gpadjust.models.component_noise import ComponentNoise
+from gpadjust.models.terms_gp import arguments_of
 from gpadjust.validation import Structure
 
 LINE = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
@@ -63,15 +64,13 @@ def one():
     return copy.deepcopy(fitted_once(1))
 
 
-def take_optimum(model):
+def take_optimum(model, points=None):
     """The best distribution of inducing values at the hyper-parameters that a model has."""
-    likelihood = model.likelihood
-    known = likelihood.noise if likelihood.noise.shape[-1] == len(model.train_inputs[0]) else None
-    data = observations(model.start, model.train_inputs[0], model.train_targets, known)
-    found = CollapsedBound(model.start, data, model.model.inducing_points).optimum()
-    model.start.eval()
-    model.model.hold(found.mean, found.root)
-    return found.bound
+    points = model.inducing_points if points is None else points.expand_as(model.inducing_points)
+    bound, mean, root = CollapsedBound(model.exact(), Observations.of(model), points).optimum()
+    model.inducing_points, model.inducing_mean, model.inducing_root = points, mean, root
+    model.eval().forget()
+    return bound
 
 
 def give_rest(model, variance=0.3, lengthscale=0.2):
@@ -91,12 +90,12 @@ def test_points_at_all_inputs_make_the_exact_model(shuffle, close, num_outputs, 
     args = [0.01 + 0.02 * X.expand(Y.shape)] if case == "known noise" else []
     model = make(X, Y, *args, num_inducing=len(X))
     exact = CKA(X, Y, *args, physics=model.physics)
-    shuffle(model.start, 1)
-    exact.load_state_dict(model.start.state_dict())
+    shuffle(model.exact(), 1)
+    own, state = exact.state_dict(), model.state_dict()
+    exact.load_state_dict({name: state[name] for name in own})
     exact.eval()
-    model.model.place(model.train_inputs[0].expand_as(model.model.inducing_points))
-    bound = take_optimum(model)
-    close(bound, log_likelihood(exact) + _jacobian(exact), 1e-4)
+    bound = take_optimum(model, model.train_inputs[0])
+    close(bound, exact.log_evidence()[1] + _jacobian(exact), 1e-4)
     Z = torch.linspace(-0.2, 1.2, 9, dtype=torch.float64).unsqueeze(-1)
     for name in ("posterior", "rho", "delta"):
         ours, theirs = getattr(model, name)(Z), getattr(exact, name)(Z)
@@ -113,7 +112,7 @@ def test_points_at_all_inputs_make_the_exact_model(shuffle, close, num_outputs, 
 def _jacobian(model):
     """From a likelihood in the user's units to that in the model's."""
     count = (~model.train_targets.isnan()).sum(-1)
-    return count * model._units()[1].squeeze(-1).log()
+    return count * model.units()[1].squeeze(-1).log()
 
 
 @pytest.mark.parametrize("rest", [False, True], ids=["none", "rest"])
@@ -145,61 +144,14 @@ def test_all_that_predicts_agrees(close, fitted, rest):
     torch.testing.assert_close(draws.std(0), sd.detach(), rtol=0.15, atol=0)
 
 
-def test_botorch_predicts_the_same_less_the_rest(close, one):
-    X = problem(12)[0].reshape(3, 4, 1)
-    assert isinstance(one, ApproximateGPyTorchModel)
-    theirs = ApproximateGPyTorchModel.posterior(one, X)
-    close(theirs.mean, one.posterior(X).mean)
-    close(theirs.variance, one.posterior(X).variance, 1e-6)
-    give_rest(one)
-    scale = one.outcome_transform.stdvs.square()
-    ours = one.posterior(X).variance - 0.3 * scale
-    close(ApproximateGPyTorchModel.posterior(one, X).variance, ours, 1e-6)
-
-
-def test_variational_elbo_at_the_optimum_is_the_bound(close, fitted):
-    X = problem(120, fitted.num_outputs)[0]
-    bound = take_optimum(fitted)
-    mll = VariationalELBO(fitted.likelihood, fitted.model, num_data=len(X))
-    fitted.train()
-    close(len(X) * mll(fitted(X), fitted.train_targets), bound, 1e-4)
-
-
-def test_minibatches_raise_the_elbo(num_outputs):
-    X, Y = problem(100, num_outputs)
-    model = make(X, Y)
-    mll = VariationalELBO(model.likelihood, model.model, num_data=len(X))
-    learnt = [p for p in model.parameters() if p.requires_grad]
-    optimizer = torch.optim.Adam(learnt, lr=0.05)
-    model.train()
-    with torch.no_grad():
-        before = mll(model(X), model.train_targets)
-    for i in range(25):
-        rows = slice(25 * (i % 4), 25 * (i % 4 + 1))
-        optimizer.zero_grad()
-        (-mll(model(X[rows]), model.train_targets[..., rows]).sum()).backward()
-        if not i:
-            center = [n for n, p in model.named_parameters() if p.grad is None and p.requires_grad]
-            assert not center
-        optimizer.step()
-    with torch.no_grad():
-        assert (mll(model(X), model.train_targets) > before + 0.1).all()
-    model.posterior(X[:3], output_indices=[0])
-    assert torch.equal(copy.deepcopy(model).predict(X).mean, model.predict(X).mean)
-
-
-def test_fit_gpytorch_mll(close, fitted):
-    X, _ = problem(120, fitted.num_outputs)
-    with torch.no_grad():
-        for term in fitted.covar_module.terms:
-            term.kernel.outputscale *= 2
-    fitted.forget()
-    before = fitted.predict(X).mean
-    mll = VariationalELBO(fitted.likelihood, fitted.model, num_data=len(X))
-    fit_gpytorch_mll(mll, optimizer_kwargs={"options": {"maxiter": 10}}, max_attempts=1)
-    after = fitted.predict(X).mean
-    assert not torch.equal(after, before)
-    close(copy.deepcopy(fitted).predict(X).mean, after)
+def test_before_a_fit_it_is_the_prior(close, num_outputs):
+    X, Y = problem(30, num_outputs)
+    model, Z = make(X, Y), problem(7)[0]
+    mean, variance = model.predict(Z)
+    close(mean, model.physics(Z))
+    prior = model.covar_module.at(model.model_inputs(Z)).variance() * model.units()[1].square()
+    close(variance, model.outputs_last(prior), 1e-6)
+    assert model.evidence.isnan().all()
 
 
 def test_shapes_of_posteriors(close, num_outputs, fitted):
@@ -230,6 +182,29 @@ def test_acquisition_functions(one):
         assert 0.2 < best.item() < 0.4  # of the maximum, 0.28
 
 
+def test_paths_of_botorch(close, fitted):
+    X, m = problem(4)[0], fitted.num_outputs
+    torch.manual_seed(0)
+    paths = draw_matheron_paths(fitted, torch.Size([200, 2]))
+    values = paths(X)
+    assert values.shape == ((200, 2, 2, 4) if m > 1 else (200, 2, 4))
+    mean, variance = (fitted.outputs_first(each).detach() for each in fitted.predict(X))
+    assert ((values.mean((0, 1)) - mean).abs() < 5 * (variance / 400).sqrt()).all()
+    torch.testing.assert_close(values.flatten(0, 1).std(0), variance.sqrt(), rtol=0.2, atol=0)
+    close(paths(X.expand(3, 200, 2, 4, 1)), values.expand(3, *values.shape))
+    own = paths(X.repeat(50, 1)[:, None, None].expand(-1, 2, 1, 1))  # a point for each of 200
+    assert own.shape == ((200, 2, 2, 1) if m > 1 else (200, 2, 1))
+    close(own[7, ..., 0], values[7, ..., 3])
+
+
+def test_thompson_sampling(one):
+    torch.manual_seed(0)
+    acquisition = PathwiseThompsonSampling(one)
+    X = torch.tensor([0.28, 0.75], dtype=torch.float64).reshape(2, 1, 1)
+    value = acquisition(X)
+    assert value[0] > value[1]
+
+
 def test_lists_of_models(close, one):
     X, Y = problem(120)
     exact = CKA(X[:20], Y[:20], physics=wave)
@@ -255,10 +230,42 @@ def test_copies(fitted):
     moved = copy.deepcopy(fitted).to(torch.float64).cpu()
     copies = [copy.deepcopy(fitted), pickle.loads(pickle.dumps(fitted)), fresh, moved]
     for each in copies:
-        assert each.start.covar_module is each.model.covar_module
+        assert each.exact().covar_module.terms[0] is each.covar_module.terms[0]
         for ours, theirs in zip(each.predict(LINE, True), fitted.predict(LINE, True), strict=True):
             assert torch.equal(ours, theirs)
         assert each.summary() == fitted.summary()
+
+
+@pytest.mark.parametrize("noise", [None, 0.01])
+def test_all_of_a_model_moves(noise):
+    model = make(*problem(40, 2), noise)
+    model.predict(LINE)
+    tensors = [*model.state_dict().values(), *model.data().values(), *model.train_inputs]
+    assert {t.device.type for t in tensors if t is not None} == {"cpu"}
+    assert not {"train_X", "train_Y", "columns"} & {n.strip("_") for n in model.state_dict()}
+    model.to("meta")
+    tensors = [*model.state_dict().values(), *model.data().values(), *model.train_inputs]
+    tensors += [model.train_targets, model.likelihood.noise, model.search_rows]
+    tensors += [model.at(model.train_inputs[0]).mean(), *model.rest.parameters()]
+    assert {t.device.type for t in tensors if t is not None} == {"meta"}
+
+
+def test_its_arguments_are_those_of_an_exact_model():
+    ours, theirs = arguments_of(VariationalCKA), arguments_of(CKA)
+    assert ours == {**theirs, "num_inducing": False, "seed": False}
+
+
+def test_all_rows_are_asked_about_once():
+    X, Y = problem(1500)
+    asked = []
+
+    def physics(X):
+        asked.append(len(X))
+        return wave(X)
+
+    model = VariationalCKA(X, Y, physics=physics, num_inducing=5)
+    fit(model, num_screened=0, max_iterations=1)
+    assert sorted(asked)[-2:] == [1000, 1500]
 
 
 @pytest.mark.parametrize("noise", [None, 0.01])
@@ -338,8 +345,6 @@ def test_bad_input(one):
             make(X, Y, num_inducing=number)
     with pytest.raises(ValueError, match="columns"):
         one.predict(torch.zeros(2, 3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="takes transformed inputs with 2 columns"):
-        one(X)
     with pytest.raises(ValueError, match="no unknown term 'season'"):
         one.term("season", X)
 
@@ -358,12 +363,22 @@ def test_texts(one):
 
 def test_an_exact_model_of_many_points_warns():
     X, Y = problem(5001)
-    with pytest.warns(UserWarning, match="gpadjust.VariationalCKA takes the same arguments"):
+    with pytest.warns(UserWarning, match="gpadjust.VariationalCKA takes the arguments of CKA"):
         CKA(X, Y, physics=wave)
 
 
 def test_stacking_and_comparison_want_exact_models(one):
-    with pytest.raises(TypeError, match="Expected exact models of gpadjust"):
+    with pytest.raises(TypeError, match="Expected exact models such as CKA, got a VariationalCKA"):
         StackedGP({"many": one}, [[1.0]])
     with pytest.raises(ValueError, match="got 'bayes'"):
         compare(*problem(8), wave, structures=[Structure("many", VariationalCKA)])
+
+
+def test_several_variances_are_refused():
+    class Halves(ComponentNoise):
+        def selection(self, inputs):
+            left = (inputs[..., 0] < 0.5).to(inputs)
+            return torch.stack([left, 1 - left], dim=-1)
+
+    with pytest.raises(ValueError, match="one variance, got Halves"):
+        VariationalCKA(*problem(30), physics=wave, num_inducing=5, likelihood=Halves(2, Size()))

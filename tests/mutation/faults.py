@@ -32,9 +32,9 @@ FAULTS = (
         "A failure on the lower side of a difference blames a row that is not there.",
     ),
     Fault(
-        "gpadjust/physics/base.py",
-        "if len(state) != len(memo.state) or not all(map(_same, state, memo.state)):",
-        "if len(state) != len(memo.state):",
+        "gpadjust/physics/black_box.py",
+        "if len(before) != len(state) or not all(map(_same, before, state)):",
+        "if len(before) != len(state):",
         "The memo outlives a change of the physics' parameters.",
     ),
     Fault(
@@ -44,21 +44,21 @@ FAULTS = (
         "The nugget has no units: targets of a tiny scale drown in it.",
     ),
     Fault(
-        "gpadjust/gp/stationary.py",
-        "by_each if shape[-1] > 1 else by_each.sum(-1, keepdim=True)",
-        "by_each if shape[-1] > 1 else by_each.mean(-1, keepdim=True)",
+        "gpadjust/inference/targets.py",
+        "by_length if shape[-1] > 1 else by_length.sum(-1, keepdim=True)",
+        "by_length if shape[-1] > 1 else by_length.mean(-1, keepdim=True)",
         "The gradient of a lengthscale that several inputs share is too small.",
     ),
     Fault(
-        "gpadjust/models/adjusted_model.py",
-        "weights.append((term, -term.basis.origin / term.basis.scale))",
-        "weights.append((term, -term.basis.origin))",
+        "gpadjust/models/terms_model.py",
+        "parts.append((other, -other.basis.origin / other.basis.scale))",
+        "parts.append((other, -other.basis.origin))",
         "With a center, delta is in the wrong units wherever the targets are scaled.",
     ),
     Fault(
-        "gpadjust/models/exact_gp_base.py",
-        "self._outputs_last(noise * scale.square())",
-        "self._outputs_last(noise * scale)",
+        "gpadjust/models/terms_gp.py",
+        "self.outputs_last(noise * scale.square())",
+        "self.outputs_last(noise * scale)",
         "Known variances are given back (and saved) as if they were standard deviations.",
     ),
     Fault(
@@ -68,7 +68,7 @@ FAULTS = (
         "RRA's weight of an unknown mean has the variance for its standard deviation.",
     ),
     Fault(
-        "gpadjust/inference/objective.py",
+        "gpadjust/inference/targets.py",
         "gradient = gradient - self.parameters.noise * by_least",
         "gradient = gradient + self.parameters.noise * by_least",
         "The gradient is wrong where the noise is at its least value, and only there.",
@@ -80,7 +80,7 @@ FAULTS = (
         "The draws are weighted as if all places were equally likely to be drawn: biased samples.",
     ),
     Fault(
-        "gpadjust/inference/full_bayes.py",
+        "gpadjust/inference/bayes.py",
         "torch.Generator().manual_seed(search.seed)",
         "torch.Generator().manual_seed(0)",
         "The seed of the sampler is ignored.",
@@ -105,7 +105,7 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/active/adjustment_information_gain.py",
-        "if self._rest is None or self._rest.source is not self.model.strategy():",
+        "if self._rest is None or self._rest.source is not self.model.conditioning():",
         "if self._rest is None:",
         "The information is that before the model was trained or given other data.",
     ),
@@ -116,7 +116,7 @@ FAULTS = (
         "An angle that wraps between prediction and truth counts as an error of a full turn.",
     ),
     Fault(
-        "gpadjust/inference/full_bayes.py",
+        "gpadjust/inference/bayes.py",
         "model.get_parameter(name).copy_(value)",
         "model.get_parameter(name).copy_(model.get_parameter(name))",
         "The parameters of a physics that learns stay where they were.",

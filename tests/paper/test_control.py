@@ -249,6 +249,7 @@ class TestArm:
         assert hundred().sum() == 100
         assert np.sqrt(np.square(distance_from_start()).mean()) == pytest.approx(34, abs=0.5)
 
+    @pytest.mark.slow
     @pytest.mark.usefixtures("_few_targets")
     def test_smoke(self, tmp_path, capsys):
         settings = replace(TINY_ARM, episodes=2, evaluate_every=2, map_after=9)
@@ -330,6 +331,7 @@ class TestExploration:
         crude = errors(PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)))
         assert all(0.01 < error < 0.5 for error in crude.values())
 
+    @pytest.mark.slow
     def test_smoke(self, tmp_path, capsys):
         experiment = Exploration(
             out=tmp_path, runs=2, jobs=1, scenarios=("gp-sac", "gp-info"),

@@ -19,6 +19,7 @@ TINY = Settings(
 pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")
 
 
+@pytest.mark.slow
 def test_a_run_and_its_tables(tmp_path, monkeypatch):
     for part in ("run", "tables"):  # the agent has the default all the same
         monkeypatch.setattr(f"paper.foresight.{part}.METHODS", {"map": METHODS["map"]})

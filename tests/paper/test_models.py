@@ -157,6 +157,7 @@ class TestPairs:
         torch.testing.assert_close(posterior.mean, Y, rtol=1e-2, atol=1e-2)
         assert (posterior.variance > 0).all()
 
+    @pytest.mark.slow
     def test_smoke(self, tmp_path, capsys):
         settings = MultifidelitySettings(num_test=50, sizes=(5,))
         experiment = Multifidelity(
@@ -177,7 +178,7 @@ class TestPairs:
         assert runs[runs["method"] == "CKA"]["nrmse"].median() < 0.1
 
     def test_unknown_pair(self, tmp_path):
-        with pytest.raises(ValueError, match="mf2 has no pair 'curin'; it has bohachevsky, "):
+        with pytest.raises(ValueError, match="There is no pair 'curin'; there are bohachevsky, "):
             Multifidelity(out=tmp_path, pairs=("curin",)).check()
 
     def test_intervals_are_judged_by_their_distance_from_95(self):
@@ -270,6 +271,7 @@ class TestWhereToMeasure:
         assert found["measurements"] == [4, 6]
         assert found["nrmse"][1] < found["nrmse"][0] < 2
 
+    @pytest.mark.slow
     def test_smoke(self, tmp_path, capsys):
         experiment = Active(
             out=tmp_path,
@@ -338,6 +340,7 @@ class TestWhereToMeasure:
 
 
 class TestCalibration:
+    @pytest.mark.slow
     def test_smoke(self, tmp_path):
         settings = CalibrationSettings(num_test=20)
         experiment = Calibration(out=tmp_path, methods=METHODS, settings=settings)
@@ -413,6 +416,7 @@ class TestCalibration:
 
 
 class TestStructures:
+    @pytest.mark.slow
     def test_smoke(self, tmp_path):
         settings = StructuresSettings(num_test=20, num_transitions=20)
         experiment = Structures(out=tmp_path, settings=settings)

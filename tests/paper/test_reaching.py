@@ -13,6 +13,7 @@ from paper.reaching.systems import FittedArm, LearntArm, as_physics, spec_of
 TINY = Settings(trials=1, long_trials=1, updates=2, starts=3)
 
 
+@pytest.mark.slow
 def test_a_run_and_its_tables(tmp_path):
     experiment = Reaching(out=tmp_path, runs=1, jobs=1, settings=TINY, systems=("sensors", "plain"))
     experiment.check()

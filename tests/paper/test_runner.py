@@ -14,6 +14,7 @@ from cloudpickle import register_pickle_by_value, unregister_pickle_by_value
 from filelock import FileLock
 
 from paper.common import runner
+from paper.common.commit import commit_of
 from paper.common.experiment import Experiment, Table
 from paper.common.runner import Refused, check_settings, main, run_missing, runs_file, versions
 from paper.common.runs_file import RunsFile
@@ -72,6 +73,7 @@ def test_all_tasks_are_run_once_and_shown(tmp_path, capsys):
     assert (record["value"], record["nothing"]) == (4, None)
     assert record["settings"] == {"scale": 1.0, "inner": {"kind": "b"}}
     assert record["versions"] == versions(Toy.packages)
+    assert record["commit"] == commit_of(ROOT)
     main(toy)
     assert len(calls(tmp_path)) == 6
     assert "a first look" not in capsys.readouterr().out
@@ -133,6 +135,68 @@ def test_runs_of_other_versions_are_refused_kept_or_run_again(tmp_path, monkeypa
     main(replace(more, other_versions="replace"))
     assert len(calls(tmp_path)) == 14
     assert {r["versions"]["numpy"] for r in runs_file(more).read().values()} == {"99"}
+
+
+def test_runs_of_a_package_that_is_no_longer_used_are_not_made_again(tmp_path, capsys):
+    main(Toy(out=tmp_path))
+    path = runs_file(Toy(out=tmp_path)).path
+    path.write_text(path.read_text().replace('"versions":{', '"versions":{"abandoned":"1",'))
+    main(Toy(out=tmp_path, runs=4))
+    assert len(calls(tmp_path)) == 8
+    assert "other versions" not in capsys.readouterr().out
+
+
+def test_runs_of_another_commit_or_without_one_are_not_made_again(tmp_path, monkeypatch, capsys):
+    toy = Toy(out=tmp_path, runs=2)
+    main(toy)
+    path = runs_file(toy).path
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    for record in records[:2]:
+        del record["commit"]
+    path.write_text("".join(json.dumps(record) + "\n" for record in records))
+    monkeypatch.setattr(runner, "commit_of", lambda root: "f" * 40)
+    main(replace(toy, runs=3))
+    assert len(calls(tmp_path)) == 6
+    assert "other versions" not in capsys.readouterr().out
+    found = [record.get("commit") for record in runs_file(toy).read().values()]
+    assert found == [None, None, *[commit_of(ROOT)] * 2, *["f" * 40] * 2]
+
+
+def test_a_commit_is_that_of_the_repository_and_says_if_files_are_changed(tmp_path):
+    def git(*command):
+        name = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+        run = ["git", "-C", str(tmp_path), *name, *command]
+        return subprocess.run(run, check=True, capture_output=True, text=True).stdout.strip()
+
+    def found(folder=tmp_path):
+        commit_of.cache_clear()
+        return commit_of(folder)
+
+    results = tmp_path / "paper" / "results"
+    results.mkdir(parents=True)
+    assert found() is None
+    git("init")
+    assert found() is None  # there is no commit
+    for file in (tmp_path / "code.py", results / "runs.jsonl"):
+        file.write_text("1\n")
+    git("add", ".")
+    git("commit", "-m", "first")
+    assert found() == git("rev-parse", "HEAD")
+    assert found(results) is None  # a folder in another's repository
+    (tmp_path / "untracked").write_text("")
+    (results / "runs.jsonl").write_text("2\n")
+    assert found() == git("rev-parse", "HEAD")
+    (tmp_path / "code.py").write_text("2\n")
+    assert found() == git("rev-parse", "HEAD") + "+"
+
+
+def test_without_git_there_is_no_commit(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    commit_of.cache_clear()
+    try:
+        assert commit_of(ROOT) is None
+    finally:
+        commit_of.cache_clear()
 
 
 def test_a_second_process_is_refused(tmp_path):
@@ -208,7 +272,7 @@ def test_help_is_quick_and_imports_nothing_slow():
     code = (
         "import sys\nsys.argv = ['paper', 'arm', '--help']\nfrom paper.__main__ import main\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        "slow = {'torch', 'smt', 'mf2', 'opensim', 'pandas', 'gpadjust'} & {*sys.modules}\n"
+        "slow = {'torch', 'smt', 'opensim', 'pandas', 'gpadjust'} & {*sys.modules}\n"
         "assert not slow, slow\n"
     )
     made = subprocess.run(

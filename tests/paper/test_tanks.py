@@ -15,6 +15,7 @@ TINY = Settings(samples=64, head=40, blocks=2, starts=1, rounds=3, tenths=6, nar
 VALUES = {**{name: known.guess for name, known in UNKNOWNS.items()}, "power": 0.5}
 
 
+@pytest.mark.slow
 def test_runs_and_their_tables(tmp_path):
     experiment = Tanks(out=tmp_path, runs=1, settings=TINY)
     experiment.check()

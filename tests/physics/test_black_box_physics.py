@@ -199,7 +199,7 @@ class TestFailures:
     @pytest.mark.parametrize(
         ("function", "batched", "says"),
         [
-            (lambda x: x[0] + x[1], True, "single row pass batched=False"),
+            (lambda x: x[0] + x[1], True, r"single row take .*batched=False"),
             (lambda x: np.zeros((2, 2)), False, r"a scalar or outputs.*found \(2, 2\)"),
             *(
                 (lambda x, result=result: result, batched, f"expected real numbers, found {found}")
@@ -295,20 +295,6 @@ class TestCopies:
         assert copy.deepcopy(torch.nn.ModuleList([physics]))[0] is physics
         assert torch.allclose(copy.copy(physics)(points(3, 2)), torch_waves(points(3, 2)))
 
-    @pytest.mark.parametrize("batched", [True, False])
-    def test_pickle_of_a_handle_keeps_the_memo(self, batched, points):
-        physics = BlackBoxPhysics(Handle(), batched=batched, name="wind tunnel")
-        X = points(3, 2)
-        physics(X)
-        loaded = pickle.loads(pickle.dumps(physics))
-        assert torch.equal(loaded(X), physics(X))
-        message = r"function of physics 'wind tunnel'.*set physics.function = ... again"
-        with pytest.raises(PhysicsError, match=message):
-            loaded(X + 1)
-        loaded.function = waves
-        assert torch.allclose(loaded(X + 1), torch_waves(X + 1))
-        assert isinstance(physics.function, Handle)
-
     def test_cloudpickle_keeps_lambdas(self, points):
         scale = 3.0
         physics = BlackBoxPhysics(
@@ -322,23 +308,10 @@ class TestCopies:
         (expected,) = torch.autograd.grad(3.0 * torch_waves(X).sum(), X)
         assert torch.allclose(found, expected)
 
-    @pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
-    def test_a_handle_never_hinders_a_pickle(self, dumps, points):
-        physics = BlackBoxPhysics(Handle())
-        Y = physics(points(3, 2))
-        assert torch.equal(pickle.loads(dumps(physics))(points(3, 2)), Y)
-
     def test_a_pickled_module_is_no_attribute(self, points):
         physics = BlackBoxPhysics(NumpyModule())
         X = points(3, 2)
         assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
-
-    def test_lost_gradient_is_not_taken_for_none(self, points):
-        physics = BlackBoxPhysics(waves, gradient=lambda X: waves_jacobian(X))
-        loaded = pickle.loads(pickle.dumps(physics))
-        Y = loaded(points(3, 2).requires_grad_())
-        with pytest.raises(PhysicsError, match=r"set physics.gradient = ... again"):
-            Y.sum().backward()
 
 
 UNKNOWNS = {"gain": Unknown(1.0, sd=1.0), "rate": Unknown(2.0, factor=1.5)}

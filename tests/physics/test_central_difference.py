@@ -2,7 +2,7 @@
 
 import torch
 
-from gpadjust.physics.finite_difference import central_difference
+from gpadjust.physics.gradient import central_difference
 
 
 def waves(X):

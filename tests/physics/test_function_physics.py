@@ -94,15 +94,6 @@ class Owner:
         return X + 1
 
 
-@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-@pytest.mark.parametrize("dumps", [pickle.dumps, pickle._dumps])
-def test_pickle_of_a_lambda_says_what_to_do(dumps, protocol):
-    models = torch.nn.ModuleList([FunctionPhysics(lambda X: X, name="ghost")])
-    message = r"function of physics 'ghost' cannot be pickled.*<lambda>.*top level.*cloudpickle"
-    with pytest.raises(pickle.PicklingError, match=message):
-        dumps(models, protocol)
-
-
 def test_cloudpickle_keeps_a_lambda_and_what_it_shares(points):
     shift = [1.0]
     physics = FunctionPhysics(lambda X: X + shift[0])
@@ -111,14 +102,6 @@ def test_cloudpickle_keeps_a_lambda_and_what_it_shares(points):
     kept[0] = 2.0
     loaded.forget()
     assert torch.equal(loaded(points(3, 2)), points(3, 2) + 2.0)
-
-
-def test_pickle_of_a_lambda_that_holds_its_physics(points):
-    physics = FunctionPhysics(lambda X: X * len(physics.name))
-    loaded = pickle.loads(cloudpickle.dumps(physics))
-    assert torch.equal(loaded(points(3, 2)), 8.0 * points(3, 2))
-    with pytest.raises(pickle.PicklingError, match="cannot be pickled"):
-        pickle.dumps(physics)
 
 
 @pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
@@ -159,49 +142,3 @@ def test_as_physics_rejects_the_rest(thing, found):
 
 
 PRIOR = Unknown(1.0, factor=2.0)
-
-
-class TestUnknownParametersOfAModule:
-    """`gain` and `shift` are one number each, `weights` are two; `net` is learnt as a network."""
-
-    class Scaled(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.gain = torch.nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
-            self.shift = torch.nn.Parameter(torch.tensor([0.5], dtype=torch.float64))
-            self.weights = torch.nn.Parameter(torch.ones(2, dtype=torch.float64))
-            self.net = torch.nn.Linear(2, 1, dtype=torch.float64)
-
-        def forward(self, X):
-            return self.gain * self.net(X) + self.shift + X @ self.weights.unsqueeze(-1)
-
-    def test_are_set_in_it_and_the_others_learnt(self, points):
-        module, X, values = self.Scaled(), points(4, 2), points(3, 2, seed=1)
-        physics = FunctionPhysics(module, unknowns={"shift": Unknown(0, sd=1), "gain": PRIOR})
-        shift, gain = values.unsqueeze(-2).split(1, dim=-1)
-        expected = gain * module.net(X) + shift + X @ module.weights.unsqueeze(-1)
-        torch.testing.assert_close(physics(X, values), expected)
-        assert not module.gain.requires_grad
-        assert module.gain.item() == 2.0
-        physics(X, values).sum().backward()
-        assert module.net.weight.grad.abs().min() > 0
-
-    def test_of_another_name(self):
-        message = "The module Scaled has no parameter 'mass'; it has gain, shift, weights, net.weig"
-        with pytest.raises(ValueError, match=message):
-            FunctionPhysics(self.Scaled(), unknowns={"gain": PRIOR, "mass": PRIOR})
-
-    def test_of_several_numbers(self):
-        with pytest.raises(
-            ValueError, match=r"a number each; 'weights' of Scaled has shape \(2,\)"
-        ):
-            FunctionPhysics(self.Scaled(), unknowns={"weights": PRIOR})
-
-    def test_that_it_takes_as_an_argument(self, points):
-        class Called(torch.nn.Module):
-            def forward(self, X, p):
-                return p.gain * X[:, 0]
-
-        X = points(3, 2)
-        physics = FunctionPhysics(Called(), unknowns={"gain": PRIOR})
-        torch.testing.assert_close(physics(X, torch.tensor([3.0])), 3.0 * X[:, :1])

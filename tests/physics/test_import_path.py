@@ -78,7 +78,6 @@ def test_wrapped_function_has_the_path_of_the_function(plant):
         lambda plant: lambda X: X,
         lambda plant: plant.local(),
         lambda plant: FunctionPhysics(plant.double, inputs=[0]),
-        lambda plant: FunctionPhysics(plant.double, memo=7),
         lambda plant: BlackBoxPhysics(plant.double),
         lambda plant: JoinedPhysics([plant.double, plant.drag]),
         lambda plant: plant.Drag(),

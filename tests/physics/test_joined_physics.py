@@ -1,9 +1,7 @@
 """Several physics side by side."""
 
 import copy
-import pickle
 
-import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -50,7 +48,7 @@ class TestValues:
 
     def test_each_part_has_its_own_memo(self, counter, numpy_counter, points):
         joined = JoinedPhysics(
-            [FunctionPhysics(counter, memo=0), BlackBoxPhysics(numpy_counter, inputs=[0, 1])]
+            [FunctionPhysics(counter), BlackBoxPhysics(numpy_counter, inputs=[0, 1])]
         )
         X = points(5, 3)
         joined(X.expand(4, 5, 3))
@@ -148,18 +146,6 @@ class TestCopies:
         assert duplicate.parts[0] is learnt.parts[0]
         assert duplicate.parts[1].function is not learnt.parts[1].function
 
-    def test_pickle(self, points):
-        X = points(3, 2)
-        joined = JoinedPhysics([total, first_log])
-        joined(X.abs())
-        loaded = pickle.loads(pickle.dumps(joined))
-        assert loaded.names == joined.names
-        assert torch.equal(loaded(X.abs()), joined(X.abs()))
-        with pytest.raises(pickle.PicklingError, match="physics 'f_2' cannot be pickled"):
-            pickle.dumps(JoinedPhysics([total, lambda X: X]))
-        scaled = JoinedPhysics([total, lambda X: 2 * X[:, 0]])
-        assert torch.equal(pickle.loads(cloudpickle.dumps(scaled))(X), scaled(X))
-
 
 MASS, DRAG = Unknown(1.0, factor=1.5), Unknown(0.1, bounds=(0.0, 1.0))
 
@@ -174,22 +160,21 @@ def fall(X, p):
 
 class TestUnknownParameters:
     @staticmethod
-    def parts(memo=1000):
+    def parts():
         """Their own columns and parameters, of which the mass is one and the same."""
-        first = FunctionPhysics(push, unknowns={"mass": MASS}, inputs=[1], memo=memo)
+        first = FunctionPhysics(push, unknowns={"mass": MASS}, inputs=[1])
         unknowns = {"drag": DRAG, "mass": MASS}
-        return [first, FunctionPhysics(fall, unknowns=unknowns, memo=memo), total]
+        return [first, FunctionPhysics(fall, unknowns=unknowns), total]
 
-    @pytest.mark.parametrize("memo", [0, 1000])
-    def test_of_the_same_name_are_one(self, memo, points):
+    def test_of_the_same_name_are_one(self, points):
         X = points(4, 2).square() + 1
         values = torch.tensor([[1.0, 0.5], [2.0, 0.1], [3.0, 0.9]], dtype=torch.float64)
-        joined = JoinedPhysics(self.parts(memo))
+        joined = JoinedPhysics(self.parts())
         assert {**joined.unknowns} == {"mass": MASS, "drag": DRAG}
         mass, drag = values.unsqueeze(-2).unbind(-1)
         x, y = X.unbind(-1)
         expected = torch.stack([y / mass, (mass * x - drag).sqrt(), (x + y).expand(3, 4)], -1)
-        nested = JoinedPhysics([JoinedPhysics(self.parts(memo)), lambda X: X[:, [0, 0, 0]]])
+        nested = JoinedPhysics([JoinedPhysics(self.parts()), lambda X: X[:, [0, 0, 0]]])
         for found in (joined(X, values), joined.or_nan(X, values), nested(X, values)[..., :3]):
             torch.testing.assert_close(found, expected)
 
@@ -200,11 +185,10 @@ class TestUnknownParameters:
         with pytest.raises(ValueError, match=message):
             JoinedPhysics(parts)
 
-    @pytest.mark.parametrize("memo", [0, 1000])
-    def test_at_which_a_part_fails(self, memo):
+    def test_at_which_a_part_fails(self):
         X = torch.tensor([[1.0, 3.0], [2.0, 4.0]], dtype=torch.float64)
         values = torch.tensor([[1.0, 0.5], [1.0, 1.5], [1.0, 9.0]], dtype=torch.float64)
-        joined = JoinedPhysics(self.parts(memo))
+        joined = JoinedPhysics(self.parts())
         found = joined.or_nan(X, values)
         assert found.isnan().all(-1).tolist() == [[False, False], [True, False], [True, True]]
         assert found.isnan().any(-1).tolist() == found.isnan().all(-1).tolist()

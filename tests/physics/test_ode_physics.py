@@ -3,7 +3,6 @@
 import math
 import pickle
 
-import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -209,13 +208,6 @@ class TestCopies:
         X = points(3, 3)
         assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
-    def test_pickle_of_a_local_rhs(self, points):
-        physics = ODEPhysics(lambda s, a: -s, 0.1, 2, name="tank")
-        with pytest.raises(pickle.PicklingError, match=r"rhs of physics 'tank' cannot be pickled"):
-            pickle.dumps(physics)
-        X = points(3, 2)
-        assert torch.equal(pickle.loads(cloudpickle.dumps(physics))(X), physics(X))
-
 
 def test_gradients_by_finite_differences_are_those_of_autograd():
     options = {"step": 0.5, "state_dim": 2}
@@ -240,26 +232,6 @@ class TestUnknownParameters:
         decaying = ODEPhysics(lambda s, a, p: -p.rate[:, None] * s, 0.3, 1, unknowns=unknowns)
         expected = X * (-0.3 * rate.unsqueeze(-1)).exp()
         torch.testing.assert_close(decaying(X, rate), expected, rtol=1e-7, atol=0)
-
-    @pytest.mark.parametrize("gradient", ["autograd", "finite-difference"])
-    def test_of_a_module_are_those_of_a_function(self, gradient, points):
-        def rhs(state, action, p):
-            rate = -p.stiffness * state[:, 0] + action[:, 0]
-            return torch.stack([state[:, 1], rate], -1)
-
-        unknowns = {"stiffness": Unknown(4.0, factor=1.5)}
-        X, values = points(5, 3), torch.tensor([[3.0], [4.0], [9.0]], dtype=torch.float64)
-        slopes = []
-        for made, how in ((Spring(), gradient), (rhs, gradient), (rhs, "autograd")):
-            physics = ODEPhysics(made, 0.2, 2, unknowns=unknowns, gradient=how)
-            leaf = X.clone().requires_grad_()
-            found = physics(leaf, values)
-            for i, row in enumerate(values):
-                spring = ODEPhysics(Spring(row.item()), 0.2, 2)
-                torch.testing.assert_close(found[i], spring(X))
-            slopes.append(torch.autograd.grad(found.square().sum(), leaf)[0])
-        torch.testing.assert_close(slopes[0], slopes[2], rtol=1e-8, atol=1e-8)
-        torch.testing.assert_close(slopes[1], slopes[2], rtol=1e-8, atol=1e-8)
 
     def test_that_an_adaptive_method_cannot_do(self):
         unknowns = {"rate": Unknown(1.0, sd=1.0)}

@@ -6,12 +6,13 @@ import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpadjust.physics import FunctionPhysics, Physics, PhysicsError
+from gpadjust.physics import BlackBoxPhysics, FunctionPhysics, Physics, PhysicsError
 
 integers_as_rows = st.lists(st.lists(st.integers(-2, 2), min_size=2, max_size=2), min_size=1)
 
@@ -95,7 +96,7 @@ def test_bad_settings_and_inputs(points):
         ({"memo": 1.5}, TypeError, r"memo must be a whole number; found 1\.5"),
     ):
         with pytest.raises(error, match=says):
-            FunctionPhysics(square, **options)
+            BlackBoxPhysics(square, **options)
     for X in ([[1.0]], torch.tensor([[1]])):
         with pytest.raises(TypeError, match=r"takes a floating-point.*found (list|torch.int64)"):
             FunctionPhysics(square)(X)
@@ -113,7 +114,7 @@ class TestMemo:
             asked.extend(tuple(row) for row in X.tolist())
             return X.sum(-1)
 
-        physics = FunctionPhysics(record)
+        physics = BlackBoxPhysics(record)
         for rows in calls:
             X = torch.tensor(rows, dtype=torch.float64)
             assert torch.equal(physics(X), X.sum(-1, keepdim=True))
@@ -121,12 +122,10 @@ class TestMemo:
 
     def test_result_can_be_changed_in_place(self, points):
         X = points(3, 2)
-        for physics, expected in ((FunctionPhysics(square), X**2), (FunctionPhysics(abs), X.abs())):
+        physics = BlackBoxPhysics(square)
+        for _ in range(2):
             physics(X).zero_()
-            assert torch.equal(physics(X), expected)
-        kept = X.clone()
-        FunctionPhysics(lambda X: X)(X).zero_()
-        assert torch.equal(X, kept)
+        assert torch.equal(physics(X), X**2)
 
     @pytest.mark.parametrize(
         "change",
@@ -142,7 +141,7 @@ class TestMemo:
     )
     def test_dropped_when_state_changes(self, change, points):
         scale = Scale()
-        physics = FunctionPhysics(scale)
+        physics = BlackBoxPhysics(scale)
         X = points(3, 1)
         with torch.no_grad():
             before = physics(X)
@@ -155,7 +154,7 @@ class TestMemo:
         assert not torch.equal(after, before)
 
     def test_dropped_when_the_dtype_changes(self):
-        physics = FunctionPhysics(lambda X: X / 3)
+        physics = BlackBoxPhysics(lambda X: X / 3)
         physics(torch.tensor([[1.0]], dtype=torch.float32))
         X = torch.tensor([[1.0]], dtype=torch.float64)
         assert torch.equal(physics(X), X / 3)
@@ -165,16 +164,16 @@ class TestMemo:
 
         def root(X):
             asked.extend(X.flatten().tolist())
-            return X.sqrt()
+            return np.where(X > 0, np.abs(X) ** 0.5, np.nan)
 
-        physics = FunctionPhysics(root)
+        physics = BlackBoxPhysics(root)
         with pytest.raises(PhysicsError, match="NaN"):
             physics(torch.tensor([[4.0], [-1.0], [9.0]]))
         assert physics(torch.tensor([[4.0], [9.0]])).flatten().tolist() == [2.0, 3.0]
         assert asked == [4.0, -1.0, 9.0]
 
     def test_a_new_number_of_outputs_is_seen_behind_known_rows(self, points):
-        physics = FunctionPhysics(lambda X: X.expand(-1, len(X)))
+        physics = BlackBoxPhysics(lambda X: np.repeat(X, len(X), 1))
         physics(points(2, 1))
         with pytest.raises(PhysicsError, match=r"returned 1 output\(s\), expected 2 as before"):
             physics(points(3, 1))
@@ -202,10 +201,8 @@ class TestGradients:
         with torch.no_grad():
             assert not physics(X.requires_grad_()).requires_grad
             physics(X)
-        assert scale.calls == 2
         scale.requires_grad_(False)
         assert not physics(X.detach()).requires_grad
-        assert scale.calls == 2
 
     def test_expanded_X_is_evaluated_once(self, counter, points):
         X = points(2, 5, 3).requires_grad_()
@@ -323,7 +320,7 @@ class TestCopies:
         assert duplicate.owners[0] is duplicate
 
     def test_pickle_brings_the_memo(self, points):
-        physics = FunctionPhysics(Scale())
+        physics = BlackBoxPhysics(Scale())
         X = points(3, 1)
         with torch.no_grad():
             expected = physics(X)
@@ -341,8 +338,7 @@ class TestCopies:
 
 class TestThreads:
     def test_dtypes_and_states_are_kept_apart(self, in_threads, points):
-        scale = Scale()
-        physics = FunctionPhysics(scale, memo=50)
+        physics = BlackBoxPhysics(Scale())
         X = points(40, 1)
 
         def ask(number):

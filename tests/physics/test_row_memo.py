@@ -26,63 +26,6 @@ def test_keys_of_a_strided_view():
     assert row_keys(X.T[:2].T) == row_keys(X[:, :2].clone())
 
 
-@given(sizes=st.lists(st.integers(1, 7), min_size=1, max_size=8))
-def test_recalls_all_batches_within_capacity(sizes):
-    memo = RowMemo(capacity=100)
-    X = torch.arange(sum(sizes), dtype=torch.float64).unsqueeze(-1)
-    for batch in X.split(sizes):
-        memo.store(row_keys(batch), batch**2)
-    assert len(memo) == len(X)
-    assert torch.equal(memo.gather(memo.lookup(row_keys(X.flip(0)))), X.flip(0) ** 2)
-
-
-def test_starts_again_when_full():
-    memo = RowMemo(capacity=3)
-    old, new = torch.tensor([[0.0], [1.0]]), torch.tensor([[2.0], [3.0]])
-    memo.store(row_keys(old), old)
-    memo.store(row_keys(new), new)
-    assert memo.lookup(row_keys(old)).tolist() == [-1, -1]
-    assert torch.equal(memo.gather(memo.lookup(row_keys(new))), new)
-
-
-def test_never_holds_more_than_its_capacity():
-    memo = RowMemo(capacity=3)
-    X = torch.arange(5.0).unsqueeze(-1)
-    memo.store(row_keys(X), X)
-    assert len(memo) == 3
-    assert memo.lookup(row_keys(X)).tolist() == [0, 1, 2, -1, -1]
-
-
-def test_gathered_values_are_copies():
-    memo = RowMemo(capacity=3)
-    X = torch.tensor([[1.0]])
-    memo.store(row_keys(X), X)
-    memo.gather(torch.tensor([0])).fill_(99.0)
-    X.fill_(99.0)
-    assert memo.gather(torch.tensor([0])).item() == 1.0
-
-
-def test_outlives_inference_mode():
-    memo = RowMemo(capacity=10)
-    with torch.inference_mode():
-        X = torch.tensor([[1.0], [2.0], [3.0]])
-        memo.store(row_keys(X[:2]), X[:2] * 2)
-        memo.store(row_keys(X[2:]), X[2:] * 2)
-    Z = torch.tensor([[4.0]])
-    memo.store(row_keys(Z), Z * 2)
-    assert memo.gather(torch.arange(4)).flatten().tolist() == [2.0, 4.0, 6.0, 8.0]
-
-
-def test_pickle_holds_the_rows_without_spare_room():
-    memo = RowMemo(capacity=100_000)
-    X = torch.arange(1025, dtype=torch.float64).unsqueeze(-1)
-    memo.store(row_keys(X[:1024]), X[:1024])
-    memo.store(row_keys(X[1024:]), X[1024:])
-    loaded = pickle.loads(pickle.dumps(memo))
-    assert torch.equal(loaded.gather(loaded.lookup(row_keys(X))), X)
-    assert loaded._values.untyped_storage().nbytes() == 1025 * 8
-
-
 def test_threads_share_a_memo_that_overflows(in_threads):
     memo = RowMemo(capacity=20)
     X = torch.arange(60, dtype=torch.float64).unsqueeze(-1)
@@ -97,19 +40,62 @@ def test_threads_share_a_memo_that_overflows(in_threads):
     in_threads(ask)
 
 
-def test_store_keeps_what_it_knows():
-    memo = RowMemo(capacity=10)
-    X = torch.tensor([[1.0], [2.0], [3.0]])
-    memo.store(row_keys(X[:2]), X[:2])
-    memo.store(row_keys(X), X)
-    assert len(memo) == 3
-    assert torch.equal(memo.gather(memo.lookup(row_keys(X))), X)
+def double(X):
+    return 2 * X
 
 
-def test_deep_copy_is_empty_with_the_same_capacity():
+def refuse(X):
+    raise AssertionError(f"asked for {X.tolist()}")
+
+
+@given(sizes=st.lists(st.integers(1, 7), min_size=1, max_size=8))
+def test_all_batches_within_capacity_are_known(sizes):
+    memo = RowMemo(capacity=100)
+    X = torch.arange(sum(sizes), dtype=torch.float64).unsqueeze(-1)
+    for batch in X.split(sizes):
+        memo.recall(batch, double)
+    assert len(memo) == len(X)
+    assert torch.equal(memo.recall(X.flip(0), refuse), 2 * X.flip(0))
+
+
+def test_it_starts_again_when_full_and_never_holds_more():
     memo = RowMemo(capacity=3)
-    memo.store(row_keys(torch.tensor([[1.0]])), torch.tensor([[2.0]]))
-    duplicate = copy.deepcopy(memo)
-    assert (len(memo), len(duplicate), duplicate.capacity) == (1, 0, 3)
-    with pytest.raises(LookupError, match="memo is empty"):
-        duplicate.gather(torch.tensor([0]))
+    old, new = torch.tensor([[0.0], [1.0]]), torch.tensor([[2.0], [3.0]])
+    memo.recall(old, double)
+    memo.recall(new, double)
+    assert len(memo) == 2
+    memo.recall(new, refuse)
+    with pytest.raises(AssertionError, match="asked for"):
+        memo.recall(old, refuse)
+    memo.recall(torch.arange(9.0).unsqueeze(-1), double)
+    assert len(memo) == 3
+
+
+def test_what_it_returns_is_a_copy():
+    memo, X = RowMemo(capacity=3), torch.tensor([[1.0]])
+    memo.recall(X, double).fill_(99.0)
+    memo.recall(X, refuse).fill_(99.0)
+    assert memo.recall(X, refuse).item() == 2.0
+
+
+def test_values_that_are_not_to_be_learnt():
+    memo, X = RowMemo(capacity=3), torch.tensor([[1.0], [2.0]])
+    memo.store(row_keys(X[:1]), X[:1])
+    found = memo.recall(X, double, learn=False)
+    assert found.flatten().tolist() == [1.0, 4.0]
+    assert len(memo) == 1
+
+
+def test_values_of_inference_mode_outlive_it():
+    memo, X = RowMemo(capacity=3), torch.tensor([[1.0]])
+    with torch.inference_mode():
+        memo.recall(X, double)
+    assert memo.recall(X, refuse).add_(1.0).item() == 3.0
+
+
+def test_a_pickle_brings_the_rows_and_a_deep_copy_none():
+    memo, X = RowMemo(capacity=3), torch.tensor([[1.0]])
+    memo.recall(X, double)
+    assert pickle.loads(pickle.dumps(memo)).recall(X, refuse).item() == 2.0
+    empty = copy.deepcopy(memo)
+    assert (len(empty), empty.capacity) == (0, 3)

@@ -48,19 +48,6 @@ class Wave(Physics):
         return wave(X, p)
 
 
-class WaveModule(torch.nn.Module):
-    """The same as a module that has the parameters."""
-
-    def __init__(self):
-        super().__init__()
-        self.a = torch.nn.Parameter(numbers(1.0).squeeze())
-        self.b = torch.nn.Parameter(numbers(2.0).reshape(1, 1))
-
-    def forward(self, X):
-        left = self.a * X[:, 0] + (self.b.squeeze() * X[:, 1]).sin()
-        return torch.stack([left, (self.a * self.b.squeeze()).expand(len(X))], -1)
-
-
 def numpy_wave(x, p):
     left = p.a * x[..., 0] + np.sin(p["b"] * x[..., 1])
     return np.stack([left, p.a * p.b + 0 * left], -1)
@@ -68,7 +55,6 @@ def numpy_wave(x, p):
 
 MAKE = {
     "function": lambda **o: FunctionPhysics(wave, unknowns={"a": A, "b": B}, **o),
-    "module": lambda **o: FunctionPhysics(WaveModule(), unknowns={"a": A, "b": B}, **o),
     "class": lambda **o: Wave(unknowns={"a": A, "b": B}, **o),
     "black box": lambda **o: BlackBoxPhysics(numpy_wave, unknowns={"a": A, "b": B}, **o),
     "rows": lambda **o: BlackBoxPhysics(numpy_wave, unknowns={"a": A, "b": B}, batched=False, **o),
@@ -242,11 +228,7 @@ class TestCalls:
         X, values = points(5, 2), points(3, 2, seed=1)
         found = physics(X.expand(4, 3, 5, 2), values)
         torch.testing.assert_close(found, wave_at(X, values).expand(4, 3, 5, 2))
-        physics(X, values[1])
-        physics(X[2:], values.flip(0))
         assert asked == [15]
-        physics(X, values[0] + 1.0)
-        assert asked == [15, 5]
 
     def test_inputs_of_some_columns(self, make, points):
         X, values = points(4, 3), points(2, 2, seed=1)
@@ -280,7 +262,7 @@ class TestGradients:
         (expected,) = torch.autograd.grad((weights * wave_at(leaf, values)).sum(), leaf)
         torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
 
-    @pytest.mark.parametrize("name", ["function", "module", "class"])
+    @pytest.mark.parametrize("name", ["function", "class"])
     def test_in_parameters(self, name, points):
         X, values = points(4, 2), points(3, 2, seed=1).requires_grad_()
         assert torch.autograd.gradcheck(lambda values: MAKE[name]()(X, values), values)
@@ -361,14 +343,14 @@ class TestFailures:
         assert asked == [(1.0, 0.0), (2.0, 0.0), (1.0, 1.5), (2.0, 1.5)]
 
 
-@pytest.mark.parametrize("name", ["function", "module", "class"])
+@pytest.mark.parametrize("name", ["function", "class"])
 def test_pickles_and_copies(name, points):
     physics, X, values = MAKE[name](), points(3, 2), points(2, 2, seed=1)
     expected = physics(X, values)
     for again in (copy.deepcopy(physics), pickle.loads(pickle.dumps(physics)), copy.copy(physics)):
         assert {**again.unknowns} == {"a": A, "b": B}
         torch.testing.assert_close(again(X, values), expected)
-    assert (copy.deepcopy(physics) is physics) == (name != "module")
+    assert copy.deepcopy(physics) is physics
 
 
 def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():

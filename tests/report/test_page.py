@@ -169,7 +169,7 @@ def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
         raise ValueError("no way")
 
     (tmp_path / "report.pt").write_text("old")
-    monkeypatch.setattr("gpadjust.report.writing.save", refuses)
+    monkeypatch.setattr("gpadjust.report.writing.content_of", refuses)
     page = read(report(comparison, tmp_path / "report.html"))
     assert "The model could not be saved: no way" in page.text
     assert [each.name for each in tmp_path.iterdir()] == ["report.html"]

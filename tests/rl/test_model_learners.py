@@ -118,7 +118,7 @@ def no_error():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("step", [7, 11])
+@pytest.mark.parametrize("step", [7, pytest.param(11, marks=pytest.mark.slow)])
 def test_an_interrupted_run_ends_as_another(make_agent, kind, step, tmp_path, tensors_of):
     path = tmp_path / "run.ckpt"
     whole = make_agent(kind).learn(15)

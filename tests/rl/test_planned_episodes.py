@@ -113,6 +113,7 @@ def test_without_exploration_nothing_changes(point_agent, learnt_dynamics, asser
     assert_same(plain, never)
 
 
+@pytest.mark.slow
 def test_two_runs_are_the_same_and_not_those_of_the_policy(
     point_agent, learnt_dynamics, assert_same
 ):

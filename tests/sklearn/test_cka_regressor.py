@@ -345,7 +345,7 @@ def test_a_lambda_needs_cloudpickle(data, several):
     own = lambda X: wave(X)  # noqa: E731
     physics = [own, wave] if several else own
     regressor = fast(physics).fit(*data)
-    with pytest.raises(pickle.PicklingError, match="Define it there, pickle with cloudpickle"):
+    with pytest.raises((pickle.PicklingError, AttributeError), match="lambda"):
         pickle.dumps(regressor)
     assert regressor.physics is physics
     again = cloudpickle.loads(cloudpickle.dumps(regressor))
@@ -374,7 +374,8 @@ def test_bad_data(data, change, error, message):
     ("parameters", "error", "message"),
     [
         ({"model": "krr"}, ValueError, "one of 'cka', 'rra'.*got 'krr'"),
-        ({"model": AR1}, ValueError, "a subclass of gpadjust.models.AdjustedModel, got"),
+        ({"model": AR1}, ValueError, "AR1 samples f_p in `bounds`"),
+        ({"model": int}, ValueError, "a subclass of gpadjust.models.TermsModel, got"),
         ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
         ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
         ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),

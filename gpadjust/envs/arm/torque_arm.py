@@ -191,7 +191,6 @@ def torque_arm_physics(
         step=ARM_TIME_STEP,
         state_dim=4,
         substeps=substeps,
-        memo=0,
         name="torque_arm",
         gradient=gradient,
     )

@@ -169,7 +169,7 @@ def equation_physics(
     if not (is_finite("time_step", time_step) and time_step > 0):
         raise ValueError(f"time_step must be a positive number of seconds; found {time_step}.")
     substeps = math.ceil(round(time_step / SUBSTEP, 6))
-    return ODEPhysics(equation, time_step, state_dim=4, substeps=substeps, memo=0, name=name)
+    return ODEPhysics(equation, time_step, state_dim=4, substeps=substeps, name=name)
 
 
 def random_cart_pole_physics(seed: int, time_step: float = TIME_STEP) -> ODEPhysics:

@@ -1,0 +1,211 @@
+"""Columns of a CSV file."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator
+from difflib import get_close_matches
+from pathlib import Path
+from typing import NoReturn, TextIO
+
+import torch
+from torch import Tensor
+
+LARGEST = 1e100
+"""The largest number that is read; squares of more are no numbers."""
+_OTHERS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas"}
+_OF_RECORDS = (
+    "Say which column it is, such as `states={'theta': 'q'}`, or what is between the fields, by "
+    "`delimiter`."
+)
+
+
+class CsvColumns:
+    r"""The columns of a CSV file by their names, which its first line has.
+
+    Lines and columns are counted from 1, as editors and spreadsheets do. Lines of nothing but
+    empty fields are left out.
+
+    Args:
+        file: The file, in UTF-8.
+        delimiter: What is between two fields.
+        decimal: The decimal mark of its numbers, a point or a comma.
+        hint: What to do about a column that is not there.
+        option: How errors write an option, such as ``"--{} {!r}"`` on a command line.
+
+    Attributes:
+        names: The names of all columns.
+        lines: The line of each row, at which an editor shows its beginning.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If it is no text, has no rows, or a row has not one field for each name.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     file = Path(folder, "pump.csv")
+        ...     _ = file.write_text("speed;head\n1000;2,5\n2000;\n")
+        ...     table = CsvColumns(file, ";", decimal=",")
+        >>> table.names
+        ('speed', 'head')
+        >>> table.numbers("head", may_miss=True)
+        tensor([2.5000,    nan], dtype=torch.float64)
+    """
+
+    def __init__(
+        self,
+        file: str | Path,
+        delimiter: str = ",",
+        *,
+        decimal: str = ".",
+        hint: str = _OF_RECORDS,
+        option: str = "`{}={!r}`",
+    ) -> None:
+        self.file, self.decimal = str(file), decimal
+        self._hint, self._option = hint, option
+        try:
+            with open(file, encoding="utf-8-sig", newline="") as text:
+                found = [(line, fields) for line, fields in _rows(text, delimiter) if any(fields)]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(
+                f"{file}: expected a CSV file in UTF-8, but {error}; save it as such."
+            ) from error
+        if len(found) < 2:
+            what = "only a line of names" if found else "an empty file"
+            raise ValueError(f"{file}: expected a line of names and then rows, found {what}.")
+        (self._header, header), *self._rows = found
+        self.names = tuple(name.strip() for name in header)
+        self.lines = tuple(line for line, _ in self._rows)
+        for line, fields in self._rows:
+            if len(fields) != len(header):
+                expected = f"{len(header)} field" + "s" * (len(header) != 1)
+                hint = self._other_delimiter() or self._miscounted(line, fields, delimiter)
+                raise ValueError(
+                    f"{file}, line {line}: expected {expected}, one for each name, found "
+                    f"{len(fields)}; mend the line, or leave it out.{hint}"
+                )
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def texts(self, name: str) -> list[str]:
+        """The fields of a column.
+
+        Raises:
+            ValueError: If there is no such column, or several, or a field is empty.
+        """
+        column, texts = self._column(name), []
+        for line, fields in self._rows:
+            texts.append(fields[column].strip())
+            if not texts[-1]:
+                self._refuse(line, column, "a text", "")
+        return texts
+
+    def numbers(self, name: str, *, may_miss: bool = False) -> Tensor:
+        """The numbers of a column, ``N``, in float64.
+
+        Args:
+            name: The name of the column.
+            may_miss: Whether numbers may be missing: NaN, where a field is empty or says so.
+
+        Raises:
+            ValueError: If there is no such column, or several, or a field is no finite number, or
+                one beyond 1e100.
+        """
+        column, values = self._column(name), []
+        expected = "a number, or nothing where it was not measured" if may_miss else "a number"
+        for line, fields in self._rows:
+            text = fields[column].strip()
+            value = self._number(text)
+            if not math.isfinite(value) and not (may_miss and math.isnan(value)):
+                self._refuse(line, column, expected, text)
+            if abs(value) > LARGEST:
+                self._refuse(
+                    line, column, f"a number between {-LARGEST:.0e} and {LARGEST:.0e}", text
+                )
+            values.append(value)
+        return torch.tensor(values, dtype=torch.float64)
+
+    def _number(self, text: str) -> float:
+        """A number; NaN for nothing, infinity for what is none."""
+        if "_" in text or (self.decimal != "." and "." in text):
+            return math.inf  # Python would take 1_000, and 1.000 is a thousand there
+        try:
+            return float(text.replace(self.decimal, ".")) if text else math.nan
+        except ValueError:
+            return math.inf
+
+    def _column(self, name: str) -> int:
+        places = [i for i, other in enumerate(self.names) if other == name]
+        if len(places) == 1:
+            return places[0]
+        where = f"{self.file}, line {self._header}"
+        if places:
+            columns = " and ".join(str(place + 1) for place in places)
+            raise ValueError(
+                f"{where}: expected one column {name!r}, found columns {columns}; "
+                "rename those that are not meant."
+            )
+        found = ", ".join(map(repr, self.names))
+        # Units in brackets and capitals are no part of a likeness.
+        plain = {other.partition("[")[0].strip().casefold(): other for other in self.names}
+        near = get_close_matches(name.partition("[")[0].strip().casefold(), plain, n=1)
+        meant = f" Is it {plain[near[0]]!r}?" if near else ""
+        hint = self._other_delimiter() or f" {self._hint}"
+        raise ValueError(f"{where}: expected a column {name!r}, found {found}.{meant}{hint}")
+
+    def _other_delimiter(self) -> str:
+        """What to do if a single column has names for several."""
+        marks = [mark for mark in _OTHERS if mark in self.names[0]] if len(self.names) == 1 else []
+        if not marks:
+            return ""
+        return (
+            f" There seem to be {_OTHERS[marks[0]]} between its fields: say so by "
+            f"{self._option.format('delimiter', marks[0])}."
+        )
+
+    def _miscounted(self, line: int, fields: list[str], delimiter: str) -> str:
+        """Why a row may have more fields than there are names."""
+        if len(self.names) == 1 and line == self.lines[0]:
+            return (
+                f" Line {self._header} has one name and line {line} has {len(fields)} fields: is "
+                f"line {self._header} a comment? Then take it away."
+            )
+        if len(fields) == len(self.names) + 1 and not fields[-1].strip():
+            return (
+                f" Its last field is empty: is there a {delimiter!r} too many at its end? Take it "
+                f"away, or put one at the end of line {self._header} too."
+            )
+        return ""
+
+    def _refuse(self, line: int, column: int, expected: str, text: str) -> NoReturn:
+        raise ValueError(
+            f"{self.file}, line {line}, column {column + 1} ({self.names[column]!r}): expected "
+            f"{expected}, found {text!r}; mend the field, or leave the line out."
+            f"{self._other_decimal(text)}"
+        )
+
+    def _other_decimal(self, text: str) -> str:
+        """What to do if a field would be a number with the other decimal mark."""
+        other = "," if self.decimal == "." else "."
+        try:
+            float(text.replace(other, "."))
+        except ValueError:
+            return ""
+        if other not in text:
+            return ""
+        name = {",": "comma", ".": "point"}[other]
+        option = self._option.format("decimal", other)
+        return f" If this {name} is a decimal {name}, say so by {option}."
+
+
+def _rows(text: TextIO, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """The rows of a file, and the line at which each begins."""
+    reader = csv.reader(text, delimiter=delimiter)
+    before = 0
+    for fields in reader:
+        yield before + 1, fields
+        before = reader.line_num

@@ -1,0 +1,303 @@
+"""Full Bayes: sampling a model's hyper-parameters."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from gpadjust.gp.gaussian import cholesky
+from gpadjust.inference import annealing
+from gpadjust.inference.annealing import Mixture, Particles
+from gpadjust.inference.calibrate import calibrate_roughly, draw_parameters, warn_of_parameters
+from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
+from gpadjust.inference.relevance import mixed, probability, without_physics
+from gpadjust.inference.targets import LogPosterior
+from gpadjust.models import TermsGP, TermsModel
+from gpadjust.models.parameters import register_priors, shared_parameters
+
+_STEP = 0.1  # of differences, in logarithms
+_WIDEST = 4.0  # standard deviation of Laplace's approximation, in logarithms
+_MODES = 6  # optima that draws begin around, at most
+_APART = 0.5  # by which these differ in some logarithm
+_EACH = 0.1  # of the draws that all of them share
+_DRAWS = (128, 1024)  # the least and the most by default
+_COST = 5_120_000  # draws times observations squared
+_GRADIENTS = 8192  # the most
+_COST_OF_GRADIENTS = 3_000_000  # gradients times observations squared
+_PARTICLES = (16, 128)  # the least and the most, for so many gradients each:
+_GRADIENTS_EACH = 40
+_STARTS = (8, 128)  # of the search, and how many are screened for them
+_ITERATIONS = 30  # of it, as the draws go on from where it got
+_DECISIVE = 7.0  # difference of log evidences that needs no closer look
+_SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
+_SAMPLED_ALONE = 2_000_000  # samples times observations squared, of a physics without a GP
+_SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
+_RETURNED = 256  # draws of parameters of a physics, at least
+_LEAST_POWER = 0.05  # of the way to the posterior, for draws that show it
+_LEAST_SHARE = 0.1  # of the draws that count
+_LEAST_SIZE_OF_PARAMETERS = 16.0
+_OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what samples represent
+_EXCHANGES = 5  # rounds of better samples for the chosen ones
+
+
+class SamplingWarning(UserWarning):
+    """The draws of the hyper-parameters do not show their distribution."""
+
+
+@dataclass(frozen=True)
+class SampleResult:
+    """What sampling the hyper-parameters has reached.
+
+    Attributes:
+        effective_size: How many independent draws tell as much as those that were made, of each
+            output, ``batch_shape x (m)``: as many as were, if two halves of them agree.
+        converged: Whether the draws are of the posterior, of each output, of the same shape;
+            there is a :class:`~gpadjust.inference.SamplingWarning` if not.
+        relevance: Posterior probability that the physics is of use at all, of each output, of the
+            same shape; None of a model that cannot do without.
+        draws: Equally likely draws of each hyper-parameter, ``k x`` its shape, by its name: 16 to
+            256, or as many as the model holds, which are some of them. Of a centre that is learnt
+            they are in standard deviations of f_p from its mean.
+    """
+
+    effective_size: Tensor
+    converged: Tensor
+    relevance: Tensor | None
+    draws: dict[str, Tensor] = field(repr=False)
+
+
+def sample(
+    model: TermsGP,
+    search: Search,
+    num_samples: int | None = None,
+    num_draws: int | None = None,
+) -> SampleResult:
+    """Sample a model's hyper-parameters and put the samples into it, see :func:`~gpadjust.fit`.
+
+    The draws begin around the optima that the search finds; its seed is that of both.
+    """
+    if isinstance(model, TermsModel) and model.not_sampled:
+        raise ValueError(model.not_sampled)
+    if not isinstance(model, TermsGP):
+        raise TypeError(
+            f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP is the "
+            "plain Gaussian process."
+        )
+    model.check_can_be_sampled()
+    copy = deepcopy(model)
+    # What outputs share, such as a physics that learns, stays at its most likely values: sampling
+    # needs problems that are apart.
+    settled: dict[str, Tensor] = {}
+    if shared := shared_parameters(copy):
+        maximise(copy, search)
+        copy.train()
+        settled = {n: copy.get_parameter(n).requires_grad_(False).detach() for n in shared}
+    calibrated = calibrate_roughly(copy, search) if copy.has_unknowns else None
+    target = LogPosterior(copy, None, None if calibrated is None else calibrated.marginalized)
+    n, parameters, without = target.num_points, target.parameters, None
+    if calibrated is None and not settled and n <= MANY:
+        without = without_physics(copy)
+    register_priors(copy)
+    if num_draws is None:
+        num_draws = max(_DRAWS[0], min(_DRAWS[1], _COST // n**2))
+    if num_samples is None:
+        num_samples = default_num_samples(n)
+        if calibrated is not None:
+            alone = all(term.is_known for term in model.terms)
+            least = min(_RETURNED, _SAMPLED_ALONE // n**2) if alone else 0
+            num_samples = max(num_samples, _SAMPLES_OF_PARAMETERS, least)
+    generator = torch.Generator().manual_seed(search.seed)
+    if parameters.names:
+        gradients = min(_GRADIENTS, _COST_OF_GRADIENTS // n**2)
+        drawn = _draw(target, _around_optima(target, search), num_draws, gradients, num_samples, generator)
+        vectors, size = drawn.positions, drawn.effective_size()
+        is_good = (drawn.power >= _LEAST_POWER) & (size >= _LEAST_SHARE * len(vectors))
+    else:  # all is known but the parameters of the physics
+        drawn, vectors = None, parameters.current()
+        size = vectors.new_full((parameters.num_problems,), math.inf)
+        is_good = size > 0
+    if calibrated is not None:
+        log_densities = vectors.new_zeros(len(vectors))
+        if drawn is not None:  # of which what is not done of the way leaves a part
+            log_densities = target.log_likelihood(vectors) - (1 - drawn.power) * drawn.log_ratio
+            log_densities = log_densities.sum(-1)
+        vectors, coordinates, own = draw_parameters(
+            calibrated,
+            parameters,
+            vectors,
+            log_densities,
+            max(_RETURNED, num_samples),
+            generator,
+        )
+        size, is_good = size.minimum(own), is_good & (own >= _LEAST_SIZE_OF_PARAMETERS)
+        rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
+        chosen = vectors[rows]
+    else:
+        chosen = _representative(target, vectors, num_samples)
+    if settled:
+        model.train()  # its inputs are then transformed again, with what they are at now
+    with torch.no_grad():
+        for name, value in settled.items():
+            model.get_parameter(name).copy_(value)
+    held, relevance = parameters.to_raw(parameters.unflatten(chosen)), None
+    if without is not None and drawn is not None:
+        register_priors(without)
+        other = LogPosterior(without)
+        around = _around_optima(other, search)
+        behind = drawn.log_evidence - around.log_evidence > _DECISIVE
+        plain = _draw(other, around, num_draws // 2, gradients // 2 * int(not behind.all()), num_samples, generator)
+        relevance = probability(drawn.log_evidence, plain.log_evidence)
+        relevance = relevance.reshape(parameters.batch_shape)
+        chosen = _representative(other, plain.positions, num_samples)
+        values = other.parameters.to_raw(other.parameters.unflatten(chosen))
+        held = mixed(held, values, copy, without, relevance)
+    raw = parameters.to_raw(parameters.unflatten(vectors))
+    named = {r.name.replace("raw_", ""): r.parameter(raw[r.name]) for r in parameters.rows}
+    if calibrated is not None:
+        held["input_transform.coordinates"] = coordinates[rows]
+        named |= model.input_transform.remember(coordinates)
+    model.hold_samples(held)
+    if calibrated is not None:
+        calibrated.calibration.direct(model, coordinates[rows])
+        warn_of_parameters(calibrated)
+    size = size.reshape(parameters.batch_shape)
+    converged = is_good.reshape(parameters.batch_shape)
+    if not converged.all():
+        warnings.warn(
+            f"The draws of {int((~converged).sum())} of {converged.numel()} outputs do not show "
+            f"the posterior (effective sample size {size.min():.2g}). Raise num_draws, or give "
+            "narrower priors, that of the noise above all.",
+            SamplingWarning,
+            stacklevel=3,
+        )
+    return SampleResult(size, converged, relevance, named)
+
+
+def default_num_samples(num_points: int) -> int:
+    """How many samples a model of so many observations holds, if that is not said."""
+    return next(number for most, number in _SAMPLES.items() if num_points <= most)
+
+
+def _draw(
+    target: LogPosterior,
+    proposal: Mixture,
+    num_draws: int,
+    gradients: int,
+    num_samples: int,
+    generator: torch.Generator,
+) -> Particles:
+    """Draws of the hyper-parameters; an error if the likelihood is nowhere finite."""
+    least, most = _PARTICLES
+    number = max(least, min(most, gradients // _GRADIENTS_EACH), num_samples)
+    try:
+        return annealing.sample(
+            target,
+            proposal,
+            num_draws,
+            number + number % 2,
+            gradients,
+            generator,
+        )
+    except FloatingPointError:
+        raise RuntimeError(NOWHERE) from None
+
+
+def _around_optima(target: LogPosterior, search: Search) -> Mixture:
+    """Laplace's approximation around all optima that the search finds, with wider tails."""
+    starts, screened = _STARTS
+    search = search._replace(
+        num_starts=search.num_starts or starts,
+        num_screened=screened if search.num_screened is None else search.num_screened,
+        max_iterations=min(search.max_iterations, _ITERATIONS),
+    )
+    centres, values = optima(target, search)
+    values, order = values.to(centres).sort(dim=0)
+    centres = centres.gather(0, order.unsqueeze(-1).expand_as(centres))
+    near = (centres.unsqueeze(1) - centres).abs().amax(-1) < _APART  # k x k x B
+    again = torch.stack([row[:i].any(0) for i, row in enumerate(near)])  # k x B
+    first = again.to(centres).argsort(dim=0, stable=True)[:_MODES]
+    centres = centres.gather(0, first.unsqueeze(-1).expand(-1, -1, centres.shape[-1]))
+    values, again = values.gather(0, first), again.gather(0, first)
+    root = laplace_root(target, centres)
+    log_share = root.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1) - values
+    share = log_share.masked_fill(again, -math.inf).softmax(0)
+    even = ~again / (~again).sum(0)
+    log_evidence = log_share.masked_fill(again, -math.inf).logsumexp(0)
+    log_evidence = log_evidence + 0.5 * centres.shape[-1] * math.log(2 * math.pi)
+    return Mixture(centres, (1 - _EACH) * share + _EACH * even, root, log_evidence)
+
+
+def laplace_root(target: LogPosterior, optima: Tensor) -> Tensor:
+    """Roots of the covariances of Laplace's approximation at optima ``k x B x p``.
+
+    Lower triangular, ``k x B x p x p``.
+    """
+    k, _, p = optima.shape
+    step = _STEP * torch.eye(p).to(optima)[:, None, None]
+    points = torch.cat([optima + step, optima - step]).flatten(0, 1)
+    _, gradient = target.value_and_gradient(points)
+    up, down = gradient.unflatten(0, (2 * p, k)).chunk(2)
+    hessian = (up - down).movedim(0, -2) / (2 * _STEP)
+    values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
+    root = vectors * values.clamp_min(_WIDEST**-2).rsqrt().unsqueeze(-2)
+    return torch.linalg.qr(root.mT).R.mT
+
+
+@torch.no_grad()
+def _representative(target: LogPosterior, vectors: Tensor, number: int) -> Tensor:
+    """Some of the vectors ``N x B x p`` whose mixture predicts as that of all, ``number x B x p``.
+
+    Their mean predictions of left-out observations, standard deviations and hyper-parameters are
+    to be those of all: greedily chosen, then exchanged one by one.
+    """
+    if number >= len(vectors):
+        return vectors[torch.arange(number) % len(vectors)]
+    mean, covariance, *_ = target.distribution(target.parameters.unflatten(vectors))
+    residual = (target.targets - mean).expand(covariance.shape[:-1])
+    observed = ~residual.isnan()
+    chol, _ = cholesky(covariance, None if observed.all() else observed)
+    variance = torch.cholesky_inverse(chol).diagonal(dim1=-1, dim2=-2).reciprocal()
+    alpha = torch.cholesky_solve(residual.nan_to_num(nan=0.0).unsqueeze(-1), chol).squeeze(-1)
+    unit = variance.mean(0).sqrt()
+    spread = vectors.std(0).clamp_min(torch.finfo(vectors.dtype).tiny)
+    parts = (alpha * variance / unit, variance.sqrt() / unit, _OF_POSITIONS * vectors / spread)
+    shape = vectors.shape[:2]
+    features = torch.cat(
+        [
+            (each - each.mean(0)).reshape(*shape, -1) / math.sqrt(each.shape[-1])
+            for each in parts
+        ],
+        dim=-1,
+    )
+    grams = features.transpose(0, 1) @ features.transpose(0, 1).mT
+    rows = torch.stack([_of_mean_zero(gram, number) for gram in grams.nan_to_num()], dim=-1)
+    return vectors.gather(0, rows.unsqueeze(-1).expand(-1, -1, vectors.shape[-1]))
+
+
+def _of_mean_zero(gram: Tensor, number: int) -> Tensor:
+    """Numbers of elements whose sum is small, by their inner products ``N x N``."""
+    size, total = gram.diagonal(), torch.zeros_like(gram[0])
+    chosen: list[int] = []
+
+    def best() -> int:
+        cost = size + 2 * total
+        cost[chosen] = math.inf
+        return int(cost.argmin())
+
+    for _ in range(number):
+        chosen.append(best())
+        total = total + gram[chosen[-1]]
+    for _ in range(_EXCHANGES):
+        before = [*chosen]
+        for _ in range(number):  # of the first, which goes to the end
+            total = total - gram[chosen.pop(0)]
+            chosen.append(best())
+            total = total + gram[chosen[-1]]
+        if sorted(before) == sorted(chosen):
+            break
+    return torch.tensor(chosen, device=gram.device)

@@ -1,0 +1,623 @@
+"""Learning the unknown parameters of a physics, with all else."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from botorch.exceptions.warnings import OptimizationWarning
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from gpadjust.gp import AppendedPhysics, OrthogonalKernel
+from gpadjust.gp.gaussian import cholesky, negative_log_likelihood
+from gpadjust.inference.annealing import raised, resampled
+from gpadjust.inference.optimise import FitResult, Search, maximise
+from gpadjust.inference.targets import ByModules, MarginalizedParameters
+from gpadjust.models import TermsGP
+from gpadjust.models.parameters import Parameters
+
+_STEP = 1e-4  # of differences, in standard deviations of the prior
+_GUESSES = 255  # of the parameters, of which the best are started from
+_STARTS = 16
+_ITERATIONS = 60  # of least squares
+_ARRIVED = 1e-4  # decrease of a negative log density at which they stop
+_TRIED = 8  # of them, after which the best go on
+_KEPT = 6  # of these
+_STUCK = 1e8  # damping of a search that finds nothing better
+_SILENT = 1e-14  # the mean square of residuals, relative to that of the targets, that is none
+_AT_ONCE = 2**22  # numbers in the covariances of a batch
+_ROUNDS = 4  # of hyper-parameters and parameters by turns
+_SETTLED = 0.05  # standard deviations that the parameters moved in the last of them
+_GIVEN = {128: 256, 512: 64, math.inf: 16}  # hyper-parameters of up to so many observations
+_ENOUGH = 128  # effective sample size of the parameters that is enough
+_COUNTED = 64  # draws, at least, by weights that are tempered if need be
+_ROUND = 256  # draws at once
+_MOST_DRAWS = 8192
+_ROWS = 1_000_000  # draws times observations
+_STEPS = 4  # from where the mean is linear to a draw
+_POLISHES = 3  # steps after these
+_TINY = 1e-300
+_SOLVED = 1e-2  # standard deviations that a draw may be from its aim
+_UNTOLD = 0.15  # of the prior's precision: what else is known of a direction is next to nothing
+_TAKES_PART = 0.3  # cosine of a parameter and such a direction
+_FAR = 3.0  # standard deviations of the prior
+
+
+class ParameterWarning(UserWarning):
+    """The observations say next to nothing of parameters of the physics, or contradict a prior."""
+
+
+class LinearizedMean(NamedTuple):
+    """The prior mean at the training inputs, linear near points of the unknown parameters.
+
+    Attributes:
+        point: Their coordinates z, ``... x p``.
+        residual: The targets less the mean there, ``... x B x n``; 0 where there is no target, and
+            infinite where the physics fails.
+        slope: Derivatives of the mean, ``... x B x n x p``; 0 likewise.
+    """
+
+    point: Tensor
+    residual: Tensor
+    slope: Tensor
+
+
+class Information(NamedTuple):
+    """What the targets of each output say of the parameters, if the mean is linear in them.
+
+    Attributes:
+        precision: :math:`J^T K^{-1} J`, ``... x B x p x p``.
+        information_vector: :math:`J^T K^{-1} (r + J z)`, ``... x B x p``.
+    """
+
+    precision: Tensor
+    information_vector: Tensor
+
+    def posterior(self, outputs: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Mean ``... x p`` and Cholesky factor of the precision, by the prior and all outputs.
+
+        With a matrix of ones and zeros, ``b x B``, for each of its rows by some of them.
+        """
+        precision, vector = self.precision, self.information_vector
+        if outputs is None:
+            precision, vector = precision.sum(-3), vector.sum(-2)
+        else:
+            precision = torch.einsum("bc,...cpq->...bpq", outputs, precision)
+            vector = outputs @ vector
+        chol = torch.linalg.cholesky(precision + torch.eye(vector.shape[-1]).to(vector))
+        return torch.cholesky_solve(vector.unsqueeze(-1), chol).squeeze(-1), chol
+
+
+class Calibration:
+    r"""The unknown parameters of a model's physics, which all of its ``B`` outputs share.
+
+    In their coordinates z, which are standard normal by the prior, the mean of the targets is
+    linear near a point, :math:`m(z) \approx m(z_0) + J (z - z_0)`. So they are integrated out in
+    closed form while hyper-parameters are learnt, as unknown constants with the bases J: given z
+    the outputs are independent, and what the others say of it is a normal prior to each.
+
+    Args:
+        model: A model with such a physics, in train mode.
+
+    Raises:
+        ValueError: If it is of a batch of data sets.
+    """
+
+    def __init__(self, model: TermsGP) -> None:
+        if model._input_batch_shape:
+            raise ValueError(
+                "Expected a model of one data set to learn unknown parameters of its physics, got "
+                f"one with batch_shape {tuple(model._input_batch_shape)}; fit the data sets of a "
+                "batch one by one."
+            )
+        self.model, self._transform = model, model.input_transform
+        raw, n = model.train_inputs[0], model.train_targets.shape[-1]
+        self._raw = raw[0] if model.num_outputs > 1 else raw
+        self._targets = model.train_targets.reshape(-1, n)
+        self._observed = ~self._targets.isnan()
+        self._all = bool(self._observed.all())
+        self.unknowns = self._transform.physics.unknowns
+        self._orthogonal = [
+            i for i, term in enumerate(model.terms) if isinstance(term.kernel, OrthogonalKernel)
+        ]
+        scaled = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
+        self._moves_covariance = bool(self._orthogonal) or not all(t.is_known for t in scaled)
+
+    @property
+    def point(self) -> Tensor:
+        """Where the parameters are, ``p``."""
+        point: Tensor = self._transform.coordinates.detach().clone()
+        return point
+
+    def move_to(self, point: Tensor) -> None:
+        """Move the parameters to coordinates ``p``."""
+        with torch.no_grad():
+            self._transform.coordinates.copy_(point)
+        self.direct(self.model, point)
+
+    @torch.no_grad()
+    def direct(self, model: TermsGP, points: Tensor) -> None:
+        """Make kernels orthogonal to what the parameters do near points, ``(k) x p``.
+
+        Args:
+            model: Whose kernels; they have a batch of ``k`` if there are ``k`` points.
+            points: Coordinates of the parameters.
+        """
+        if not self._orthogonal:
+            return
+        inputs, slope = self._inputs(points), self.linearized(points).slope
+        shape = (*points.shape[:-1], *self.model.train_targets.shape, points.shape[-1])
+        for term in (model.terms[i] for i in self._orthogonal):
+            kernel = term.kernel
+            if isinstance(kernel, OrthogonalKernel):
+                kernel.set_directions(inputs[..., : term.num_inputs], slope.reshape(shape))
+
+    @torch.no_grad()
+    def linearized(self, points: Tensor) -> LinearizedMean:
+        """The prior mean near points ``... x p``."""
+        p = points.shape[-1]
+        moves, here = _STEP * torch.eye(p).to(points), points.unsqueeze(-2)
+        residual = self._residuals(torch.cat([here, here + moves, here - moves], dim=-2))
+        here, up, down = residual.split([1, p, p], dim=-3)
+        slope = ((down - up) / (2 * _STEP)).movedim(-3, -1)
+        return LinearizedMean(points, here.squeeze(-3), slope.nan_to_num(0.0, 0.0, 0.0))
+
+    def check_slope(self, near: LinearizedMean) -> None:
+        """Raise a ValueError if the mean has no slope by some parameters, for no good reason."""
+        silent = ~near.slope.flatten(0, 1).any(0)
+        if not silent.any():
+            return
+        moves = _STEP * torch.eye(len(silent)).to(near.point)[silent]
+        beside = torch.cat([near.point + moves, near.point - moves])
+        failing = beside[~self._residuals(beside).isfinite().flatten(1).all(-1)]
+        if len(failing):
+            best, there = (self.unknowns.at(z) for z in (near.point, failing[0]))
+            raise ValueError(
+                f"The physics fails at {self._text(there)}, next to the best parameters that were "
+                f"found, {self._text(best)}: better ones may lie where it cannot run. Correct it "
+                "there, or say by `bounds` of Unknown which values are possible."
+            )
+        if silent.all():
+            raise ValueError(
+                f"The unknown parameters {', '.join(self.unknowns)} of the physics change nothing "
+                "at the training inputs that the prior mean of the model takes from it; correct "
+                "the physics, or give rho a mean that is not 0 (rho_mean=1.0)."
+            )
+
+    @torch.no_grad()
+    def least_squares(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        r"""The parameters that fit best without any Gaussian process, by Levenberg and Marquardt.
+
+        They minimise :math:`\sum_j \tfrac{n_j}{2} \log |r_j|^2 + \tfrac12 |z|^2`, with the variance
+        of each output's residuals at its best, from several starts at once.
+
+        Returns:
+            Their coordinates, ``p``, and the mean squares of the residuals, ``B``.
+        """
+        current = self.point.unsqueeze(0)  # where it works, as the model was built there
+        others = _spread_normal((_GUESSES, current.shape[-1]), generator).to(current)
+        guesses = torch.cat([current, others])
+        values = self._misfit(guesses, self._residuals(guesses))[0]
+        best = torch.cat([values.new_zeros(1).long(), values[1:].argsort()[: _STARTS - 1] + 1])
+        near = self.linearized(guesses[best[values[best].isfinite()]])
+        values, variances = self._misfit(near.point, near.residual)
+        damping = values.new_full((len(values), 1, 1), 1e-3)
+        going = torch.ones_like(values, dtype=torch.bool)
+        for iteration in range(_ITERATIONS):
+            if iteration == _TRIED:
+                best = values.argsort()[:_KEPT]
+                near = LinearizedMean(*(part[best] for part in near))
+                values, variances = values[best], variances[best]
+                damping, going = damping[best], going[best]
+            z, slope = near.point, near.slope / variances[..., None, None]
+            gradient = (slope.mT @ near.residual.unsqueeze(-1)).sum(-3).squeeze(-1) - z
+            hessian = (slope.mT @ near.slope).sum(-3) + torch.eye(z.shape[-1]).to(z)
+            hessian = hessian + damping * torch.diag_embed(hessian.diagonal(dim1=-1, dim2=-2))
+            moved = self.linearized(z + torch.linalg.solve(hessian, gradient))
+            found, others = self._misfit(moved.point, moved.residual)
+            better = found < values
+            stops = better & (values - found < _ARRIVED)
+            going &= ~stops & (damping.flatten() < _STUCK)
+            pairs = zip((*moved, others, found), (*near, variances, values), strict=True)
+            *parts, variances, values = (_where(better, new, old) for new, old in pairs)
+            near = LinearizedMean(*parts)
+            damping = damping * torch.where(better, 0.2, 5.0)[:, None, None]
+            if not going.any():
+                break
+        i = values.argmin()
+        return near.point[i], variances[i]
+
+    def information(self, near: LinearizedMean, covariance: Tensor) -> Information:
+        """What targets say of covariances ``... x B x n x n``."""
+        chol = self._factor(covariance)
+        # What the slopes times the parameters are to make.
+        target = near.residual.unsqueeze(-1) + near.slope @ near.point[..., None, :, None]
+        columns = torch.cat([near.slope, target], dim=-1)
+        white = torch.linalg.solve_triangular(
+            chol, columns.expand(*chol.shape[:-1], -1), upper=False
+        )
+        slope, target = white[..., :-1], white[..., -1:]
+        return Information(slope.mT @ slope, (slope.mT @ target).squeeze(-1))
+
+    def marginalized(
+        self, near: LinearizedMean, information: Information
+    ) -> MarginalizedParameters:
+        """What the parameters, by their prior and the other outputs, add to each output."""
+        count = len(self._targets)
+        mean, chol = information.posterior((1 - torch.eye(count)).to(near.point))
+        root = torch.linalg.solve_triangular(chol, near.slope.mT, upper=False).mT
+        away = near.slope @ (mean - near.point).unsqueeze(-1)
+        shape = self.model.train_targets.shape
+        return MarginalizedParameters(
+            away.reshape(shape), (root @ root.mT).reshape(*shape, shape[-1])
+        )
+
+    @torch.no_grad()
+    def moments(
+        self, parameters: Parameters, vectors: Tensor, points: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Mean ``k x B x n`` and covariance of the targets, for vectors ``k x B x q`` at points."""
+        inputs = self._inputs(points)
+        self.direct(self.model, points)
+        distribution = ByModules(self.model, parameters, inputs, self.model.noise.known, True)
+        mean, covariance, *_ = distribution(parameters.unflatten(vectors))
+        b, n = self._targets.shape
+        shape = (max(len(vectors), len(points)), b, n)
+        mean = mean.expand(covariance.shape[:-1]).reshape(-1, b, n)
+        return mean.expand(shape), covariance.reshape(-1, b, n, n).expand(*shape, n)
+
+    @torch.no_grad()
+    def newton(self, near: LinearizedMean, covariance: Tensor) -> Tensor:
+        """The most likely parameters, ``p``, at a covariance ``B x n x n``: a step of Newton's."""
+        target, _ = self.information(near, covariance).posterior()
+        shares = torch.tensor([1.0, 0.5, 0.25, 0.1, 0.0]).to(target).unsqueeze(-1)
+        points = near.point + shares * (target - near.point)
+        return points[self._at_covariance(points, self._factor(covariance)).argmin()]
+
+    @torch.no_grad()
+    def draw(
+        self,
+        near: LinearizedMean,
+        parameters: Parameters,
+        vectors: Tensor,
+        log_densities: Tensor,
+        number: int,
+        generator: torch.Generator,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw parameters and hyper-parameters jointly, by importance sampling.
+
+        Parameters are drawn for each of some vectors (:meth:`_randomized`), and the pairs weighted.
+
+        Args:
+            near: The prior mean near the most likely parameters.
+            parameters: The learnable hyper-parameters.
+            vectors: Vectors of them, ``H x B x q``.
+            log_densities: Of what these were drawn from, less that of their priors, ``H``.
+            number: Number ``K`` of pairs.
+            generator: Source of randomness.
+
+        Returns:
+            Equally likely pairs, numbers of the vectors, ``K``, and coordinates, ``K x p``; and the
+            effective sample size.
+        """
+        _, covariance = self.moments(parameters, vectors, near.point.unsqueeze(0))
+        chol = self._factor(covariance)
+        density = self._density_given(parameters, vectors, chol)
+        found, log_weights = near.point[None][:0], log_densities[:0]
+        size = log_densities.new_zeros(())
+        most = max(_ROUND, min(_MOST_DRAWS, _ROWS // len(self._raw)))
+        while len(found) < most:
+            z, log_q = self._randomized(near, chol, _ROUND, generator)
+            log_w = -density(z.unflatten(0, (-1, len(vectors)))) - log_densities
+            found = torch.cat([found, z])
+            log_w = (log_w.flatten() - log_q).nan_to_num(nan=-math.inf, posinf=-math.inf)
+            log_weights = torch.cat([log_weights, log_w])
+            if not log_weights.isfinite().any():
+                continue
+            size = log_weights.softmax(0).square().sum().reciprocal()
+            if size >= _ENOUGH:
+                break
+        if not log_weights.isfinite().any():
+            raise FloatingPointError("The density of the parameters is zero at all draws.")
+        # Weights are tempered as far as few would have them all.
+        least, start = min(_COUNTED, len(found) / 4), log_weights.new_zeros(1)
+        _, weights, _ = raised(log_weights.unsqueeze(1), start, least)
+        rows = resampled(weights, number + number % 2, generator)[:number, 0]
+        return rows % len(vectors), found[rows], size
+
+    def _randomized(
+        self, near: LinearizedMean, chol: Tensor, number: int, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        r"""Draw parameters by least squares of randomised targets, which follow where a mean bends.
+
+        With whitened residuals of prior and targets, :math:`F(z) = (z, L^{-1} (m(z) - y))`, and an
+        orthonormal basis Q of their slopes near a point, a draw is the solution of :math:`Q^T F(z)
+        = \eta`, :math:`\eta \sim N(0, I)`. Its density is :math:`|\det Q^T F'(z)| \, N(Q^T F(z))`
+        (randomize-then-optimize, Bardsley et al. 2014), the posterior itself of a linear mean. The
+        equations are solved by Broyden's method, in one step or, where that does not do, in some.
+
+        Args:
+            near: The mean near a point ``p``.
+            chol: Factors of the targets' covariance, ``H x B x n x n``.
+            number: Number ``N`` of draws, of the ``H`` by turns.
+            generator: Source of randomness.
+
+        Returns:
+            Coordinates, ``N x p``, and logarithms of their densities, ``N``; infinite where there
+            is no solution.
+        """
+        p, slope = len(near.point), near.slope.expand(*chol.shape[:-1], -1)
+        white = torch.linalg.solve_triangular(chol, slope, upper=False)
+        identity = torch.eye(p).to(white).expand(len(white), p, p)
+        basis, _ = torch.linalg.qr(torch.cat([identity, white.flatten(1, 2)], dim=-2))
+        first, rest = basis.split([p, basis.shape[-2] - p], dim=-2)
+        rest = torch.linalg.solve_triangular(
+            chol.mT, rest.unflatten(1, slope.shape[1:3]), upper=True
+        )
+        turns = number // len(white)
+        first, rest = first.repeat(turns, 1, 1), rest.repeat(turns, 1, 1, 1)
+        near = LinearizedMean(*(part.expand(number, *part.shape) for part in near))
+
+        def value_of(z: Tensor, residual: Tensor, which: Tensor) -> Tensor:
+            back = (rest[which] * residual.unsqueeze(-1)).sum((1, 2))
+            return (first[which] * z.unsqueeze(-1)).sum(1) - back
+
+        def slope_of(slope: Tensor) -> Tensor:
+            return first.mT + (rest.unsqueeze(-1) * slope.unsqueeze(-2)).sum((1, 2))
+
+        aim = _spread_normal((number, p), generator).to(white)
+        every = torch.arange(number, device=white.device)
+        start, by_z = value_of(near.point, near.residual, every), slope_of(near.slope)
+        found, unsolved = near.point.clone(), every
+        for steps in (1, _STEPS):  # where one does not do, a way that keeps to the ridge
+            z, value, slopes = near.point[unsolved], start[unsolved], by_z[unsolved]
+            for step in range(steps + _POLISHES):
+                share = min(1.0, (step + 1) / steps)
+                goal = start[unsolved] + share * (aim - start)[unsolved]
+                move = torch.linalg.solve_ex(slopes, (goal - value).unsqueeze(-1))[0]
+                z = z + move.squeeze(-1)
+                missed = value + (slopes @ move).squeeze(-1)
+                value = value_of(z, self._residuals(z), unsolved)
+                length = move.square().sum(-2, keepdim=True).clamp_min(_TINY)
+                slopes = slopes + (value - missed).unsqueeze(-1) * move.mT / length
+                solved = (value - aim[unsolved]).abs().amax(-1) < _SOLVED
+                if step + 1 >= steps and solved.all():
+                    break
+            found[unsolved[solved]] = z[solved]
+            unsolved = unsolved[~solved]
+            if not len(unsolved):
+                break
+        around = self.linearized(found)
+        by_z = slope_of(around.slope)
+        by_z[unsolved] = torch.eye(p).to(by_z)
+        value = value_of(found, around.residual, every)
+        log_q = torch.linalg.slogdet(by_z).logabsdet - 0.5 * value.square().sum(-1)
+        log_q[unsolved] = math.inf
+        return found, log_q
+
+    def _density_given(
+        self, parameters: Parameters, vectors: Tensor, chol: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Negative log densities ``k x H`` of targets and parameters ``k x H x p``.
+
+        They are given each of the ``H`` vectors of hyper-parameters, of which ``chol`` is the
+        factor of the targets' covariance, up to a constant.
+        """
+        if not self._moves_covariance:
+            log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum((-1, -2))
+            return lambda z: self._at_covariance(z, chol) + log_det
+        at_once = max(1, _AT_ONCE // chol[0].numel())
+
+        def density(z: Tensor) -> Tensor:
+            flat, which = z.flatten(0, 1), torch.arange(len(vectors)).repeat(len(z))
+            parts = zip(flat.split(at_once), which.split(at_once), strict=True)
+            found = [self._density(part, parameters, vectors[rows]) for part, rows in parts]
+            return torch.cat(found).view(z.shape[:2])
+
+        return density
+
+    def _at_covariance(self, z: Tensor, chol: Tensor) -> Tensor:
+        """Negative log densities ``k (x H)`` of ``z``, with factors ``(H) x B x n x n``."""
+        residual = self._residuals(z).movedim(0, -1)  # (H) x B x n x k
+        white = torch.linalg.solve_triangular(chol, residual, upper=False)
+        value = white.square().sum((-3, -2)).movedim(-1, 0) + z.square().sum(-1)
+        return _or_infinite(0.5 * value)
+
+    def _density(self, z: Tensor, parameters: Parameters, vectors: Tensor) -> Tensor:
+        """Negative log densities ``k`` of parameters ``k x p`` beside vectors ``k x B x q``."""
+        mean, covariance = self.moments(parameters, vectors, z)
+        failed = (mean.isnan() & self._observed).flatten(1).any(-1)
+        # Where the physics fails there is no covariance either.
+        one = torch.eye(mean.shape[-1]).to(covariance)
+        covariance = covariance.where(~failed[:, None, None, None], one)
+        residual = self._targets - mean.nan_to_num(nan=0.0)
+        value = negative_log_likelihood(residual, covariance).value.sum(-1)
+        return _or_infinite(value.masked_fill(failed, math.inf) + 0.5 * z.square().sum(-1))
+
+    def _inputs(self, points: Tensor) -> Tensor:
+        """What the terms read at points ``... x p``, ``... x (1) x n x d``; NaN if f_p fails."""
+        inputs: Tensor = self._transform.at(self._raw, points)
+        return inputs.unsqueeze(-3) if self.model.num_outputs > 1 else inputs
+
+    def _residuals(self, points: Tensor) -> Tensor:
+        """As in :class:`LinearizedMean`, at points ``... x p``."""
+        mean = self.model.mean_module(self._inputs(points))
+        mean = mean.reshape(*points.shape[:-1], *self._targets.shape)
+        residual = self._targets - _or_infinite(mean)
+        return residual.where(self._observed, torch.zeros_like(residual))
+
+    def _misfit(self, z: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+        """What least squares minimise, ``k``, and the variances of residuals, ``k x B``."""
+        count = self._observed.sum(-1).to(z)
+        least = _SILENT * self._targets.square().nanmean(-1) + torch.finfo(z.dtype).tiny
+        variances = (residual.square().sum(-1) / count).maximum(least)
+        value = (0.5 * count * variances.log()).sum(-1) + 0.5 * z.square().sum(-1)
+        return _or_infinite(value), variances
+
+    def _factor(self, covariance: Tensor) -> Tensor:
+        return cholesky(covariance.clone(), None if self._all else self._observed)[0]
+
+    def _text(self, values: Tensor) -> str:
+        """Parameters ``p`` in words."""
+        named = zip(self.unknowns.names, values.tolist(), strict=True)
+        return ", ".join(f"{name} = {value:.6g}" for name, value in named)
+
+
+class Calibrated(NamedTuple):
+    """A model at its most likely parameters, about which they are integrated out.
+
+    Attributes:
+        calibration: Its parameters.
+        near: The prior mean near them.
+        information: What the targets of each output say of them.
+        marginalized: What they add to the distribution of the targets.
+        result: What the fit of the hyper-parameters reached.
+    """
+
+    calibration: Calibration
+    near: LinearizedMean
+    information: Information
+    marginalized: MarginalizedParameters
+    result: FitResult
+
+
+def calibrate(model: TermsGP, search: Search) -> Calibrated:
+    """Bring a model to its most likely hyper-parameters, and then parameters of the physics.
+
+    The first are those most likely with the parameters integrated out, near their most likely
+    values; the search for these begins with least squares. The two go by turns until the parameters
+    stay. The model is left in train mode; after an error, as it was.
+    """
+    model.train()
+    calibration = Calibration(model)
+    start = [(parameter, parameter.detach().clone()) for parameter in model.parameters()]
+    try:
+        return _calibrate(calibration, search)
+    except BaseException:
+        with torch.no_grad():
+            for parameter, before in start:
+                parameter.copy_(before)
+        raise
+
+
+def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
+    model, generator = calibration.model, torch.Generator().manual_seed(search.seed)
+    point, variances = calibration.least_squares(generator)
+    near = calibration.linearized(point)
+    calibration.check_slope(near)
+    independent = torch.diag_embed(variances.unsqueeze(-1).expand(near.residual.shape))
+    information = calibration.information(near, independent)
+    for _ in range(_ROUNDS):
+        calibration.move_to(point)
+        result = maximise(model, search, calibration.marginalized(near, information))
+        search = search._replace(num_screened=0)
+        model.train()
+        parameters = Parameters(model)
+        _, covariance = calibration.moments(parameters, parameters.current(), point.unsqueeze(0))
+        target = calibration.newton(near, covariance[0])
+        _, chol = calibration.information(near, covariance[0]).posterior()
+        moved = (chol.mT @ (target - point)).norm()
+        point, near = target, calibration.linearized(target)
+        information = calibration.information(near, covariance[0])
+        if moved < _SETTLED * len(point) ** 0.5:
+            break
+    calibration.move_to(point)
+    model.input_transform.remember(point.unsqueeze(0))
+    marginalized = calibration.marginalized(near, information)
+    return Calibrated(calibration, near, information, marginalized, result)
+
+
+def calibrate_roughly(model: TermsGP, search: Search) -> Calibrated:
+    """As :func:`calibrate`, of a model whose hyper-parameters are sampled afterwards."""
+    search = search._replace(
+        num_starts=search.num_starts or 4,
+        num_screened=64 if search.num_screened is None else search.num_screened,
+        max_iterations=min(search.max_iterations, 60),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OptimizationWarning)
+        return calibrate(model, search)
+
+
+def draw_parameters(
+    calibrated: Calibrated,
+    parameters: Parameters,
+    vectors: Tensor,
+    log_densities: Tensor,
+    number: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw parameters of the physics, and of vectors of hyper-parameters those that go with them.
+
+    Args:
+        calibrated: The model near its most likely parameters.
+        parameters: The learnable hyper-parameters.
+        vectors: Draws of them with the parameters integrated out near there, ``H x B x q``.
+        log_densities: Theirs, less that of their priors, ``H``.
+        number: Number ``K`` of draws.
+        generator: Source of randomness.
+
+    Returns:
+        Vectors, ``K x B x q``, coordinates of parameters, ``K x p``, and the effective sample size.
+    """
+    n = calibrated.near.residual.shape[-1]
+    count = next(count for most, count in _GIVEN.items() if n <= most) if parameters.names else 1
+    rows = torch.linspace(0, len(vectors) - 1, min(count, len(vectors))).round().long()
+    which, coordinates, size = calibrated.calibration.draw(
+        calibrated.near, parameters, vectors[rows], log_densities[rows], number, generator
+    )
+    return vectors[rows][which], coordinates, size
+
+
+def warn_of_parameters(calibrated: Calibrated) -> None:
+    """Warn of parameters that the observations tell nothing of, or against what was known.
+
+    The first are directions in which the observations have next to none of the prior's precision;
+    the second are likely more standard deviations of the prior away from its middle than it allows.
+    """
+    names = calibrated.calibration.unknowns.names
+
+    def of(which: Tensor) -> str:
+        return ", ".join(name for name, yes in zip(names, which.tolist(), strict=True) if yes)
+
+    values, vectors = torch.linalg.eigh(calibrated.information.precision.sum(-3))
+    if silent := of(vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART):
+        warnings.warn(
+            f"The observations say next to nothing of {silent} of the physics, or only of a "
+            "combination of them: their posterior is their prior there. Observe where they matter, "
+            "give narrower priors, or take one of them as known.",
+            ParameterWarning,
+            stacklevel=4,
+        )
+    if against := of(calibrated.near.point.abs() > _FAR):
+        warnings.warn(
+            f"Observations and prior disagree about {against} of the physics: most likely are "
+            f"values more than {_FAR:g} standard deviations of the prior away. Look at guess, sd, "
+            "factor and bounds, or at the physics.",
+            ParameterWarning,
+            stacklevel=4,
+        )
+
+
+def _spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    """Standard normal draws ``... x p`` that fill space evenly, in random order (Sobol)."""
+    seed = int(torch.randint(2**31, (1,), generator=generator))
+    engine = SobolEngine(shape[-1], scramble=True, seed=seed)
+    number = math.prod(shape[:-1])
+    shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
+    order = torch.randperm(number, generator=generator)
+    return torch.special.ndtri(shares[order]).reshape(shape)
+
+
+def _where(which: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Rows of the one or of the other."""
+    return torch.where(which.reshape(-1, *[1] * (new.dim() - 1)), new, old)
+
+
+def _or_infinite(values: Tensor) -> Tensor:
+    """Values with infinity in place of NaN."""
+    return values.nan_to_num(nan=math.inf, posinf=math.inf)

@@ -1,0 +1,562 @@
+"""What fits bring to an optimum or sample: functions of vectors of a model's hyper-parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Self
+
+import torch
+from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
+from gpytorch.settings import lazily_evaluate_kernels
+from linear_operator import to_dense
+from torch import Tensor
+from torch.nn import Parameter
+
+from gpadjust.gp import SumOfTerms
+from gpadjust.gp.gaussian import (
+    LikelihoodValue,
+    cholesky,
+    least_squares,
+    negative_log_likelihood,
+    nugget,
+    scaled,
+)
+from gpadjust.gp.kernels import Pairs, Profile, Stationary, stationary_parts
+from gpadjust.gp.noise import Noise
+from gpadjust.models.parameters import LogPriors, Parameters, Values
+from gpadjust.physics import PhysicsError
+
+_LEAST = 3  # observations, for a constant to be vague
+_FEW_INPUTS = 3  # up to which a linear trend is, too
+_AT_ONCE = 2**20  # numbers in the covariances of a batch; larger ones make memory the bottleneck
+_VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
+
+
+class MarginalizedParameters(NamedTuple):
+    """What unknown parameters of a physics add to the distribution of the targets.
+
+    Attributes:
+        mean: Added to their mean, ``(m) x n``.
+        covariance: Added to their covariance, ``(m) x n x n``.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+
+
+class Moments(NamedTuple):
+    """The distribution of the targets at given hyper-parameters.
+
+    Attributes:
+        mean: ``... x n``.
+        covariance: With noise, ``... x n x n``; it may be overwritten.
+        basis: The bases of unknown constants that are not in these, ``... x n x q``, or None.
+        pull_back: Carries derivatives of a likelihood back to the hyper-parameters, if asked for.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    basis: Tensor | None
+    pull_back: Callable[[LikelihoodValue], Values] | None
+
+
+class Target:
+    r"""The negative log marginal likelihood, less registered log priors, of hyper-parameters.
+
+    .. math:: \tfrac12 (y - m)^T K^{-1} (y - m) + \tfrac12 \log|K| + \tfrac n2 \log 2\pi
+
+    It takes a model as it is, with unknown constants integrated over their priors. It is evaluated
+    at ``k`` vectors of all ``B`` problems in one batch
+    (:class:`~gpadjust.models.parameters.Parameters`); where outputs share parameters, one vector
+    after the other.
+
+    Args:
+        model: The model; it is put in train mode.
+        rows: The observations that count, numbers of rows. Default: all.
+        marginalized: What unknown parameters of the physics add to mean and covariance, if they
+            are integrated out.
+
+    Attributes:
+        parameters: The vectors and their bounds.
+        targets: The observations, ``... x n``, and ``num_points`` their number ``n``.
+        distribution: Theirs.
+        concentrated: Whether the overall scale of all variances is at its optimum.
+    """
+
+    random_means: ClassVar[bool] = True
+    of_logs: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        model: BatchedMultiOutputGPyTorchModel,
+        rows: Tensor | None = None,
+        marginalized: MarginalizedParameters | None = None,
+    ) -> None:
+        model.train()
+        self.model, self.parameters = model, Parameters(model)
+        kept = slice(None) if rows is None else rows
+        self.targets = model.train_targets[..., kept]
+        self.num_points = self.targets.shape[-1]
+        self._of_all, self._added = marginalized, self.targets.new_zeros(())
+        if marginalized is not None:
+            self.targets = self.targets - marginalized.mean[..., kept]
+            self._added = marginalized.covariance[..., kept, :][..., kept]
+        with torch.no_grad():
+            inputs = model.transform_inputs(model.train_inputs[0])[..., kept, :]
+        self._raw_inputs = model.train_inputs[0][..., kept, :]
+        noise = Noise(model.likelihood).known
+        noise = None if noise is None else noise[..., kept]
+        inputs = self._raw_inputs if self.parameters.learns_inputs else inputs
+        args = (model, self.parameters, inputs, noise, self.random_means)
+        found = stationary_terms(*args) if self.parameters.is_batched else None
+        self.distribution: StationaryTerms | ByModules = found or ByModules(*args)
+        vague = self.of_logs and marginalized is None
+        self._trend = _trend(self._raw_inputs, self.targets) if vague else None
+        self._log_priors: LogPriors | None = None
+        if self.of_logs or next(iter(model.named_priors()), None) is not None:
+            self._log_priors = LogPriors(model, self.parameters, self.of_logs)
+        # Targets that are met exactly would have no variance at all: their rounding errors have.
+        square = self.targets.square().nanmean(-1)
+        square = square.where(square > 0, torch.ones_like(square))
+        self._rounding = torch.finfo(square.dtype).eps ** 2 * square
+        self.concentrated = False
+
+    def of_rows(self, rows: Tensor) -> Self:
+        """The same of some of the observations, numbers of rows."""
+        return type(self)(self.model, rows, self._of_all)
+
+    @torch.no_grad()
+    def assign(self, vector: Tensor) -> None:
+        """Give the model a vector, ``B x p``, at its best scale, and its constant means."""
+        if self.concentrated:
+            vector = self.at_best_scale(vector.unsqueeze(0))[0][0]
+        self.parameters.assign(vector)
+        values = {n: v[0] for n, v in self.parameters.unflatten(vector.unsqueeze(0)).items()}
+        mean, covariance, basis, _ = self.distribution(values)
+        if basis is None:
+            return
+        covariance = covariance + self._added
+        shift, vague = _constant_means(self.targets - mean, covariance, basis)
+        terms = [term for term in self.model.covar_module.terms if term.learns_mean]
+        for i, term in enumerate(terms):
+            term.mean.add_(shift[..., i : i + 1])
+            term.mean_variance.copy_(vague[..., i : i + 1])
+
+    def __call__(self, vectors: Tensor) -> Tensor:
+        """The value at ``vectors`` (``k x B x p``), ``k x B``.
+
+        It is infinite where the covariance has no Cholesky factor.
+        """
+        return self._in_chunks(lambda part: self._evaluate(part, derivatives=False), vectors)[0]
+
+    def value_and_gradient(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """The value and its gradient, ``k x B`` and ``k x B x p``.
+
+        The gradient is zero where the value is infinite.
+        """
+        return self._in_chunks(lambda part: self._evaluate(part, derivatives=True), vectors)
+
+    def log_likelihood(self, vectors: Tensor) -> Tensor:
+        """The log likelihood at ``vectors`` (``k x B x p``) without priors, ``k x B``."""
+        log_prior = 0.0 if self._log_priors is None else self._log_priors(vectors)[0]
+        return -self(vectors) - log_prior
+
+    @torch.no_grad()
+    def at_best_scale(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Multiply all variances by the factor that maximises the likelihood.
+
+        With :math:`c K` in place of :math:`K` it is :math:`(y - m)^T K^{-1} (y - m) / n`, or what
+        brings the noise to its bound.
+
+        Args:
+            vectors: ``k x B x p``.
+
+        Returns:
+            The vectors, moved into the bounds, and the value there, ``k x B``.
+        """
+        if not self.parameters.is_batched:
+            return vectors, self(vectors)
+
+        def likelihood(part: Tensor) -> tuple[Tensor, Tensor]:
+            found, _ = self._likelihood(part, self._least_scale(part), derivatives=False)
+            return found.value.reshape(len(part), -1), found.scale.reshape(len(part), -1)
+
+        values, scale = self._in_chunks(likelihood, vectors)
+        usable = scale.isfinite() & (scale > 0)
+        shift = scale.where(usable, torch.ones_like(scale)).log().unsqueeze(-1)
+        moved = self.parameters.clipped(vectors + self.parameters.variances * shift)
+        return moved, values if self.concentrated else self(moved)
+
+    def _in_chunks(
+        self, function: Callable[[Tensor], tuple[Tensor, Tensor]], vectors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluate a function of vectors in parts that fit in memory.
+
+        Where problems share parameters, as the physics learns, it is one vector after the other.
+        """
+        size = self.parameters.num_problems * self.num_points**2
+        at_once = max(1, _AT_ONCE // size) if self.parameters.is_batched else 1
+        first, second = zip(*(function(part) for part in vectors.split(at_once)), strict=True)
+        return torch.cat(first), torch.cat(second)
+
+    @torch.no_grad()
+    def _evaluate(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
+        """The value and its gradient (zero if not asked for)."""
+        least = self._least_scale(vectors) if self.concentrated else None
+        try:
+            found, gradient = self._likelihood(vectors, least, derivatives)
+        except PhysicsError:
+            # Parameters that the physics cannot run with are a bad vector, not the end of a fit.
+            return vectors.new_full(vectors.shape[:-1], math.inf), torch.zeros_like(vectors)
+        # Outputs that share parameters are independent given these.
+        value = found.value.reshape(*vectors.shape[:-1], -1).sum(-1)
+        if found.by_least_scale is not None:
+            # The least scale is that of the least noise, in inverse proportion to the noise.
+            by_least = found.by_least_scale.reshape(*value.shape, 1)
+            gradient = gradient - self.parameters.noise * by_least
+        if self._log_priors is not None:
+            log_prior, by_prior = self._log_priors(vectors)
+            value, gradient = value - log_prior, gradient - by_prior
+        # NaN and minus infinity are what only failures give.
+        value = value.nan_to_num(math.inf, math.inf, math.inf)
+        good = (value.isfinite() & gradient.isfinite().all(-1)).unsqueeze(-1)
+        return value, torch.where(good, gradient, torch.zeros_like(gradient))
+
+    def _likelihood(
+        self, vectors: Tensor, least: Tensor | None, derivatives: bool
+    ) -> tuple[LikelihoodValue, Tensor]:
+        """The likelihood, and its gradient at a fixed scale (zero if not asked for)."""
+        values = self.parameters.unflatten(vectors)
+        if not self.parameters.is_batched:
+            values = {name: value[0] for name, value in values.items()}
+        mean, covariance, basis, pull_back = self.distribution(values, derivatives)
+        covariance = covariance if self._of_all is None else covariance + self._added
+        residual = (self.targets - mean).expand(covariance.shape[:-1])
+        found = negative_log_likelihood(
+            residual, covariance, basis, least, derivatives, self._trend
+        )
+        if pull_back is None:
+            return found, torch.zeros_like(vectors)
+        return found, self.parameters.flatten(pull_back(found))
+
+    def _least_scale(self, vectors: Tensor) -> Tensor:
+        """The factor of all variances that brings the noise to its bound, ``k x batch_shape``."""
+        least = ((self.parameters.lower - vectors).exp() * self.parameters.noise).sum(-1)
+        least = least.maximum(self._rounding.reshape(-1))
+        return least.reshape(len(vectors), *self.parameters.batch_shape)
+
+
+class LogLikelihood(Target):
+    """The negative log likelihood that ``"map"`` brings to its minimum.
+
+    Unknown constants are at their generalised least squares estimate. Where all variances are
+    learnt without priors, their overall scale is *concentrated* out: it is at its optimum, in
+    closed form, as far as the noise keeps to its least value. The arguments are those of
+    :class:`Target`.
+    """
+
+    random_means = False
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.concentrated = self._is_homogeneous()
+
+    @torch.no_grad()
+    def _is_homogeneous(self) -> bool:
+        """Whether a factor of all variances is one of the covariance, and no prior minds."""
+        parameters = self.parameters
+        one_noise = bool((parameters.noise.sum(-1) == 1).all())
+        alone = self._log_priors is None and self._of_all is None
+        if not (parameters.is_batched and one_noise and alone):
+            return False
+        vector = parameters.current()
+        one = self.distribution(parameters.unflatten(vector))
+        two = self.distribution(parameters.unflatten(vector + parameters.variances * math.log(2)))
+        off = (two.covariance - 2 * one.covariance).abs().amax((-1, -2))
+        close = bool((off <= 1e-9 * one.covariance.abs().amax((-1, -2))).all())
+        return close and torch.allclose(two.mean, one.mean, rtol=1e-9, atol=1e-12)
+
+
+class LogPosterior(Target):
+    """The negative log posterior density of vectors, which is what full Bayes samples.
+
+    Priors are densities of the logarithms of lengthscales and variances, and the model is at its
+    own scale. All sizes of a constant and a linear trend in the observations cost the same, as far
+    as there are enough of them: a factor of the prior, such that the size of a trend says nothing
+    of how smooth a function is. A model is else the less likely, the larger the functions that its
+    prior allows beside the one that is seen, which speaks against all that are nearly polynomial.
+    Where a physics has unknown parameters, a trend is what these explain, and not vague. The
+    arguments are those of :class:`Target`.
+    """
+
+    of_logs = True
+
+    def _evaluate(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
+        value, gradient = super()._evaluate(vectors, derivatives)
+        return value.where(self.parameters.is_allowed(vectors), math.inf), gradient
+
+
+class _Part(NamedTuple):
+    """A term of a sum in closed form; what may be learnt is said by name.
+
+    Attributes:
+        x: Its inputs, centred, ``... x n x d``.
+        profile: Its kernel as a function of the distance.
+        lengthscale: The name of the lengthscales.
+        scale: That of the outputscale, or None for 1.
+        weight: Its basis at the current constant, ``... x n``, or None for 1.
+        constant: The name of the constant that the basis is affine in, or None.
+        slope: The derivative of the basis by it, ``... x n`` or what broadcasts to it.
+    """
+
+    x: Tensor
+    profile: Profile
+    lengthscale: str
+    scale: str | None
+    weight: Tensor | None
+    constant: str | None = None
+    slope: Any = None
+
+
+@dataclass(eq=False)
+class StationaryTerms:
+    r"""The targets' distribution with :math:`K = \sum_t s_t B_t k_t(X / \ell_t) B_t + K_0 + S`.
+
+    Each term has a stationary kernel, and a diagonal B for a basis, affine in at most one learnt
+    constant; :math:`K_0` is the covariance of random means, and S that of the noise. There is no
+    graph of autograd: :meth:`~gpadjust.gp.kernels.Pairs.pull_back` carries derivatives back.
+
+    Args:
+        parts: The terms.
+        current: The model's values of what may be learnt, by name.
+        mean: The prior mean, ``... x n``.
+        constant: :math:`K_0`, ``... x n x n``, or None.
+        basis: As in :class:`Moments`.
+        noise: The noise variances, ``... x n``; or the name of those that are learnt.
+        selection: Which of those each target has, ``... x n x K``; None for the only one.
+    """
+
+    parts: list[_Part]
+    current: Values
+    mean: Tensor
+    constant: Tensor | None
+    basis: Tensor | None
+    noise: Tensor | str
+    selection: Tensor | None
+
+    def __call__(self, values: Values, derivatives: bool = False) -> Moments:
+        """Moments at values by name; see :class:`Moments`."""
+        every = {**self.current, **values}
+        found: list[tuple[Pairs, Tensor | None]] = []
+        total: Any = self.constant
+        for part in self.parts:
+            lengthscale, weight = every[part.lengthscale].exp(), part.weight
+            scale = lengthscale.new_ones(()) if part.scale is None else every[part.scale].exp()
+            pairs = Stationary(lengthscale, scale, part.profile).pairs(part.x, derivatives)
+            covariance = pairs.covariance
+            if weight is not None and part.constant is not None:
+                weight = weight + part.slope * (every[part.constant] - self.current[part.constant])
+                covariance = (covariance * weight.unsqueeze(-1)).mul_(weight.unsqueeze(-2))
+            elif weight is not None:  # a part of the kernel, as it stays
+                for factor in (weight.unsqueeze(-1), weight.unsqueeze(-2)):
+                    covariance = scaled(covariance, factor)
+                    slope = None if pairs.slope is None else scaled(pairs.slope, factor)
+                    pairs = Pairs(covariance, slope, pairs.z)
+                weight = None
+            found.append((pairs, weight))
+            total = covariance if total is None else total + covariance
+        variances = self.noise
+        if isinstance(variances, str):
+            variances = every[variances].exp()
+            if self.selection is not None:
+                variances = (self.selection * variances.unsqueeze(-2)).sum(-1)
+        if total.dim() <= variances.dim():  # only the noise is learnt
+            total = total.expand(*variances.shape[:-1], *total.shape[-2:]).clone()
+        elif total is found[0][0].covariance:
+            total = total.clone()
+        total.diagonal(dim1=-1, dim2=-2).add_(variances)
+
+        def pull_back(likelihood: LikelihoodValue) -> Values:
+            by: Any = likelihood.by_covariance
+            result: Values = {}
+            if isinstance(self.noise, str) and self.noise in values:
+                by_noise = by.diagonal(dim1=-1, dim2=-2).unsqueeze(-1)
+                by_noise = by_noise if self.selection is None else by_noise * self.selection
+                result[self.noise] = values[self.noise].exp() * by_noise.sum(-2)
+            for part, (pairs, weight) in zip(self.parts, found, strict=True):
+                by_length, by_scale, by_weight = pairs.pull_back(by, weight)
+                if part.lengthscale in values:
+                    shape = values[part.lengthscale].shape
+                    by_length = by_length if shape[-1] > 1 else by_length.sum(-1, keepdim=True)
+                    result[part.lengthscale] = by_length.reshape(shape)
+                if part.scale in values:
+                    result[part.scale] = by_scale.reshape(values[part.scale].shape)
+                if part.constant in values:
+                    by_constant = (by_weight * part.slope).sum(-1)
+                    result[part.constant] = by_constant.reshape(values[part.constant].shape)
+            return result
+
+        return Moments(self.mean, total, self.basis, pull_back if derivatives else None)
+
+
+@torch.no_grad()
+def stationary_terms(
+    model: BatchedMultiOutputGPyTorchModel,
+    parameters: Parameters,
+    inputs: Tensor,
+    known_noise: Tensor | None,
+    random_means: bool,
+) -> StationaryTerms | None:
+    """The distribution of a model in closed form, or None if it has another form.
+
+    The arguments are those of :class:`ByModules`.
+    """
+    if not isinstance(model.covar_module, SumOfTerms):
+        return None
+    current: Values = {}
+
+    def enter(raw: Parameter) -> str:
+        row = parameters.table[id(raw)]
+        current[row.name] = row.value()
+        return row.name
+
+    likelihood, kernel, parts = Noise(model.likelihood), model.covar_module, []
+    centred = inputs - inputs.mean(-2, keepdim=True)
+    for term in kernel.terms:
+        form = None if term.kernel is None else stationary_parts(term.kernel, term.num_inputs)
+        if form is not None:
+            base, outer, profile = form
+            x, constant = centred[..., : term.num_inputs], getattr(term.basis, "learnt", None)
+            scale = None if outer is None else enter(outer.raw_outputscale)
+            part = _Part(x, profile, enter(base.raw_lengthscale), scale, term.weights(inputs))
+            if constant is not None:
+                part = part._replace(constant=enter(constant), slope=term.basis.slope(inputs))
+            parts.append(part)
+        elif term.kernel is not None:
+            return None
+    noise: Any = known_noise
+    if noise is None and likelihood.learnt is not None:
+        noise = enter(likelihood.learnt)
+    if noise is None or not parts or not current.keys() >= {*parameters.names}:
+        return None
+    basis, mean = kernel.basis_of_means(inputs), model.mean_module(inputs)
+    for row in (row for row in parameters.rows if row.kind == "constant"):
+        # All but its basis stays, or the closed form would have to follow.
+        before = row.value().clone()
+        row.raw.add_(1.0)
+        there = model.mean_module(inputs)
+        row.raw.copy_(before)
+        if basis is not None or not torch.allclose(there, mean, rtol=1e-9, atol=1e-12):
+            return None
+    of_means: Tensor | None = None
+    if basis is not None and random_means:
+        variances = [term.mean_variance for term in kernel.terms if term.learns_mean]
+        root = basis * torch.stack(variances, dim=-1).sqrt()
+        of_means, basis = root @ root.mT, None
+    selection = None if known_noise is not None else likelihood.selection(inputs)
+    return StationaryTerms(parts, current, mean, of_means, basis, noise, selection)
+
+
+@dataclass(eq=False)
+class ByModules:
+    """The distribution by the model's own modules, differentiated by autograd: of any model.
+
+    Autograd does not see the factorisation: it starts from the derivatives by mean and covariance,
+    which are known in closed form.
+
+    Args:
+        model: The model, in train mode.
+        parameters: Its learnable parameters.
+        inputs: Its training inputs, or some rows of them; transformed, unless parameters of the
+            input transform are among those that are learnt.
+        known_noise: The noise variances of these inputs, if they are known.
+        random_means: Whether the prior variances of unknown constants are in the covariance.
+    """
+
+    model: BatchedMultiOutputGPyTorchModel
+    parameters: Parameters
+    inputs: Tensor
+    known_noise: Tensor | None
+    random_means: bool
+
+    def __call__(self, values: Values, derivatives: bool = False) -> Moments:
+        """Moments at values by name; see :class:`Moments`."""
+        if derivatives:
+            values = {name: value.detach().requires_grad_() for name, value in values.items()}
+        with torch.set_grad_enabled(derivatives), lazily_evaluate_kernels(False):
+            mean, covariance, basis = self.parameters.call_at(values, self._moments)
+
+        def pull_back(found: LikelihoodValue) -> Values:
+            by: list[Any] = [(covariance, found.by_covariance), (mean, found.by_mean)]
+            if found.by_mean is not None and found.coefficients is not None:
+                # The estimates minimise, so that no derivative goes through them.
+                by.append((basis, found.by_mean.unsqueeze(-1) * found.coefficients.unsqueeze(-2)))
+            by = [(moment, each) for moment, each in by if moment.requires_grad]
+            moments, each = zip(*by, strict=True)
+            slopes = torch.autograd.grad(moments, list(values.values()), each, allow_unused=True)
+            return {
+                name: torch.zeros_like(value) if slope is None else slope
+                for (name, value), slope in zip(values.items(), slopes, strict=True)
+            }
+
+        if not derivatives:
+            return Moments(mean, covariance, basis, None)
+        fixed = None if basis is None else basis.detach()
+        return Moments(mean.detach(), covariance.detach().clone(), fixed, pull_back)
+
+    def _moments(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Mean, covariance and basis at the model's parameters."""
+        model, inputs, noise = self.model, self.inputs, self.known_noise
+        if self.parameters.learns_inputs:
+            inputs = model.transform_inputs(inputs)
+        kernel, basis = model.covar_module, None
+        if self.random_means or not isinstance(kernel, SumOfTerms):
+            covariance = to_dense(kernel(inputs))
+        else:
+            covariance = kernel.covariance(inputs, known_means=True)
+            basis = kernel.basis_of_means(inputs)
+        noise = Noise(model.likelihood).at(inputs) if noise is None else noise
+        noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
+        mean = model.mean_module(inputs).expand(noise.shape)
+        return mean, covariance + torch.diag_embed(noise), basis
+
+
+def _constant_means(residual: Tensor, covariance: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """Generalised least squares of unknown constant means, and vague prior variances around them.
+
+    Args:
+        residual: Targets less the rest of their mean, ``... x n``; NaN where there is none.
+        covariance: Their covariance, ``... x n x n``; it is overwritten.
+        basis: The bases of the means, ``... x n x q``.
+    """
+    observed = ~residual.isnan()
+    chol, _ = cholesky(covariance, None if observed.all() else observed)
+    basis = (basis * observed.unsqueeze(-1)).expand(*chol.shape[:-1], -1)
+    means, errors = least_squares(chol, residual.nan_to_num(nan=0.0), basis)
+    vague = _VAGUE * errors.diagonal(dim1=-1, dim2=-2)
+    # A wider prior would drown the smallest pivot in rounding errors.
+    pivot = chol.diagonal(dim1=-1, dim2=-2).amin(-1, keepdim=True).square()
+    size = basis.square().amax(-2).clamp_min(torch.finfo(chol.dtype).tiny)
+    return means, vague.minimum(pivot / (nugget(chol.shape[-1]) * size))
+
+
+def _trend(inputs: Tensor, targets: Tensor) -> Tensor | None:
+    """A constant and, of few inputs, a linear trend, orthogonal: ``... x n x q``, or None."""
+    observed = (~targets.isnan()).unsqueeze(-1)
+    n, d = int(observed.sum(-2).min()), inputs.shape[-1]
+    if n < _LEAST:
+        return None
+    one = observed.to(inputs)
+    if d > _FEW_INPUTS or n < 2 * (d + 1):
+        return one
+    count = one.sum(-2, keepdim=True)
+    away = (inputs - (inputs * one).sum(-2, keepdim=True) / count) * one
+    spread = (away.square().sum(-2, keepdim=True) / count).sqrt()
+    rounding = 8 * n * torch.finfo(inputs.dtype).eps * inputs.abs().amax(-2, keepdim=True)
+    away = torch.where(spread > rounding, away / spread, torch.zeros_like(away))
+    slopes, sizes, _ = torch.linalg.svd(away, full_matrices=False)
+    # Inputs that do not vary, or only together, have no slopes of their own.
+    rank = int((sizes > 1e-6 * math.sqrt(n)).sum(-1).amin())
+    return torch.cat([one, slopes[..., :rank] * math.sqrt(n)], dim=-1)

@@ -1,0 +1,233 @@
+"""What all models predict: marginals, intervals, joint posteriors and functions."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from botorch.acquisition.objective import PosteriorTransform
+from botorch.models.model import Model
+from botorch.posteriors import Posterior
+from torch import Tensor
+from torch.nn import Module
+
+from gpadjust.models.posteriors import (
+    HyperparameterMixture,
+    MarginalMixture,
+    ScaleFreePosterior,
+    mixture_moments,
+    mixture_quantile,
+)
+from gpadjust.models.sampled_functions import DRAWING, check_num_features, check_number, seeded
+from gpadjust.models.training_data import ArrayLike
+from gpadjust.physics.base import whole_number
+
+
+class Prediction(NamedTuple):
+    """Marginal predictions, as :meth:`~gpadjust.CKA.predict` returns them.
+
+    Args:
+        mean: Posterior means, ``batch_shape x q x m``, in the units of the targets.
+        variance: Posterior variances, ``batch_shape x q x m``, in their square.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+
+class PredictiveModel(Model):
+    """A BoTorch model whose predictions are mixtures of ``S`` Gaussians, or of one.
+
+    Attributes:
+        num_samples: Number ``S`` of Gaussians; None for a single one.
+        input_names: The names of the inputs.
+        output_names: The names of the outputs.
+    """
+
+    num_samples: int | None = None
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+
+    def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
+        """Means and variances of each of the Gaussians, ``... x S x q x m``."""
+        raise NotImplementedError
+
+    def joint_moments(
+        self, X: ArrayLike, observation_noise: bool | Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Means ``... x (S) x (m) x q`` and covariances ``... x (S) x (m) x q x q``."""
+        raise NotImplementedError
+
+    def draw_functions(self, num_functions: int, num_features: int) -> Module:
+        """The functions of :meth:`sample_functions`."""
+        raise NotImplementedError
+
+    def posterior(
+        self,
+        X: ArrayLike,
+        output_indices: list[int] | None = None,
+        observation_noise: bool | Tensor = False,
+        posterior_transform: PosteriorTransform | None = None,
+    ) -> Posterior:
+        """The joint posterior at raw ``X`` (``batch_shape x q x d``); see BoTorch.
+
+        Variances that are given as ``observation_noise`` are, as in BoTorch, those of the targets
+        after ``outcome_transform``; :meth:`predict` takes them in the user's units.
+        """
+        if output_indices is not None and list(output_indices) != list(range(self.num_outputs)):
+            noise, subset = observation_noise, self.subset_output(list(output_indices))
+            if isinstance(noise, Tensor) and noise.shape[-1] > 1:
+                noise = noise[..., list(output_indices)]
+            return subset.posterior(X, None, noise, posterior_transform)
+        moments = self.joint_moments(X, observation_noise)
+        posterior = self.as_posterior(*moments)
+        if posterior_transform is None:
+            return posterior
+        return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))
+
+    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
+        """Predict each point by itself, without the covariances between them.
+
+        The mean and variance of ``posterior(X)``, from factors of the training covariance that are
+        kept until the model is trained or given other data: much faster for many points, with
+        memory linear in their number. Differentiable in ``X`` as far as f_p is, and without a graph
+        unless ``X`` asks for one. Of a model that holds samples of its hyper-parameters, the mean
+        and variance of the mixture.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            observation_noise: Whether to predict observations instead of the function; or their
+                noise variances, ``batch_shape x q x m``, in the square of the user's units.
+
+        Returns:
+            The mean and the variance, ``batch_shape x q x m`` each, in the user's units.
+
+        Raises:
+            TypeError: If ``X`` is not float64.
+            ValueError: If ``X`` has not the columns that the model was built on, or a variance is
+                negative.
+            PhysicsError: If the physics fails at ``X``.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import CKA
+            >>> train_X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = CKA(train_X, train_X.sin(), physics=lambda X: X)
+            >>> mean, variance = model.predict(torch.rand(1000, 1, dtype=torch.float64))
+            >>> mean.shape
+            torch.Size([1000, 1])
+        """
+        return Prediction(*mixture_moments(*self.components(X, observation_noise)))
+
+    def interval(
+        self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
+    ) -> tuple[Tensor, Tensor]:
+        """The central interval at each point by itself.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            level: The probability that it holds, between 0 and 1.
+            observation_noise: As in :meth:`predict`.
+
+        Returns:
+            Lower and upper ends, ``batch_shape x q x m`` each, in the user's units.
+
+        Raises:
+            ValueError: If ``level`` is not between 0 and 1.
+        """
+        if not isinstance(level, float) or not 0 < level < 1:
+            raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
+        parts = self.components(X, observation_noise)
+        return mixture_quantile(*parts, (1 - level) / 2), mixture_quantile(*parts, (1 + level) / 2)
+
+    def sample_functions(
+        self, num_functions: int, seed: int | None = None, num_features: int = 1024
+    ) -> Module:
+        """Draw functions from the posterior, to be called anywhere.
+
+        Of a mixture, the functions are spread over its Gaussians.
+
+        Args:
+            num_functions: Number ``k`` of functions.
+            seed: Seed of the draw. Default: go on with PyTorch's generator.
+            num_features: Number of random features that stand for each kernel, an even one. The
+                more, the nearer is the functions' spread to the posterior's standard deviation;
+                the time of a call is linear in it.
+
+        Returns:
+            A module that maps raw ``... x q x d`` to ``k x ... x q x m`` in the user's units.
+            Later fits of the model leave it as it is.
+
+        Raises:
+            ValueError: If a number is not a positive whole one.
+            NotImplementedError: If BoTorch knows no features of a kernel of yours.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import CKA
+            >>> train_X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = CKA(train_X, train_X.sin(), physics=lambda X: X)
+            >>> functions = model.sample_functions(3, seed=0)
+            >>> functions(torch.rand(5, 1, dtype=torch.float64)).shape
+            torch.Size([3, 5, 1])
+        """
+        check_number(num_functions, "num_functions")
+        check_num_features(num_features)
+        self.eval()
+        with DRAWING, seeded(None if seed is None else whole_number("seed", seed)):
+            return self.draw_functions(num_functions, num_features)
+
+    @property
+    def num_mcmc_samples(self) -> int | None:
+        """``num_samples``, under BoTorch's name."""
+        return self.num_samples
+
+    def as_posterior(self, mean: Tensor, covariance: Tensor, mixed: bool = False) -> Posterior:
+        """The posterior of independent outputs, of moments as in :meth:`joint_moments`.
+
+        With ``mixed``, moments of a mixture are those of the whole, without a dimension for ``S``.
+        """
+        posterior = ScaleFreePosterior.of_outputs(mean, covariance, self.num_outputs > 1)
+        if self.num_samples is None:
+            return posterior
+        return MarginalMixture(posterior) if mixed else HyperparameterMixture(posterior)
+
+    def checked_outputs(self, idcs: Any) -> list[int]:
+        """Numbers of outputs, for ``subset_output``; negative ones count from the end.
+
+        Raises:
+            ValueError: If they are none, or out of range.
+        """
+        m = self.num_outputs
+        if not idcs or any(not isinstance(i, int) or not -m <= i < m for i in idcs):
+            raise ValueError(
+                f"Expected numbers of outputs from 0 to {m - 1} (one at least), got {idcs}."
+            )
+        return [i % m for i in idcs]
+
+
+def given_noise(noise: Any, num_points: int, num_outputs: int) -> Tensor:
+    """Variances that are given as ``observation_noise``, ``... x q x m``, checked.
+
+    Raises:
+        TypeError: If it is no tensor.
+        ValueError: If shapes disagree, or a variance is negative.
+    """
+    if not isinstance(noise, Tensor):
+        raise TypeError(
+            "Expected observation_noise as True, False, or a tensor of variances, got "
+            f"{noise!r}; known noise belongs to the model (train_Yvar)."
+        )
+    expected = (num_points, num_outputs)
+    if noise.dim() < 2 or any(
+        have not in (1, want) for have, want in zip(noise.shape[-2:], expected, strict=True)
+    ):
+        raise ValueError(
+            "Expected observation_noise as True, False, or variances of shape ... x "
+            f"{expected[0]} x {expected[1]}, got shape {tuple(noise.shape)}."
+        )
+    if not (noise.isfinite() & (noise >= 0)).all():
+        raise ValueError(
+            "Expected observation_noise (variances) to be finite and not negative, found "
+            f"{float(noise.min()):.3g} to {float(noise.max()):.3g}."
+        )
+    return noise

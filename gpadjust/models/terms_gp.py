@@ -1,0 +1,427 @@
+"""An exact Gaussian process that is a sum of terms, as a SingleTaskGP."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from inspect import signature
+from typing import Any, ClassVar, Self
+
+import torch
+from botorch.fit import _fit_fallback
+from botorch.models import SingleTaskGP
+from botorch.models.utils import fantasize as fantasize_flag
+from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.settings import validate_input_scaling
+from gpytorch.likelihoods import Likelihood
+from gpytorch.mlls import ExactMarginalLogLikelihood, MarginalLogLikelihood
+from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
+from torch import Size, Tensor
+
+import gpadjust
+from gpadjust.gp import SumOfTerms, Term, TermsMean
+from gpadjust.gp.gaussian import negative_log_likelihood
+from gpadjust.models.exact_conditioning import ExactConditioning
+from gpadjust.models.hyperparameter_samples import (
+    HOLDS_SAMPLES,
+    hold_samples,
+    match_parameters,
+    release_samples,
+    transform_training_inputs,
+)
+from gpadjust.models.parameters import learnt_noise, set_initial_values
+from gpadjust.models.term_builder import ModelOptions, TermBuilder
+from gpadjust.models.terms_model import TermsModel
+from gpadjust.models.training_data import (
+    ArrayLike,
+    check_noise,
+    new_observations,
+)
+
+_MANY = 5_000  # points, above which an exact fit takes long
+# What a state has as many of as there were draws, samples or points.
+_OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions")
+
+
+class TermsGP(TermsModel, SingleTaskGP):
+    r"""The base of this library's exact models: a sum of terms, given as a list.
+
+    A ``SingleTaskGP`` with independent outputs, with the ends tied that BoTorch leaves loose: a
+    subset of its outputs can be fitted again, whatever its kernels and transforms; it can be
+    conditioned on observations before any prediction was made, with gradients to where they are
+    made; ``output_indices`` may come in any order; an output may be missing (NaN) in some rows.
+
+    Args:
+        made: The data, and what the terms were made by.
+        terms: The terms of the model.
+
+    Attributes:
+        was_fitted: Whether :func:`~gpadjust.fit` or ``load_state_dict`` gave it hyper-parameters;
+            set it after training of your own.
+
+    Raises:
+        ValueError: If there are both known variances and a likelihood, or too few points for the
+            unknown means of terms.
+    """
+
+    prediction_strategy: Any
+    conditioning_class: ClassVar[type[ExactConditioning]] = ExactConditioning
+
+    def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
+        data, likelihood = made.data, made.likelihood
+        if likelihood is not None and data.Yvar is not None:
+            raise ValueError("Expected train_Yvar or a likelihood, got both: give one of them.")
+        unknown = sum(term.learns_mean for term in terms)
+        if unknown and data.X.shape[-2] < 2 + unknown:
+            raise ValueError(
+                f"Expected at least {2 + unknown} points to learn {unknown} constant means and a "
+                f"variance, got {data.X.shape[-2]}; give the means instead: rho_mean=1.0 (a number "
+                "for each physics), delta_mean=0.0."
+            )
+        if (n := data.X.shape[-2]) > _MANY:
+            warnings.warn(
+                f"{type(self).__name__} is exact: of {n} points a fit takes from many minutes to "
+                f"hours, and each covariance {8e-9 * n**2:.1f} GB. gpadjust.VariationalCKA takes "
+                "the arguments of CKA and learns from all of them in minutes.",
+                UserWarning,
+                stacklevel=3,
+            )
+        covar_module = SumOfTerms(terms)
+        Y, Yvar = data.Y, data.Yvar
+        noise = likelihood
+        if likelihood is None and Yvar is None:
+            noise = self._learnt_noise(covar_module.batch_shape)
+        if made.units is not None:
+            Y, Yvar = made.units(Y, Yvar)
+        with validate_input_scaling(False):  # ours is by the data's scales, and NaN is missing
+            super().__init__(
+                data.X,
+                Y,
+                Yvar,
+                likelihood=noise,
+                covar_module=covar_module,
+                mean_module=TermsMean(covar_module),
+                outcome_transform=None,
+                input_transform=made.input_transform,
+            )
+        if made.units is not None:  # not earlier: BoTorch would estimate it anew
+            self.outcome_transform = made.units
+        self.input_names, self.output_names = data.input_names, data.output_names
+        set_initial_values(self, *made.given)
+        self.was_fitted = False
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether it was fitted, or has nothing to learn."""
+        return self.was_fitted or not any(p.requires_grad for p in self.parameters())
+
+    def custom_fit(
+        self,
+        mll: MarginalLogLikelihood,
+        closure: Callable[[], Any] | None = None,
+        closure_kwargs: dict[str, Any] | None = None,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        **options: Any,
+    ) -> MarginalLogLikelihood:
+        """BoTorch's hook: what ``fit_gpytorch_mll`` does to a model of this library.
+
+        It is ``fit(model, "map")``, which keeps to priors and ``requires_grad``; with an optimizer,
+        closure or other options of the caller's, or another objective, BoTorch's own.
+        """
+        mll.train()  # an error, if the model holds samples
+        plain = type(mll) is ExactMarginalLogLikelihood and mll.likelihood is self.likelihood
+        if not plain or closure or closure_kwargs or optimizer_kwargs or options:
+            return _fit_fallback(
+                mll,
+                closure=closure,
+                closure_kwargs=closure_kwargs,
+                optimizer_kwargs=optimizer_kwargs,
+                **options,
+            )
+        # Without noise the likelihood has rounding errors at which SciPy's line search gives up,
+        # and BoTorch throws away what was found. `fit` is asked for as a user would, by the name
+        # of the package and at the call: rooms below are not imported here.
+        gpadjust.fit(self, "map")
+        return mll.eval()
+
+    @staticmethod
+    def _learnt_noise(batch_shape: Size) -> Likelihood:
+        """The default likelihood."""
+        return learnt_noise(batch_shape)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Evaluate the model at *transformed* inputs, as GPyTorch does."""
+        if not self.training and self.train_inputs is not None and args:
+            self.check_transformed(args[0])
+            if prior_mode.off():
+                self.conditioning()
+        return super().__call__(*args, **kwargs)
+
+    def conditioning(self) -> ExactConditioning:
+        """What the training data say of the terms; made if it is not there."""
+        if self.prediction_strategy is None:
+            self.prediction_strategy = self.conditioning_class(
+                self.train_inputs[0], self.train_targets, self.noise, self.covar_module
+            )
+        strategy: ExactConditioning = self.prediction_strategy
+        return strategy
+
+    def log_evidence(self) -> tuple[str, Tensor]:
+        """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
+        train, (_, scale) = self.at(self.train_inputs[0]), self.units()
+        residual = self.train_targets - train.mean()
+        covariance = train.covariance() + torch.diag_embed(self.noise.at(train.x))
+        value = negative_log_likelihood(residual, covariance).value
+        count = (~residual.isnan()).sum(-1)
+        return "log likelihood", -value - count * scale.squeeze(-1).log()
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        r"""Each training target predicted from all others, means and variances ``... x (m) x n``.
+
+        With :math:`\alpha = K^{-1} (y - m)` they are :math:`y_i - \alpha_i / [K^{-1}]_{ii}` and
+        :math:`1 / [K^{-1}]_{ii}` (Rasmussen and Williams 2006, eqs. 5.10-5.12), in model units;
+        NaN where there is no observation.
+        """
+        if self.training:
+            self.eval()
+        factors = self.conditioning().factors()
+        precision = factors.squared_columns()
+        variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
+        return self.train_targets - factors.alpha * variance, variance
+
+    def data(self) -> dict[str, Tensor | None]:
+        """The data that the model could be built on: raw inputs, targets and known variances."""
+        self.eval()
+        inputs = self._original_train_inputs
+        inputs = self.train_inputs[0] if inputs is None else inputs
+        inputs = inputs.select(-3, 0) if self._num_outputs > 1 else inputs
+        shift, scale = self.units()
+        targets = self.outputs_last(self.train_targets * scale + shift)
+        noise = self.noise.known
+        noise = None if noise is None else self.outputs_last(noise * scale.square())
+        if self.num_samples is not None:
+            inputs, targets = inputs[0], targets[0]
+            if noise is not None and noise.shape != targets.shape:  # of later observations, too
+                noise = noise[0]
+        return {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
+
+    def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
+        """Raw training inputs without what the model added to them, and the user's rows of them."""
+        return inputs, slice(None)
+
+    def hold_samples(self, samples: dict[str, Tensor]) -> None:
+        """Make the model fully Bayesian: a batch of itself, one for each hyper-parameter sample.
+
+        Its posterior then is a Gaussian mixture, as that of BoTorch's fully Bayesian models.
+        :func:`gpadjust.fit` calls this.
+
+        Args:
+            samples: Raw parameters by their names, ``S x`` the parameter's shape.
+
+        Raises:
+            RuntimeError: If the model holds samples already.
+            ValueError: If the model cannot be fully Bayesian: it is of a batch of data sets, say.
+        """
+        if self.num_samples is not None:
+            raise RuntimeError(HOLDS_SAMPLES)
+        self.check_can_be_sampled()
+        hold_samples(self, samples)
+        self.was_fitted = True
+
+    def release_samples(self) -> None:
+        """Make the model what it was before it held samples, with the first of them.
+
+        It does nothing if the model holds none.
+
+        Raises:
+            RuntimeError: If it is a model of fantasies.
+        """
+        if self.num_samples is not None:
+            release_samples(self)
+
+    def check_can_be_sampled(self) -> None:
+        """Raise a ValueError if the model cannot hold samples of its hyper-parameters."""
+        if self.not_sampled:
+            raise ValueError(self.not_sampled)
+        # Of a model that holds samples these are a batch, too.
+        held = 0 if self.num_samples is None else 1
+        if self._input_batch_shape[held:]:
+            raise ValueError(
+                "Expected a model of one data set to hold samples, got one with batch_shape "
+                f"{tuple(self._input_batch_shape)}; sample the data sets of a batch one by one."
+            )
+
+    def train(self, mode: bool = True) -> Self:
+        """Put the model in train mode, or eval mode; one that holds samples is not trained."""
+        if mode and self.num_samples is not None:
+            raise RuntimeError(HOLDS_SAMPLES)
+        return super().train(mode)
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
+    ) -> Any:
+        """Load parameters; with those of a model that holds samples, this one holds them too."""
+        samples = {
+            name: state_dict[name]
+            for name, parameter in self.named_parameters()
+            if name in state_dict and state_dict[name].dim() > parameter.dim()
+        }
+        own = self.state_dict()
+        other = {n for n in own.keys() & state_dict.keys() if own[n].shape != state_dict[n].shape}
+        other = {n for n in other if n.rpartition(".")[-1] not in _OF_ANY_NUMBER}
+        if samples:  # of which there are as many of each
+            sizes = {len(values) for values in samples.values()}
+            other = {n for n in other if not _has_samples(state_dict[n], own[n], sizes)}
+        if other or (strict and own.keys() != state_dict.keys()):
+            wrong = sorted(own.keys() ^ state_dict.keys()) or sorted(other)
+            held = self.num_samples is not None
+            hint = (
+                " It holds samples: for a state with another number of them, or none, call "
+                "`model.release_samples()` first."
+            )
+            raise RuntimeError(
+                f"The state is of another model than this {type(self).__name__}, which is left as "
+                f"it was; they differ in {', '.join(wrong[:5])}.{hint * held}"
+            )
+        if samples:
+            self.train()
+            # Before samples are held, for which inputs are transformed once and for all.
+            prefix = "input_transform."
+            own = {n.removeprefix(prefix): v for n, v in state_dict.items() if n.startswith(prefix)}
+            if f"{prefix}coordinates" in samples:
+                own["coordinates"] = samples[f"{prefix}coordinates"][0].flatten()
+            if own:
+                self.input_transform.load_state_dict(own, strict)
+            self.hold_samples(samples)
+        elif self.has_unknowns and self.num_samples is None:
+            self.train()  # for inputs to be transformed again, with what is loaded
+        keys = super().load_state_dict(state_dict, strict, *args, **kwargs)
+        self.was_fitted = True
+        if self.num_samples is not None:
+            transform_training_inputs(self)
+        return keys
+
+    @property
+    def _subset_batch_dict(self) -> dict[str, int]:
+        """Where in each batched parameter and buffer the outputs lie, for ``subset_output``."""
+        outputs: Size = self._aug_batch_shape
+        return {
+            name: len(outputs) - 1 - tensor.dim()
+            for name, tensor in [*self.named_parameters(), *self.named_buffers()]
+            if name.startswith(("covar_module.", "likelihood."))
+            and tensor.shape[: len(outputs)] == outputs
+            and self.num_outputs > 1
+        }
+
+    def subset_output(self, idcs: list[int]) -> Self:
+        """Subset the model along the outputs; see BoTorch. Negative ones count from the end."""
+        idcs, m = self.checked_outputs(idcs), self.num_outputs
+        subset = super().subset_output(idcs)
+        original = subset._original_train_inputs
+        if original is not None and m > 1 and idcs != list(range(m)):
+            # BoTorch subsets the transformed inputs only, and a later fit starts from these.
+            subset._original_train_inputs = original[..., idcs if len(idcs) > 1 else idcs[0], :, :]
+        subset.output_names = tuple(self.output_names[i] for i in idcs)
+        match_parameters(subset)
+        return subset
+
+    def _new_inputs(self, X: Tensor) -> Tensor:
+        """Raw inputs to condition on; BoTorch's entropy searches transform them."""
+        inputs = self.train_inputs[0].shape[-1]
+        if X.shape[-1] == inputs != len(self.input_names) and hasattr(self, "input_transform"):
+            return self.input_transform.untransform(X)
+        return X
+
+    def condition_on_observations(self, X: ArrayLike, Y: ArrayLike, **kwargs: Any) -> Self:
+        """Condition on new observations; see BoTorch. No posterior has to be called before.
+
+        The hyper-parameters stay, and with them the factors of the training covariance, to which
+        ``k`` new points among ``n`` are appended in O(n^2 k).
+
+        Args:
+            X: Raw inputs, ``batch_shape x k x d``.
+            Y: Observations, ``(f) x batch_shape x k x m``, in the user's units; NaN where an
+                output was not observed.
+            kwargs: ``noise``, the variances of the new observations, of a model with known noise:
+                of the shape of ``Y``, in the square of the user's units.
+
+        Raises:
+            TypeError: If ``X``, ``Y`` or ``noise`` is not float64.
+            ValueError: If ``X`` is not finite, ``Y`` is missing in a whole row, their numbers of
+                rows or of outputs disagree, or ``noise`` is missing, negative, of another shape, or
+                given to a model that learns it.
+        """
+        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        X = self._new_inputs(X)
+        return self.with_observations(X, Y, **kwargs)
+
+    def with_observations(
+        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
+    ) -> Self:
+        """As :meth:`condition_on_observations`, of checked tensors, where whole rows may be NaN."""
+        if self.noise.is_known and noise is None:
+            raise ValueError(
+                "The model was built with known noise (train_Yvar), so that of new observations is "
+                "needed, too: pass `noise`, variances of the shape of Y."
+            )
+        if noise is not None:
+            check_noise(noise, Y)
+            if not self.noise.is_known:
+                raise ValueError(
+                    "The model learns its noise, which new observations have, too: leave `noise` "
+                    "out, or build the model with known noise (train_Yvar)."
+                )
+            transform = getattr(self, "outcome_transform", None)
+            if transform is not None and fantasize_flag.off():
+                noise = noise / transform.stdvs.square()
+            kwargs["noise"] = noise.nan_to_num(nan=1.0, posinf=1.0)  # where nothing was observed
+        if self.num_samples is not None:
+            # All samples see the same observations, unless these have a dimension for them, as
+            # fantasies have.
+            if fantasize_flag.on() or X.dim() == 2:
+                X = X.unsqueeze(MCMC_DIM)
+                X = X.expand(*X.shape[:MCMC_DIM], self.num_samples, *X.shape[-2:])
+            if Y.dim() == 2:
+                Y = Y.expand(self.num_samples, *Y.shape)
+        self.eval()
+        self.conditioning()
+        # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
+        with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
+            return super(TermsGP, self._shell()).condition_on_observations(X, Y, **kwargs)
+
+    def _shell(self) -> Self:
+        """The same parts as another object: GPyTorch takes some of them off for a moment.
+
+        Meanwhile other threads may ask this model.
+        """
+        shell = copy(self)
+        shell._modules = copy(self._modules)
+        return shell
+
+
+def _has_samples(values: Tensor, one: Tensor, sizes: set[int]) -> bool:
+    """Whether values are as many of one as there are samples."""
+    return len(sizes) == 1 and values.shape == (*sizes, *one.shape)
+
+
+def arguments_of(model: type) -> dict[str, bool]:
+    """The arguments of a model by name, and whether they are needed.
+
+    Where it passes on whatever else it is given, those of its base class are among them, and at
+    last the :class:`~gpadjust.models.term_builder.ModelOptions` that all structures share.
+    """
+    found: dict[str, bool] = {}
+    for owner in model.__mro__:
+        if owner in (TermsGP, TermsModel):
+            return {**dict.fromkeys(ModelOptions.__annotations__, False), **found}
+        if "__init__" not in vars(owner):
+            continue
+        own = [*signature(vars(owner)["__init__"]).parameters.values()][1:]
+        needed = not found  # what a base class needs is given by the class
+        for each in own:
+            if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY):
+                found.setdefault(each.name, needed and each.default is each.empty)
+        if not any(each.kind is each.VAR_KEYWORD for each in own):
+            break
+    return found

@@ -1,0 +1,157 @@
+"""Arrays and frames that NumPy would turn into other numbers are refused with the way out."""
+
+from datetime import date, datetime, time, timedelta
+from decimal import Decimal
+from fractions import Fraction
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from gpadjust import CKA, VariationalCKA
+from gpadjust.dynamics import Record
+from gpadjust.models.training_data import to_tensor
+
+N = 6
+ONE_TO_SIX = np.arange(1.0, N + 1)
+SECOND = np.timedelta64(1, "s")
+DATES = np.datetime64("2020-01-01") + np.arange(N) * SECOND
+
+TEXT = {
+    "text": ONE_TO_SIX.astype(str),
+    "bytes": ONE_TO_SIX.astype("S"),
+    "text as objects": ONE_TO_SIX.astype(str).astype(object),
+    "one text among numbers": np.array([*ONE_TO_SIX[1:], "1.5"], dtype=object),
+    "a column of text": pd.Series(ONE_TO_SIX.astype(str)),
+    "categories": pd.Series(pd.Categorical(["a", "b"] * 3)),
+}
+COMPLEX = {
+    "complex": ONE_TO_SIX + 1j,
+    "complex without imaginary part": ONE_TO_SIX.astype(complex),
+    "one complex among numbers": np.array([*ONE_TO_SIX[1:], 1j], dtype=object),
+    "a column": pd.Series(ONE_TO_SIX + 1j),
+    "tensor": torch.tensor(ONE_TO_SIX + 1j),
+}
+TIMES = {
+    "dates": DATES,
+    "durations": DATES - DATES[0],
+    "index": pd.date_range("2020", periods=N, freq="s"),
+    "column": pd.Series(DATES),
+    "time zone": pd.Series(pd.date_range("2020", periods=N, freq="s", tz="Europe/London")),
+    "column of durations": pd.Series(pd.to_timedelta(range(N), unit="s")),
+    "datetime": np.array([datetime(2020, 1, 1, 0, 0, i) for i in range(N)], dtype=object),
+    "date": np.array([date(2020, 1, i + 1) for i in range(N)], dtype=object),
+    "time": np.array([time(0, 0, i) for i in range(N)], dtype=object),
+    "timedelta": np.array([timedelta(seconds=i) for i in range(N)], dtype=object),
+}
+REFUSED = [
+    *[pytest.param(values, "text.*astype", id=f"text: {name}") for name, values in TEXT.items()],
+    *[pytest.param(v, "complex numbers.*parts", id=f"complex: {n}") for n, v in COMPLEX.items()],
+    *[pytest.param(v, "dates or times.*to seconds", id=f"times: {n}") for n, v in TIMES.items()],
+]
+
+
+def column(values):
+    """Values, an array or a series, as a single column."""
+    if isinstance(values, pd.Series | pd.Index):
+        return values.to_frame()
+    return values.reshape(-1, 1)
+
+
+def physics(X):
+    return 2 + X.sum(-1)
+
+
+@pytest.mark.parametrize(("values", "message"), REFUSED)
+class TestRefused:
+    def test_inputs(self, values, message):
+        with pytest.raises(TypeError, match=f"train_X to hold numbers.*{message}"):
+            CKA(column(values), column(ONE_TO_SIX), physics=physics)
+
+    def test_targets(self, values, message):
+        with pytest.raises(TypeError, match=f"train_Y to hold numbers.*{message}"):
+            CKA(column(ONE_TO_SIX), column(values), physics=physics)
+
+    def test_questions_and_observations(self, values, message):
+        model = CKA(column(ONE_TO_SIX), column(ONE_TO_SIX), physics=physics)
+        with pytest.raises(TypeError, match=f"X to hold numbers.*{message}"):
+            model.predict(column(values))
+        with pytest.raises(TypeError, match=f"Y to hold numbers.*{message}"):
+            model.condition_on_observations(column(ONE_TO_SIX), column(values))
+
+    def test_records(self, values, message):
+        numbers = column(ONE_TO_SIX)
+        with pytest.raises(TypeError, match=f"times to hold numbers.*{message}"):
+            Record(values, numbers, numbers)
+        with pytest.raises(TypeError, match=f"states to hold numbers.*{message}"):
+            Record(ONE_TO_SIX, column(values), numbers)
+
+
+@pytest.mark.parametrize("values", [TIMES[n] for n in ("dates", "index", "column", "time zone")])
+def test_the_way_out_of_times(values):
+    seconds = (values - values.min()) / SECOND
+    record = Record(seconds, column(ONE_TO_SIX), column(ONE_TO_SIX))
+    assert record.times.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+def test_a_frame_with_a_column_of_times():
+    frame = pd.DataFrame({"t": DATES, "x": ONE_TO_SIX})
+    with pytest.raises(TypeError, match="train_X to hold numbers only, found dates or times"):
+        CKA(frame, column(ONE_TO_SIX), physics=physics)
+
+
+class TestMasked:
+    values = np.ma.masked_array(column(ONE_TO_SIX), mask=column(ONE_TO_SIX) == 3)
+
+    def test_inputs_and_targets(self):
+        with pytest.raises(ValueError, match="train_X without masked values, found 1"):
+            CKA(self.values, column(ONE_TO_SIX), physics=physics)
+        with pytest.raises(ValueError, match=r"train_Y without.*`train_Y.filled\(np.nan\)`"):
+            CKA(column(ONE_TO_SIX), self.values, physics=physics)
+        with pytest.raises(ValueError, match="times without masked values"):
+            Record(self.values[:, 0], column(ONE_TO_SIX), column(ONE_TO_SIX))
+
+    def test_the_way_out(self):
+        Y = np.ma.hstack([self.values, column(ONE_TO_SIX)])
+        model = CKA(column(ONE_TO_SIX), Y.filled(np.nan), physics=lambda X: X + torch.ones(2))
+        assert model.train_targets.isnan().tolist()[0] == [False, False, True, False, False, False]
+
+    def test_a_mask_of_nothing(self):
+        array = np.ma.masked_array(ONE_TO_SIX, mask=False)
+        assert to_tensor(array, "X").tolist() == ONE_TO_SIX.tolist()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.arange(1, N + 1),
+        np.arange(1, N + 1, dtype=np.uint8),
+        ONE_TO_SIX.astype(np.float32),
+        ONE_TO_SIX.astype(object),
+        np.array([Fraction(i, 1) for i in range(1, N + 1)], dtype=object),
+        np.array([Decimal(i) for i in range(1, N + 1)], dtype=object),
+        pd.Series(ONE_TO_SIX, dtype="Float64"),
+        pd.Series(range(1, N + 1)),
+        pd.RangeIndex(1, N + 1),
+    ],
+    ids=lambda values: f"{type(values).__name__}-{values.dtype}",
+)
+def test_real_numbers_are_taken(values):
+    assert to_tensor(values, "X").tolist() == ONE_TO_SIX.tolist()
+
+
+@pytest.mark.parametrize("make", [torch.as_tensor, np.asarray, pd.Series])
+def test_inputs_of_one_dimension(make, build, kind):
+    X, Y = make(ONE_TO_SIX), torch.as_tensor(column(ONE_TO_SIX))
+    options = {"low_X": Y, "low_Y": Y, "physics": None} if kind == "AR1" else {}
+    if kind not in ("ZeroMeanGP", "AR1"):
+        options["physics"] = physics
+    with pytest.raises(ValueError, match=r"train_X with at least 2 dim.*train_X.reshape\(-1, 1\)"):
+        build(kind, X, Y, **options)
+
+
+def test_inputs_of_one_dimension_of_a_sparse_model():
+    X = torch.as_tensor(ONE_TO_SIX)
+    with pytest.raises(ValueError, match="train_X with at least 2 dimensions"):
+        VariationalCKA(X, X.unsqueeze(-1), physics=physics)

@@ -1,0 +1,192 @@
+"""BoTorch's `fit_gpytorch_mll` ends where the library's own search ends, noise or none."""
+
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+from botorch.exceptions.warnings import OptimizationWarning
+from botorch.fit import fit_gpytorch_mll
+from botorch.models import ModelListGP
+from botorch.models.transforms import Normalize
+from botorch.optim.closures import get_loss_closure_with_grads
+from botorch.optim.fit import fit_gpytorch_mll_scipy
+from gpytorch.mlls import (
+    ExactMarginalLogLikelihood,
+    LeaveOneOutPseudoLikelihood,
+    SumMarginalLogLikelihood,
+)
+from gpytorch.priors import LogNormalPrior
+
+from gpadjust import CKA, CalibratedPhysics, fit
+from gpadjust.inference.targets import LogLikelihood
+from gpadjust.physics import FunctionPhysics, Unknown
+
+
+def own_likelihood(model):
+    """The log likelihood where the model is, unknown means at their best."""
+    objective = LogLikelihood(model)
+    objective.concentrated = False  # at the model's own scale
+    value = -objective(objective.parameters.current()).sum().item()
+    model.eval()
+    return value
+
+
+def fit_by_botorch(model, of=ExactMarginalLogLikelihood, **options):
+    """The mll that comes back; a failed line search is an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", OptimizationWarning)
+        mll = of(model.likelihood, model)
+        assert fit_gpytorch_mll(mll, **options) is mll
+    assert not mll.training
+    assert not model.training
+    return mll
+
+
+@pytest.mark.filterwarnings("ignore:f_p is nearly zero")
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 0.1])
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("n", [5, 12, pytest.param(60, marks=pytest.mark.slow)])
+def test_as_likely_as_the_search(data, build, kind, num_outputs, noise, unit, n):
+    X, Y = data(n=max(n, 8) if kind == "AR1" else n, num_outputs=num_outputs, seed=n)
+    Y = unit * (Y + noise * Y.std(0) * torch.randn_like(Y))
+    options = {} if kind == "ZeroMeanGP" else {"physics": lambda X: unit * X.sin().cumsum(-1)}
+    if kind != "ZeroMeanGP" and num_outputs == 1:
+        options["physics"] = lambda X: unit * X.sin().sum(-1, keepdim=True)
+    model, searched = build(kind, X, Y, **options), build(kind, X, Y, **options)
+    fit_by_botorch(model)
+    fit(searched, "map")
+    assert own_likelihood(model) > own_likelihood(searched) - 0.1
+
+
+@pytest.mark.parametrize("center", ["learn", "mean", 0.0])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("normalised", [False, True])
+def test_without_noise(data, center, seed, normalised):
+    X, Y = data(n=12, seed=seed)
+    options = {"input_transform": Normalize(2)} if normalised else {}
+    model = CKA(X, Y, physics=lambda X: 3 * X[:, :1].sin() + X[:, 1:], center=center, **options)
+    before = own_likelihood(model)
+    fit_by_botorch(model)
+    assert own_likelihood(model) > before + 10
+    assert (model.posterior(X).mean - Y).abs().max() < 0.01 * Y.std()
+
+
+def test_parameters_of_the_physics():
+    t = torch.linspace(0.1, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    law = FunctionPhysics(
+        lambda t, p: 0.5 * p.g * t[:, 0] ** 2, unknowns={"g": Unknown(9.0, sd=1.0)}
+    )
+    model = CalibratedPhysics(t, 0.5 * 9.81 * t**2, physics=law)
+    fit_by_botorch(model)
+    assert model.physics_parameters.mean.item() == pytest.approx(9.81, abs=1e-3)
+
+
+def test_missing_targets(data, build):
+    X, Y = data(n=12, num_outputs=2)
+    Y[3, 0] = torch.nan
+    model = build("CKA", X, Y)
+    before = own_likelihood(model)
+    fit_by_botorch(model)
+    assert own_likelihood(model) > before + 1
+
+
+def test_each_model_of_a_list(data, build):
+    X, Y = data(n=12, num_outputs=2)
+    models = [build("CKA", X, Y[:, :1]), build("PhysicsMeanGP", X, Y[:, :1])]
+    before = [own_likelihood(model) for model in models]
+    fit_by_botorch(ModelListGP(*models), SumMarginalLogLikelihood)
+    assert all(own_likelihood(m) > b + 1 for m, b in zip(models, before, strict=True))
+
+
+def test_priors_are_honoured(data, build):
+    X, Y = data(n=12)
+    free, held = build("CKA", X, Y), build("CKA", X, Y)
+    for model in (free, held):
+        kernel = model.terms[1].kernel.base_kernel
+        if model is held:
+            kernel.register_prior("lengthscale_prior", LogNormalPrior(0.0, 1e-3), "lengthscale")
+        fit_by_botorch(model)
+    assert (kernel.lengthscale.log().abs() < 0.1).all()
+    assert (free.terms[1].kernel.base_kernel.lengthscale.log().abs() > 0.2).any()
+
+
+def test_what_needs_no_gradient_stays(data, build):
+    X, Y = data(n=12)
+    model = build("CKA", X, Y)
+    rest = model.terms[0].kernel.raw_outputscale.requires_grad_(False)
+    before, other = rest.clone(), model.terms[1].kernel.raw_outputscale.clone()
+    fit_by_botorch(model)
+    assert torch.equal(rest, before)
+    assert not torch.equal(model.terms[1].kernel.raw_outputscale, other)
+
+
+def test_a_model_that_holds_samples_is_refused(data, build):
+    model = build("CKA", *data(n=12))
+    fit(model, num_samples=2, num_draws=64)
+    with pytest.raises(RuntimeError, match="holds samples"):
+        fit_by_botorch(model)
+    assert model.num_samples == 2
+
+
+class TestWhatTheCallerAsksFor:
+    @pytest.fixture
+    def model(self, data, build):
+        X, Y = data(n=12)
+        return build("CKA", X, Y + 0.1 * torch.randn_like(Y))
+
+    def test_optimizer(self, model):
+        calls = []
+
+        def optimizer(mll, **options):
+            calls.append(options)
+            return fit_gpytorch_mll_scipy(mll, **options)
+
+        fit_by_botorch(model, optimizer=optimizer, optimizer_kwargs={"method": "SLSQP"})
+        assert [call["method"] for call in calls] == ["SLSQP"]
+
+    def test_options_of_the_optimizer(self, model):
+        twin = own_likelihood(model)
+        fit_by_botorch(model, optimizer_kwargs={"options": {"maxiter": 1}})
+        once = own_likelihood(model)
+        fit_by_botorch(model, optimizer_kwargs={})  # nothing special
+        assert twin < once < own_likelihood(model)
+
+    def test_closure(self, model):
+        mll = ExactMarginalLogLikelihood(model.likelihood, model)
+        named = {n: p for n, p in mll.named_parameters() if p.requires_grad}
+        closure, calls = get_loss_closure_with_grads(mll, named), []
+        fit_by_botorch(model, closure=lambda: calls.append(1) or closure())
+        assert len(calls) > 1
+
+    def test_attempts(self, model):
+        before = own_likelihood(model)
+        fit_by_botorch(model, max_attempts=2, pick_best_of_all_attempts=True)
+        assert own_likelihood(model) > before
+
+    def test_another_objective(self, data, build):
+        X, Y = data(n=12)
+        model, found = build("CKA", X, Y, torch.full_like(Y, 0.01)), []
+        for of in (ExactMarginalLogLikelihood, LeaveOneOutPseudoLikelihood):
+            fit_by_botorch(model, of)
+            mll = LeaveOneOutPseudoLikelihood(model.likelihood, model).train()
+            with torch.no_grad():
+                found.append(mll(model(*model.train_inputs), model.train_targets).item())
+            model.eval()
+        assert found[1] > found[0]
+
+
+def test_whichever_room_the_model_is_imported_from():
+    code = """
+import torch
+from botorch.fit import fit_gpytorch_mll
+from gpytorch.mlls import ExactMarginalLogLikelihood
+from gpadjust.models import CKA
+X = torch.rand(12, 2, generator=torch.Generator().manual_seed(0)).double()
+f = lambda X: X.sin().sum(-1, keepdim=True)
+model = CKA(X, 1.3 * f(X) + X[:, :1] ** 2, physics=f)
+fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+assert (model.posterior(X).variance < 1e-6).all()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

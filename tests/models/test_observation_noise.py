@@ -1,0 +1,164 @@
+"""Noise that is given: in BoTorch's units to `posterior`, in the user's to all else."""
+
+import pytest
+import torch
+from botorch.models import SingleTaskGP
+from botorch.models.transforms import Standardize
+from botorch.sampling import SobolQMCNormalSampler
+
+from gpadjust import CKA, PhysicsMeanGP, StackedGP
+
+
+def added(model, Z, noise, **options):
+    """What the noise adds to the variance of the posterior."""
+    noisy = model.posterior(Z, observation_noise=noise, **options).variance
+    return (noisy - model.posterior(Z, **options).variance).detach()
+
+
+@pytest.fixture
+def large(data):
+    """Targets of a standard deviation of about 40."""
+
+    def large(num_outputs, **options):
+        X, Y = data(n=12, num_outputs=num_outputs, **options)
+        return X / 2, 60 * Y  # in the unit cube, as BoTorch wants it
+
+    return large
+
+
+def held(model, num_samples=3):
+    """The model, with samples of its hyper-parameters."""
+    learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
+    steps = torch.linspace(-0.2, 0.2, num_samples).tolist()
+    model.hold_samples({n: torch.stack([p + s for s in steps]) for n, p in learnt.items()})
+    return model
+
+
+class TestPosterior:
+    @pytest.mark.parametrize("shape", [(5,), (3, 5)])
+    def test_as_a_single_task_gp(self, large, build, num_outputs, kind, uniform, shape):
+        X, Y = large(num_outputs)
+        if kind == "RRA-paper":
+            pytest.skip("It has no outcome transform.")
+        theirs = SingleTaskGP(X, Y, outcome_transform=Standardize(num_outputs))
+        ours = build(kind, X, Y, outcome_transform=Standardize(num_outputs))
+        Z, noise = uniform(*shape, 2), uniform(*shape, num_outputs, low=0.1, seed=2)
+        scale = ours.outcome_transform.stdvs.reshape(-1)
+        torch.testing.assert_close(added(ours, Z, noise), noise * scale.square())
+        if kind != "AR1":  # whose transform is that of two levels
+            torch.testing.assert_close(added(ours, Z, noise), added(theirs, Z, noise))
+
+    def test_without_outcome_transform_in_the_users_units(self, large, num_outputs, uniform):
+        X, Y = large(num_outputs)
+        model = CKA(X, Y, physics=lambda X: 0 * X[:, :num_outputs], outcome_transform=None)
+        Z, noise = uniform(5, 2), uniform(5, num_outputs, low=0.1, seed=2)
+        torch.testing.assert_close(added(model, Z, noise), noise)
+
+    def test_some_outputs(self, large, build, uniform):
+        X, Y = large(2)
+        theirs = SingleTaskGP(X, Y, outcome_transform=Standardize(2))
+        ours = build("CKA", X, Y, outcome_transform=Standardize(2))
+        Z, noise = uniform(5, 2), uniform(5, 2, low=0.1, seed=2)
+        expected = added(ours, Z, noise)
+        for outputs in ([1], [0], [1, 0]):
+            found = added(ours, Z, noise, output_indices=outputs)
+            torch.testing.assert_close(found, expected[:, outputs])
+        torch.testing.assert_close(expected, added(theirs, Z, noise))
+
+    def test_one_number_for_all_points(self, large, build, num_outputs, uniform):
+        X, Y = large(num_outputs)
+        model = build("CKA", X, Y, outcome_transform=Standardize(num_outputs))
+        found = added(model, uniform(5, 2), torch.full((1, 1), 0.5, dtype=torch.float64))
+        torch.testing.assert_close(found, (0.5 * Y.var(0)).expand(5, num_outputs))
+
+    def test_of_samples(self, large, build, num_outputs, uniform):
+        X, Y = large(num_outputs)
+        model = held(build("CKA", X, Y, outcome_transform=Standardize(num_outputs)))
+        noise = uniform(5, num_outputs, low=0.1, seed=2)
+        expected = (noise * Y.var(0)).expand(3, 5, num_outputs)
+        torch.testing.assert_close(added(model, uniform(5, 2), noise), expected)
+
+    def test_of_a_mixture_of_structures(self, large, num_outputs, uniform):
+        X, Y = large(num_outputs)
+
+        def f(X):
+            return 60 * torch.stack([X.sum(-1), X.prod(-1)], -1)[..., :num_outputs]
+
+        models = {
+            "CKA": held(CKA(X, Y, physics=f)),
+            "standardised": PhysicsMeanGP(
+                X, Y, physics=f, outcome_transform=Standardize(num_outputs)
+            ),
+        }
+        model = StackedGP(models, [[0.5] * num_outputs] * 2, num_components=4)
+        for shape in ((5,), (3, 5)):
+            Z, noise = uniform(*shape, 2), uniform(*shape, num_outputs, low=0.1, seed=2)
+            expected = noise.unsqueeze(-3).expand(*shape[:-1], 4, 5, num_outputs)
+            torch.testing.assert_close(added(model, Z, noise), expected)
+            low, high = model.interval(Z), model.interval(Z, observation_noise=noise)
+            assert (high[1] > low[1]).all()
+            difference = model.predict(Z, noise).variance - model.predict(Z).variance
+            torch.testing.assert_close(difference.detach(), noise)
+        if num_outputs == 2:
+            found = added(model, Z, noise, output_indices=[1])
+            torch.testing.assert_close(found, expected[..., 1:])
+
+    def test_fantasies_of_known_noise(self, large, build, uniform):
+        """BoTorch passes their noise, in the units after the transform, to `posterior`."""
+        X, Y = large(1)
+        model = build("CKA", X, Y, torch.full_like(Y, 4.0), outcome_transform=Standardize(1))
+        asked, posterior = [], model.posterior
+        model.posterior = lambda *args, **kwargs: asked.append(kwargs) or posterior(*args, **kwargs)
+        sampler = SobolQMCNormalSampler(torch.Size([4]), seed=0)
+        fantasies = model.fantasize(uniform(3, 2), sampler)
+        (noise,) = [kwargs["observation_noise"] for kwargs in asked]
+        torch.testing.assert_close(noise * Y.var(), torch.full_like(noise, 4.0))
+        known = fantasies.likelihood.noise[..., -3:] * Y.var()
+        torch.testing.assert_close(known, torch.full_like(known, 4.0))
+
+
+class TestInTheUsersUnits:
+    @pytest.mark.parametrize("transform", ["default", "standardize", None])
+    @pytest.mark.parametrize("samples", [False, True])
+    def test_predict_and_interval(self, large, build, num_outputs, uniform, transform, samples):
+        X, Y = large(num_outputs)
+        options = {} if transform == "default" else {"outcome_transform": None}
+        if transform == "standardize":
+            options["outcome_transform"] = Standardize(num_outputs)
+        model = build("CKA", X, Y, **options)
+        model = held(model) if samples else model
+        Z, noise = uniform(5, 2), uniform(5, num_outputs, low=0.1, seed=2)
+        with torch.no_grad():
+            silent, noisy = model.predict(Z), model.predict(Z, noise)
+            torch.testing.assert_close(noisy.variance - silent.variance, noise)
+            low, high = model.interval(Z, 0.95, observation_noise=noise)
+        if not samples:
+            width = 2 * 1.959963984540054 * noisy.variance.sqrt()
+            torch.testing.assert_close(high - low, width)
+
+
+class TestRefused:
+    @pytest.fixture(params=["CKA", "RRA", "AR1", "samples", "mixture"])
+    def model(self, request, large, build):
+        X, Y = large(2)
+        if request.param == "mixture":
+            return StackedGP({"CKA": build("CKA", X, Y)}, [[1.0, 1.0]], num_components=2)
+        if request.param == "samples":
+            return held(build("CKA", X, Y))
+        return build(request.param, X, Y)
+
+    @pytest.mark.parametrize("wrong", [-1.0, -1e-300, float("nan"), float("inf")])
+    @pytest.mark.parametrize("asked", ["posterior", "predict", "interval", "one output"])
+    def test_what_is_no_variance(self, model, uniform, wrong, asked):
+        Z, noise = uniform(5, 2), torch.ones(5, 2, dtype=torch.float64)
+        noise[2, 1] = wrong
+        options = {"output_indices": [1]} if asked == "one output" else {}
+        method = getattr(model, "posterior" if options else asked)
+        with pytest.raises(ValueError, match="finite and not negative"):
+            method(Z, observation_noise=noise, **options)
+
+    @pytest.mark.parametrize("shape", [(), (2,), (4, 2), (5, 3), (2, 5)])
+    def test_shapes(self, model, uniform, shape):
+        for method in (model.posterior, model.predict, model.interval):
+            with pytest.raises(ValueError, match="Expected observation_noise"):
+                method(uniform(5, 2), observation_noise=torch.ones(shape, dtype=torch.float64))

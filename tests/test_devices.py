@@ -1,0 +1,101 @@
+"""Tensors are made where the data are: kept without a GPU by reading the code."""
+
+import ast
+from pathlib import Path
+
+import gpadjust
+
+ROOT = Path(gpadjust.__file__).parent
+ROOMS = ("physics", "gp", "models", "inference")
+FACTORIES = {
+    *("arange", "empty", "eye", "full", "linspace", "ones", "rand", "randint", "randn", "randperm"),
+    *("scalar_tensor", "tensor", "zeros"),
+}
+# Functions that may make tensors on the CPU, by why.
+ALLOWED = {
+    "numbers of rows or samples, which index tensors of any device": {
+        "physics/base.py forward",
+        "physics/error.py relocate",
+        "physics/memo.py recall",
+        "inference/bayes.py sample",
+        "inference/calibrate.py density",
+        "inference/calibrate.py draw_parameters",
+        "inference/optimise.py _optima_of_some",
+        "inference/optimise.py maximise",
+        "models/stacked.py __init__",
+        "models/stacked.py _components",
+        "models/stacked.py draw_functions",
+        "models/terms_model.py draw_functions",
+        "models/terms_model.py mean_functions",
+    },
+    "drawn on the CPU, so that a seed says the same everywhere, and moved": {
+        "inference/calibrate.py _spread_normal",
+        "inference/importance_sampling.py resampled",
+        "models/rra.py fourier_kernel",
+        "models/sampled_functions.py by_matheron",
+    },
+    "numbers that become Python's, a file's, or are moved by their callers": {
+        "models/posteriors.py mixture_quantile",
+        "models/saving.py content_of",
+        "models/training_data.py standardize",
+        "physics/black_box.py _slope",
+        "physics/unknown.py _cdf",
+        "physics/unknown.py guess",
+    },
+    "parameters and buffers, which move with their model": {
+        "gp/orthogonal_kernel.py __init__",
+        "models/ar1.py __init__",
+    },
+}
+
+
+def is_factory(node):
+    function = node.func if isinstance(node, ast.Call) else None
+    return (
+        isinstance(function, ast.Attribute)
+        and isinstance(function.value, ast.Name)
+        and function.value.id == "torch"
+        and function.attr in FACTORIES
+        and not any(keyword.arg == "device" for keyword in node.keywords)
+    )
+
+
+def unplaced(source):
+    """Factory calls without a device that no `.to(...)` of the same expression moves."""
+    tree = ast.parse(source)
+    moved = set()
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Attribute)
+            and node.func.attr in ("to", "type_as", "copy_")
+        ):
+            moved |= {id(inner) for inner in ast.walk(node.func.value)}
+    found = []
+    for outer in ast.walk(tree):
+        if isinstance(outer, ast.FunctionDef):
+            found += [
+                (outer.name, node.lineno)
+                for node in ast.walk(outer)
+                if is_factory(node) and id(node) not in moved
+            ]
+    return {line: name for name, line in found}
+
+
+def test_the_check_finds_what_it_is_for():
+    bad = "def f(x):\n    return x + torch.zeros(3)\n"
+    assert unplaced(bad) == {2: "f"}
+    for good in ("torch.zeros(3, device=x.device)", "torch.zeros(3).to(x)", "x.new_zeros(3)"):
+        assert not unplaced(bad.replace("torch.zeros(3)", good))
+
+
+def test_tensors_are_made_where_the_data_are():
+    found = {
+        f"{path.relative_to(ROOT).as_posix()} {name}"
+        for room in ROOMS
+        for path in (ROOT / room).glob("*.py")
+        for name in unplaced(path.read_text()).values()
+    }
+    allowed = set().union(*ALLOWED.values())
+    assert not found - allowed, "make it with `device=`, `x.new_...` or `.to(x)`"
+    assert not allowed - found, "these need no exception any more"
