@@ -98,11 +98,12 @@ def sample(
         copy.train()
         settled = {n: copy.get_parameter(n).requires_grad_(False).detach() for n in shared}
     calibrated = calibrate_roughly(copy, search) if copy.has_unknowns else None
-    target = LogPosterior(copy, None, None if calibrated is None else calibrated.marginalized)
-    n, parameters, without = target.num_points, target.parameters, None
+    n, without = copy.train_targets.shape[-1], None
     if calibrated is None and not settled and n <= MANY:
         without = without_physics(copy)
     register_priors(copy)
+    target = LogPosterior(copy, None, None if calibrated is None else calibrated.marginalized)
+    parameters = target.parameters
     if num_draws is None:
         num_draws = max(_DRAWS[0], min(_DRAWS[1], _COST // n**2))
     if num_samples is None:
@@ -114,7 +115,8 @@ def sample(
     generator = torch.Generator().manual_seed(search.seed)
     if parameters.names:
         gradients = min(_GRADIENTS, _COST_OF_GRADIENTS // n**2)
-        drawn = _draw(target, _around_optima(target, search), num_draws, gradients, num_samples, generator)
+        around = _around_optima(target, search)
+        drawn = _draw(target, around, num_draws, gradients, num_samples, generator)
         vectors, size = drawn.positions, drawn.effective_size()
         is_good = (drawn.power >= _LEAST_POWER) & (size >= _LEAST_SHARE * len(vectors))
     else:  # all is known but the parameters of the physics
@@ -150,7 +152,8 @@ def sample(
         other = LogPosterior(without)
         around = _around_optima(other, search)
         behind = drawn.log_evidence - around.log_evidence > _DECISIVE
-        plain = _draw(other, around, num_draws // 2, gradients // 2 * int(not behind.all()), num_samples, generator)
+        gradients = 0 if behind.all() else gradients // 2
+        plain = _draw(other, around, num_draws // 2, gradients, num_samples, generator)
         relevance = probability(drawn.log_evidence, plain.log_evidence)
         relevance = relevance.reshape(parameters.batch_shape)
         chosen = _representative(other, plain.positions, num_samples)
@@ -268,10 +271,7 @@ def _representative(target: LogPosterior, vectors: Tensor, number: int) -> Tenso
     parts = (alpha * variance / unit, variance.sqrt() / unit, _OF_POSITIONS * vectors / spread)
     shape = vectors.shape[:2]
     features = torch.cat(
-        [
-            (each - each.mean(0)).reshape(*shape, -1) / math.sqrt(each.shape[-1])
-            for each in parts
-        ],
+        [(each - each.mean(0)).reshape(*shape, -1) / math.sqrt(each.shape[-1]) for each in parts],
         dim=-1,
     )
     grams = features.transpose(0, 1) @ features.transpose(0, 1).mT

@@ -18,7 +18,8 @@ HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
     "`model.release_samples()` keeps the first."
 )
-_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term)  # modules whose buffers have the batch
+# Modules whose buffers have the batch.
+_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
