@@ -13,7 +13,7 @@ _DEGREES = 5  # of freedom: tails that are wider than those of what is sampled, 
 _HALVINGS = 20  # of an interval, for the power at which enough draws count
 _LEAST = 0.5  # of the particles, that count after each change of the power
 _LEAPS = 5  # of a move, about a quarter of a Gaussian's orbit
-_LENGTH = 0.35  # standard deviations in each of them, at first
+_LENGTH = 0.25  # standard deviations in each of them, at first
 _JITTER = (0.6, 1.4)  # multiples of that, as orbits have periods
 _ACCEPTED = 0.8  # of the moves, by the length that is taken
 _LAST = 2  # moves when all is done
@@ -64,14 +64,11 @@ class Mixture(NamedTuple):
         centres: ``k x B x p``.
         weights: ``k x B``, which sum to one.
         root: Roots of their shapes, lower triangular, ``k x B x p x p``.
-        log_evidence: What they are an approximation to has for the logarithm of its integral,
-            ``B``, or None.
     """
 
     centres: Tensor
     weights: Tensor
     root: Tensor
-    log_evidence: Tensor | None = None
 
     def sample(self, number: int, generator: torch.Generator) -> Tensor:
         """Draw ``number x B x p``."""

@@ -27,11 +27,13 @@ _APART = 0.5  # by which these differ in some logarithm
 _EACH = 0.1  # of the draws that all of them share
 _DRAWS = (128, 1024)  # the least and the most by default
 _COST = 5_120_000  # draws times observations squared
-_GRADIENTS = 8192  # the most
-_COST_OF_GRADIENTS = 3_000_000  # gradients times observations squared
-_PARTICLES = (16, 128)  # the least and the most, for so many gradients each:
-_GRADIENTS_EACH = 40
+_GRADIENTS = 8  # for each draw, at most
+_COST_OF_GRADIENTS = 2_000_000  # gradients times observations squared
+_LEAST_PARTICLES = 16
+_DRAWS_EACH = 8  # first draws for each particle
+_GRADIENTS_EACH = 40  # of each particle
 _STARTS = (8, 128)  # of the search, and how many are screened for them
+_STARTS_OF_RIVAL = (4, 64)  # the same of the model without its physics
 _ITERATIONS = 30  # of it, as the draws go on from where it got
 _DECISIVE = 7.0  # difference of log evidences that needs no closer look
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
@@ -39,7 +41,7 @@ _SAMPLED_ALONE = 2_000_000  # samples times observations squared, of a physics w
 _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
 _RETURNED = 256  # draws of parameters of a physics, at least
 _LEAST_POWER = 0.05  # of the way to the posterior, for draws that show it
-_LEAST_SHARE = 0.1  # of the draws that count
+_LEAST_SHARE = 0.06  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 16.0
 _OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what samples represent
 _EXCHANGES = 5  # rounds of better samples for the chosen ones
@@ -81,29 +83,16 @@ def sample(
 
     The draws begin around the optima that the search finds; its seed is that of both.
     """
-    if isinstance(model, TermsModel) and model.not_sampled:
-        raise ValueError(model.not_sampled)
-    if not isinstance(model, TermsGP):
-        raise TypeError(
-            f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP is the "
-            "plain Gaussian process."
-        )
-    model.check_can_be_sampled()
-    copy = deepcopy(model)
-    # What outputs share, such as a physics that learns, stays at its most likely values: sampling
-    # needs problems that are apart.
-    settled: dict[str, Tensor] = {}
-    if shared := shared_parameters(copy):
-        maximise(copy, search)
-        copy.train()
-        settled = {n: copy.get_parameter(n).requires_grad_(False).detach() for n in shared}
+    _check(model)
+    copy, n = deepcopy(model), model.train_targets.shape[-1]
+    settled = _settle_shared(copy, search)
     calibrated = calibrate_roughly(copy, search) if copy.has_unknowns else None
-    n, without = copy.train_targets.shape[-1], None
+    without = None
     if calibrated is None and not settled and n <= MANY:
         without = without_physics(copy)
     register_priors(copy)
     target = LogPosterior(copy, None, None if calibrated is None else calibrated.marginalized)
-    parameters = target.parameters
+    parameters, generator = target.parameters, torch.Generator().manual_seed(search.seed)
     if num_draws is None:
         num_draws = max(_DRAWS[0], min(_DRAWS[1], _COST // n**2))
     if num_samples is None:
@@ -112,48 +101,34 @@ def sample(
             alone = all(term.is_known for term in model.terms)
             least = min(_RETURNED, _SAMPLED_ALONE // n**2) if alone else 0
             num_samples = max(num_samples, _SAMPLES_OF_PARAMETERS, least)
-    generator = torch.Generator().manual_seed(search.seed)
+    drawn, relevance = None, None
     if parameters.names:
-        gradients = min(_GRADIENTS, _COST_OF_GRADIENTS // n**2)
-        around = _around_optima(target, search)
-        drawn = _draw(target, around, num_draws, gradients, num_samples, generator)
+        drawn = _draw(target, search, num_draws, generator)
         vectors, size = drawn.positions, drawn.effective_size()
         is_good = (drawn.power >= _LEAST_POWER) & (size >= _LEAST_SHARE * len(vectors))
     else:  # all is known but the parameters of the physics
-        drawn, vectors = None, parameters.current()
+        vectors = parameters.current()
         size = vectors.new_full((parameters.num_problems,), math.inf)
         is_good = size > 0
-    if calibrated is not None:
-        log_densities = vectors.new_zeros(len(vectors))
-        if drawn is not None:  # of which what is not done of the way leaves a part
-            log_densities = target.log_likelihood(vectors) - (1 - drawn.power) * drawn.log_ratio
-            log_densities = log_densities.sum(-1)
+    if calibrated is None:
+        chosen = _representative(target, vectors, num_samples)
+    else:
         vectors, coordinates, own = draw_parameters(
             calibrated,
             parameters,
             vectors,
-            log_densities,
+            _log_densities(target, drawn, vectors),
             max(_RETURNED, num_samples),
             generator,
         )
         size, is_good = size.minimum(own), is_good & (own >= _LEAST_SIZE_OF_PARAMETERS)
         rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
         chosen = vectors[rows]
-    else:
-        chosen = _representative(target, vectors, num_samples)
-    if settled:
-        model.train()  # its inputs are then transformed again, with what they are at now
-    with torch.no_grad():
-        for name, value in settled.items():
-            model.get_parameter(name).copy_(value)
-    held, relevance = parameters.to_raw(parameters.unflatten(chosen)), None
+    held = parameters.to_raw(parameters.unflatten(chosen))
     if without is not None and drawn is not None:
         register_priors(without)
         other = LogPosterior(without)
-        around = _around_optima(other, search)
-        behind = drawn.log_evidence - around.log_evidence > _DECISIVE
-        gradients = 0 if behind.all() else gradients // 2
-        plain = _draw(other, around, num_draws // 2, gradients, num_samples, generator)
+        plain = _draw(other, search, num_draws // 2, generator, drawn.log_evidence)
         relevance = probability(drawn.log_evidence, plain.log_evidence)
         relevance = relevance.reshape(parameters.batch_shape)
         chosen = _representative(other, plain.positions, num_samples)
@@ -161,6 +136,11 @@ def sample(
         held = mixed(held, values, copy, without, relevance)
     raw = parameters.to_raw(parameters.unflatten(vectors))
     named = {r.name.replace("raw_", ""): r.parameter(raw[r.name]) for r in parameters.rows}
+    if settled:
+        model.train()  # its inputs are then transformed again, with what they are at now
+    with torch.no_grad():
+        for name, value in settled.items():
+            model.get_parameter(name).copy_(value)
     if calibrated is not None:
         held["input_transform.coordinates"] = coordinates[rows]
         named |= model.input_transform.remember(coordinates)
@@ -186,35 +166,76 @@ def default_num_samples(num_points: int) -> int:
     return next(number for most, number in _SAMPLES.items() if num_points <= most)
 
 
+def _check(model: TermsGP) -> None:
+    """Raise the error of a model that cannot be sampled."""
+    if isinstance(model, TermsModel) and model.not_sampled:
+        raise ValueError(model.not_sampled)
+    if not isinstance(model, TermsGP):
+        raise TypeError(
+            f"Sampling needs a model of gpadjust, got {type(model).__name__}; ZeroMeanGP is the "
+            "plain Gaussian process."
+        )
+    model.check_can_be_sampled()
+
+
+def _settle_shared(model: TermsGP, search: Search) -> dict[str, Tensor]:
+    """Bring what outputs share, such as a physics that learns, to its most likely values.
+
+    It stays there: sampling needs problems that are apart.
+    """
+    names = shared_parameters(model)
+    if names:
+        maximise(model, search)
+        model.train()
+    return {name: model.get_parameter(name).requires_grad_(False).detach() for name in names}
+
+
 def _draw(
     target: LogPosterior,
-    proposal: Mixture,
+    search: Search,
     num_draws: int,
-    gradients: int,
-    num_samples: int,
     generator: torch.Generator,
+    rival: Tensor | None = None,
 ) -> Particles:
-    """Draws of the hyper-parameters; an error if the likelihood is nowhere finite."""
-    least, most = _PARTICLES
-    number = max(least, min(most, gradients // _GRADIENTS_EACH), num_samples)
+    """Draws of the hyper-parameters; an error if the likelihood is nowhere finite.
+
+    Of a model that is weighed against the log evidence of a ``rival``, the search takes fewer
+    starts, and rough draws do where it is far behind.
+    """
+    starts = _STARTS if rival is None else _STARTS_OF_RIVAL
+    proposal, log_evidence = _around_optima(target, search, starts)
+    gradients = min(_GRADIENTS * num_draws, _COST_OF_GRADIENTS // target.num_points**2)
+    if rival is not None and (rival - log_evidence > _DECISIVE).all():
+        gradients = 0
+    number = min(num_draws // _DRAWS_EACH, gradients // _GRADIENTS_EACH)
+    number = max(_LEAST_PARTICLES, number)
     try:
         return annealing.sample(
-            target,
-            proposal,
-            num_draws,
-            number + number % 2,
-            gradients,
-            generator,
+            target, proposal, num_draws, number + number % 2, gradients, generator
         )
     except FloatingPointError:
         raise RuntimeError(NOWHERE) from None
 
 
-def _around_optima(target: LogPosterior, search: Search) -> Mixture:
-    """Laplace's approximation around all optima that the search finds, with wider tails."""
-    starts, screened = _STARTS
+def _log_densities(target: LogPosterior, drawn: Particles | None, vectors: Tensor) -> Tensor:
+    """Log densities of what vectors were drawn from, less those of their priors, ``N``."""
+    if drawn is None:
+        return vectors.new_zeros(len(vectors))
+    # What is not done of the way to the posterior leaves a part.
+    log_densities = target.log_likelihood(vectors) - (1 - drawn.power) * drawn.log_ratio
+    return log_densities.sum(-1)
+
+
+def _around_optima(
+    target: LogPosterior, search: Search, starts: tuple[int, int]
+) -> tuple[Mixture, Tensor]:
+    """Laplace's approximation around all optima that the search finds, with wider tails.
+
+    And the log evidence by it, ``B``.
+    """
+    number, screened = starts
     search = search._replace(
-        num_starts=search.num_starts or starts,
+        num_starts=search.num_starts or number,
         num_screened=screened if search.num_screened is None else search.num_screened,
         max_iterations=min(search.max_iterations, _ITERATIONS),
     )
@@ -228,11 +249,11 @@ def _around_optima(target: LogPosterior, search: Search) -> Mixture:
     values, again = values.gather(0, first), again.gather(0, first)
     root = laplace_root(target, centres)
     log_share = root.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1) - values
-    share = log_share.masked_fill(again, -math.inf).softmax(0)
+    log_share = log_share.masked_fill(again, -math.inf)
     even = ~again / (~again).sum(0)
-    log_evidence = log_share.masked_fill(again, -math.inf).logsumexp(0)
-    log_evidence = log_evidence + 0.5 * centres.shape[-1] * math.log(2 * math.pi)
-    return Mixture(centres, (1 - _EACH) * share + _EACH * even, root, log_evidence)
+    log_evidence = log_share.logsumexp(0) + 0.5 * centres.shape[-1] * math.log(2 * math.pi)
+    weights = (1 - _EACH) * log_share.softmax(0) + _EACH * even
+    return Mixture(centres, weights, root), log_evidence
 
 
 def laplace_root(target: LogPosterior, optima: Tensor) -> Tensor:

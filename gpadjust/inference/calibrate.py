@@ -566,7 +566,8 @@ def draw_parameters(
     """
     n = calibrated.near.residual.shape[-1]
     count = next(count for most, count in _GIVEN.items() if n <= most) if parameters.names else 1
-    rows = torch.linspace(0, len(vectors) - 1, min(count, len(vectors))).round().long()
+    count = 2 ** int(math.log2(min(count, len(vectors))))  # a round of draws has them equally often
+    rows = torch.linspace(0, len(vectors) - 1, count).round().long()
     which, coordinates, size = calibrated.calibration.draw(
         calibrated.near, parameters, vectors[rows], log_densities[rows], number, generator
     )

@@ -51,8 +51,10 @@ def test_result_and_model(build, data, kind, num_outputs, uniform):
     assert isinstance(result, SampleResult)
     expected = (num_outputs,) if num_outputs > 1 else ()
     assert result.effective_size.shape == expected
+    count = len(result.draws["likelihood.noise_covar.noise"])
+    assert 8 <= count <= 256
     assert {name: draws.shape for name, draws in result.draws.items()} == {
-        name: (256, *shape) for name, shape in shapes.items()
+        name: (count, *shape) for name, shape in shapes.items()
     }
     assert model.num_samples == 8
     assert not model.training
@@ -61,9 +63,7 @@ def test_result_and_model(build, data, kind, num_outputs, uniform):
     for name, values in model.named_parameters():
         if name == "likelihood.noise_covar.raw_noise":  # samples of the model are draws
             draws = result.draws[name.replace("raw_", "")]
-            assert all(
-                torch.isclose(draws, v.exp(), rtol=1e-9).flatten(1).all(1).any() for v in values
-            )
+            assert all(torch.isclose(draws, v.exp(), rtol=1e-9).any(0).all() for v in values)
 
 
 @quick
@@ -99,13 +99,14 @@ def test_figures(build, data):
 
 
 def test_a_warning_when_the_draws_are_not_of_the_posterior(XY, monkeypatch):
-    result = fit(CKA(*XY, physics=crude), **SHORT | {"num_draws": 16})
-    size, power = result.effective_size, result.power
-    assert 1 <= size < 16
-    assert 0.05 < power < 1
-    monkeypatch.setattr(bayes, "LEAST_POWER", power.item() + 1e-9)
+    result = fit(CKA(*XY, physics=crude), **SHORT)
+    size = result.effective_size
+    assert result.converged.all()
+    assert 1 <= size <= len(result.draws["likelihood.noise_covar.noise"])
+    monkeypatch.setattr(bayes, "_LEAST_SHARE", 1.1)
     with pytest.warns(SamplingWarning, match=rf"sample size {size.item():.2g}\). Raise num_draws"):
-        fit(CKA(*XY, physics=crude), **SHORT | {"num_draws": 16})
+        again = fit(CKA(*XY, physics=crude), **SHORT)
+    assert not again.converged.any()
 
 
 @pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
@@ -179,7 +180,7 @@ def test_laplaces_root_is_triangular_and_of_the_inverse_of_the_hessian(XY):
     register_priors(model)
     objective = LogPosterior(model)
     optimum = best_of(objective)
-    root = laplace_root(objective, optimum)
+    (root,) = laplace_root(objective, optimum.unsqueeze(0))
     assert (root.triu(1) == 0).all()
     precision = torch.linalg.inv(root @ root.mT)[0]
     step = 0.1 * torch.eye(len(precision), dtype=torch.float64).unsqueeze(1)
@@ -249,14 +250,18 @@ def test_nuts_agrees(XY):
     expected = nuts(model, num_samples=600, num_warmup=200)
     result = fit(model, num_draws=8192)
     assert result.effective_size > 500
-    draws = torch.cat([each.reshape(256, -1).log() for each in result.draws.values()], dim=-1)
+    draws = torch.cat([each.reshape(len(each), -1).log() for each in result.draws.values()], -1)
     assert draws.shape[-1] == expected.shape[-1] == 5
-    sizes = 128, effective_sample_size(expected, chain_dim=1, sample_dim=0)
+    sizes = result.effective_size, effective_sample_size(expected, chain_dim=1, sample_dim=0)
     second = expected.flatten(0, 1)
-    error = (draws.var(0) / sizes[0] + second.var(0) / sizes[1]).sqrt()
-    assert ((draws.mean(0) - second.mean(0)).abs() < 4 * error).all()
-    ratio = draws.std(0) / second.std(0)
-    assert ((ratio > 0.7) & (ratio < 1.4)).all()
+    middle, width = second.mean(0), second.std(0)
+    for own, other in (
+        ((draws - middle) / width, (second - middle) / width),
+        (((draws - middle) / width).abs(), ((second - middle) / width).abs()),
+    ):
+        error = (own.var(0) / sizes[0] + other.var(0) / sizes[1]).sqrt()
+        assert ((own.mean(0) - other.mean(0)).abs() < 4 * error).all()
+        assert error.max() < 0.15
 
 
 @quick
