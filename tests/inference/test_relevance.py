@@ -1,0 +1,393 @@
+"""Whether a physics is of use: the model without it, and samples of both."""
+
+import math
+from copy import deepcopy
+
+import pytest
+import torch
+from gpytorch.constraints import Interval
+from gpytorch.kernels import RBFKernel, ScaleKernel
+from gpytorch.priors import LogNormalPrior
+
+from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit, load, save
+from gpadjust.inference import FitResult, register_priors
+from gpadjust.inference.relevance import mixed, probability, without_physics
+from gpadjust.inference.targets import LogPosterior
+
+SHORT = {"num_draws": 64, "num_starts": 1, "num_screened": 8}
+quick = pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # few draws
+
+
+def truth(X):
+    return (6 * X).sin() + X
+
+
+def unrelated(X):
+    """Numbers that change from point to point as if they were drawn."""
+    return 3 * (1e4 * X).sin() + (3.3e5 * X).cos()
+
+
+def double(X):
+    return 2 * truth(X)
+
+
+def unrelated_and_double(X):
+    return torch.cat([unrelated(X), double(X)], dim=-1)
+
+
+@pytest.fixture(scope="module")
+def data():
+    """15 points, where the truth is seen without noise, and others."""
+    generator = torch.Generator().manual_seed(0)
+    X = torch.rand(15, 1, generator=generator, dtype=torch.float64)
+    return X, truth(X), torch.linspace(0, 1, 40, dtype=torch.float64).unsqueeze(-1)
+
+
+@pytest.fixture(scope="module")
+def _fitted(data):
+    X, Y, _ = data
+    model = CKA(X, torch.cat([Y, Y], dim=-1), physics=unrelated_and_double)
+    return model, fit(model)
+
+
+@pytest.fixture
+def fitted(_fitted):
+    """A model whose first output has a physics of no use, and the second one of use; its fit."""
+    model, result = _fitted
+    return deepcopy(model), result
+
+
+def drawn(model, number, seed=0):
+    """Samples around the learnable parameters of a model, by their names."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        name: p.detach()
+        + 0.3 * torch.randn(number, *p.shape, generator=generator, dtype=torch.float64)
+        for name, p in model.named_parameters()
+        if p.requires_grad
+    }
+
+
+def half_off(model, share, number=4):
+    """Samples of a model, of which some have the physics switched off; with those of both."""
+    other = without_physics(model)
+    on, off = drawn(model, number), drawn(other, number, seed=1)
+    return mixed(on, off, model, other, torch.as_tensor(share, dtype=torch.float64)), on, off
+
+
+@pytest.fixture
+def partly(data):
+    """A model of which a fourth of the samples of one output has no physics, half of the other."""
+    X, Y, _ = data
+    options = {"physics": unrelated_and_double, "center": 0.0, "outcome_transform": None}
+    model = CKA(X, torch.cat([Y, 1 - Y], dim=-1), **options)
+    samples, *_ = half_off(model, [0.75, 0.5])
+    model.hold_samples(samples)
+    return model, samples, options
+
+
+def rbf(A, B, scale, lengthscale):
+    return scale * (-0.5 * torch.cdist(A / lengthscale, B / lengthscale).square()).exp()
+
+
+class TestWithoutPhysics:
+    @pytest.mark.parametrize("center", ["learn", "mean", 0.0])
+    def test_it_is_a_gaussian_process_around_the_mean_of_the_targets(self, data, center):
+        X, Y, _ = data
+        targets = torch.cat([Y, 3 - 2 * Y], dim=-1)
+        targets[3, 1] = torch.nan
+        mean = targets.nanmean(0)
+        options = {"outcome_transform": None}
+        model = CKA(X, targets, physics=unrelated_and_double, center=center, **options)
+        before = deepcopy(model.state_dict())
+        other, plain = without_physics(model), ZeroMeanGP(X, targets - mean, **options)
+        assert all(torch.equal(before[name], v) for name, v in model.state_dict().items())
+        assert all(parameter.requires_grad for parameter in model.terms[0].kernel.parameters())
+        # The same hyper-parameters with the same priors.
+        register_priors(other)
+        register_priors(plain)
+        ours, theirs = LogPosterior(other), LogPosterior(plain)
+        assert [name.replace("terms.1", "terms.0") for name in ours.parameters.names] == (
+            theirs.parameters.names
+        )
+        vectors = ours.parameters.current()
+        vectors = vectors + 0.5 * torch.randn(5, *vectors.shape[1:], dtype=torch.float64)
+        torch.testing.assert_close(ours(vectors), theirs(vectors), rtol=1e-6, atol=1e-6)
+
+    def test_its_predictions_in_plain_linear_algebra(self, data):
+        X, Y, Z = data
+        other = without_physics(CKA(X, Y, physics=unrelated)).eval()
+        kernel, noise = other.terms[1].kernel, other.likelihood.noise
+        args = kernel.outputscale, kernel.base_kernel.lengthscale
+        scale = other.units()[1]
+        K = rbf(X, X, *args) + noise * torch.eye(15)
+        k = rbf(Z, X, *args)
+        mean = Y.mean() + k @ torch.linalg.solve(K, Y - Y.mean())
+        variance = args[0] - (k * torch.linalg.solve(K, k.mT).mT).sum(-1, keepdim=True)
+        found = other.predict(Z)
+        torch.testing.assert_close(found.mean, mean, rtol=1e-6, atol=1e-8)
+        torch.testing.assert_close(found.variance, variance * scale.square(), rtol=1e-5, atol=1e-9)
+
+    def test_of_several_physics_all_are_off(self, data):
+        X, Y, Z = data
+        model = CKA(X, Y, physics=[unrelated, double], rho_mean=[1.0, 0.3])
+        other, one = without_physics(model), without_physics(CKA(X, Y, physics=double))
+        other, one = other.eval(), one.eval()
+        assert [t.mean.item() for t in other.terms[:2]] == [0.0, 0.0]
+        kernels = [(each.terms[-1].kernel, each.units()[1].square()) for each in (one, other)]
+        with torch.no_grad():  # in units of the targets
+            ours, theirs = ((k.outputscale * unit).squeeze() for k, unit in kernels)
+            other.likelihood.noise = one.likelihood.noise * kernels[0][1] / kernels[1][1]
+            kernels[1][0].outputscale = kernels[1][0].outputscale * ours / theirs
+        for a, b in zip(other.predict(Z), one.predict(Z), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-8)
+
+    @pytest.mark.parametrize(
+        "build",
+        [
+            ZeroMeanGP,
+            lambda X, Y: PhysicsMeanGP(X, Y, physics=double),
+            lambda X, Y: PhysicsMeanGP(X, Y, physics=double, rho_mean="learn"),
+            lambda X, Y: ScaleGP(X, Y, physics=lambda X: 3 + X),
+            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
+            lambda X, Y: CKA(X, Y, physics=double, rho_mean="learn"),
+            lambda X, Y: CKA(X, Y, physics=double, delta_mean="learn"),
+            lambda X, Y: CKA(X, Y, physics=[double, unrelated]),
+            lambda X, Y: CKA(X, Y, physics=double, rho_covar_module=RBFKernel()),
+            lambda X, Y: CKA(
+                X,
+                Y,
+                physics=double,
+                rho_covar_module=ScaleKernel(
+                    RBFKernel(), outputscale_constraint=Interval(0.1, 1.0)
+                ),
+            ),
+        ],
+        ids=[
+            "no physics",
+            "as a mean",
+            "by an unknown factor",
+            "no delta",
+            "two levels",
+            "unknown rho",
+            "unknown delta",
+            "unknown weights",
+            "a rho of one size",
+            "a size that is bounded",
+        ],
+    )
+    def test_there_is_none(self, data, build):
+        X, Y, _ = data
+        assert without_physics(build(X, Y)) is None
+
+    def test_there_is_none_with_priors_or_values_of_the_user(self, data):
+        X, Y, _ = data
+        models = [CKA(X, Y, physics=double) for _ in range(3)]
+        assert without_physics(models[0]) is not None
+        models[0].terms[1].kernel.register_prior("p", LogNormalPrior(0.0, 1.0), "outputscale")
+        models[1].terms[0].kernel.base_kernel.raw_lengthscale.requires_grad_(False)
+        models[2].terms[0].kernel.raw_outputscale.requires_grad_(False)
+        for model in models:
+            assert without_physics(model) is None
+
+    def test_there_is_one_of_a_ridge_regression(self, data):
+        X, Y, Z = data
+        other = without_physics(RRA(X, Y, physics=unrelated, num_features=32))
+        on_delta = other.eval().delta(Z).mean
+        torch.testing.assert_close(other.predict(Z).mean, on_delta, rtol=1e-6, atol=1e-8)
+
+
+def test_probability():
+    # With a prior probability of 0.8.
+    with_, without = torch.tensor([0.3, -2.0, 5.0]), torch.tensor([0.1, 1.0, 5.0])
+    expected = 0.8 * with_.exp() / (0.8 * with_.exp() + 0.2 * without.exp())
+    torch.testing.assert_close(probability(with_, without), expected)
+    assert probability(with_, without)[2] == pytest.approx(0.8)
+    far = torch.tensor([1e4, -1e4])
+    assert probability(far, torch.zeros(2)).tolist() == [1.0, 0.0]
+    torch.testing.assert_close(probability(far - 1e4, far - 1e4), torch.full((2,), 0.8))
+
+
+class TestMixed:
+    def test_shares_of_each_output(self, data):
+        X, Y, _ = data
+        model = CKA(X, torch.cat([Y, 1 - Y], dim=-1), physics=unrelated_and_double)
+        samples, on, off = half_off(model, [0.3, 0.95], number=8)  # 2 of 8, and all
+        other, own = (dict(m.named_parameters()) for m in (without_physics(model), model))
+        for name in on:
+            apart = off.get(name, other[name].expand(8, *other[name].shape))
+            for output, count in ((0, 2), (1, 8)):
+                values = samples[name][:, output]
+                assert torch.equal(values[:count], on[name][:count, output])
+                assert torch.equal(values[count:], apart[count:, output])
+        for i in range(2):
+            name = f"covar_module.terms.{i}.mean"
+            assert (samples[name][:2] == own[name]).all()
+            assert (samples[name][2:, 0] == other[name][0]).all()
+            assert (samples[name][2:, 1] == own[name][1]).all()
+        assert (samples["covar_module.terms.0.mean"][2:, 0] == 0).all()
+        assert (samples["covar_module.terms.0.kernel.raw_outputscale"][2:, 0] < -40).all()
+
+    @pytest.mark.parametrize(("share", "count"), [(0.0, 0), (0.4, 2), (1.0, 4)])
+    def test_samples_predict_as_what_they_are_of(self, data, share, count):
+        X, Y, Z = data
+        model, plain, other = (CKA(X, Y, physics=unrelated) for _ in range(3))
+        samples, on, off = half_off(model, share)
+        other = without_physics(other)
+        for each, values in ((model, samples), (plain, on), (other, off)):
+            each.hold_samples(values)
+        found, ours, theirs = (m.components(Z, False) for m in (model, plain, other))
+        for a, b, c in zip(found, ours, theirs, strict=True):
+            torch.testing.assert_close(a[:count], b[:count])
+            torch.testing.assert_close(a[count:], c[count:])
+
+
+class TestFit:
+    def test_of_physics_of_no_use_and_of_use(self, fitted, data):
+        X, Y, Z = data
+        model, result = fitted
+        assert result.relevance.shape == (2,)
+        assert result.relevance[0] < 0.5
+        assert result.relevance[1] > 0.95
+        assert result.converged.all()
+        plain = ZeroMeanGP(X, Y)
+        fit(plain)
+        mean, expected = model.predict(Z).mean, plain.predict(Z).mean
+        assert (mean[:, :1] - expected).abs().max() < 0.01
+        assert (mean[:, 1:] - truth(Z)).abs().max() < 1e-4
+
+    def test_with_noise_too(self, data):
+        X, Y, Z = data
+        Y = Y + 0.2 * torch.randn(Y.shape, dtype=torch.float64)
+        model, plain = CKA(X, Y, physics=unrelated), ZeroMeanGP(X, Y)
+        relevance = fit(model).relevance
+        fit(plain)
+        assert relevance.shape == ()
+        assert relevance < 0.5
+        found, expected = model.predict(Z), plain.predict(Z)
+        assert ((found.mean - expected.mean).abs() < expected.variance.sqrt()).all()
+
+    def test_the_rho_of_a_physics_of_no_use_is_none(self, fitted, data):
+        *_, Z = data
+        model, _ = fitted
+        rho, delta, total = model.rho(Z), model.delta(Z), model.predict(Z)
+        assert rho.mean[:, 0].abs().max() < 1e-6
+        assert rho.variance[:, 0].max() < 1e-6
+        torch.testing.assert_close(delta.mean[:, 0], total.mean[:, 0], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(rho.mean[:, 1], torch.full_like(Z[:, 0], 0.5), rtol=0, atol=0.2)
+
+    @quick
+    @pytest.mark.parametrize(
+        "build",
+        [
+            ZeroMeanGP,
+            lambda X, Y: PhysicsMeanGP(X, Y, physics=double),
+            lambda X, Y: AR1(X, Y, physics=double, low_X=X),
+        ],
+        ids=["no physics", "as a mean", "two levels"],
+    )
+    def test_nothing_is_said_of_what_cannot_do_without(self, data, build):
+        X, Y, _ = data
+        assert fit(build(X, Y), "bayes", **SHORT).relevance is None
+
+    @quick
+    def test_nothing_is_said_with_priors_of_the_user(self, data):
+        X, Y, _ = data
+        model = CKA(X, Y, physics=unrelated)
+        register_priors(model)
+        assert fit(model, "bayes", **SHORT).relevance is None
+        assert (model.terms[0].mean == 1.0).all()
+
+    def test_the_most_likely_values_know_nothing_of_it(self, fitted, data):
+        X, Y, Z = data
+        model, _ = fitted
+        new = CKA(X, torch.cat([Y, Y], dim=-1), physics=unrelated_and_double)
+        for each in (new, model):
+            assert isinstance(fit(each, "map"), FitResult)
+            torch.testing.assert_close(each.fallback(Z), unrelated_and_double(Z))
+            assert (each.terms[0].mean == 1.0).all()
+        found, expected = (each.log_evidence()[1] for each in (model, new))
+        torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-2)
+
+    def test_again(self, data):
+        X, Y, Z = data
+        model = CKA(X, Y, physics=unrelated)
+        first, mean = fit(model).relevance, model.predict(Z).mean
+        second = fit(model).relevance
+        assert first < 0.5
+        assert second < 0.5
+        assert (model.predict(Z).mean - mean).abs().max() < 0.01
+
+
+class TestPartlyOff:
+    """What samples with the physics on, and others with it off, are to a model."""
+
+    def test_terms_make_up_the_function(self, partly, data):
+        *_, Z = data
+        model, *_ = partly
+        rho, delta = (f(Z, mixed=False).mean for f in (model.rho, model.delta))  # S x q x m
+        mean, variance = model.components(Z, False)
+        torch.testing.assert_close(rho * unrelated_and_double(Z) + delta, mean)
+        assert (rho[3:, :, 0].abs() < 1e-8).all()
+        assert (rho[2:, :, 1].abs() < 1e-8).all()
+        assert (rho[:2].abs() > 1e-4).any(1).all()
+        found = model.predict(Z)
+        torch.testing.assert_close(found.mean, mean.mean(0))
+        torch.testing.assert_close(
+            found.variance, variance.mean(0) + mean.var(0, correction=0), rtol=1e-6, atol=1e-10
+        )
+        parts = model.rho(Z), model.delta(Z)
+        assert all(each.variance.isfinite().all() for each in parts)
+        torch.testing.assert_close(parts[0].mean, rho.mean(0))
+
+    def test_conditioning(self, partly, data):
+        X, Y, Z = data
+        model, samples, options = partly
+        new_X = torch.tensor([[1.4], [1.7]], dtype=torch.float64)
+        new_Y = torch.cat([truth(new_X), 1 - truth(new_X)], dim=-1)
+        found = model.condition_on_observations(new_X, new_Y)
+        every = torch.cat([Y, 1 - Y], dim=-1)
+        expected = CKA(torch.cat([X, new_X]), torch.cat([every, new_Y]), **options)
+        expected.hold_samples(samples)
+        Z = torch.cat([Z, 1.5 + Z])
+        for a, b in zip(found.components(Z, False), expected.components(Z, False), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+        for name in ("rho", "delta"):
+            a, b = (m.term(name, Z) for m in (found, expected))
+            torch.testing.assert_close(a.mean, b.mean, rtol=1e-5, atol=1e-6)
+
+    def test_sampled_functions(self, partly, data):
+        *_, Z = data
+        model, *_ = partly
+        mean, _ = model.components(Z, False)
+        torch.testing.assert_close(model.mean_functions()(Z), mean)
+        torch.manual_seed(0)
+        values = model.sample_functions(200)(Z)
+        assert values.isfinite().all()
+        found = model.predict(Z)
+        sd = found.variance.sqrt()
+        assert ((values.mean(0) - found.mean).abs() < 4 * sd / math.sqrt(200)).all()
+        assert (values.var(0) / found.variance - 1).abs().median() < 0.2
+
+    @pytest.mark.parametrize("which", ["fitted", "partly"])
+    def test_saved_and_loaded_it_predicts_the_same(self, request, which, data, tmp_path):
+        *_, Z = data
+        model, *_ = request.getfixturevalue(which)
+        save(model, tmp_path / "model.pt")
+        again = load(tmp_path / "model.pt", physics=unrelated_and_double)
+        assert again.num_samples == model.num_samples
+        for a, b in (
+            *zip(again.predict(Z), model.predict(Z), strict=True),
+            (again.rho(Z).mean, model.rho(Z).mean),
+            (again.fallback(Z), model.fallback(Z)),
+        ):
+            assert torch.equal(a, b)
+
+    def test_of_one_output(self, partly, data):
+        *_, Z = data
+        model, *_ = partly
+        both = model.predict(Z)
+        for i in range(2):
+            one = model.subset_output([i]).predict(Z)
+            torch.testing.assert_close(one.mean, both.mean[:, i : i + 1])
+            torch.testing.assert_close(one.variance, both.variance[:, i : i + 1])
