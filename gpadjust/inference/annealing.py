@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 _DEGREES = 5  # of freedom: tails that are wider than those of what is sampled, as a rule
-_HALVINGS = 20  # of an interval, for the power at which enough draws count
+_HALVINGS = 30  # of an interval of logarithms, for the power at which enough draws count
+_LEAST_STEP = 1e-12  # of the power
 _LEAST = 0.5  # of the particles, that count after each change of the power
 _LEAPS = 5  # of a move, about a quarter of a Gaussian's orbit
 _LENGTH = 0.25  # standard deviations in each of them, at first
@@ -241,7 +242,7 @@ def raised(log_ratio: Tensor, power: Tensor, least: float) -> tuple[Tensor, Tens
 
     With their weights, ``N x B``, and the logarithms of the means of these before they sum to one.
     """
-    low, high = torch.zeros_like(power), 1 - power
+    low, high = torch.full_like(power, _LEAST_STEP).minimum(1 - power), 1 - power
 
     def log_weights(more: Tensor) -> Tensor:
         return (more * log_ratio).where(log_ratio > -math.inf, -math.inf)
@@ -250,7 +251,7 @@ def raised(log_ratio: Tensor, power: Tensor, least: float) -> tuple[Tensor, Tens
     for _ in range(_HALVINGS):
         size = log_weights(more).softmax(0).square().sum(0).reciprocal()
         low, high = more.where(size >= least, low), high.where(size >= least, more)
-        more = 0.5 * (low + high)
+        more = (low * high).sqrt()
     found = log_weights(low)
     reached = torch.where(low < 1 - power, power + low, torch.ones_like(power))
     return reached, found.softmax(0), found.logsumexp(0) - math.log(len(found))
@@ -259,16 +260,17 @@ def raised(log_ratio: Tensor, power: Tensor, least: float) -> tuple[Tensor, Tens
 def resampled(weights: Tensor, number: int, generator: torch.Generator) -> Tensor:
     """Numbers of rows by their weights ``N x B``, ``number x B``, systematic in each half.
 
-    The number is even.
+    The number is even. For a half without any weight the rows are those of the other.
     """
-    halves = []
+    halves, is_odd = [], torch.arange(len(weights), device=weights.device).unsqueeze(-1) % 2
     for i in range(2):
-        part = weights[i::2].cumsum(0)
+        own = weights * (is_odd == i)
+        part = own.where(own.sum(0) > 0, weights).cumsum(0)
         first = torch.rand(1, part.shape[1], generator=generator, dtype=part.dtype).to(part)
         steps = torch.arange(number // 2, device=part.device).unsqueeze(-1)
         height = (steps + first) / (number // 2) * part[-1]
         rows = torch.searchsorted(part.mT.contiguous(), height.mT.contiguous()).mT
-        halves.append(2 * rows.clamp_max(len(part) - 1) + i)
+        halves.append(rows.clamp_max(len(part) - 1))
     return torch.stack(halves, dim=1).flatten(0, 1)
 
 

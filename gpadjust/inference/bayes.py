@@ -39,7 +39,8 @@ _DECISIVE = 7.0  # difference of log evidences that needs no closer look
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
 _SAMPLED_ALONE = 2_000_000  # samples times observations squared, of a physics without a GP
 _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
-_RETURNED = 256  # draws of parameters of a physics, at least
+_RETURNED = 1024  # draws of parameters of a physics, at least
+_HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.05  # of the way to the posterior, for draws that show it
 _LEAST_SHARE = 0.06  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 16.0
@@ -60,17 +61,17 @@ class SampleResult:
             output, ``batch_shape x (m)``: as many as were, if two halves of them agree.
         converged: Whether the draws are of the posterior, of each output, of the same shape;
             there is a :class:`~gpadjust.inference.SamplingWarning` if not.
-        relevance: Posterior probability that the physics is of use at all, of each output, of the
-            same shape; None of a model that cannot do without.
         draws: Equally likely draws of each hyper-parameter, ``k x`` its shape, by its name: 16 to
-            256, or as many as the model holds, which are some of them. Of a centre that is learnt
-            they are in standard deviations of f_p from its mean.
+            128 by default, 1,024 beside unknown parameters of the physics. Of a centre that is
+            learnt they are in standard deviations of f_p from its mean.
+        relevance: Posterior probability that the physics is of use at all, of each output, of the
+            same shape; None of a model that is not weighed without it.
     """
 
     effective_size: Tensor
     converged: Tensor
-    relevance: Tensor | None
     draws: dict[str, Tensor] = field(repr=False)
+    relevance: Tensor | None = None
 
 
 def sample(
@@ -99,11 +100,11 @@ def sample(
         num_samples = default_num_samples(n)
         if calibrated is not None:
             alone = all(term.is_known for term in model.terms)
-            least = min(_RETURNED, _SAMPLED_ALONE // n**2) if alone else 0
+            least = min(_HELD_ALONE, _SAMPLED_ALONE // n**2) if alone else 0
             num_samples = max(num_samples, _SAMPLES_OF_PARAMETERS, least)
     drawn, relevance = None, None
     if parameters.names:
-        drawn = _draw(target, search, num_draws, generator)
+        drawn, laplace = _draw(target, search, num_draws, generator)
         vectors, size = drawn.positions, drawn.effective_size()
         is_good = (drawn.power >= _LEAST_POWER) & (size >= _LEAST_SHARE * len(vectors))
     else:  # all is known but the parameters of the physics
@@ -128,8 +129,11 @@ def sample(
     if without is not None and drawn is not None:
         register_priors(without)
         other = LogPosterior(without)
-        plain = _draw(other, search, num_draws // 2, generator, drawn.log_evidence)
-        relevance = probability(drawn.log_evidence, plain.log_evidence)
+        plain, its_laplace = _draw(other, search, num_draws // 2, generator, drawn.log_evidence)
+        both = (drawn.power == 1) & (plain.power == 1)  # or evidences are those on the way
+        relevance = probability(
+            drawn.log_evidence.where(both, laplace), plain.log_evidence.where(both, its_laplace)
+        )
         relevance = relevance.reshape(parameters.batch_shape)
         chosen = _representative(other, plain.positions, num_samples)
         values = other.parameters.to_raw(other.parameters.unflatten(chosen))
@@ -158,7 +162,7 @@ def sample(
             SamplingWarning,
             stacklevel=3,
         )
-    return SampleResult(size, converged, relevance, named)
+    return SampleResult(size, converged, named, relevance)
 
 
 def default_num_samples(num_points: int) -> int:
@@ -196,11 +200,12 @@ def _draw(
     num_draws: int,
     generator: torch.Generator,
     rival: Tensor | None = None,
-) -> Particles:
-    """Draws of the hyper-parameters; an error if the likelihood is nowhere finite.
+) -> tuple[Particles, Tensor]:
+    """Draws of the hyper-parameters, and the log evidence by Laplace's approximation, ``B``.
 
-    Of a model that is weighed against the log evidence of a ``rival``, the search takes fewer
-    starts, and rough draws do where it is far behind.
+    There is an error if the likelihood is nowhere finite. Of a model that is weighed against the
+    log evidence of a ``rival``, the search takes fewer starts, and rough draws do where it is far
+    behind.
     """
     starts = _STARTS if rival is None else _STARTS_OF_RIVAL
     proposal, log_evidence = _around_optima(target, search, starts)
@@ -210,9 +215,9 @@ def _draw(
     number = min(num_draws // _DRAWS_EACH, gradients // _GRADIENTS_EACH)
     number = max(_LEAST_PARTICLES, number)
     try:
-        return annealing.sample(
-            target, proposal, num_draws, number + number % 2, gradients, generator
-        )
+        number += number % 2
+        drawn = annealing.sample(target, proposal, num_draws, number, gradients, generator)
+        return drawn, log_evidence
     except FloatingPointError:
         raise RuntimeError(NOWHERE) from None
 

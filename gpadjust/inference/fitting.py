@@ -143,8 +143,8 @@ def fit(
             state is left alone. Of ``"bayes"`` only: ``num_samples`` that the model is to hold
             (default: 16, 8 with more than 40 points, 4 with more than 100; 16 if the physics has
             unknown parameters, and up to 256 of a model that has nothing else), and ``num_draws``
-            that they are chosen from (default: 1,024, or 4,096 beside unknown parameters; down to
-            128 with more than 70 points).
+            that the sampling begins with (default: 1,024; down to 128 with more than 70 points),
+            which the effort of all that follows is in proportion to.
 
     Returns:
         For ``"map"`` the likelihood reached and whether the optimiser converged, otherwise the
@@ -160,7 +160,7 @@ def fit(
 
     Warns:
         OptimizationWarning: If the optimiser did not converge.
-        SamplingWarning: If few draws have all the weight.
+        SamplingWarning: If the draws do not show the posterior.
         ParameterWarning: If the observations tell next to nothing of a parameter of the physics, or
             of a combination of some, or contradict its prior.
     """
@@ -248,6 +248,7 @@ def _can_be_sampled(model: Fittable) -> bool:
 def _without_samples(model: Fittable) -> Iterator[None]:
     """Let a model go of the samples that it holds; it holds them again if there is an error."""
     if not isinstance(model, TermsGP) or model.num_samples is None:
+        _restore_means(model)  # of a sample without the physics that was kept
         yield
         return
     samples = {
@@ -260,12 +261,18 @@ def _without_samples(model: Fittable) -> Iterator[None]:
         for basis in model.covar_module.modules():
             if isinstance(basis, AppendedPhysics) and basis.learnt is not None:
                 basis.learnt.zero_()  # where a new model has it
-        for term in model.terms:
-            if not term.learns_mean:
-                term.mean.copy_(term.given_mean)
+    _restore_means(model)
     try:
         yield
     except BaseException:
         model.release_samples()
         model.hold_samples(samples)
         raise
+
+
+@torch.no_grad()
+def _restore_means(model: Fittable) -> None:
+    """Give known prior means their values, which samples without the physics do not have."""
+    for term in model.terms if isinstance(model, TermsGP) else ():
+        if not term.learns_mean:
+            term.mean.copy_(term.given_mean)

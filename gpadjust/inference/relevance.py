@@ -13,7 +13,7 @@ from gpadjust.models import TermsGP
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
 _DOUBT = 0.2  # prior probability that a physics is of no use
-_NONE = 1e-20  # variance of a rho that is switched off
+_NONE = 1e-20  # variance of a rho that is switched off, in its typical size
 
 
 def is_scaled(term: Term) -> bool:
@@ -33,6 +33,9 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     is_plain = len(rest) == 1 and rest[0].basis is None and rest[0].kernel is not None
     if not (scaled and is_plain) or any(term.learns_mean for term in model.terms):
         return None
+    centres = [term.basis for term in scaled if term.basis.learns_center]
+    if any(basis.learnt is None and basis.center.any() for basis in centres):
+        return None
     other = deepcopy(model)
     rows = _of_scaled(other)
     sizes = [row for row in rows if row.kind == "scaling"]
@@ -44,11 +47,21 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     for row in rows:
         row.raw.requires_grad_(False)
         if row.kind == "scaling":
-            row.raw.copy_(row.to_raw(torch.full_like(row.raw, math.log(_NONE))))
+            row.raw.copy_(row.to_raw(row.log_of(torch.full_like(row.raw, _NONE))))
     mean = model.train_targets.nanmean(-1, keepdim=True)
     for term in other.terms:
         term.mean.copy_(torch.zeros_like(mean) if is_scaled(term) else mean)
+        if is_scaled(term) and term.basis.learns_center:
+            term.basis.center.zero_()  # or it would move the mean
     return other
+
+
+@torch.no_grad()
+def uses_physics(model: TermsGP) -> Tensor:
+    """Which samples that a model holds have its physics, ``S x batch_shape x (m)``."""
+    known = [term for term in model.terms if not term.learns_mean]
+    same = [(term.mean == term.given_mean).squeeze(-1) for term in known]
+    return torch.stack(same).all(0) if same else model.terms[0].mean.squeeze(-1).isfinite()
 
 
 def _of_scaled(model: TermsGP) -> list[Hyperparameter]:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from gpadjust.gp import AppendedPhysics
+from gpadjust.inference.relevance import uses_physics
 from gpadjust.models import TermsGP, TermsModel, VariationalCKA
 from gpadjust.models.parameters import hyperparameters
 
@@ -42,7 +43,7 @@ def warm_start(model: TermsModel, previous: TermsModel) -> None:
             if row.kind in ("outputscale", "noise"):
                 factor = ratio[(..., *[None] * (value.dim() - ratio.dim()))].exp()
                 value = row.constraint.inverse_transform(row.parameter(value) * factor)
-            row.raw.copy_(value)
+            row.raw.copy_(value.where(value.isfinite(), row.raw))
     if isinstance(model, VariationalCKA):
         model.forget()
         if model.has_unknowns:
@@ -50,12 +51,20 @@ def warm_start(model: TermsModel, previous: TermsModel) -> None:
 
 
 def _mean_of_samples(model: TermsGP) -> TermsGP:
-    """A copy with the means of the raw parameters that a model holds samples of."""
-    held = dict(model.named_parameters())
+    """A copy with the means of the raw parameters that a model holds samples of.
+
+    Samples that do without the physics do not count; NaN where there are no others.
+    """
+    held, counts = dict(model.named_parameters()), uses_physics(model).double()
+    weights, shape = counts / counts.sum(0), counts.shape
     model = deepcopy(model)
     model.release_samples()
     with torch.no_grad():
         for name, parameter in model.named_parameters():
-            if held[name].dim() > parameter.dim():
-                parameter.copy_(held[name].mean(0).reshape(parameter.shape))
+            values = held[name]
+            if values.shape[: len(shape)] == shape:
+                own = weights.reshape(*shape, *[1] * (values.dim() - len(shape)))
+                parameter.copy_((own * values).sum(0).reshape(parameter.shape))
+            elif values.dim() > parameter.dim():
+                parameter.copy_(values.mean(0).reshape(parameter.shape))
     return model

@@ -206,7 +206,8 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
     unit = (targets - model.mean_module(inputs)).square().nanmean(-1)
     # A physics that misleads says nothing of how large functions and noise are.
     spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1)
-    unit = unit.where(spread <= 0, unit.minimum(spread))
+    is_constant = spread <= _ROUNDING**2 * targets.square().nanmean(-1)
+    unit = unit.where(is_constant, unit.minimum(spread))
     if getattr(model, "has_unknowns", False):  # a physics that is right leaves rounding errors
         unit = unit.maximum(_ROUNDING * targets.square().nanmean(-1))
     unit = unit.where(unit > 0, torch.ones_like(unit))

@@ -31,7 +31,7 @@ class PhysicsParameters(Mapping[str, Tensor]):
         >>> model = CalibratedPhysics(t, 0.5 * 9.81 * t**2, physics=law)
         >>> result = fit(model)
         >>> len(model.physics_parameters["g"])
-        256
+        1024
     """
 
     def __init__(self, unknowns: Mapping[str, Unknown], draws: Tensor) -> None:

@@ -250,7 +250,8 @@ class TermsModel(PredictiveModel):
         """What the model says where there are no data: its prior mean, such as f_p itself.
 
         Weights of the physics that are unknown (``rho_mean="learn"``) are those it began with, 1,
-        or least squares of several; after a point fit they are its estimates.
+        or least squares of several; after a point fit they are its estimates. Samples that do
+        without the physics (see :func:`~gpadjust.fit`) count as if they had it.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
@@ -260,8 +261,9 @@ class TermsModel(PredictiveModel):
         """
         inputs = self.model_inputs(X)
         shift, scale = self.units()
+        means = {t.name: t.mean if t.learns_mean else t.given_mean for t in self.terms}
         # The same for all samples of hyper-parameters but for rounding.
-        values = self.outputs_last(self.at(inputs).mean() * scale + shift)
+        values = self.outputs_last(self.at(inputs).combine(means) * scale + shift)
         return values if self.num_samples is None else values.mean(MCMC_DIM)
 
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:

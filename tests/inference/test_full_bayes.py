@@ -371,3 +371,18 @@ def test_a_list_of_models_of_few_and_many_points(uniform):
     fit(models, num_draws=64, num_starts=1, num_screened=8)
     assert few.num_samples == many.num_samples == 8
     assert models.posterior(X[:5]).mean.shape == (8, 5, 2)
+
+
+@pytest.mark.parametrize("d", [6, 8])
+def test_narrow_constraints_are_kept(d, uniform):
+    X = uniform(20, d)
+    base = RBFKernel(ard_num_dims=d, lengthscale_constraint=Interval(0.9, 1.1))
+    model = CKA(
+        X,
+        X.sum(-1, keepdim=True).sin(),
+        physics=lambda X: X[:, :1],
+        delta_covar_module=ScaleKernel(base),
+    )
+    fit(model)
+    assert ((base.lengthscale >= 0.9) & (base.lengthscale <= 1.1)).all()
+    assert model.predict(X).mean.isfinite().all()

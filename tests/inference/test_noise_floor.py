@@ -43,7 +43,9 @@ TARGETS = {
 def floors(model, Y):
     """The least noise of each output, in the user's units; 0 where all targets are met exactly."""
     residual = Y if isinstance(model, ZeroMeanGP) else Y - crude(X[: len(Y)])
-    return KINDS["noise"].bounds[0] * residual.square().nanmean(0)
+    size, spread = residual.square().nanmean(0), (Y - Y.nanmean(0)).square().nanmean(0)
+    size = size.where(spread < 1e-20, size.minimum(spread))
+    return KINDS["noise"].bounds[0] * size
 
 
 def assert_above(model, Y):

@@ -225,7 +225,8 @@ class TestConcentration:
         at_scale, _ = objective.at_best_scale(point)
         torch.testing.assert_close(objective(point), marginal(at_scale), rtol=1e-9, atol=1e-9)
         objective.assign(point[0])
-        floor = KINDS["noise"].bounds[0] * (XY[1] - crude(XY[0])).square().mean(0)
+        size = (XY[1] - crude(XY[0])).square().mean(0).minimum(XY[1].var(0, correction=0))
+        floor = KINDS["noise"].bounds[0] * size
         ratio = model.likelihood.noise.mT * model.outcome_transform.stdvs.square() / floor
         expected = torch.full_like(ratio, math.exp(max(0.0, -excess)))
         torch.testing.assert_close(ratio, expected, rtol=1e-6, atol=0)

@@ -13,6 +13,8 @@ from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit, loa
 from gpadjust.inference import FitResult, register_priors
 from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.targets import LogPosterior
+from gpadjust.inference.warm_start import warm_start
+from gpadjust.validation import trust
 
 SHORT = {"num_draws": 64, "num_starts": 1, "num_screened": 8}
 quick = pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # few draws
@@ -391,3 +393,69 @@ class TestPartlyOff:
             one = model.subset_output([i]).predict(Z)
             torch.testing.assert_close(one.mean, both.mean[:, i : i + 1])
             torch.testing.assert_close(one.variance, both.variance[:, i : i + 1])
+
+
+class TestTracesOfSamplesWithoutPhysics:
+    def test_relevance_of_many_inputs(self):
+        """Draws that do not get to the posterior are no evidence against the physics."""
+        g = torch.Generator().manual_seed(0)
+        X = torch.rand(100, 20, generator=g, dtype=torch.float64)
+        W = torch.randn(20, generator=g, dtype=torch.float64)
+
+        def physics(X):
+            return 2 * (3 * (X * W).sum(-1, keepdim=True)).sin() + (9 * X[:, :1]).cos()
+
+        noise = torch.randn(100, 1, generator=g, dtype=torch.float64)
+        Y = 1.5 * physics(X) + 0.3 * X[:, :1] + 0.5 * noise
+        assert fit(CKA(X, Y, physics=physics)).relevance > 0.95
+
+    def test_a_warm_start_after_the_physics_was_off(self, data):
+        X, Y, _ = data
+        again = 3 * unrelated(X) + X
+        model = CKA(X, Y, physics=unrelated)
+        fit(model)
+        new, cold = (CKA(X, again, physics=unrelated) for _ in range(2))
+        warm_start(new, model)
+        for each in (new, cold):
+            fit(each, "map", num_screened=0, num_starts=1)
+        assert new.log_evidence()[1] > cold.log_evidence()[1] - 1
+
+    def test_released_samples_leave_none(self, data):
+        X, Y, Z = data
+        model = CKA(X, Y, physics=unrelated)
+        fit(model)
+        model.release_samples()
+        fit(model, "map")
+        torch.testing.assert_close(model.fallback(Z), unrelated(Z))
+
+    def test_a_centre_that_moved(self, data):
+        X, Y, _ = data
+        model = CKA(X, Y, physics=unrelated)
+        with torch.no_grad():
+            model.terms[0].basis.center.fill_(1.0)
+        other = without_physics(model).eval()
+        mean = other.mean_module(other.train_inputs[0])
+        torch.testing.assert_close(mean, other.train_targets.mean().expand_as(mean))
+        model.terms[0].basis.center.requires_grad_(False)
+        assert without_physics(model) is None
+
+    def test_trust_is_about_the_physics(self, data):
+        X, Y, _ = data
+        model = CKA(X, Y, physics=unrelated)
+        fit(model)
+        found = trust(model)
+        moments = model.predict(found.X)
+        least = 1e-3 * (Y - Y.mean()).square().mean().sqrt()
+        half = (1.96 * moments.variance.sqrt()).maximum(least)
+        expected = (moments.mean - unrelated(found.X)).abs() / half
+        torch.testing.assert_close(found.override, expected, rtol=0.01, atol=0.01)
+
+    @pytest.mark.parametrize("scale", [1e-3, 1e3])
+    def test_a_physics_of_any_unit_is_switched_off(self, data, scale):
+        X, Y, Z = data
+        found = []
+        for each in (unrelated, lambda X: scale * unrelated(X)):
+            model = CKA(X, Y, physics=each, outcome_transform=None)
+            fit(model)
+            found.append((model.predict(Z).mean - truth(Z)).square().mean().sqrt())
+        assert found[1] < 2 * found[0] + 1e-3

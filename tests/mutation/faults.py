@@ -74,9 +74,9 @@ FAULTS = (
         "The gradient is wrong where the noise is at its least value, and only there.",
     ),
     Fault(
-        "gpadjust/inference/importance_sampling.py",
-        "-values - (log_q + log_shares[:, None, None]).logsumexp(0))",
-        "-values)",
+        "gpadjust/inference/annealing.py",
+        "proposal.value_and_gradient(positions)[0] - density(positions)",
+        "-density(positions)",
         "The draws are weighted as if all places were equally likely to be drawn: biased samples.",
     ),
     Fault(

@@ -9,6 +9,7 @@ import torch
 from botorch.models.transforms import Normalize
 
 from gpadjust import CKA, FunctionPhysics, StackedGP, Unknown, ZeroMeanGP, compare, fit
+from gpadjust.inference import bayes
 from gpadjust.validation import STRUCTURES, Gain, Structure, leave_one_out, stacking_weights
 from gpadjust.validation.gain import physics_gain
 from gpadjust.validation.ranking import Candidate, is_clear, ranking
@@ -100,7 +101,7 @@ def test_the_best_structure_is_recommended_where_it_is_clear(scaled):
 
 
 def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
-    monkeypatch.setattr(advice_of, "LEAST_POWER", 2.0)  # as if all sampling had been poor
+    monkeypatch.setattr(bayes, "_LEAST_SHARE", 1.1)  # as if all sampling had been poor
     Y = torch.cat([scaled[1], 100 * (3 * X).cos() + noise], -1)
     Y[3, 1] = torch.nan
 
