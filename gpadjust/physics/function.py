@@ -131,15 +131,11 @@ class JoinedPhysics(Physics):
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """As the base class; checks, memory and gradients are the parts'."""
-        d = rows.shape[-1] - self._p
-        given = [self.unknowns.named(rows[:, d:])] if self._p else []
-        return self._of_parts(lambda part, own: part.of_rows(own), rows[:, :d], *given)
+        return self.evaluate(*self._arguments(rows))
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
         """As :meth:`of_rows`, whatever the parts remember."""
-        d = rows.shape[-1] - self._p
-        given = [self.unknowns.named(rows[:, d:])] if self._p else []
-        return self._of_parts(lambda part, own: part.fresh_rows(own), rows[:, :d], *given)
+        return self._of_parts(lambda part, own: part.fresh_rows(own), *self._arguments(rows))
 
     def _of_parts(
         self, ask: Callable[[Physics, Tensor], Tensor], X: Tensor, *parameters: ParameterValues

@@ -102,27 +102,14 @@ class ODEPhysics(Physics):
             )
         name = name or getattr(rhs, "__name__", type(rhs).__name__)
         super().__init__(unknowns=unknowns, inputs=inputs, name=name)
-        self.rhs = rhs
-        self.step = float(step)
-        self.state_dim = state_dim
-        self.substeps = substeps
-        self.method = method
-        self.rtol = rtol
-        self.atol = atol
-        self.max_steps = max_steps
-        self.difference = difference
+        self.rhs, self.step, self.difference = rhs, float(step), difference
+        self.state_dim, self.substeps, self.max_steps = state_dim, substeps, max_steps
+        self.method, self.rtol, self.atol = method, rtol, atol
         self.gradient = gradient
         self.num_outputs = state_dim
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The state after the step, or its change.
-
-        Args:
-            X: ``N x (state_dim + a)``, states and actions.
-            parameters: Those that are unknown, if there are any.
-
-        Returns:
-            ``N x state_dim``.
+        """The state after the step or its change, ``N x state_dim``.
 
         Raises:
             PhysicsError: If X has fewer than ``state_dim`` columns, ``rhs`` returns something else
@@ -180,18 +167,17 @@ class ODEPhysics(Physics):
         if not by_differences or any(p.requires_grad for p in self.parameters()):
             return super().of_rows(rows)
 
+        slope: Tensor | None = None
         with torch.no_grad():
             try:
                 # In one call, as what it costs grows slowly with the rows.
                 values, slope = self.jacobian(rows.detach(), with_values=True)
             except PhysicsError:  # which rows they are, or that only those beside them failed
-                values, found = super().of_rows(rows.detach()), None
-            else:
-                found = slope
+                values = super().of_rows(rows.detach())
 
         def jacobian(rows: Tensor) -> Tensor:
             with torch.no_grad():
-                return self.jacobian(rows)[1] if found is None else found
+                return self.jacobian(rows)[1] if slope is None else slope
 
         return ExternalCall.apply(rows, lambda _: values, jacobian)
 
@@ -207,15 +193,7 @@ class ODEPhysics(Physics):
 
 
 def is_finite(name: str, value: float) -> bool:
-    """Whether a setting is finite.
-
-    Raises:
-        TypeError: If it is no number.
-
-    Example:
-        >>> is_finite("step", float("inf"))
-        False
-    """
+    """Whether a setting is finite; a TypeError if it is no number."""
     try:
         return math.isfinite(value)
     except TypeError:

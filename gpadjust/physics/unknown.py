@@ -192,16 +192,8 @@ class ParameterValues(Mapping[str, Any]):
         return ParameterValues(self._names, np.asarray(self.rows[i]))
 
 
-class Unknowns(Mapping[str, Unknown]):
-    """The unknown parameters of a physics, by name, and their coordinates.
-
-    Args:
-        given: The parameters; None for none.
-
-    Raises:
-        TypeError: If it is no mapping from names to :class:`Unknown`.
-        ValueError: If a name is none of an attribute.
-    """
+class Unknowns(dict[str, Unknown]):
+    """The unknown parameters of a physics, by name, and their coordinates."""
 
     def __init__(self, given: Mapping[str, Unknown] | None) -> None:
         given = {} if given is None else given
@@ -213,54 +205,34 @@ class Unknowns(Mapping[str, Unknown]):
                 f"{{'mass': Unknown(1.0, factor=1.5)}}; found {given!r}."
             )
         for name in given:
-            if not isinstance(name, str) or not _can_be_attribute(name):
+            is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
+            if not is_word or name.startswith("_") or hasattr(ParameterValues((), None), name):
                 raise ValueError(
                     f"Unknown parameters have names such as 'mass', that can be attributes; found "
                     f"{name!r}."
                 )
-        self._given = dict(given)
-
-    def __getitem__(self, name: str) -> Unknown:
-        """The parameter of a name."""
-        return self._given[name]
-
-    def __iter__(self) -> Iterator[str]:
-        """The names."""
-        return iter(self._given)
-
-    def __len__(self) -> int:
-        """Their number p."""
-        return len(self._given)
+        super().__init__(given)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names."""
-        return tuple(self._given)
+        return tuple(self)
 
     @property
     def guess(self) -> Tensor:
         """The guesses, ``p``."""
-        return torch.tensor([u.guess for u in self._given.values()], dtype=torch.float64)
+        return torch.tensor([u.guess for u in self.values()], dtype=torch.float64)
 
     def at(self, coordinates: Tensor) -> Tensor:
         """Values ``... x p`` at coordinates ``... x p``, standard normal by the prior."""
-        pairs = zip(self._given.values(), coordinates.unbind(-1), strict=True)
+        pairs = zip(self.values(), coordinates.unbind(-1), strict=True)
         return torch.stack([u.value(z) for u, z in pairs], dim=-1)
 
     def coordinates(self, values: Tensor) -> Tensor:
         """The reverse of :meth:`at`."""
-        pairs = zip(self._given.values(), values.unbind(-1), strict=True)
+        pairs = zip(self.values(), values.unbind(-1), strict=True)
         return torch.stack([u.coordinate(value) for u, value in pairs], dim=-1)
 
     def named(self, values: Tensor) -> ParameterValues:
         """Values ``N x p`` by name."""
         return ParameterValues(self.names, values)
-
-
-def _can_be_attribute(name: str) -> bool:
-    """Whether ``p.name`` can be a parameter's value."""
-    is_word = name.isidentifier() and not iskeyword(name) and not name.startswith("_")
-    return is_word and not hasattr(_NO_VALUES, name)
-
-
-_NO_VALUES = ParameterValues((), torch.zeros(0, 0))
