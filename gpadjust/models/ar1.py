@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from typing import Any
 
 import gpytorch
@@ -16,9 +15,9 @@ from gpytorch.likelihoods import Likelihood
 from torch import Size, Tensor
 from torch.nn import Parameter
 
+from gpadjust.gp.kernels import Batched
 from gpadjust.gp.physics_columns import check_one_to_one
 from gpadjust.models.component_noise import ComponentNoise
-from gpadjust.models.exact_conditioning import pad
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models.term_builder import KernelLike, PhysicsLike, TermBuilder, transformed
 from gpadjust.models.terms_gp import TermsGP
@@ -84,7 +83,7 @@ class LevelInput(InputTransform):
         return torch.cat([inputs, X[..., -1:]], dim=-1)
 
 
-class Level(gpytorch.Module):
+class Level(Batched, gpytorch.Module):
     r"""The basis of a term of two levels l, the last input: :math:`\rho^{[l=1]}`, or :math:`[l=1]`.
 
     Args:
@@ -114,13 +113,6 @@ class Level(gpytorch.Module):
     def slope(self, x: Tensor) -> Tensor:
         """The derivative of the basis by the constant, ``... x n``."""
         return x[..., -1]
-
-    def map_batches(self, change: Callable[[Tensor], Tensor]) -> Level:
-        """A copy whose constant is changed along its batch dimensions."""
-        new = deepcopy(self)
-        if self.rho is not None:
-            new.rho = Parameter(change(self.rho.detach()))
-        return new
 
 
 class LevelNoise(ComponentNoise):
@@ -202,7 +194,8 @@ class AR1(TermsGP):
                 f"{low.X.shape[-1]} and {low.Y.shape[-1]}."
             )
         transform = LevelInput(d, input_transform)
-        X = torch.cat([pad(low.X, 1), transform.with_level(high.X)], dim=-2)
+        at_low = torch.nn.functional.pad(low.X, (0, 1))
+        X = torch.cat([at_low, transform.with_level(high.X)], dim=-2)
         Y = torch.cat([low.Y, high.Y], dim=-2)
         count, mean = (~low.Y.isnan()).sum(-2, keepdim=True), low.Y.nanmean(-2, keepdim=True)
         variance = (low.Y - mean).square().nansum(-2, keepdim=True) / (count - 1)
@@ -224,7 +217,8 @@ class AR1(TermsGP):
         super().__init__(make, [low_term, delta])
 
     @staticmethod
-    def _learnt_noise(batch_shape: Size) -> Likelihood:
+    def learnt_noise(batch_shape: Size) -> Likelihood:
+        """One variance for each level."""
         return LevelNoise(2, batch_shape)
 
     @property

@@ -97,11 +97,6 @@ class LogInterval(Interval):
         return self.check(self.transform(tensor))
 
 
-def default_constraint() -> LogInterval:
-    """The constraint of a parameter whose bounds are read off the data."""
-    return LogInterval()
-
-
 def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
     """An RBF kernel with one lengthscale per input and an outputscale."""
     base = RBFKernel(num_inputs, batch_shape=batch_shape, lengthscale_constraint=LogInterval())

@@ -78,8 +78,7 @@ class PredictiveModel(Model):
             if isinstance(noise, Tensor) and noise.shape[-1] > 1:
                 noise = noise[..., list(output_indices)]
             return subset.posterior(X, None, noise, posterior_transform)
-        moments = self.joint_moments(X, observation_noise)
-        posterior = self.as_posterior(*moments)
+        posterior = self.as_posterior(*self.joint_moments(X, observation_noise))
         if posterior_transform is None:
             return posterior
         return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))

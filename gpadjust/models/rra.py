@@ -16,7 +16,7 @@ from torch import Size, Tensor
 from gpadjust.gp import WeightedSum
 from gpadjust.gp.features import term_features
 from gpadjust.models.exact_conditioning import ExactConditioning
-from gpadjust.models.parameters import default_constraint
+from gpadjust.models.parameters import LogInterval
 from gpadjust.models.sampled_functions import SampledFunctions
 from gpadjust.models.term_builder import Center, Means, ModelOptions, PhysicsLike, TermBuilder
 from gpadjust.models.terms_gp import TermsGP
@@ -312,11 +312,11 @@ def fourier_kernel(
         num_samples=half,
         ard_num_dims=num_inputs,
         batch_shape=batch_shape,
-        lengthscale_constraint=default_constraint(),
+        lengthscale_constraint=LogInterval(),
     )
     frequencies = torch.randn(num_inputs, half, generator=generator, dtype=torch.float64)
     base._init_weights(randn_weights=frequencies.repeat(*batch_shape, 1, 1))
-    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=default_constraint())
+    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=LogInterval())
 
 
 def regression(design: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -78,18 +78,13 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
 
 def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
     """What a file holds of a model; the errors are those of :func:`save`."""
-    if not isinstance(model, StackedGP):
-        return _content(model)
-    return {
-        "format": _FORMAT,
-        "models": {name: _content(part) for name, part in model.made_of.items()},
-        "weights": torch.tensor([*model.weights.values()], dtype=torch.float64),
-        "num_components": model.num_samples,
-    }
-
-
-def _content(model: Any) -> dict[str, Any]:
-    """What a file holds of a model of one structure."""
+    if isinstance(model, StackedGP):
+        return {
+            "format": _FORMAT,
+            "models": {name: content_of(part) for name, part in model.made_of.items()},
+            "weights": torch.tensor([*model.weights.values()], dtype=torch.float64),
+            "num_components": model.num_samples,
+        }
     if not isinstance(model, TermsModel):
         raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
     name = f"{type(model).__module__}:{type(model).__qualname__}"

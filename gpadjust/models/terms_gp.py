@@ -14,7 +14,6 @@ from botorch.models import SingleTaskGP
 from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.settings import validate_input_scaling
-from gpytorch.likelihoods import Likelihood
 from gpytorch.mlls import ExactMarginalLogLikelihood, MarginalLogLikelihood
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
 from torch import Size, Tensor
@@ -33,11 +32,7 @@ from gpadjust.models.hyperparameter_samples import (
 from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import ModelOptions, TermBuilder
 from gpadjust.models.terms_model import TermsModel
-from gpadjust.models.training_data import (
-    ArrayLike,
-    check_noise,
-    new_observations,
-)
+from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
 
 _MANY = 5_000  # points, above which an exact fit takes long
 # What a state has as many of as there were draws, samples or points.
@@ -67,6 +62,7 @@ class TermsGP(TermsModel, SingleTaskGP):
 
     prediction_strategy: Any
     conditioning_class: ClassVar[type[ExactConditioning]] = ExactConditioning
+    learnt_noise = staticmethod(learnt_noise)
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
         data, likelihood = made.data, made.likelihood
@@ -91,7 +87,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         Y, Yvar = data.Y, data.Yvar
         noise = likelihood
         if likelihood is None and Yvar is None:
-            noise = self._learnt_noise(covar_module.batch_shape)
+            noise = self.learnt_noise(covar_module.batch_shape)
         if made.units is not None:
             Y, Yvar = made.units(Y, Yvar)
         with validate_input_scaling(False):  # ours is by the data's scales, and NaN is missing
@@ -145,15 +141,16 @@ class TermsGP(TermsModel, SingleTaskGP):
         gpadjust.fit(self, "map")
         return mll.eval()
 
-    @staticmethod
-    def _learnt_noise(batch_shape: Size) -> Likelihood:
-        """The default likelihood."""
-        return learnt_noise(batch_shape)
-
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the model at *transformed* inputs, as GPyTorch does."""
         if not self.training and self.train_inputs is not None and args:
-            self.check_transformed(args[0])
+            expected = self.train_inputs[0].shape[-1]
+            if args[0].shape[-1] != expected:
+                raise ValueError(
+                    "In eval mode the model itself takes transformed inputs with "
+                    f"{expected} columns, got shape {tuple(args[0].shape)}. Call "
+                    "`model.posterior(X)` on raw inputs, or `model(model.transform_inputs(X))`."
+                )
             if prior_mode.off():
                 self.conditioning()
         return super().__call__(*args, **kwargs)
@@ -272,7 +269,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         other = {n for n in other if n.rpartition(".")[-1] not in _OF_ANY_NUMBER}
         if samples:  # of which there are as many of each
             sizes = {len(values) for values in samples.values()}
-            other = {n for n in other if not _has_samples(state_dict[n], own[n], sizes)}
+            other = {n for n in other if state_dict[n].shape != (*sizes, *own[n].shape)}
         if other or (strict and own.keys() != state_dict.keys()):
             wrong = sorted(own.keys() ^ state_dict.keys()) or sorted(other)
             held = self.num_samples is not None
@@ -386,23 +383,12 @@ class TermsGP(TermsModel, SingleTaskGP):
                 Y = Y.expand(self.num_samples, *Y.shape)
         self.eval()
         self.conditioning()
-        # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
-        with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
-            return super(TermsGP, self._shell()).condition_on_observations(X, Y, **kwargs)
-
-    def _shell(self) -> Self:
-        """The same parts as another object: GPyTorch takes some of them off for a moment.
-
-        Meanwhile other threads may ask this model.
-        """
+        # GPyTorch takes parts of a model off for a moment, while other threads may ask this one.
         shell = copy(self)
         shell._modules = copy(self._modules)
-        return shell
-
-
-def _has_samples(values: Tensor, one: Tensor, sizes: set[int]) -> bool:
-    """Whether values are as many of one as there are samples."""
-    return len(sizes) == 1 and values.shape == (*sizes, *one.shape)
+        # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
+        with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
+            return super(TermsGP, shell).condition_on_observations(X, Y, **kwargs)
 
 
 def arguments_of(model: type) -> dict[str, bool]:

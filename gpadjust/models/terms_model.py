@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from inspect import signature
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from botorch.posteriors import Posterior
@@ -24,18 +24,6 @@ from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.training_data import ArrayLike, check_columns, to_tensor
 from gpadjust.physics import Physics
-
-
-class Conditioning(Protocol):
-    """What the data of a model say of its terms."""
-
-    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
-        """Posterior means and variances of a weighted sum at each point, ``... x q``."""
-        ...
-
-    def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
-        """Posterior means ``... x q`` and covariances ``... x q x q`` of a weighted sum."""
-        ...
 
 
 class TermsModel(PredictiveModel):
@@ -92,7 +80,10 @@ class TermsModel(PredictiveModel):
         return title(self)
 
     def conditioning(self) -> Any:
-        """What the data say of the terms, a :class:`Conditioning`; made if it is not there."""
+        """What the data say of the terms; made if it is not there.
+
+        It has ``marginals`` and ``joint``: moments of a :class:`~gpadjust.gp.WeightedSum`.
+        """
         raise NotImplementedError
 
     def data(self) -> dict[str, Tensor | None]:
@@ -211,7 +202,13 @@ class TermsModel(PredictiveModel):
         Raises:
             ValueError: If there is no such term.
         """
-        term = self._unknown_term(name)
+        unknown = [term for term in self.terms if term.name == name and not term.is_known]
+        if not unknown:
+            raise ValueError(
+                f"{type(self).__name__} has no unknown term {name!r}; it has "
+                f"{', '.join(map(repr, self.term_names))}."
+            )
+        (term,) = unknown
         with self._graph_for(X):
             inputs = self.model_inputs(X, with_basis=False)
             mean, covariance = self.conditioning().joint(self._at(term, inputs))
@@ -367,16 +364,6 @@ class TermsModel(PredictiveModel):
             )
         return inputs
 
-    def check_transformed(self, inputs: Tensor) -> None:
-        """Raise a ValueError if inputs of the model itself, in eval mode, are not transformed."""
-        expected = self.train_inputs[0].shape[-1]
-        if inputs.shape[-1] != expected:
-            raise ValueError(
-                f"In eval mode the model itself takes transformed inputs with {expected} columns, "
-                f"got shape {tuple(inputs.shape)}. Call `model.posterior(X)` on raw inputs, or "
-                "`model(model.transform_inputs(X))`."
-            )
-
     def observation_noise(self, inputs: Tensor) -> Tensor:
         """The noise variances of observations at transformed inputs, ``... x (m) x q`` or 1.
 
@@ -407,15 +394,6 @@ class TermsModel(PredictiveModel):
     def outputs_first(self, values: Tensor) -> Tensor:
         """From ``... x q x m`` to ``... x (m) x q``."""
         return values.mT if self._num_outputs > 1 else values.squeeze(-1)
-
-    def _unknown_term(self, name: str) -> Term:
-        found = [term for term in self.terms if term.name == name and not term.is_known]
-        if not found:
-            raise ValueError(
-                f"{type(self).__name__} has no unknown term {name!r}; it has "
-                f"{', '.join(map(repr, self.term_names))}."
-            )
-        return found[0]
 
     def _at(self, term: Term, inputs: Tensor) -> WeightedSum:
         """A term in the user's meaning at transformed inputs: a bias has no centres beside it."""
