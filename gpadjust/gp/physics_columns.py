@@ -18,8 +18,7 @@ class PhysicsInput(InputTransform):
     r"""Appends f_p to the inputs: :math:`X \mapsto [\text{base}(X), f_p(X)]`.
 
     The physics sees the user's raw ``X``, once; the user's own input transform (``Normalize``, say)
-    acts on the other columns. A mean and a kernel that read the columns are then the whole prior,
-    for whatever in BoTorch bypasses a model's ``forward``, too.
+    acts on the other columns. What bypasses a model's ``forward`` in BoTorch is then right, too.
 
     Args:
         physics: The physics f_p, ``... x n x d`` to ``... x n x k``; of several, side by side.
@@ -27,8 +26,8 @@ class PhysicsInput(InputTransform):
         base: The user's input transform, or none.
 
     Attributes:
-        coordinates: The unknown parameters of the physics, if any, ``(S) x p``, in coordinates that
-            are standard normal by their prior. The guesses at first.
+        coordinates: Those of the unknown parameters of the physics, if any, ``(S) x p``. The
+            guesses at first.
         draws: Draws from what is known of them, ``K x p``, in their units; likewise.
     """
 
@@ -130,8 +129,7 @@ class AppendedPhysics(Batched, gpytorch.Module):
     r"""Reads f_p from a column that :class:`PhysicsInput` appended: the basis of a term.
 
     For output :math:`j` it returns :math:`(f_{p,j}(x) - c_j) / \text{scale}_j`, in the units of the
-    model's targets. The centre c is the offset, or that and a learnt number of spreads, on which
-    the prior mean of the whole function does not depend as long as ``mean`` is that of the term.
+    model's targets. The centre c is the offset, or that and a learnt number of spreads.
 
     Args:
         num_inputs: Number ``d`` of input columns before the appended ones.
@@ -140,7 +138,7 @@ class AppendedPhysics(Batched, gpytorch.Module):
         offset: ``batch_shape x (m) x 1``, in the user's units, as the next three.
         scale: Its scale.
         spread: For a centre that is learnt, or None.
-        mean: What f_p is multiplied by in the prior mean, if there is a spread.
+        mean: The term's prior mean, so that a centre that moves leaves that of the whole function.
     """
 
     prior_of_learnt = (0.0, 3.0)  # mean and standard deviation of the centre's prior, in spreads

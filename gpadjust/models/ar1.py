@@ -33,12 +33,7 @@ from gpadjust.physics.base import whole_number
 
 
 class LevelInput(InputTransform):
-    """Appends the level of fidelity, 1 for a user's inputs; training inputs bring their own.
-
-    Args:
-        num_inputs: Number ``d`` of raw input columns.
-        base: The user's input transform, or none.
-    """
+    """Appends the level of fidelity, 1 for a user's inputs; training inputs bring their own."""
 
     transform_on_train = transform_on_eval = transform_on_fantasize = True
 
@@ -88,12 +83,9 @@ class Level(Batched, gpytorch.Module):
 
     Args:
         batch_shape: Batch shape of the constant :math:`\rho`, or None for the basis without.
-
-    Attributes:
-        prior_of_learnt: Mean and standard deviation of the prior of the constant.
     """
 
-    prior_of_learnt = (1.0, 1.0)
+    prior_of_learnt = (1.0, 1.0)  # mean and standard deviation of the constant's prior
 
     def __init__(self, batch_shape: Size | None = None) -> None:
         super().__init__()
@@ -128,9 +120,8 @@ class AR1(TermsGP):
 
     The classic of multi-fidelity modelling (Kennedy and O'Hagan 2000; Wannawas and Faisal 2023,
     sec. 2.1.3), for comparison: a Gaussian process of the data and ``N_1`` samples of f_p, with one
-    noise level each, on which its cost and accuracy hang, and far from which it forgets the
-    physics. ``posterior(X)`` is about the high level, of which :class:`~gpadjust.CKA` says what
-    the arguments are, but for:
+    noise level each, far from which it forgets the physics. ``posterior(X)`` is about the high
+    level. The arguments are those of :class:`~gpadjust.CKA`, but for:
 
     Args:
         train_Yvar: Known observation variances of the high level, or None to learn the noise of

@@ -170,8 +170,8 @@ def least_variance(prior_variance: Tensor, n: int) -> Tensor:
 class ExactConditioning(DefaultPredictionStrategy):
     r"""What ``n`` noisy targets say, by two factors that new targets only border.
 
-    With the covariance :math:`K = L L^T` of the targets y and their prior mean m, the factors are L
-    and :math:`\alpha = K^{-1} (y - m)` (Rasmussen and Williams 2006, sec. 2.2). For ``k`` further
+    With the covariance :math:`K = L L^T` of the targets y and their prior mean m, they are L and
+    :math:`\alpha = K^{-1} (y - m)` (Rasmussen and Williams 2006, sec. 2.2). For ``k`` further
     observations of cross-covariance U and covariance S, with residual
     :math:`r = y' - m' - U^T \alpha`,
 
@@ -184,12 +184,6 @@ class ExactConditioning(DefaultPredictionStrategy):
 
     which takes :math:`O(n^2 k)` operations where GPyTorch refactorises in :math:`O(n^3)`. It is
     GPyTorch's prediction strategy of a model, ``model.prediction_strategy``, and dies with that.
-
-    Args:
-        inputs: Transformed training inputs, ``... x n x (d + k)``.
-        targets: Training targets, ``... x n``; NaN where one is missing.
-        noise: Their noise.
-        kernel: The covariance of the sum.
     """
 
     def __init__(self, inputs: Tensor, targets: Tensor, noise: Noise, kernel: SumOfTerms) -> None:
@@ -271,14 +265,9 @@ class ExactConditioning(DefaultPredictionStrategy):
     def pathwise_update(self, prior: Tensor) -> Tensor:
         r"""The weights :math:`K^{-1} (y - f - \varepsilon)` that make functions meet the data.
 
-        Matheron's rule (Wilson et al. 2020): a function f from the prior, plus its covariances with
-        the data times these weights, is one from the posterior.
-
-        Args:
-            prior: Functions from the prior at the training inputs, ``k x ... x n``.
-
-        Returns:
-            ``k x ... x n``; zero where an observation is missing.
+        Matheron's rule (Wilson et al. 2020): a function f from the prior (here at the training
+        inputs, ``k x ... x n``), plus its covariances with the data times these weights, is one
+        from the posterior. They are zero where an observation is missing.
         """
         (train,) = self.train_inputs
         # What the factors have beside the prior: the noise, and their nugget.

@@ -63,14 +63,9 @@ _GUESSED = 0.3  # spread of the starts of a physics' parameters around the user'
 class LogInterval(Interval):
     """Positive parameters in an interval, with their logarithm as the raw parameter.
 
-    A step in the logarithm is a relative one, so that an optimiser does the same whatever the
-    units. The bounds are those of the search: BoTorch's L-BFGS keeps to them, and GPyTorch refuses
-    values beyond them, but the transform does not squash, so that gradients stay honest.
-
-    Args:
-        lower_bound: Lower bound, positive. Default: both are read off the data; any positive value
-            may then be set, as samplers do that follow a prior.
-        upper_bound: Upper bound.
+    BoTorch's L-BFGS keeps to the bounds, and GPyTorch refuses values beyond them, but the transform
+    does not squash, so that gradients stay honest. Without a lower bound both are read off the
+    data, and any positive value may be set, as samplers do that follow a prior.
     """
 
     def __init__(
@@ -356,18 +351,14 @@ Values = dict[str, Tensor]
 class Parameters:
     """Vectors of a model's learnable parameters: logarithms of lengthscales and variances.
 
-    Parameters of other kinds stay as they are. A model's outputs (and batches) have their own
-    hyper-parameters each, and are ``B`` problems apart; where parameters are shared, by several
-    outputs or with the input transform (a physics that learns), all outputs make up one problem.
+    Parameters of other kinds stay as they are. A model's outputs (and batches) are ``B`` problems
+    apart; where parameters are shared, by several outputs or with the input transform (a physics
+    that learns), all outputs make up one problem.
 
     Bounds and starts are multiples of sizes read off the data, so that units do not matter; a
-    constraint that the user gave takes their place. Parameters of other kinds start at normal draws
-    around their current values, one to ten times as wide as these are large, and are bounded by
-    nothing but their constraints. Those of the physics start within about a third of the user's
-    guesses, which mean something.
-
-    Args:
-        model: The model.
+    constraint that the user gave takes their place. Parameters of other kinds start around their
+    current values (those of the physics within about a third, the others one to ten times as wide),
+    and are bounded by nothing but their constraints.
 
     Attributes:
         table: The rows of all its parameters, by the ``id`` of the raw one.

@@ -28,8 +28,7 @@ class SampledFunctions(Module):
     .. math:: f(x) = m(x) + \varphi(x)^T w + k(x, X) v, \quad
         v = K^{-1} (y - f_{prior}(X) - \varepsilon).
 
-    They can be called anywhere, so that particles that follow one of them stay consistent along a
-    trajectory; gradients flow to the inputs as far as f_p allows, which is evaluated once a call.
+    Gradients flow to the inputs as far as f_p allows, which is evaluated once a call.
 
     Args:
         model: The model; later changes of it have no effect here.
@@ -99,16 +98,9 @@ class SampledFunctions(Module):
         return self._to_user(self._values(inputs, extra))
 
     def each(self, X: Tensor) -> Tensor:
-        """Evaluate each function at points of its own.
+        """Evaluate each function at points of its own, ``k x q x d``: ``k x q x m``.
 
-        Args:
-            X: Raw inputs, ``k x q x d``; of a model without a batch shape.
-
-        Returns:
-            ``k x q x m``: the i-th function at the i-th block of points.
-
-        Raises:
-            ValueError: If ``X`` has another shape.
+        Of a model without a batch shape; a ValueError if ``X`` has another shape.
         """
         check_each(X, len(self.weights))
         return self._to_user(self._values(self._inputs(X)))
@@ -152,11 +144,7 @@ def _product(matrix: Tensor, vectors: Tensor, extra: int) -> Tensor:
 
 
 class FunctionPerBatch(Module):
-    """One function of each batch of a model, seen as so many functions of the same inputs.
-
-    Args:
-        functions: Functions of a model with ``k`` batches, one of each.
-    """
+    """One function of each of ``k`` batches of a model, as ``k`` functions of the same inputs."""
 
     def __init__(self, functions: SampledFunctions) -> None:
         super().__init__()

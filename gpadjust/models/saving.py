@@ -23,16 +23,14 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
     """Save a model: data, settings, hyper-parameters (or samples of them), and names.
 
     The physics is saved by its import path, if it is a function or object of a module. What cannot
-    be saved (a lambda, a kernel or transform of yours) is to be given to :func:`load` again. Of a
-    :class:`~gpadjust.StackedGP`, its models and weights.
+    be saved (a lambda, a kernel or transform of yours) is to be given to :func:`load` again.
 
     Args:
         model: The model.
         path: The file, which ``torch.load`` reads with ``weights_only=True``.
 
     Warns:
-        UserWarning: If another program cannot import the physics, so that :func:`load` asks for it:
-            a lambda, or a function of a script.
+        UserWarning: If another program cannot import the physics: a lambda, or one of a script.
 
     Raises:
         TypeError: If it is no model of this library, or the path none.
@@ -130,11 +128,7 @@ def load(path: str | Path, **objects: Any) -> Any:
     Args:
         path: The file.
         objects: ``physics`` and other arguments of the model that could not be saved; an error
-            says which. Of a mixture each goes to the models that have it; of several physics, by
-            their names, as the model was built with.
-
-    Returns:
-        The model, an :class:`~gpadjust.models.TermsModel` or a :class:`~gpadjust.StackedGP`.
+            says which. Of a mixture each goes to the models that have it.
 
     Raises:
         ValueError: If it is no such file, or damaged; if objects are missing, or given though the
@@ -180,7 +174,6 @@ def _loaded(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel | St
 
 
 def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
-    """The model of one structure."""
     missing = [name for name in content["missing"] if name not in objects]
     if missing:
         given = ", ".join(f"{name}=..." for name in missing)
@@ -193,10 +186,9 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
         way = "has no such model" if module in sys.modules else "was not imported: do so first"
         raise ValueError(f"it is of the class {content['class']}, but the module {module!r} {way}.")
-    own = _own(content, objects)
-    if content["physics"] is not None and "physics" not in own:
-        parts = {name: _named_physics(path) for name, path in content["physics"].items()}
-        own["physics"] = parts[""] if "" in parts else as_physics(parts)
+    own = {name: each for name, each in objects.items() if name in content["missing"]}
+    if content["physics"] is not None:
+        own["physics"] = _physics(content, objects)
     model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
     priors = {name: v for name, v in model.state_dict().items() if "_prior." in name}
     model.load_state_dict(content["state"] | priors)
@@ -234,16 +226,15 @@ def _named_physics(path: str) -> Physics:
 
 
 def _is_of_python(path: str) -> bool:
-    """Whether an import path begins in Python's standard library."""
     return path.partition(":")[0].partition(".")[0] in sys.stdlib_module_names
 
 
-def _own(content: dict[str, Any], objects: dict[str, Any]) -> dict[str, Any]:
-    """Those of the objects that a model is built with."""
-    own = {name: each for name, each in objects.items() if name in content["missing"]}
-    if "physics" not in objects or content["physics"] is None:
-        return own
+def _physics(content: dict[str, Any], objects: dict[str, Any]) -> Any:
+    """The physics that is given, of several the model's own, or else those that the file names."""
+    if "physics" not in objects:
+        parts = {name: _named_physics(path) for name, path in content["physics"].items()}
+        return parts[""] if "" in parts else as_physics(parts)
     physics, names = as_physics(objects["physics"]), content["physics_names"]
     if isinstance(physics, JoinedPhysics) and len(names) == 1 and names[0] in physics.names:
-        return {**own, "physics": physics.parts[physics.names.index(names[0])]}
-    return {**own, "physics": physics}
+        return physics.parts[physics.names.index(names[0])]
+    return physics

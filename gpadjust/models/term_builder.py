@@ -119,10 +119,9 @@ class TermBuilder:
         The model's input transform appends all f_i to the inputs
         (:class:`~gpadjust.gp.PhysicsInput`), once; the terms read those columns.
 
-        With a center c the basis of rho is :math:`f_p - c`. The bias that makes :math:`f_a = \rho
-        f_p + \delta` is then :math:`\delta = \delta_0 - \sum_i c_i \rho_i` for the model's own term
-        :math:`\delta_0`. A centre that is learnt is a hyper-parameter, in standard deviations of
-        f_p from its mean; the prior mean stays.
+        With a center c the basis of rho is :math:`f_p - c`. The bias is then :math:`\delta =
+        \delta_0 - \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`. A centre that is
+        learnt is in standard deviations of f_p from its mean.
 
         The arguments are those of :class:`~gpadjust.CKA`; a model without physics has None.
         """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from inspect import signature
 from typing import Any, ClassVar, Self
@@ -42,8 +42,7 @@ _OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions")
 class TermsGP(TermsModel, SingleTaskGP):
     r"""The base of this library's exact models: a sum of terms, given as a list.
 
-    A ``SingleTaskGP`` with independent outputs, with the ends tied that BoTorch leaves loose: a
-    subset of its outputs can be fitted again, whatever its kernels and transforms; it can be
+    A ``SingleTaskGP`` with independent outputs, of which a subset can be fitted again; it can be
     conditioned on observations before any prediction was made, with gradients to where they are
     made; ``output_indices`` may come in any order; an output may be missing (NaN) in some rows.
 
@@ -112,14 +111,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         """Whether it was fitted, or has nothing to learn."""
         return self.was_fitted or not any(p.requires_grad for p in self.parameters())
 
-    def custom_fit(
-        self,
-        mll: MarginalLogLikelihood,
-        closure: Callable[[], Any] | None = None,
-        closure_kwargs: dict[str, Any] | None = None,
-        optimizer_kwargs: dict[str, Any] | None = None,
-        **options: Any,
-    ) -> MarginalLogLikelihood:
+    def custom_fit(self, mll: MarginalLogLikelihood, **options: Any) -> MarginalLogLikelihood:
         """BoTorch's hook: what ``fit_gpytorch_mll`` does to a model of this library.
 
         It is ``fit(model, "map")``, which keeps to priors and ``requires_grad``; with an optimizer,
@@ -127,14 +119,9 @@ class TermsGP(TermsModel, SingleTaskGP):
         """
         mll.train()  # an error, if the model holds samples
         plain = type(mll) is ExactMarginalLogLikelihood and mll.likelihood is self.likelihood
-        if not plain or closure or closure_kwargs or optimizer_kwargs or options:
-            return _fit_fallback(
-                mll,
-                closure=closure,
-                closure_kwargs=closure_kwargs,
-                optimizer_kwargs=optimizer_kwargs,
-                **options,
-            )
+        others = options.keys() - {"closure", "closure_kwargs", "optimizer_kwargs"}
+        if not plain or others or any(options.values()):
+            return _fit_fallback(mll, **options)
         # Without noise the likelihood has rounding errors at which SciPy's line search gives up,
         # and BoTorch throws away what was found. `fit` is asked for as a user would, by the name
         # of the package and at the call: rooms below are not imported here.
@@ -156,7 +143,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         return super().__call__(*args, **kwargs)
 
     def conditioning(self) -> ExactConditioning:
-        """What the training data say of the terms; made if it is not there."""
+        """As the base class."""
         if self.prediction_strategy is None:
             self.prediction_strategy = self.conditioning_class(
                 self.train_inputs[0], self.train_targets, self.noise, self.covar_module
@@ -188,7 +175,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         return self.train_targets - factors.alpha * variance, variance
 
     def data(self) -> dict[str, Tensor | None]:
-        """The data that the model could be built on: raw inputs, targets and known variances."""
+        """As the base class."""
         self.eval()
         inputs = self._original_train_inputs
         inputs = self.train_inputs[0] if inputs is None else inputs
@@ -210,8 +197,7 @@ class TermsGP(TermsModel, SingleTaskGP):
     def hold_samples(self, samples: dict[str, Tensor]) -> None:
         """Make the model fully Bayesian: a batch of itself, one for each hyper-parameter sample.
 
-        Its posterior then is a Gaussian mixture, as that of BoTorch's fully Bayesian models.
-        :func:`gpadjust.fit` calls this.
+        Its posterior then is a mixture, as of BoTorch's fully Bayesian models.
 
         Args:
             samples: Raw parameters by their names, ``S x`` the parameter's shape.
@@ -227,12 +213,9 @@ class TermsGP(TermsModel, SingleTaskGP):
         self.was_fitted = True
 
     def release_samples(self) -> None:
-        """Make the model what it was before it held samples, with the first of them.
+        """Make the model, if it holds samples, what it was before, with the first of them.
 
-        It does nothing if the model holds none.
-
-        Raises:
-            RuntimeError: If it is a model of fantasies.
+        A model of fantasies raises a RuntimeError.
         """
         if self.num_samples is not None:
             release_samples(self)

@@ -29,13 +29,10 @@ from gpadjust.physics import Physics
 class TermsModel(PredictiveModel):
     r"""A model of a sum of terms, :math:`f(x) = \sum_t b_t(x) g_t(x)`, and of each of them.
 
-    All predictions are those of a weighted sum of the terms, of which :meth:`conditioning` knows
-    what the data say. It is the base of exact models and of sparse ones, beside BoTorch's own of
-    each.
-
-    In an adjusted physics :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)` the terms that scale
-    a physics are the rhos; with a centre c, :math:`f_p - c` is what they scale, and :math:`\delta =
-    \delta_0 - \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`.
+    The base of exact models and of sparse ones, beside BoTorch's own of each. In an adjusted
+    physics :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)` the terms that scale a physics are
+    the rhos; with a centre c, :math:`f_p - c` is what they scale, and :math:`\delta = \delta_0 -
+    \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`.
 
     Attributes:
         covar_module: The covariance of the sum, which holds the terms.
@@ -76,7 +73,6 @@ class TermsModel(PredictiveModel):
         return model
 
     def __repr__(self) -> str:
-        """One line; :meth:`summary` says more."""
         return title(self)
 
     def conditioning(self) -> Any:
@@ -97,10 +93,7 @@ class TermsModel(PredictiveModel):
     def summary(self) -> str:
         """What the model has learnt, as a text in the user's units.
 
-        The structure; unknown parameters of the physics; the log marginal likelihood; means,
-        standard deviations and lengthscales of the terms; the noise as a standard deviation; and
-        what is at a bound. Of a model that holds samples, their medians and the ranges of 95 % of
-        them.
+        Of a model that holds samples, their medians and the ranges of 95 % of them.
         """
         return summary(self)
 
@@ -149,27 +142,18 @@ class TermsModel(PredictiveModel):
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
-        """What the model knows of the unknown parameters of the physics.
-
-        Raises:
-            ValueError: If the physics has none.
-        """
+        """What the model knows of the unknown parameters of the physics; an error without any."""
         return PhysicsParameters.of(self.input_transform if self.has_unknowns else None)
 
     def rho(self, X: ArrayLike, physics: str | int | None = None, mixed: bool = True) -> Posterior:
         r"""The posterior of the scaling :math:`\rho` at ``X``, ``q x m``; f_p is not evaluated.
 
-        After the default fit rho and delta apart are far less certain than their sum: observations
-        are of the sum alone, and how much of it is rho's depends on centre and sizes, which few
-        data tell.
+        Rho and delta apart are far less certain than their sum, which alone is observed.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
             physics: Which of several physics, by its name or number.
             mixed: As in :meth:`term`.
-
-        Returns:
-            A posterior over ``batch_shape x q x m``, without units.
 
         Raises:
             ValueError: If the model has no such rho.
@@ -177,16 +161,13 @@ class TermsModel(PredictiveModel):
         return self.term(self.rho_name(physics), X, mixed)
 
     def delta(self, X: ArrayLike, mixed: bool = True) -> Posterior:
-        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`.
-
-        Like rho it is far less certain than their sum.
-        """
+        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`."""
         return self.term("delta", X, mixed)
 
     def term(self, name: str, X: ArrayLike, mixed: bool = True) -> Posterior:
         """The posterior of a term's Gaussian process, ``q x m``; its basis is not evaluated.
 
-        It has no graph unless ``X`` asks for one.
+        A rho is without units, others are in the targets'. No graph unless ``X`` asks for one.
 
         Args:
             name: One of ``term_names``.
@@ -194,10 +175,6 @@ class TermsModel(PredictiveModel):
             mixed: Of a model that holds ``S`` samples of its hyper-parameters: whether moments and
                 draws are those of the mixture, ``... x q x m``; else they are those of each sample,
                 ``... x S x q x m``, as :meth:`posterior` has them for BoTorch.
-
-        Returns:
-            A posterior over ``batch_shape x q x m``: of a rho without units, else in those of the
-            targets.
 
         Raises:
             ValueError: If there is no such term.
@@ -246,14 +223,8 @@ class TermsModel(PredictiveModel):
     def fallback(self, X: ArrayLike) -> Tensor:
         """What the model says where there are no data: its prior mean, such as f_p itself.
 
-        Weights of the physics that are unknown (``rho_mean="learn"``) are those it began with, 1,
-        or least squares of several; after a point fit they are its estimates.
-
-        Args:
-            X: Raw inputs, ``batch_shape x q x d``.
-
-        Returns:
-            ``batch_shape x q x m``, in the units of the targets.
+        It is ``batch_shape x q x m``, in the units of the targets. Weights of the physics that are
+        unknown (``rho_mean="learn"``) are those it began with, or a point fit's estimates.
         """
         inputs = self.model_inputs(X)
         shift, scale = self.units()
@@ -304,16 +275,12 @@ class TermsModel(PredictiveModel):
         """The posterior mean, as a function to be called anywhere: faster than ``predict``.
 
         Args:
-            most: The most samples of the hyper-parameters to take, evenly of those held. Default:
-                all.
+            most: The most samples of the hyper-parameters to take, evenly of those held, at least
+                1. Default: all.
 
         Returns:
-            A module that maps raw ``... x q x d`` to ``S x ... x q x m`` in the user's units: a
-            mean for each sample of the hyper-parameters, or a single one. Gradients flow to the
-            inputs as far as f_p allows. Later fits of the model leave it as it is.
-
-        Raises:
-            ValueError: If ``most`` is no whole number of at least 1.
+            As of :meth:`sample_functions`: a mean for each sample of the hyper-parameters, or a
+            single one.
         """
         if most is not None:
             check_number(most, "most")
@@ -325,11 +292,9 @@ class TermsModel(PredictiveModel):
         return FunctionPerBatch(each._mean_functions_of_batches())
 
     def _functions_of_batches(self, num_functions: int, num_features: int) -> SampledFunctions:
-        """Functions drawn for each batch of the model."""
         return SampledFunctions.by_matheron(self, num_functions, num_features)
 
     def _mean_functions_of_batches(self) -> SampledFunctions:
-        """The posterior mean of each batch of the model."""
         return SampledFunctions.mean(self)
 
     def at(self, inputs: Tensor) -> WeightedSum:

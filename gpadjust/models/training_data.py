@@ -95,12 +95,7 @@ def training_data(
 def new_observations(
     X: ArrayLike, Y: ArrayLike, input_names: tuple[str, ...], num_outputs: int
 ) -> tuple[Tensor, Tensor]:
-    """Further observations of a model as tensors ``... x k x d`` and ``... x k x m``, checked.
-
-    Raises:
-        TypeError: If one of them is not float64.
-        ValueError: If shapes disagree, ``X`` is not finite, or a row of ``Y`` holds nothing.
-    """
+    """Further observations of a model as tensors ``... x k x d`` and ``... x k x m``, checked."""
     check_columns(X, input_names)
     X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
     check_finite(X, "X")
@@ -117,11 +112,8 @@ def new_observations(
 def to_tensor(values: ArrayLike, name: str) -> Tensor:
     """Take a float64 tensor as it is, and make one of a NumPy array or a DataFrame.
 
-    Raises:
-        TypeError: If it is something else, or holds something else than real numbers: text (which
-            NumPy would read), complex numbers (cut to their real parts), dates or times
-            (nanoseconds).
-        ValueError: If values are masked.
+    A TypeError for anything else, also for what NumPy would turn into numbers: text, complex
+    numbers, dates or times. A ValueError if values are masked.
     """
     if isinstance(values, Tensor):
         if values.is_complex():
@@ -253,10 +245,9 @@ def standardize(means: Tensor, stdvs: Tensor) -> Standardize:
 def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
     r"""The default outcome transform: divide by the root mean square of ``Y - mean``.
 
-    BoTorch's default takes shift and scale from the targets. A model with physics wants the scale
-    of the residual, so that a good physics does not push the noise under the likelihood's floor,
-    and no shift, so that :math:`\rho` keeps its meaning. Where the prior mean meets the targets but
-    for rounding, the scale is a millionth of theirs (or 1 if they are zero).
+    A good physics then does not push the noise under the likelihood's floor, and without a shift
+    :math:`\rho` keeps its meaning. Where the prior mean meets the targets but for rounding, the
+    scale is a millionth of theirs (or 1 if they are zero).
     """
 
     def rms(values: Tensor) -> Tensor:
@@ -268,11 +259,7 @@ def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
 
 
 def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Standardize | None:
-    """The user's outcome transform with shift and scale estimated from the targets.
-
-    Raises:
-        ValueError: If it is not a shift and scale of each output, or of another number of them.
-    """
+    """The user's outcome transform with shift and scale estimated from the targets."""
     if transform is None:
         return None
     if type(transform) is not Standardize:

@@ -264,7 +264,6 @@ class Physics(torch.nn.Module, ABC):
         return copy
 
     def _checked_parameters(self, parameters: Tensor | None, X: Tensor) -> Tensor:
-        """Values of the unknown parameters, ``... x p``."""
         names = self.unknowns.names
         if parameters is None:
             return self.unknowns.guess.to(X)

@@ -24,19 +24,14 @@ Array = NDArray[np.float64]
 class BlackBoxPhysics(Physics):
     """Physics given as a NumPy function or a simulator.
 
-    Simulations of single rows (``batched=False``) run in parallel, with no change of code, inside
+    Simulations of single rows (``batched=False``) run in parallel inside ``with
+    joblib.parallel_config(backend="loky", n_jobs=4)``, or any other backend of joblib, a cluster's
+    included.
 
-        with joblib.parallel_config(backend="loky", n_jobs=4):
-            ...
-
-    or any other backend of joblib, a cluster's included. Rows that succeed are remembered even
-    when others fail.
-
-    A result is remembered, and each distinct row is evaluated once: fitting a model, predicting and
-    differentiating ask for the same rows again. The memory is dropped when a parameter or buffer of
-    the physics changes, or dtype and device of the inputs; it cannot see other changes, such as a
-    plain attribute: call ``forget()`` after those. Threads may share a physics if what it calls
-    allows that.
+    Each distinct row is evaluated once, and its result remembered, even when other rows fail. The
+    memory is dropped when a parameter or buffer of the physics changes, or dtype and device of the
+    inputs; it cannot see other changes, such as a plain attribute: call ``forget()`` after those.
+    Threads may share a physics if what it calls allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with

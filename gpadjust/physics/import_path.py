@@ -43,13 +43,8 @@ def physics_from_path(path: str) -> Physics:
     Importing a module runs its code, so take paths from files that you trust only.
 
     Args:
-        path: ``"package.module:qualname"``.
-
-    Returns:
-        The physics, or the callable in a ``FunctionPhysics``.
-
-    Raises:
-        ValueError: If the path has another form, cannot be imported, or names something else.
+        path: ``"package.module:qualname"``; a ValueError if it has another form, cannot be
+            imported, or names something else.
 
     Example:
         >>> physics_from_path("torch:sin").name

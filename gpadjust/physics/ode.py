@@ -36,8 +36,7 @@ class ODEPhysics(Physics):
         state_dim: The number of leading columns that hold the state; the others hold the action.
         substeps: Integration steps within the step, for the fixed-step methods.
         method: A method of ``torchdiffeq.odeint``. The adaptive ones control one step size for all
-            rows of a batch together, so that a row's result depends, within the tolerances, on
-            the rows it is evaluated with; hence the default.
+            rows of a batch, on which a row's result then depends within the tolerances.
         rtol: Relative tolerance of the adaptive methods.
         atol: Absolute tolerance of the adaptive methods, in the unit of the state.
         max_steps: The most steps that an adaptive method tries within ``step``.
@@ -51,10 +50,8 @@ class ODEPhysics(Physics):
         name: The name in messages. Default: that of ``rhs``.
 
     Raises:
-        TypeError: If ``rhs`` is not callable, or a setting is no number, or none that is whole
-            where it counts something.
-        ValueError: If ``step``, ``substeps``, ``state_dim`` or ``max_steps`` is not positive, a
-            tolerance is negative, or ``method`` or ``gradient`` is unknown.
+        TypeError: If ``rhs`` is not callable, or a setting is no number, or not whole.
+        ValueError: If a setting is out of range, or ``method`` or ``gradient`` is unknown.
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)

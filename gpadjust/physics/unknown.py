@@ -52,7 +52,6 @@ class Unknown:
     unit: str = ""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         for name in ("guess", "sd", "factor"):
             value = getattr(self, name)
             if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):
@@ -127,7 +126,6 @@ class Unknown:
 
     @property
     def _is_cut(self) -> bool:
-        """Whether bounds cut a prior off."""
         low, high = self.bounds
         return not self._is_uniform and (high < math.inf or low > (-math.inf if self.sd else 0.0))
 
@@ -151,9 +149,7 @@ def _share(z: Tensor) -> Tensor:
 class ParameterValues(Mapping[str, Any]):
     """Values of parameters by their names, as items or attributes: ``p["mass"]``, ``p.mass``.
 
-    Args:
-        names: The names.
-        rows: The values side by side, ``N x p``, or ``p`` for a single row.
+    They are ``N`` each of ``rows``, ``N x p``, or numbers of a single row, ``p``.
     """
 
     def __init__(self, names: tuple[str, ...], rows: Any) -> None:
@@ -161,13 +157,11 @@ class ParameterValues(Mapping[str, Any]):
         self.rows = rows
 
     def __getitem__(self, name: str) -> Any:
-        """The values of a parameter, ``N``."""
         if name not in self._names:
             raise KeyError(f"There is no parameter {name!r}; there are {', '.join(self._names)}.")
         return self.rows[..., self._names.index(name)]
 
     def __getattr__(self, name: str) -> Any:
-        """The values of a parameter, ``N``."""
         if name.startswith("_"):  # also of a copy that has nothing yet
             raise AttributeError(name)
         if name not in self._names:
@@ -176,11 +170,9 @@ class ParameterValues(Mapping[str, Any]):
         return self[name]
 
     def __iter__(self) -> Iterator[str]:
-        """The names."""
         return iter(self._names)
 
     def __len__(self) -> int:
-        """How many there are."""
         return len(self._names)
 
     def numpy(self) -> ParameterValues:
