@@ -95,11 +95,8 @@ class Factors(NamedTuple):
     def append(self, cross: Tensor, corner: Tensor, residual: Tensor) -> Factors:
         """Return the factors with ``k`` more points.
 
-        Args:
-            cross: Covariances of the new points with the old ones, ``... x k x n``.
-            corner: Covariance of the new targets, noise included, ``... x k x k``.
-            residual: New targets less their prediction by the old ones, ``... x k``; NaN where one
-                is missing.
+        They have covariances ``cross`` with the old ones, ``... x k x n``, and ``corner``, noise
+        included; the residual is the new targets less their prediction by the old ones.
         """
         n, k = cross.shape[-1], cross.shape[-2]
         observed = ~residual.isnan()
@@ -279,7 +276,7 @@ class ExactConditioning(DefaultPredictionStrategy):
     def exact_predictive_mean(
         self, test_mean: Tensor, test_train_covar: Tensor | LinearOperator
     ) -> Tensor:
-        """GPyTorch's hook for the posterior mean, ``... x q``."""
+        """GPyTorch's hook for the posterior mean."""
         return test_mean + (test_train_covar @ self.mean_cache.unsqueeze(-1)).squeeze(-1)
 
     def exact_predictive_covar(

@@ -112,29 +112,23 @@ def learnt_noise(batch_shape: Size) -> Likelihood:
 class Hyperparameter:
     """A row of the table: a parameter of a model, and what is assumed of it.
 
+    A ``kind`` is a key of :data:`KINDS`; or ``"constant"`` of one that a basis is affine in,
+    ``"physics"`` of one of the input transform, ``"other"``.
+
     Attributes:
-        name: Its name in ``model.named_parameters()``.
-        raw: GPyTorch's raw parameter.
-        owner: The module that has it.
-        leaf: Its name there.
-        kind: A key of :data:`KINDS`; or ``"constant"`` of one that a basis is affine in,
-            ``"physics"`` of one of the input transform, ``"other"``.
-        size: Its typical size, of its shape, or None for the last three.
-        constraint: Its GPyTorch constraint, or None.
-        is_shared: Whether it is no output's own, as that of a physics.
         is_log: Whether vectors have its logarithm; ``squashes``: which the raw parameter is not.
         is_default: Whether its bounds are read off the data.
         is_free: Whether it is positive, and nothing but the data bounds it.
     """
 
-    name: str
-    raw: Parameter
-    owner: Any
-    leaf: str
+    name: str  # in `model.named_parameters()`
+    raw: Parameter  # GPyTorch's
+    owner: Any  # the module that has it
+    leaf: str  # its name there
     kind: str
-    size: Tensor | None
-    constraint: Any
-    is_shared: bool
+    size: Tensor | None  # its typical size, of its shape, if it is of one of KINDS
+    constraint: Any  # GPyTorch's, or None
+    is_shared: bool  # it is no output's own, as that of a physics
 
     def __post_init__(self) -> None:
         constraint, is_ours = self.constraint, isinstance(self.constraint, LogInterval)

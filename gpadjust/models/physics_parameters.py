@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from gpadjust.gp import PhysicsInput
 from gpadjust.physics import Unknown
 
 
-class PhysicsParameters(Mapping[str, Tensor]):
+class PhysicsParameters(dict[str, Tensor]):
     """The posterior of the unknown parameters of a physics, as draws.
 
     It maps names to their draws, ``K`` each: one, the value itself, after a point fit (``"map"``)
@@ -35,6 +35,7 @@ class PhysicsParameters(Mapping[str, Tensor]):
     """
 
     def __init__(self, unknowns: Mapping[str, Unknown], draws: Tensor) -> None:
+        super().__init__(zip(unknowns, draws.unbind(-1), strict=True))
         self.unknowns = unknowns
         self.draws = draws
 
@@ -48,16 +49,8 @@ class PhysicsParameters(Mapping[str, Tensor]):
             )
         return cls(transform.physics.unknowns, transform.draws)
 
-    def __getitem__(self, name: str) -> Tensor:
-        if name not in self.unknowns:
-            raise KeyError(f"There is no parameter {name!r}; there are {', '.join(self.unknowns)}.")
-        return self.draws[:, [*self.unknowns].index(name)]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.unknowns)
-
-    def __len__(self) -> int:
-        return len(self.unknowns)
+    def __missing__(self, name: str) -> Tensor:
+        raise KeyError(f"There is no parameter {name!r}; there are {', '.join(self)}.")
 
     @property
     def mean(self) -> Tensor:

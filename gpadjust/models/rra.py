@@ -317,15 +317,7 @@ def regression(design: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor,
 
     With :math:`\begin{bmatrix} \Phi / \sigma \\ I \end{bmatrix} = Q R` the posterior of the weights
     is :math:`N(R^{-1} Q^T [r / \sigma; 0], \; R^{-1} R^{-T})`: no digits cancel, however small the
-    noise.
-
-    Args:
-        design: :math:`\Phi`, ``... x n x p``.
-        residual: Targets less their prior mean, ``... x n``; NaN where one is missing.
-        noise: Noise variances, ``... x n``.
-
-    Returns:
-        The mean ``... x p``, and the root :math:`R^{-1}` of the covariance, ``... x p x p``.
+    noise. The residual may be NaN. Returns the mean and the root :math:`R^{-1}`.
     """
     n, p = design.shape[-2:]
     weight = noise.rsqrt().masked_fill(residual.isnan(), 0.0)

@@ -33,8 +33,8 @@ class SampledFunctions(Module):
     Args:
         model: The model; later changes of it have no effect here.
         features: The features of each term, by its name.
-        weights: The weights w, ``k x batch_shape x (m) x D``.
-        train: Where the data are; None for functions that the weights say all about.
+        weights: w, ``k x batch_shape x (m) x D``.
+        train: Where the data are, if there are any for an update.
         update: v, ``k x batch_shape x (m) x n``.
     """
 
@@ -117,8 +117,7 @@ class SampledFunctions(Module):
     def _values(self, inputs: Tensor, extra: int = 0, among_reached: bool = False) -> Tensor:
         """The functions in model units, ``k x ... x (m) x q``, at ``... x (m) x q x (d + k)``.
 
-        So many dimensions of the inputs as ``extra`` says lead those of the model. They are of all
-        terms, or of those alone that the data reach.
+        ``extra`` dimensions of the inputs lead those of the model.
         """
         sought = self.sum.at(inputs, self._reached if among_reached else None)
         parts = self.weights.split([each.num_features for each in self.features.values()], dim=-1)

@@ -30,13 +30,9 @@ from gpadjust.models.training_data import (
     training_data,
 )
 from gpadjust.physics import Physics, as_physics
+from gpadjust.physics.function import AnyPhysics, Parts
 
-PhysicsLike = (
-    Physics
-    | Callable[[Tensor], Tensor]
-    | Sequence[Physics | Callable[[Tensor], Tensor]]
-    | dict[str, Physics | Callable[[Tensor], Tensor]]
-)
+PhysicsLike = AnyPhysics | Parts
 KernelLike: TypeAlias = Kernel | Callable[[int, Size], Kernel]
 Kernels: TypeAlias = KernelLike | Sequence[KernelLike] | None
 Means = float | Sequence[float] | Literal["learn"]
@@ -59,7 +55,7 @@ class TermBuilder:
         input_transform: What makes the columns that terms read out of raw inputs, or None.
         units: Shift and scale of the targets, or None.
         num_inputs: Number ``d`` of these columns without those of the physics.
-        likelihood: The user's likelihood, or None for the default.
+        likelihood: The user's, or None.
 
     Attributes:
         batch_shape: That of the model with its outputs last, for its kernels.
