@@ -220,9 +220,8 @@ class TermBuilder:
         if len(each) != k or (k > 1 and isinstance(kernels, Module)):
             found = len(each) if isinstance(kernels, Sequence) else "one"
             raise ValueError(
-                f"Expected {k} kernels of rho, one for each physics, got {found}: pass a sequence "
-                "of kernels, or a function of the number of inputs and the batch shape that makes "
-                "one."
+                f"Expected {k} kernels of rho, one for each physics, got {found}: pass a sequence, "
+                "or a function of the number of inputs and the batch shape that makes one."
             )
         several = getattr(self.input_transform.physics, "names", ())
         names = [f"rho_{name}" for name in several] if k > 1 else ["rho"]

@@ -71,15 +71,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         if unknown and data.X.shape[-2] < 2 + unknown:
             raise ValueError(
                 f"Expected at least {2 + unknown} points to learn {unknown} constant means and a "
-                f"variance, got {data.X.shape[-2]}; give the means instead: rho_mean=1.0 (a number "
-                "for each physics), delta_mean=0.0."
+                f"variance, got {data.X.shape[-2]}; give the means: rho_mean=1.0, delta_mean=0.0."
             )
         if (n := data.X.shape[-2]) > _MANY:
             warnings.warn(
                 f"{type(self).__name__} is exact: of {n} points a fit takes from many minutes to "
                 f"hours, and each covariance {8e-9 * n**2:.1f} GB. gpadjust.VariationalCKA takes "
                 "the arguments of CKA and learns from all of them in minutes.",
-                UserWarning,
                 stacklevel=3,
             )
         covar_module = SumOfTerms(terms)

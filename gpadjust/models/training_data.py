@@ -133,8 +133,7 @@ def to_tensor(values: ArrayLike, name: str) -> Tensor:
     if np.ma.is_masked(array):
         raise ValueError(
             f"Expected {name} without masked values, found {np.ma.count_masked(array)}. Leave "
-            "their rows out; targets that were not measured are NaN, which "
-            f"`{name}.filled(np.nan)` makes them."
+            f"their rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
         )
     found = {type(each) for each in array.flat} if array.dtype.kind == "O" else set()
     for what, (kinds, types, _) in _NO_NUMBERS.items():
@@ -264,10 +263,9 @@ def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Stand
         return None
     if type(transform) is not Standardize:
         raise ValueError(
-            f"The outcome transform {type(transform).__name__} is not supported: f_p lives in the "
-            "units of the targets, so the transform must be one shift and scale per output. Use "
-            "Standardize, None, or the default, which divides by the residual's scale; to model "
-            "log(y), say, take the logarithm of both train_Y and the physics."
+            f"The outcome transform {type(transform).__name__} is not supported: it must be one "
+            "shift and scale per output, as the physics has the units of the targets. Use "
+            "Standardize, None, or the default; to model log(y), take both logarithms yourself."
         )
     transform.train()
     try:

@@ -285,8 +285,8 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         """Refuse: inducing values that are optimal for further data are another fit."""
         raise NotImplementedError(
             "VariationalCKA cannot be conditioned on further observations, which fantasies and "
-            "look-ahead acquisition functions need: build it of all data and fit it again (a warm "
-            "start of few iterations will do), or take an exact CKA of some thousand."
+            "look-ahead acquisition functions need: build it of all data and fit it again, or take "
+            "an exact CKA of some thousand."
         )
 
     def fantasize(self, X: Tensor, sampler: Any, **kwargs: Any) -> NoReturn:

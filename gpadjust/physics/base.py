@@ -38,7 +38,7 @@ class Physics(torch.nn.Module, ABC):
         unknowns: The unknown parameters, ``p`` of them.
 
     Raises:
-        TypeError: If ``inputs`` holds something else than whole numbers.
+        TypeError: If ``inputs`` are no whole numbers.
         ValueError: If ``inputs`` is empty.
 
     Example:
@@ -99,13 +99,11 @@ class Physics(torch.nn.Module, ABC):
 
         Returns:
             ``batch_shape x n x m``, of X's dtype. Dimensions along which X is expanded (stride 0)
-            are evaluated once, and the result is expanded along them; the gradient is then right
-            for the tensor that was expanded.
+            are evaluated once; the gradient is then right for the tensor that was expanded.
 
         Raises:
             TypeError: If X is not a floating-point tensor.
-            ValueError: If X has fewer than two dimensions or lacks a column of ``inputs``, or
-                parameters are not of that shape.
+            ValueError: If X lacks a dimension or column, or parameters are of another shape.
             PhysicsError: If the physics fails, or returns something else than finite outputs.
         """
         columns, shape = self.read(X), X.shape[:-1]
@@ -172,8 +170,8 @@ class Physics(torch.nn.Module, ABC):
         if absent:
             raise ValueError(
                 f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X of shape "
-                f"{tuple(X.shape)} has {d} column(s), so there is no column {absent}. Pass X with "
-                "all its columns, or correct inputs."
+                f"{tuple(X.shape)} has {d} column(s), no column {absent}. Pass all, or correct "
+                "inputs."
             )
         return X[..., list(self.inputs)]
 
@@ -235,8 +233,7 @@ class Physics(torch.nn.Module, ABC):
             if bad:
                 raise PhysicsError(
                     f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} "
-                    "row(s), expected finite numbers. Mend the physics there, or keep such inputs "
-                    "out:",
+                    "row(s), expected finite numbers. Mend it, or keep such inputs out:",
                     bad,
                     partial=Y.detach(),
                 )

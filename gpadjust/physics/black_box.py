@@ -123,16 +123,15 @@ class BlackBoxPhysics(Physics):
         if errors:
             first = next(iter(errors.values()))
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(first)}, in the first of "
-                f"{len(errors)} failed row(s) of {len(rows)}. Mend the function there, or keep "
-                "such inputs out; the other rows are done:",
+                f"Physics {self.name!r} raised {described(first)}, in the first of {len(errors)} "
+                f"failed row(s) of {len(rows)}. Mend it, or keep such inputs out:",
                 errors,
                 partial=torch.from_numpy(Y) if outputs else None,
             ) from first
         return Y
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, by the memory and with the gradient that was asked for."""
+        """As the base class, by the memory and with the gradient asked for."""
         if not torch.is_grad_enabled() or not rows.requires_grad or len(rows) == 0:
             return self._recall(rows.detach())
         if self.gradient is None:

@@ -108,9 +108,8 @@ class ODEPhysics(Physics):
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The state after the step or its change, ``N x state_dim``.
 
-        Raises:
-            PhysicsError: If X has fewer than ``state_dim`` columns, ``rhs`` returns something else
-                than one time derivative per state, or an adaptive method does not arrive.
+        A PhysicsError says that X has fewer columns, ``rhs`` returns something else than one time
+        derivative per state, or an adaptive method does not arrive.
         """
         if X.shape[1] < self.state_dim:
             raise PhysicsError(
@@ -150,9 +149,8 @@ class ODEPhysics(Physics):
                 raise
             raise PhysicsError(
                 f"The method {self.method!r} of physics {self.name!r} did not reach the end of the "
-                f"time step ({error}); expected it to within max_steps={self.max_steps}. The rhs "
-                "may be stiff, have jumps, or blow up: use a method with a fixed step, such as "
-                "'rk4' with many substeps, or larger rtol and atol, or more max_steps.",
+                f"time step ({error}) within max_steps={self.max_steps}. The rhs may be stiff: use "
+                "'rk4' with many substeps, larger rtol and atol, or more max_steps.",
                 range(len(X)),
             ) from error
         return path[-1] - state if self.difference else path[-1]
