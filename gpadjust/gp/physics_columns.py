@@ -48,11 +48,11 @@ class PhysicsInput(InputTransform):
 
     def transform(self, X: Tensor) -> Tensor:
         """Map raw ``X`` (``... x n x d``) to ``... x n x (d' + k)``."""
-        return self._append(X, self.values(X))
+        return appended(self.base, X, self.values(X))
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
         """As :meth:`transform`, with the base transform's own preprocessing."""
-        return self._append(X, self.values(X), preprocess=True)
+        return appended(self.base, X, self.values(X), preprocess=True)
 
     def values(self, X: Tensor) -> Tensor:
         """Outputs of the physics, ``... x n x k``, by what was learnt of its parameters."""
@@ -63,13 +63,14 @@ class PhysicsInput(InputTransform):
 
     def at(self, X: Tensor, coordinates: Tensor) -> Tensor:
         """As :meth:`transform`, at other coordinates, ``... x p``; f_p is NaN where it fails."""
-        return self._append(X, self.physics.or_nan(X, self.physics.unknowns.at(coordinates)))
+        f_p = self.physics.or_nan(X, self.physics.unknowns.at(coordinates))
+        return appended(self.base, X, f_p)
 
     def without_physics(self, X: Tensor) -> Tensor:
         """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
         self._check(X)
         # The number of outputs is known: f_p was evaluated at the training inputs.
-        return self._append(X, X.new_zeros(self.physics.num_outputs or 0))
+        return appended(self.base, X, X.new_zeros(self.physics.num_outputs or 0))
 
     def remember(self, coordinates: Tensor) -> dict[str, Tensor]:
         """Remember draws of the parameters at coordinates ``K x p``; return them by their names."""
@@ -95,13 +96,6 @@ class PhysicsInput(InputTransform):
             self.draws = torch.empty_like(state_dict[f"{prefix}draws"])
         super()._load_from_state_dict(state_dict, prefix, *args)
 
-    def _append(self, X: Tensor, values: Tensor, preprocess: bool = False) -> Tensor:
-        """Join columns; the base transform, or samples of parameters, may have added a batch."""
-        if self.base is not None:
-            X = self.base.preprocess_transform(X) if preprocess else self.base(X)
-        shape = torch.broadcast_shapes(X.shape[:-1], values.shape[:-1])
-        return torch.cat([X.expand(*shape, -1), values.expand(*shape, -1)], dim=-1)
-
     def _check(self, X: Tensor) -> None:
         if not isinstance(X, Tensor) or X.dtype != torch.float64:
             found = X.dtype if isinstance(X, Tensor) else type(X).__name__
@@ -112,6 +106,14 @@ class PhysicsInput(InputTransform):
                 f"Expected X with {self.num_inputs} columns, the inputs that the model was built "
                 f"on, got shape {tuple(X.shape)}. Pass raw inputs: the model appends f_p itself."
             )
+
+
+def appended(base: Any, X: Tensor, values: Tensor, preprocess: bool = False) -> Tensor:
+    """Columns that a transform (or None) makes, and others, one of which may have added a batch."""
+    if base is not None:
+        X = base.preprocess_transform(X) if preprocess else base(X)
+    shape = torch.broadcast_shapes(X.shape[:-1], values.shape[:-1])
+    return torch.cat([X.expand(*shape, -1), values.expand(*shape, -1)], dim=-1)
 
 
 def check_one_to_one(transform: InputTransform | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gpytorch
@@ -16,7 +15,7 @@ from torch import Size, Tensor
 from torch.nn import Parameter
 
 from gpadjust.gp.kernels import Batched
-from gpadjust.gp.physics_columns import check_one_to_one
+from gpadjust.gp.physics_columns import appended, check_one_to_one
 from gpadjust.models.component_noise import ComponentNoise
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models.term_builder import KernelLike, PhysicsLike, TermBuilder, transformed
@@ -40,22 +39,17 @@ class LevelInput(InputTransform):
     def __init__(self, num_inputs: int, base: InputTransform | None = None) -> None:
         super().__init__()
         check_one_to_one(base)
-        self.num_inputs = num_inputs
-        self.base = base
+        self.num_inputs, self.base = num_inputs, base
 
     def transform(self, X: Tensor) -> Tensor:
         """Map ``... x n x d`` (or ``d + 1``, level included) to ``... x n x (d' + 1)``."""
-        return self._of_base(X, self.base)
+        X = self.with_level(X)
+        return appended(self.base, X[..., :-1], X[..., -1:])
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
         """As :meth:`transform`, with the base transform's own preprocessing."""
-        return self._of_base(X, None if self.base is None else self.base.preprocess_transform)
-
-    def _of_base(self, X: Tensor, base: Callable[[Tensor], Tensor] | None) -> Tensor:
         X = self.with_level(X)
-        inputs, level = X[..., :-1], X[..., -1:]
-        inputs = inputs if base is None else base(inputs)
-        return torch.cat([inputs, level.expand(*inputs.shape[:-1], 1)], dim=-1)
+        return appended(self.base, X[..., :-1], X[..., -1:], preprocess=True)
 
     def with_level(self, X: Tensor) -> Tensor:
         """Append level 1 to ``X`` unless it has a level column."""

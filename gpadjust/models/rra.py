@@ -197,15 +197,12 @@ class RRA(TermsGP):
         pyro.sample("Y", dist.Normal(values, noise_sd).to_event(values.dim()), obs=obs)
         return values
 
-    def _functions_of_batches(self, num_functions: int, num_features: int) -> SampledFunctions:
+    def _functions_of_batches(self, number: int | None, num_features: int = 0) -> SampledFunctions:
         """As the base class, but exactly."""
         with torch.no_grad():
-            return self.functions(self.weights().sample(Size([num_functions])))
-
-    def _mean_functions_of_batches(self) -> SampledFunctions:
-        """As the base class, but exactly."""
-        with torch.no_grad():
-            return self.functions(self.weights().mean.unsqueeze(0))
+            beta = self.weights()
+            drawn = beta.mean.unsqueeze(0) if number is None else beta.sample(Size([number]))
+            return self.functions(drawn)
 
     def _regression(self) -> WeightConditioning:
         return cast("WeightConditioning", self.conditioning())

@@ -94,8 +94,7 @@ class SampledFunctions(Module):
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
         lead = torch.broadcast_shapes(X.shape[:-2], self.batch_shape)
         extra = len(lead) - len(self.batch_shape)
-        inputs = self._inputs(X.expand(*lead, *X.shape[-2:]))
-        return self._to_user(self._values(inputs, extra))
+        return self._at(X.expand(*lead, *X.shape[-2:]), extra)
 
     def each(self, X: Tensor) -> Tensor:
         """Evaluate each function at points of its own, ``k x q x d``: ``k x q x m``.
@@ -103,15 +102,12 @@ class SampledFunctions(Module):
         Of a model without a batch shape; a ValueError if ``X`` has another shape.
         """
         check_each(X, len(self.weights))
-        return self._to_user(self._values(self._inputs(X)))
+        return self._at(X)
 
-    def _inputs(self, X: Tensor) -> Tensor:
+    def _at(self, X: Tensor, extra: int = 0) -> Tensor:
         X = X.unsqueeze(-3) if self.has_outputs else X
-        inputs: Tensor = X if self.input_transform is None else self.input_transform(X)
-        return inputs
-
-    def _to_user(self, values: Tensor) -> Tensor:
-        values = values * self.scale + self.shift
+        inputs = X if self.input_transform is None else self.input_transform(X)
+        values = self._values(inputs, extra) * self.scale + self.shift
         return values.mT if self.has_outputs else values.unsqueeze(-1)
 
     def _values(self, inputs: Tensor, extra: int = 0, among_reached: bool = False) -> Tensor:

@@ -286,16 +286,16 @@ class TermsModel(PredictiveModel):
             check_number(most, "most")
         self.eval()
         if self.num_samples is None:
-            return self._mean_functions_of_batches()
+            return self._functions_of_batches(None)
         taken = self.num_samples if most is None else min(most, self.num_samples)
         each = take_samples(self, torch.arange(taken) * self.num_samples // taken)
-        return FunctionPerBatch(each._mean_functions_of_batches())
+        return FunctionPerBatch(each._functions_of_batches(None))
 
-    def _functions_of_batches(self, num_functions: int, num_features: int) -> SampledFunctions:
-        return SampledFunctions.by_matheron(self, num_functions, num_features)
-
-    def _mean_functions_of_batches(self) -> SampledFunctions:
-        return SampledFunctions.mean(self)
+    def _functions_of_batches(self, number: int | None, num_features: int = 0) -> SampledFunctions:
+        """So many functions of each batch of the model, or its mean."""
+        if number is None:
+            return SampledFunctions.mean(self)
+        return SampledFunctions.by_matheron(self, number, num_features)
 
     def at(self, inputs: Tensor) -> WeightedSum:
         """The function itself at transformed inputs, ``... x n x (d + k)``."""

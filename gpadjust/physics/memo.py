@@ -65,11 +65,13 @@ class RowMemo:
         keys = row_keys(rows)
         with self._lock:
             found = {key: self._rows[key] for key in keys if key in self._rows}
-        asked = {key: i for i, key in reversed([*enumerate(keys)]) if key not in found}
-        new = sorted(asked, key=asked.__getitem__)
-        if new:
+        first: dict[bytes, int] = {}  # where each new row is
+        for i, key in enumerate(keys):
+            if key not in found:
+                first.setdefault(key, i)
+        if new := [*first]:
             try:
-                values = evaluate(rows[[asked[key] for key in new]])
+                values = evaluate(rows[[*first.values()]])
             except PhysicsError as error:
                 partial, error.partial = error.partial, None
                 if partial is not None and learn:
