@@ -202,8 +202,7 @@ class AR1(TermsGP):
         super().__init__(make, [low_term, delta])
 
     @staticmethod
-    def learnt_noise(batch_shape: Size) -> Likelihood:
-        """One variance for each level."""
+    def _learnt_noise(batch_shape: Size) -> Likelihood:
         return LevelNoise(2, batch_shape)
 
     @property

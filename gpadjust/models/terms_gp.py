@@ -61,7 +61,7 @@ class TermsGP(TermsModel, SingleTaskGP):
 
     prediction_strategy: Any
     conditioning_class: ClassVar[type[ExactConditioning]] = ExactConditioning
-    learnt_noise = staticmethod(learnt_noise)
+    _learnt_noise = staticmethod(learnt_noise)
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
         data, likelihood = made.data, made.likelihood
@@ -84,7 +84,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         Y, Yvar = data.Y, data.Yvar
         noise = likelihood
         if likelihood is None and Yvar is None:
-            noise = self.learnt_noise(covar_module.batch_shape)
+            noise = self._learnt_noise(covar_module.batch_shape)
         if made.units is not None:
             Y, Yvar = made.units(Y, Yvar)
         with validate_input_scaling(False):  # ours is by the data's scales, and NaN is missing

@@ -18,13 +18,8 @@ def call_rows(
 ) -> list[NDArray[np.float64] | Exception]:
     """Calls a function on each row, in parallel if a ``joblib.parallel_config`` says so.
 
-    Args:
-        function: Maps a row ``(d,)`` to a scalar or ``(m,)``.
-        X: ``N x d``.
-        more: Further arguments of the function, one for each row.
-
-    Returns:
-        For each row its outputs ``(m,)``, or the exception it raised.
+    It maps a row ``(d,)``, and ``more`` for each, to a scalar or ``(m,)``. For each row there are
+    its outputs ``(m,)``, or the exception it raised.
 
     Example:
         >>> call_rows(lambda x: 1 / int(x[0]), np.array([[2.0], [0.0]]))
