@@ -55,16 +55,12 @@ class LevelInput(InputTransform):
         """Append level 1 to ``X`` unless it has a level column."""
         if X.shape[-1] == self.num_inputs + 1:
             return X
-        self.check_raw(X)
-        return torch.cat([X, torch.ones_like(X[..., :1])], dim=-1)
-
-    def check_raw(self, X: Tensor) -> None:
-        """Raise a ValueError unless ``X`` has the columns of raw inputs, and no level."""
         if X.shape[-1] != self.num_inputs:
             raise ValueError(
                 f"Expected X with {self.num_inputs} columns, the inputs that the model was built "
                 f"on, got shape {tuple(X.shape)}."
             )
+        return torch.cat([X, torch.ones_like(X[..., :1])], dim=-1)
 
     def untransform(self, X: Tensor) -> Tensor:
         """Map ``... x n x (d' + 1)`` back to ``... x n x (d + 1)``, raw inputs with their level."""
@@ -226,12 +222,6 @@ class AR1(TermsGP):
     def measured(self) -> Tensor:
         """As the base class: targets of the high level."""
         return super().measured() & (self.train_inputs[0][..., -1] == 1)
-
-    def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
-        """As the base class; the level, which training inputs may bring, is refused."""
-        if isinstance(X, Tensor):
-            self.input_transform.check_raw(X)
-        return super().model_inputs(X, with_basis)
 
     def _new_inputs(self, X: Tensor) -> Tensor:
         raw = X.shape[-1] == self.input_transform.num_inputs

@@ -311,23 +311,18 @@ class TermsModel(PredictiveModel):
             self.eval()
         check_columns(X, self.input_names)
         X = to_tensor(X, "X")
-        if X.dim() < 2:
+        d = len(self.input_names)
+        if X.dim() < 2 or X.shape[-1] != d:
             raise ValueError(
-                f"Expected X with at least 2 dimensions (points x inputs), got {tuple(X.shape)}."
+                f"Expected X with {d} columns, the inputs that the model was built on, and with at "
+                f"least 2 dimensions (points x inputs), got shape {tuple(X.shape)}."
             )
         X = X if self.num_samples is None else X.unsqueeze(MCMC_DIM)
         X = X.unsqueeze(-3) if self._num_outputs > 1 else X
         transform = getattr(self, "input_transform", None)
         if isinstance(transform, PhysicsInput) and not with_basis:
-            inputs = transform.without_physics(X)
-        else:
-            inputs = self.transform_inputs(X)
-        if inputs.shape[-1] != self.train_inputs[0].shape[-1]:
-            raise ValueError(
-                f"Expected X with the {len(self.input_names)} columns that the model was built on, "
-                f"got shape {tuple(X.shape)}."
-            )
-        return inputs
+            return transform.without_physics(X)
+        return self.transform_inputs(X)
 
     def observation_noise(self, inputs: Tensor) -> Tensor:
         """The noise variances of observations at transformed inputs, ``... x (m) x q`` or 1.
