@@ -22,12 +22,9 @@ from gpadjust.models.training_data import ArrayLike, check_noise, new_observatio
 
 
 class Part(Module):
-    """Components of the mixture of an output that are of one structure.
+    """The ``number`` components of an output's mixture that are of one structure.
 
-    Args:
-        name: The structure's name.
-        model: A model of that output alone.
-        number: Number of the components; a model without samples is all of them.
+    The model is of that output alone; one without samples is all of them.
     """
 
     def __init__(self, name: str, model: TermsGP, number: int) -> None:
@@ -284,9 +281,7 @@ class StackedGP(PredictiveModel):
 class StackedFunctions(Module):
     """Functions drawn from a mixture, of several models for each output.
 
-    Args:
-        functions: The functions of the models of each output.
-        owners: Which of these models each function is of, ``m x k``.
+    The owners, ``m x k``, say which of these models each function is of.
     """
 
     owners: Tensor

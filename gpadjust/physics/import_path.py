@@ -17,10 +17,8 @@ from gpadjust.physics.function import FunctionPhysics, as_physics
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
     """The path of a physics, for ``physics_from_path``.
 
-    Args:
-        physics: A callable, or a physics. A ``FunctionPhysics`` without a path of its own has that
-            of its function if it was made of this alone. A physics or another object has a path if
-            it is an attribute of the module of its class, or of that of its callables.
+    A ``FunctionPhysics`` without a path of its own has that of its function if it was made of this
+    alone. Objects have a path if they are attributes of the module of their class or callables.
 
     Returns:
         ``"package.module:qualname"``; None for what has no name in a module, as lambdas and
