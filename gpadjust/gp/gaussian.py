@@ -24,9 +24,8 @@ _SMALL = 256  # points of a covariance up to which a second thread costs more th
 def nugget(n: int) -> float:
     r"""The nugget of every factorised covariance of ``n`` points, :math:`\max(100 n, n^2)\epsilon`.
 
-    It is relative to the mean of the diagonal, in fits and in predictions alike. With less,
-    rounding errors, of the order of :math:`n \epsilon` of the prior variance, would decide what a
-    model without noise knows.
+    It is relative to the mean of the diagonal. With less, rounding errors, of the order of :math:`n
+    \epsilon` of the prior variance, would decide what a model without noise knows.
     """
     return max(100 * n, n**2) * torch.finfo(torch.float64).eps
 
@@ -40,11 +39,10 @@ def cholesky(
         covariance: ``... x n x n``.
         observed: Which targets there are, ``... x n``; the others become independent ones of
             variance 1. Default: all.
-        n: The number of points that the nugget is for. Default: that of the covariance.
+        n: The number of points that the nugget is for, if another.
 
     Returns:
-        The Cholesky factors of covariance and nugget, which is raised where it must be, and which
-        of them failed all the same, ``...``.
+        The Cholesky factors, and which of them failed with the largest nugget, too, ``...``.
     """
     n = covariance.shape[-1] if n is None else n
     if observed is None:
@@ -116,9 +114,9 @@ def negative_log_likelihood(
     .. math:: \tfrac{1}{2s} r^T P r + \tfrac12 \log|s K| + \tfrac n2 \log 2\pi
 
     where :math:`P = K^{-1} - K^{-1} H (H^T K^{-1} H)^{-1} H^T K^{-1}`: the coefficients
-    :math:`\beta` of the basis are at their generalised least squares estimate. With a
-    ``least_scale`` the factor s is at its optimum, :math:`s = r^T P r / n`, or at that least value
-    if the optimum is below it; without one it is 1 (Rasmussen and Williams 2006, sec. 2.7, 5.4).
+    :math:`\beta` are at their generalised least squares estimate. With a ``least_scale`` the factor
+    s is at its optimum, :math:`s = r^T P r / n`, or at that least value if the optimum is below it;
+    without one it is 1 (Rasmussen and Williams 2006, sec. 2.7, 5.4).
 
     Its derivative by the covariance is :math:`\tfrac12 (K^{-1} - \alpha \alpha^T / s)` with
     :math:`\alpha = P r`. A trend T adds :math:`\tfrac12 \log|T^T K^{-1} T|`, for s = 1, as in the
@@ -182,15 +180,10 @@ def negative_log_likelihood(
 
 
 def least_squares(chol: Tensor, residual: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-    """Generalised least squares of a residual on a basis.
+    """Generalised least squares of a residual, ``... x n``, on a basis, ``... x n x q``.
 
-    Args:
-        chol: Cholesky factor of the residual's covariance, ``... x n x n``.
-        residual: ``... x n``.
-        basis: ``... x n x q``.
-
-    Returns:
-        The coefficients, ``... x q``, and their covariance, ``... x q x q``.
+    With the Cholesky factor of the residual's covariance. Returns the coefficients, ``... x q``,
+    and their covariance, ``... x q x q``.
     """
     both = torch.cat([basis, residual.unsqueeze(-1)], dim=-1)
     white = torch.linalg.solve_triangular(chol, both, upper=False)
@@ -206,9 +199,9 @@ def least_squares(chol: Tensor, residual: Tensor, basis: Tensor) -> tuple[Tensor
 def threads_for(num_points: int) -> Iterator[None]:
     """Compute a small problem with one thread; the user's settings hold again after.
 
-    On a busy machine, threads that wait for each other at every small product can make a fit of
-    twelve points take a hundred times as long. PyTorch is limited in the calling thread alone,
-    NumPy's and SciPy's libraries in the process, by the first thread that asks; in about 0.2 ms.
+    On a busy machine, threads that wait for each other at every small product can make a fit take a
+    hundred times as long. PyTorch is limited in the calling thread alone, NumPy's and SciPy's
+    libraries in the process, by the first thread that asks; in about 0.2 ms.
 
     Example:
         >>> import torch

@@ -83,12 +83,8 @@ class Pairs(NamedTuple):
         :math:`\log \ell_k` is :math:`\sum_{ij} M_{ij} (z_{ik} - z_{jk})^2 = 2 \sum_i z_{ik}^2 (M
         1)_i - 2 z_k^T M z_k`, with the slope in place of K: one product for all inputs.
 
-        Args:
-            by: D, symmetric, ``... x n x n``.
-            weight: The diagonal of B, ``... x n``, or None for 1.
-
-        Returns:
-            Derivatives by log lengthscales, ``... x d``, log s, ``...``, and weight, ``... x n``.
+        D is symmetric; the weight is the diagonal of B, ``... x n``, or None for 1. Returns the
+        derivatives by log lengthscales, ``... x d``, log s, ``...``, and weight, ``... x n``.
         """
         z = self.z
         columns = torch.cat([z, torch.ones_like(z[..., :1])], dim=-1)
@@ -168,10 +164,6 @@ class ToPoints:
 
     With :math:`\tilde x` the inputs less the mean of the points, -r^2 / 2 is :math:`[\tilde x,
     \tilde x^2, 1] \, R` for a matrix R of the points and lengthscales.
-
-    Args:
-        forms: The kernels by names.
-        points: ``... x n x d``.
     """
 
     @torch.no_grad()

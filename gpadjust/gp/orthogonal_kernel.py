@@ -24,13 +24,9 @@ class OrthogonalKernel(CompositeKernel):
 
     (Plumlee 2017). As the kernel of a model's delta, :func:`gpadjust.fit` takes the observed
     inputs for the points, and for the directions what the unknown parameters of the physics change
-    there. The parameters, and their intervals, are then about the physics that is *best* at these
-    inputs, in the sense of least squares, each output by itself. With a free delta (Kennedy and
-    O'Hagan 2001) they are the *true* ones as far as its prior is right. Until there are directions
-    it is k itself.
-
-    Args:
-        base_kernel: The kernel k.
+    there. The parameters are then those of the physics that is *best* at these inputs, by least
+    squares; with a free delta (Kennedy and O'Hagan 2001) the *true* ones as far as its prior is
+    right. Until there are directions it is ``base_kernel`` k itself.
 
     Example:
         >>> import torch

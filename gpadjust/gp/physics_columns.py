@@ -18,8 +18,7 @@ class PhysicsInput(InputTransform):
     r"""Appends f_p to the inputs: :math:`X \mapsto [\text{base}(X), f_p(X)]`.
 
     The physics sees the user's raw ``X``, once; the user's own input transform (``Normalize``, say)
-    acts on the other columns. A mean and a kernel that read the columns are then the whole prior,
-    for whatever in BoTorch bypasses a model's ``forward``, too.
+    acts on the other columns. What bypasses a model's ``forward`` in BoTorch is then right, too.
 
     Args:
         physics: The physics f_p, ``... x n x d`` to ``... x n x k``; of several, side by side.
@@ -27,8 +26,8 @@ class PhysicsInput(InputTransform):
         base: The user's input transform, or none.
 
     Attributes:
-        coordinates: The unknown parameters of the physics, if any, ``(S) x p``, in coordinates that
-            are standard normal by their prior. The guesses at first.
+        coordinates: Those of the unknown parameters of the physics, if any, ``(S) x p``. The
+            guesses at first.
         draws: Draws from what is known of them, ``K x p``, in their units; likewise.
     """
 
@@ -49,11 +48,11 @@ class PhysicsInput(InputTransform):
 
     def transform(self, X: Tensor) -> Tensor:
         """Map raw ``X`` (``... x n x d``) to ``... x n x (d' + k)``."""
-        return self._append(X, self.values(X))
+        return appended(self.base, X, self.values(X))
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
         """As :meth:`transform`, with the base transform's own preprocessing."""
-        return self._append(X, self.values(X), preprocess=True)
+        return appended(self.base, X, self.values(X), preprocess=True)
 
     def values(self, X: Tensor) -> Tensor:
         """Outputs of the physics, ``... x n x k``, by what was learnt of its parameters."""
@@ -64,13 +63,14 @@ class PhysicsInput(InputTransform):
 
     def at(self, X: Tensor, coordinates: Tensor) -> Tensor:
         """As :meth:`transform`, at other coordinates, ``... x p``; f_p is NaN where it fails."""
-        return self._append(X, self.physics.or_nan(X, self.physics.unknowns.at(coordinates)))
+        f_p = self.physics.or_nan(X, self.physics.unknowns.at(coordinates))
+        return appended(self.base, X, f_p)
 
     def without_physics(self, X: Tensor) -> Tensor:
         """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
         self._check(X)
         # The number of outputs is known: f_p was evaluated at the training inputs.
-        return self._append(X, X.new_zeros(self.physics.num_outputs or 0))
+        return appended(self.base, X, X.new_zeros(self.physics.num_outputs or 0))
 
     def remember(self, coordinates: Tensor) -> dict[str, Tensor]:
         """Remember draws of the parameters at coordinates ``K x p``; return them by their names."""
@@ -96,13 +96,6 @@ class PhysicsInput(InputTransform):
             self.draws = torch.empty_like(state_dict[f"{prefix}draws"])
         super()._load_from_state_dict(state_dict, prefix, *args)
 
-    def _append(self, X: Tensor, values: Tensor, preprocess: bool = False) -> Tensor:
-        """Join columns; the base transform, or samples of parameters, may have added a batch."""
-        if self.base is not None:
-            X = self.base.preprocess_transform(X) if preprocess else self.base(X)
-        shape = torch.broadcast_shapes(X.shape[:-1], values.shape[:-1])
-        return torch.cat([X.expand(*shape, -1), values.expand(*shape, -1)], dim=-1)
-
     def _check(self, X: Tensor) -> None:
         if not isinstance(X, Tensor) or X.dtype != torch.float64:
             found = X.dtype if isinstance(X, Tensor) else type(X).__name__
@@ -113,6 +106,14 @@ class PhysicsInput(InputTransform):
                 f"Expected X with {self.num_inputs} columns, the inputs that the model was built "
                 f"on, got shape {tuple(X.shape)}. Pass raw inputs: the model appends f_p itself."
             )
+
+
+def appended(base: Any, X: Tensor, values: Tensor, preprocess: bool = False) -> Tensor:
+    """Columns that a transform (or None) makes, and others, one of which may have added a batch."""
+    if base is not None:
+        X = base.preprocess_transform(X) if preprocess else base(X)
+    shape = torch.broadcast_shapes(X.shape[:-1], values.shape[:-1])
+    return torch.cat([X.expand(*shape, -1), values.expand(*shape, -1)], dim=-1)
 
 
 def check_one_to_one(transform: InputTransform | None) -> None:
@@ -130,8 +131,7 @@ class AppendedPhysics(Batched, gpytorch.Module):
     r"""Reads f_p from a column that :class:`PhysicsInput` appended: the basis of a term.
 
     For output :math:`j` it returns :math:`(f_{p,j}(x) - c_j) / \text{scale}_j`, in the units of the
-    model's targets. The centre c is the offset, or that and a learnt number of spreads, on which
-    the prior mean of the whole function does not depend as long as ``mean`` is that of the term.
+    model's targets. The centre c is the offset, or that and a learnt number of spreads.
 
     Args:
         num_inputs: Number ``d`` of input columns before the appended ones.
@@ -140,7 +140,7 @@ class AppendedPhysics(Batched, gpytorch.Module):
         offset: ``batch_shape x (m) x 1``, in the user's units, as the next three.
         scale: Its scale.
         spread: For a centre that is learnt, or None.
-        mean: What f_p is multiplied by in the prior mean, if there is a spread.
+        mean: The term's prior mean, so that a centre that moves leaves that of the whole function.
     """
 
     prior_of_learnt = (0.0, 3.0)  # mean and standard deviation of the centre's prior, in spreads

@@ -18,16 +18,13 @@ from gpadjust.physics import Physics, as_physics
 class PhysicsMean(Mean):
     r"""The mean function :math:`m(x) = f_p(x)`, for any GPyTorch model.
 
-    The physics may be a torch function or module (whose parameters are then trained with the
-    model's), an ODE or a black box. It sees the inputs as the model's mean does, transformed: the
-    models in :mod:`gpadjust.models` show it the raw ones.
+    The physics sees the inputs as the model's mean does, transformed: the models in
+    :mod:`gpadjust.models` show it the raw ones. Parameters of a module are trained with the model.
 
     Args:
         physics: The physics f_p, ``... x n x d`` to ``... x n x m`` or ``n``.
-        output: Which of the physics' outputs to use, if it has several.
-
-    Raises:
-        ValueError: When called, if the physics has several outputs and ``output`` is None.
+        output: Which of the physics' outputs to use; to be said (or a ValueError when called) if it
+            has several.
 
     Example:
         >>> import torch
@@ -46,7 +43,7 @@ class PhysicsMean(Mean):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return f_p at ``x`` (``... x n x d``) as ``... x n``."""
-        return _one_output(self.physics(x), self.output, self.physics.name)
+        return _one_output(self.physics, x, self.output)
 
 
 class PhysicsScaledKernel(CompositeKernel):
@@ -60,8 +57,8 @@ class PhysicsScaledKernel(CompositeKernel):
 
     Args:
         base_kernel: The kernel :math:`k_\rho`; its ``active_dims`` are for it alone.
-        physics: The physics f_p, ``... x n x d`` to ``... x n x m`` or ``n``.
-        output: Which of the physics' outputs to use, if it has several.
+        physics: As of :class:`~gpadjust.gp.PhysicsMean`.
+        output: Likewise.
         active_dims: Select the inputs that this kernel, physics included, sees.
 
     Example:
@@ -88,7 +85,7 @@ class PhysicsScaledKernel(CompositeKernel):
 
     def basis(self, x: Tensor) -> Tensor:
         """Return f_p at ``x`` (``... x n x d``) as ``... x n``."""
-        return _one_output(self.physics(x), self.output, self.physics.name)
+        return _one_output(self.physics, x, self.output)
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: Any) -> Tensor:
         """Return ``... x n x n'``, or its diagonal ``... x n`` without building the matrix."""
@@ -104,11 +101,11 @@ class PhysicsScaledKernel(CompositeKernel):
         return covar * f1 * f2 if diag else covar * f1.unsqueeze(-1) * f2.unsqueeze(-2)
 
 
-def _one_output(values: Tensor, output: int | None, name: str) -> Tensor:
-    """One column of the outputs of a physics, ``... x n x m``."""
+def _one_output(physics: Physics, x: Tensor, output: int | None) -> Tensor:
+    values: Tensor = physics(x)
     if output is None and values.shape[-1] != 1:
         raise ValueError(
-            f"The physics '{name}' has {values.shape[-1]} outputs; say with `output=` which one "
-            "this mean or kernel is about (one model, or one batch, per output)."
+            f"The physics '{physics.name}' has {values.shape[-1]} outputs; say with `output=` "
+            "which one this mean or kernel is about (one model, or one batch, per output)."
         )
     return values[..., output or 0]

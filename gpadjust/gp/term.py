@@ -25,10 +25,7 @@ from gpadjust.gp.kernels import (
 
 
 class Unit(Enum):
-    """The unit of a term's Gaussian process, beside the model's targets.
-
-    The targets' transform scales and shifts them.
-    """
+    """The unit of a term's Gaussian process, beside the model's targets."""
 
     NONE = "none"  # a number, as a scaling of the physics is
     DIFFERENCE = "difference"  # of targets: it is scaled
@@ -132,16 +129,11 @@ class WeightedSum:
     r"""A weighted sum of terms at inputs, :math:`\sum_t w_t(x) g_t(x)`: the one place that sums.
 
     With the bases for weights it is the model's function; with one weight of 1, a term of it.
-
-    Args:
-        x: The inputs, ``... x n x (d + k)``.
-        parts: Terms and their weights, ``... x n`` (or what broadcasts to it), or None for 1.
-        shift: What the prior mean has beside that, ``... x 1``.
     """
 
-    x: Tensor
-    parts: Sequence[tuple[Term, Tensor | None]]
-    shift: Tensor | float = 0.0
+    x: Tensor  # ... x n x (d + k)
+    parts: Sequence[tuple[Term, Tensor | None]]  # the terms and their weights, ... x n, None for 1
+    shift: Tensor | float = 0.0  # what the prior mean has beside that, ... x 1
     _prepared: dict[tuple[str, ...], ToPoints] = field(default_factory=dict, init=False)
 
     def combine(self, values: Mapping[str, Tensor]) -> Tensor:
@@ -289,11 +281,7 @@ class SumOfTerms(CompositeKernel):
 
 
 class TermsMean(Mean):
-    r"""The prior mean :math:`\sum_t b_t(x) \bar g_t` of a sum of terms.
-
-    Args:
-        covariance: The covariance of the sum, which owns the terms.
-    """
+    r"""The prior mean :math:`\sum_t b_t(x) \bar g_t` of a sum of terms, by its covariance."""
 
     def __init__(self, covariance: SumOfTerms) -> None:
         super().__init__()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import deepcopy
 from typing import Any
 
 import gpytorch
@@ -16,9 +14,9 @@ from gpytorch.likelihoods import Likelihood
 from torch import Size, Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp.physics_columns import check_one_to_one
+from gpadjust.gp.kernels import Batched
+from gpadjust.gp.physics_columns import appended, check_one_to_one
 from gpadjust.models.component_noise import ComponentNoise
-from gpadjust.models.exact_conditioning import pad
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models.term_builder import KernelLike, PhysicsLike, TermBuilder, transformed
 from gpadjust.models.terms_gp import TermsGP
@@ -34,49 +32,35 @@ from gpadjust.physics.base import whole_number
 
 
 class LevelInput(InputTransform):
-    """Appends the level of fidelity, 1 for a user's inputs; training inputs bring their own.
-
-    Args:
-        num_inputs: Number ``d`` of raw input columns.
-        base: The user's input transform, or none.
-    """
+    """Appends the level of fidelity, 1 for a user's inputs; training inputs bring their own."""
 
     transform_on_train = transform_on_eval = transform_on_fantasize = True
 
     def __init__(self, num_inputs: int, base: InputTransform | None = None) -> None:
         super().__init__()
         check_one_to_one(base)
-        self.num_inputs = num_inputs
-        self.base = base
+        self.num_inputs, self.base = num_inputs, base
 
     def transform(self, X: Tensor) -> Tensor:
         """Map ``... x n x d`` (or ``d + 1``, level included) to ``... x n x (d' + 1)``."""
-        return self._of_base(X, self.base)
+        X = self.with_level(X)
+        return appended(self.base, X[..., :-1], X[..., -1:])
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
         """As :meth:`transform`, with the base transform's own preprocessing."""
-        return self._of_base(X, None if self.base is None else self.base.preprocess_transform)
-
-    def _of_base(self, X: Tensor, base: Callable[[Tensor], Tensor] | None) -> Tensor:
         X = self.with_level(X)
-        inputs, level = X[..., :-1], X[..., -1:]
-        inputs = inputs if base is None else base(inputs)
-        return torch.cat([inputs, level.expand(*inputs.shape[:-1], 1)], dim=-1)
+        return appended(self.base, X[..., :-1], X[..., -1:], preprocess=True)
 
     def with_level(self, X: Tensor) -> Tensor:
         """Append level 1 to ``X`` unless it has a level column."""
         if X.shape[-1] == self.num_inputs + 1:
             return X
-        self.check_raw(X)
-        return torch.cat([X, torch.ones_like(X[..., :1])], dim=-1)
-
-    def check_raw(self, X: Tensor) -> None:
-        """Raise a ValueError unless ``X`` has the columns of raw inputs, and no level."""
         if X.shape[-1] != self.num_inputs:
             raise ValueError(
                 f"Expected X with {self.num_inputs} columns, the inputs that the model was built "
                 f"on, got shape {tuple(X.shape)}."
             )
+        return torch.cat([X, torch.ones_like(X[..., :1])], dim=-1)
 
     def untransform(self, X: Tensor) -> Tensor:
         """Map ``... x n x (d' + 1)`` back to ``... x n x (d + 1)``, raw inputs with their level."""
@@ -84,17 +68,14 @@ class LevelInput(InputTransform):
         return torch.cat([inputs, X[..., -1:]], dim=-1)
 
 
-class Level(gpytorch.Module):
+class Level(Batched, gpytorch.Module):
     r"""The basis of a term of two levels l, the last input: :math:`\rho^{[l=1]}`, or :math:`[l=1]`.
 
     Args:
         batch_shape: Batch shape of the constant :math:`\rho`, or None for the basis without.
-
-    Attributes:
-        prior_of_learnt: Mean and standard deviation of the prior of the constant.
     """
 
-    prior_of_learnt = (1.0, 1.0)
+    prior_of_learnt = (1.0, 1.0)  # mean and standard deviation of the constant's prior
 
     def __init__(self, batch_shape: Size | None = None) -> None:
         super().__init__()
@@ -115,13 +96,6 @@ class Level(gpytorch.Module):
         """The derivative of the basis by the constant, ``... x n``."""
         return x[..., -1]
 
-    def map_batches(self, change: Callable[[Tensor], Tensor]) -> Level:
-        """A copy whose constant is changed along its batch dimensions."""
-        new = deepcopy(self)
-        if self.rho is not None:
-            new.rho = Parameter(change(self.rho.detach()))
-        return new
-
 
 class LevelNoise(ComponentNoise):
     """One variance for each level, told by the last column of the inputs."""
@@ -136,9 +110,8 @@ class AR1(TermsGP):
 
     The classic of multi-fidelity modelling (Kennedy and O'Hagan 2000; Wannawas and Faisal 2023,
     sec. 2.1.3), for comparison: a Gaussian process of the data and ``N_1`` samples of f_p, with one
-    noise level each, on which its cost and accuracy hang, and far from which it forgets the
-    physics. ``posterior(X)`` is about the high level, of which :class:`~gpadjust.CKA` says what
-    the arguments are, but for:
+    noise level each, far from which it forgets the physics. ``posterior(X)`` is about the high
+    level. The arguments are those of :class:`~gpadjust.CKA`, but for:
 
     Args:
         train_Yvar: Known observation variances of the high level, or None to learn the noise of
@@ -202,7 +175,8 @@ class AR1(TermsGP):
                 f"{low.X.shape[-1]} and {low.Y.shape[-1]}."
             )
         transform = LevelInput(d, input_transform)
-        X = torch.cat([pad(low.X, 1), transform.with_level(high.X)], dim=-2)
+        at_low = torch.nn.functional.pad(low.X, (0, 1))
+        X = torch.cat([at_low, transform.with_level(high.X)], dim=-2)
         Y = torch.cat([low.Y, high.Y], dim=-2)
         count, mean = (~low.Y.isnan()).sum(-2, keepdim=True), low.Y.nanmean(-2, keepdim=True)
         variance = (low.Y - mean).square().nansum(-2, keepdim=True) / (count - 1)
@@ -248,12 +222,6 @@ class AR1(TermsGP):
     def measured(self) -> Tensor:
         """As the base class: targets of the high level."""
         return super().measured() & (self.train_inputs[0][..., -1] == 1)
-
-    def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
-        """As the base class; the level, which training inputs may bring, is refused."""
-        if isinstance(X, Tensor):
-            self.input_transform.check_raw(X)
-        return super().model_inputs(X, with_basis)
 
     def _new_inputs(self, X: Tensor) -> Tensor:
         raw = X.shape[-1] == self.input_transform.num_inputs

@@ -12,7 +12,7 @@ from gpytorch.likelihoods.noise_models import MultitaskHomoskedasticNoise
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
-from gpadjust.models.parameters import default_constraint
+from gpadjust.models.parameters import LogInterval
 from gpadjust.models.terms_gp import TermsGP
 
 
@@ -30,7 +30,7 @@ class ComponentNoise(_GaussianLikelihoodBase):
 
     def __init__(self, num_variances: int, batch_shape: Size) -> None:
         noise = MultitaskHomoskedasticNoise(
-            num_variances, noise_constraint=default_constraint(), batch_shape=batch_shape
+            num_variances, noise_constraint=LogInterval(), batch_shape=batch_shape
         )
         super().__init__(noise)
 

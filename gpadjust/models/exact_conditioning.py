@@ -95,11 +95,8 @@ class Factors(NamedTuple):
     def append(self, cross: Tensor, corner: Tensor, residual: Tensor) -> Factors:
         """Return the factors with ``k`` more points.
 
-        Args:
-            cross: Covariances of the new points with the old ones, ``... x k x n``.
-            corner: Covariance of the new targets, noise included, ``... x k x k``.
-            residual: New targets less their prediction by the old ones, ``... x k``; NaN where one
-                is missing.
+        They have covariances ``cross`` with the old ones, ``... x k x n``, and ``corner``, noise
+        included; the residual is the new targets less their prediction by the old ones.
         """
         n, k = cross.shape[-1], cross.shape[-2]
         observed = ~residual.isnan()
@@ -115,7 +112,8 @@ class Factors(NamedTuple):
         chol, _ = cholesky(corner - border @ border.mT, None if observed.all() else observed, n + k)
         chol = _without(chol, observed).expand(*border.shape[:-1], k)
         rows = torch.cat([border, chol], dim=-1)
-        rows = torch.cat([pad(self.rows, k).expand(*rows.shape[:-2], -1, -1), rows], dim=-2)
+        before = torch.nn.functional.pad(self.rows, (0, k))
+        rows = torch.cat([before.expand(*rows.shape[:-2], -1, -1), rows], dim=-2)
         last = torch.cholesky_solve(residual, chol).mT
         first = self.alpha - self._unwhiten(last @ border).squeeze(-2)
         return Factors(self.base, rows, torch.cat([first, last.squeeze(-2)], dim=-1))
@@ -132,11 +130,6 @@ def batched_solve(left: Tensor, right: Tensor, upper: bool) -> Tensor:
     """``left`` times the inverse of a triangular ``right``, as :func:`batched_product`."""
     solve = partial(torch.linalg.solve_triangular, upper=upper, left=False)
     return _stacked(lambda rows: solve(right, rows), left, right)
-
-
-def pad(tensor: Tensor, k: int) -> Tensor:
-    """Append ``k`` zeros to the last dimension."""
-    return torch.nn.functional.pad(tensor, (0, k))
 
 
 def batched_product(left: Tensor, right: Tensor) -> Tensor:
@@ -174,8 +167,8 @@ def least_variance(prior_variance: Tensor, n: int) -> Tensor:
 class ExactConditioning(DefaultPredictionStrategy):
     r"""What ``n`` noisy targets say, by two factors that new targets only border.
 
-    With the covariance :math:`K = L L^T` of the targets y and their prior mean m, the factors are L
-    and :math:`\alpha = K^{-1} (y - m)` (Rasmussen and Williams 2006, sec. 2.2). For ``k`` further
+    With the covariance :math:`K = L L^T` of the targets y and their prior mean m, they are L and
+    :math:`\alpha = K^{-1} (y - m)` (Rasmussen and Williams 2006, sec. 2.2). For ``k`` further
     observations of cross-covariance U and covariance S, with residual
     :math:`r = y' - m' - U^T \alpha`,
 
@@ -188,12 +181,6 @@ class ExactConditioning(DefaultPredictionStrategy):
 
     which takes :math:`O(n^2 k)` operations where GPyTorch refactorises in :math:`O(n^3)`. It is
     GPyTorch's prediction strategy of a model, ``model.prediction_strategy``, and dies with that.
-
-    Args:
-        inputs: Transformed training inputs, ``... x n x (d + k)``.
-        targets: Training targets, ``... x n``; NaN where one is missing.
-        noise: Their noise.
-        kernel: The covariance of the sum.
     """
 
     def __init__(self, inputs: Tensor, targets: Tensor, noise: Noise, kernel: SumOfTerms) -> None:
@@ -253,28 +240,31 @@ class ExactConditioning(DefaultPredictionStrategy):
 
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Posterior means and variances at each point by itself, ``... x q``."""
-        cross = self._cross(sought)
+        mean, cross = self._mean(sought)
         prior = sought.variance(data=None if self.has_graph else self.train)
-        return self._mean(sought, cross), self._reduced(prior, cross)
+        factors = self.factors()
+        if self._inverse is None:
+            self._inverse = _inverse(factors)
+        # For few points with noise by the inverse, which is faster.
+        if self._inverse is False or factors.base.requires_grad:
+            white = factors.whiten(cross)
+        else:
+            white = batched_product(cross, self._inverse.mT)
+        known = torch.linalg.vector_norm(white, dim=-1).square()
+        return mean, (prior - known).maximum(least_variance(prior, self.num_train))
 
     def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Posterior means ``... x q`` and covariances ``... x q x q``."""
-        cross = self._cross(sought)
-        mean = self._mean(sought, cross)
-        covariance = self._reduced_jointly(sought.covariance(), cross)
+        mean, cross = self._mean(sought)
+        covariance = conditional_covariance(sought.covariance(), self.factors().whiten(cross))
         return mean, covariance.expand(*mean.shape, mean.shape[-1])
 
     def pathwise_update(self, prior: Tensor) -> Tensor:
         r"""The weights :math:`K^{-1} (y - f - \varepsilon)` that make functions meet the data.
 
-        Matheron's rule (Wilson et al. 2020): a function f from the prior, plus its covariances with
-        the data times these weights, is one from the posterior.
-
-        Args:
-            prior: Functions from the prior at the training inputs, ``k x ... x n``.
-
-        Returns:
-            ``k x ... x n``; zero where an observation is missing.
+        Matheron's rule (Wilson et al. 2020): a function f from the prior (here at the training
+        inputs, ``k x ... x n``), plus its covariances with the data times these weights, is one
+        from the posterior. They are zero where an observation is missing.
         """
         (train,) = self.train_inputs
         # What the factors have beside the prior: the noise, and their nugget.
@@ -286,7 +276,7 @@ class ExactConditioning(DefaultPredictionStrategy):
     def exact_predictive_mean(
         self, test_mean: Tensor, test_train_covar: Tensor | LinearOperator
     ) -> Tensor:
-        """GPyTorch's hook for the posterior mean, ``... x q``."""
+        """GPyTorch's hook for the posterior mean."""
         return test_mean + (test_train_covar @ self.mean_cache.unsqueeze(-1)).squeeze(-1)
 
     def exact_predictive_covar(
@@ -295,8 +285,8 @@ class ExactConditioning(DefaultPredictionStrategy):
         """GPyTorch's hook for the posterior covariance, ``... x q x q``."""
         if skip_posterior_variances.on():
             return ZeroLinearOperator(*test_test_covar.shape)
-        prior, cross = to_dense(test_test_covar), to_dense(test_train_covar)
-        return to_linear_operator(self._reduced_jointly(prior, cross))
+        white = self.factors().whiten(to_dense(test_train_covar))
+        return to_linear_operator(conditional_covariance(to_dense(test_test_covar), white))
 
     def get_fantasy_strategy(
         self,
@@ -309,19 +299,12 @@ class ExactConditioning(DefaultPredictionStrategy):
     ) -> ExactConditioning:
         """GPyTorch's hook for ``k`` further observations.
 
-        Args:
-            inputs: Transformed new inputs, one tensor ``... x k x d``; not used.
-            targets: New targets, ``(f) x ... x k``; with a dimension of fantasies ``f`` that the
-                inputs lack, all fantasies share one factor.
-            full_inputs: All inputs, one tensor ``... x (n + k) x d``.
-            full_targets: All targets, ``(f) x ... x (n + k)``.
-            full_output: The prior at all inputs.
-            kwargs: ``noise``, the known variances of the new observations, ``... x k``.
+        Targets are ``(f) x ... x k``; with a dimension of fantasies ``f`` that the inputs lack, all
+        fantasies share one factor. Of known noise ``kwargs`` has the variances, ``... x k``.
         """
         n = self.num_train
-        train, new = (
-            self.kernel.at(x) for x in (full_inputs[0][..., :n, :], full_inputs[0][..., n:, :])
-        )
+        train = self.kernel.at(full_inputs[0][..., :n, :])
+        new = self.kernel.at(full_inputs[0][..., n:, :])
         noise = self.noise.after(**kwargs)
         cross = new.cross(train)
         corner = new.covariance() + torch.diag_embed(noise.at(new.x, **kwargs))
@@ -337,27 +320,10 @@ class ExactConditioning(DefaultPredictionStrategy):
         """Pickle as nothing, as it is copied: it can be made again from the model."""
         return type(None), ()
 
-    def _cross(self, sought: WeightedSum) -> Tensor:
-        return sought.cross(self.train, is_data=not self.has_graph)
-
-    def _mean(self, sought: WeightedSum, cross: Tensor) -> Tensor:
-        return sought.mean() + (cross @ self.factors().alpha.unsqueeze(-1)).squeeze(-1)
-
-    def _reduced(self, prior: Tensor, cross: Tensor) -> Tensor:
-        """Prior variances ``... x q`` less what covariances with the data say is known."""
-        factors = self.factors()
-        if self._inverse is None:
-            self._inverse = _inverse(factors)
-        # For few points with noise by the inverse, which is faster.
-        if self._inverse is False or factors.base.requires_grad:
-            white = factors.whiten(cross)
-        else:
-            white = batched_product(cross, self._inverse.mT)
-        known = torch.linalg.vector_norm(white, dim=-1).square()
-        return (prior - known).maximum(least_variance(prior, self.num_train))
-
-    def _reduced_jointly(self, prior: Tensor, cross: Tensor) -> Tensor:
-        return conditional_covariance(prior, self.factors().whiten(cross))
+    def _mean(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
+        """Posterior means of a sum, and its covariances with the data."""
+        cross = sought.cross(self.train, is_data=not self.has_graph)
+        return self.exact_predictive_mean(sought.mean(), cross), cross
 
     def _forget(self, *gradients: Any) -> None:
         self._factors = None

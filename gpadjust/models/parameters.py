@@ -63,14 +63,9 @@ _GUESSED = 0.3  # spread of the starts of a physics' parameters around the user'
 class LogInterval(Interval):
     """Positive parameters in an interval, with their logarithm as the raw parameter.
 
-    A step in the logarithm is a relative one, so that an optimiser does the same whatever the
-    units. The bounds are those of the search: BoTorch's L-BFGS keeps to them, and GPyTorch refuses
-    values beyond them, but the transform does not squash, so that gradients stay honest.
-
-    Args:
-        lower_bound: Lower bound, positive. Default: both are read off the data; any positive value
-            may then be set, as samplers do that follow a prior.
-        upper_bound: Upper bound.
+    BoTorch's L-BFGS keeps to the bounds, and GPyTorch refuses values beyond them, but the transform
+    does not squash, so that gradients stay honest. Without a lower bound both are read off the
+    data, and any positive value may be set, as samplers do that follow a prior.
     """
 
     def __init__(
@@ -97,11 +92,6 @@ class LogInterval(Interval):
         return self.check(self.transform(tensor))
 
 
-def default_constraint() -> LogInterval:
-    """The constraint of a parameter whose bounds are read off the data."""
-    return LogInterval()
-
-
 def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
     """An RBF kernel with one lengthscale per input and an outputscale."""
     base = RBFKernel(num_inputs, batch_shape=batch_shape, lengthscale_constraint=LogInterval())
@@ -122,29 +112,23 @@ def learnt_noise(batch_shape: Size) -> Likelihood:
 class Hyperparameter:
     """A row of the table: a parameter of a model, and what is assumed of it.
 
+    A ``kind`` is a key of :data:`KINDS`; or ``"constant"`` of one that a basis is affine in,
+    ``"physics"`` of one of the input transform, ``"other"``.
+
     Attributes:
-        name: Its name in ``model.named_parameters()``.
-        raw: GPyTorch's raw parameter.
-        owner: The module that has it.
-        leaf: Its name there.
-        kind: A key of :data:`KINDS`; or ``"constant"`` of one that a basis is affine in,
-            ``"physics"`` of one of the input transform, ``"other"``.
-        size: Its typical size, of its shape, or None for the last three.
-        constraint: Its GPyTorch constraint, or None.
-        is_shared: Whether it is no output's own, as that of a physics.
         is_log: Whether vectors have its logarithm; ``squashes``: which the raw parameter is not.
         is_default: Whether its bounds are read off the data.
         is_free: Whether it is positive, and nothing but the data bounds it.
     """
 
-    name: str
-    raw: Parameter
-    owner: Any
-    leaf: str
+    name: str  # in `model.named_parameters()`
+    raw: Parameter  # GPyTorch's
+    owner: Any  # the module that has it
+    leaf: str  # its name there
     kind: str
-    size: Tensor | None
-    constraint: Any
-    is_shared: bool
+    size: Tensor | None  # its typical size, of its shape, if it is of one of KINDS
+    constraint: Any  # GPyTorch's, or None
+    is_shared: bool  # it is no output's own, as that of a physics
 
     def __post_init__(self) -> None:
         constraint, is_ours = self.constraint, isinstance(self.constraint, LogInterval)
@@ -362,18 +346,14 @@ Values = dict[str, Tensor]
 class Parameters:
     """Vectors of a model's learnable parameters: logarithms of lengthscales and variances.
 
-    Parameters of other kinds stay as they are. A model's outputs (and batches) have their own
-    hyper-parameters each, and are ``B`` problems apart; where parameters are shared, by several
-    outputs or with the input transform (a physics that learns), all outputs make up one problem.
+    Parameters of other kinds stay as they are. A model's outputs (and batches) are ``B`` problems
+    apart; where parameters are shared, by several outputs or with the input transform (a physics
+    that learns), all outputs make up one problem.
 
     Bounds and starts are multiples of sizes read off the data, so that units do not matter; a
-    constraint that the user gave takes their place. Parameters of other kinds start at normal draws
-    around their current values, one to ten times as wide as these are large, and are bounded by
-    nothing but their constraints. Those of the physics start within about a third of the user's
-    guesses, which mean something.
-
-    Args:
-        model: The model.
+    constraint that the user gave takes their place. Parameters of other kinds start around their
+    current values (those of the physics within about a third, the others one to ten times as wide),
+    and are bounded by nothing but their constraints.
 
     Attributes:
         table: The rows of all its parameters, by the ``id`` of the raw one.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from gpadjust.gp import PhysicsInput
 from gpadjust.physics import Unknown
 
 
-class PhysicsParameters(Mapping[str, Tensor]):
+class PhysicsParameters(dict[str, Tensor]):
     """The posterior of the unknown parameters of a physics, as draws.
 
     It maps names to their draws, ``K`` each: one, the value itself, after a point fit (``"map"``)
@@ -35,6 +35,7 @@ class PhysicsParameters(Mapping[str, Tensor]):
     """
 
     def __init__(self, unknowns: Mapping[str, Unknown], draws: Tensor) -> None:
+        super().__init__(zip(unknowns, draws.unbind(-1), strict=True))
         self.unknowns = unknowns
         self.draws = draws
 
@@ -48,19 +49,8 @@ class PhysicsParameters(Mapping[str, Tensor]):
             )
         return cls(transform.physics.unknowns, transform.draws)
 
-    def __getitem__(self, name: str) -> Tensor:
-        """The draws of a parameter, ``K``."""
-        if name not in self.unknowns:
-            raise KeyError(f"There is no parameter {name!r}; there are {', '.join(self.unknowns)}.")
-        return self.draws[:, [*self.unknowns].index(name)]
-
-    def __iter__(self) -> Iterator[str]:
-        """The names."""
-        return iter(self.unknowns)
-
-    def __len__(self) -> int:
-        """How many there are."""
-        return len(self.unknowns)
+    def __missing__(self, name: str) -> Tensor:
+        raise KeyError(f"There is no parameter {name!r}; there are {', '.join(self)}.")
 
     @property
     def mean(self) -> Tensor:
@@ -73,11 +63,7 @@ class PhysicsParameters(Mapping[str, Tensor]):
         return self.draws.std(0, correction=0)
 
     def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
-        """Lower and upper ends of the central intervals of probability ``level``, ``p`` each.
-
-        Raises:
-            ValueError: If ``level`` is not between 0 and 1.
-        """
+        """Lower and upper ends of the central intervals of probability ``level``, ``p`` each."""
         if not 0 < level < 1:
             raise ValueError(f"Expected level between 0 and 1, got {level}.")
         ends = torch.tensor([(1 - level) / 2, (1 + level) / 2]).to(self.draws)
@@ -85,7 +71,6 @@ class PhysicsParameters(Mapping[str, Tensor]):
         return low, high
 
     def __repr__(self) -> str:
-        """A table of means, intervals and priors."""
         low, high = self.interval()
         rows = [("", "mean", "95 % interval", "prior", "unit")]
         for i, (name, unknown) in enumerate(self.unknowns.items()):

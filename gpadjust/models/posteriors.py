@@ -119,14 +119,7 @@ class HyperparameterMixture(GaussianMixturePosterior):
         return self.distribution.covariance_matrix.mean(-3) + spread
 
     def quantile(self, value: Tensor) -> Tensor:
-        """The mixture's quantiles, ``(b) x batch_shape x q x m``.
-
-        Args:
-            value: The level, or ``b`` of them.
-
-        Raises:
-            ValueError: If a level is not between 0 and 1.
-        """
+        """The mixture's quantiles at ``b`` levels or one, ``(b) x batch_shape x q x m``."""
         if value.numel() > 1:
             return torch.stack([self.quantile(level) for level in value])
         level = float(value)
@@ -141,21 +134,9 @@ class MarginalMixture(HyperparameterMixture):
     Shapes are ``batch_shape x q x m``, without the dimension of the components.
     """
 
-    @property
-    def mean(self) -> Tensor:
-        """The mean, ``batch_shape x q x m``."""
-        mean: Tensor = self.mixture_mean
-        return mean
-
-    @property
-    def variance(self) -> Tensor:
-        """The variance, ``batch_shape x q x m``."""
-        return self.mixture_variance
-
-    @property
-    def covariance_matrix(self) -> Tensor:
-        """The covariance, ``batch_shape x (m q) x (m q)``: output by output."""
-        return self.mixture_covariance_matrix
+    mean = HyperparameterMixture.mixture_mean
+    variance = HyperparameterMixture.mixture_variance
+    covariance_matrix = HyperparameterMixture.mixture_covariance_matrix
 
     def log_prob(self, value: Tensor) -> Tensor:
         """The joint log density of values at all points and outputs, ``... x q x m``: ``...``."""

@@ -78,8 +78,7 @@ class PredictiveModel(Model):
             if isinstance(noise, Tensor) and noise.shape[-1] > 1:
                 noise = noise[..., list(output_indices)]
             return subset.posterior(X, None, noise, posterior_transform)
-        moments = self.joint_moments(X, observation_noise)
-        posterior = self.as_posterior(*moments)
+        posterior = self.as_posterior(*self.joint_moments(X, observation_noise))
         if posterior_transform is None:
             return posterior
         return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))
@@ -87,19 +86,15 @@ class PredictiveModel(Model):
     def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
         """Predict each point by itself, without the covariances between them.
 
-        The mean and variance of ``posterior(X)``, from factors of the training covariance that are
-        kept until the model is trained or given other data: much faster for many points, with
-        memory linear in their number. Differentiable in ``X`` as far as f_p is, and without a graph
-        unless ``X`` asks for one. Of a model that holds samples of its hyper-parameters, the mean
-        and variance of the mixture.
+        The mean and variance of ``posterior(X)`` (of a model that holds samples of its
+        hyper-parameters, of the mixture), much faster for many points, with memory linear in their
+        number. Differentiable in ``X`` as far as f_p is, and without a graph unless ``X`` asks for
+        one.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
             observation_noise: Whether to predict observations instead of the function; or their
                 noise variances, ``batch_shape x q x m``, in the square of the user's units.
-
-        Returns:
-            The mean and the variance, ``batch_shape x q x m`` each, in the user's units.
 
         Raises:
             TypeError: If ``X`` is not float64.
@@ -121,18 +116,12 @@ class PredictiveModel(Model):
     def interval(
         self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
     ) -> tuple[Tensor, Tensor]:
-        """The central interval at each point by itself.
+        """The central interval at each point by itself: lower and upper ends.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
-            level: The probability that it holds, between 0 and 1.
+            level: The probability that it holds; a ValueError if it is not between 0 and 1.
             observation_noise: As in :meth:`predict`.
-
-        Returns:
-            Lower and upper ends, ``batch_shape x q x m`` each, in the user's units.
-
-        Raises:
-            ValueError: If ``level`` is not between 0 and 1.
         """
         if not isinstance(level, float) or not 0 < level < 1:
             raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
@@ -149,9 +138,8 @@ class PredictiveModel(Model):
         Args:
             num_functions: Number ``k`` of functions.
             seed: Seed of the draw. Default: go on with PyTorch's generator.
-            num_features: Number of random features that stand for each kernel, an even one. The
-                more, the nearer is the functions' spread to the posterior's standard deviation;
-                the time of a call is linear in it.
+            num_features: Number of random features that stand for each kernel, an even one; the
+                time of a call is linear in it, and the functions' spread the more accurate.
 
         Returns:
             A module that maps raw ``... x q x d`` to ``k x ... x q x m`` in the user's units.
@@ -192,11 +180,7 @@ class PredictiveModel(Model):
         return MarginalMixture(posterior) if mixed else HyperparameterMixture(posterior)
 
     def checked_outputs(self, idcs: Any) -> list[int]:
-        """Numbers of outputs, for ``subset_output``; negative ones count from the end.
-
-        Raises:
-            ValueError: If they are none, or out of range.
-        """
+        """Numbers of outputs, for ``subset_output``; negative ones count from the end."""
         m = self.num_outputs
         if not idcs or any(not isinstance(i, int) or not -m <= i < m for i in idcs):
             raise ValueError(
@@ -206,12 +190,7 @@ class PredictiveModel(Model):
 
 
 def given_noise(noise: Any, num_points: int, num_outputs: int) -> Tensor:
-    """Variances that are given as ``observation_noise``, ``... x q x m``, checked.
-
-    Raises:
-        TypeError: If it is no tensor.
-        ValueError: If shapes disagree, or a variance is negative.
-    """
+    """Variances that are given as ``observation_noise``, ``... x q x m``, checked."""
     if not isinstance(noise, Tensor):
         raise TypeError(
             "Expected observation_noise as True, False, or a tensor of variances, got "

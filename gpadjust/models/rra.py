@@ -16,7 +16,7 @@ from torch import Size, Tensor
 from gpadjust.gp import WeightedSum
 from gpadjust.gp.features import term_features
 from gpadjust.models.exact_conditioning import ExactConditioning
-from gpadjust.models.parameters import default_constraint
+from gpadjust.models.parameters import LogInterval
 from gpadjust.models.sampled_functions import SampledFunctions
 from gpadjust.models.term_builder import Center, Means, ModelOptions, PhysicsLike, TermBuilder
 from gpadjust.models.terms_gp import TermsGP
@@ -43,7 +43,7 @@ class WeightConditioning(ExactConditioning):
         return mean, root @ root.mT
 
     def weights(self) -> tuple[Tensor, Tensor]:
-        """Mean ``... x p`` and a root of the covariance of the weights, in their prior's units."""
+        """Moments of the weights as of :func:`regression`, in units of their prior."""
         if self.has_graph:
             return self.regress()
         if self._weights is None:
@@ -52,7 +52,7 @@ class WeightConditioning(ExactConditioning):
         return self._weights
 
     def regress(self) -> tuple[Tensor, Tensor]:
-        """Regress the targets on the features: mean and a root of the covariance of weights."""
+        """Regress the targets on the features, see :func:`regression`."""
         train = self.kernel.at(self.train_inputs[0])
         residual = self.targets - train.mean()
         return regression(train.features(self.features), residual, self.noise.at(train.x))
@@ -71,10 +71,9 @@ class RRA(TermsGP):
         \beta_\rho \sim N(0, s_\rho^2 I), \; \beta_\delta \sim N(0, s_\delta^2 I)
 
     on random Fourier features, pairs of sines and cosines (Rahimi and Recht 2007):
-    :class:`~gpadjust.CKA` with RBF kernels, seen through finitely many weights. Its evidence
-    chooses lengthscales, prior scales and noise; all predictions are those of the weights' exact
-    posterior, which lose no digits where there is no noise. The weights make whole *functions* that
-    can be evaluated anywhere (:meth:`sample_functions`), and a Pyro model (:meth:`pyro_model`).
+    :class:`~gpadjust.CKA` with RBF kernels, seen through finitely many weights. All predictions are
+    those of the weights' exact posterior, which lose no digits where there is no noise. The weights
+    make whole functions (:meth:`sample_functions`), and a Pyro model (:meth:`pyro_model`).
 
     The arguments and errors are those of :class:`~gpadjust.CKA`, without kernels, and:
 
@@ -126,11 +125,9 @@ class RRA(TermsGP):
     def weights(self) -> MultivariateNormal:
         r"""The posterior of the weights :math:`\beta = [\beta_\rho, \beta_\delta]`.
 
-        Returns:
-            A normal distribution over ``batch_shape x (m) x 2D`` weights (of several physics,
-            ``D`` for each), those of delta in the units of the targets, of precision
-            :math:`\Phi^T \Phi / \sigma^2 + \text{diag}(s^2)^{-1}`. An unknown mean
-            (``rho_mean="learn"``) is a weight more, after those of its function.
+        It is normal, of ``batch_shape x (m) x 2D`` weights (of several physics, ``D`` for each),
+        those of delta in the units of the targets, with the precision :math:`\Phi^T \Phi / \sigma^2
+        + \text{diag}(s^2)^{-1}`. An unknown mean is a weight more, after those of its function.
         """
         self.eval()
         (mean, root), sd = self._regression().weights(), self._prior_sd()
@@ -139,15 +136,11 @@ class RRA(TermsGP):
     def functions(self, weights: Tensor) -> SampledFunctions:
         r"""The functions :math:`f_i` that given weights make, to be called anywhere.
 
+        They are as those of :meth:`sample_functions`.
+
         Args:
             weights: ``k x batch_shape x (m) x 2D``, as sampled from :meth:`weights`, or from
-                :meth:`pyro_model` by NUTS or a guide.
-
-        Returns:
-            As of :meth:`sample_functions`, ``... x q x d`` to ``k x ... x q x m``.
-
-        Raises:
-            ValueError: If the weights have another shape.
+                :meth:`pyro_model`; a ValueError for another shape.
         """
         sd = self._prior_sd()
         if weights.dim() != sd.dim() + 1 or weights.shape[1:] != sd.shape:
@@ -204,15 +197,12 @@ class RRA(TermsGP):
         pyro.sample("Y", dist.Normal(values, noise_sd).to_event(values.dim()), obs=obs)
         return values
 
-    def _functions_of_batches(self, num_functions: int, num_features: int) -> SampledFunctions:
+    def _functions_of_batches(self, number: int | None, num_features: int = 0) -> SampledFunctions:
         """As the base class, but exactly."""
         with torch.no_grad():
-            return self.functions(self.weights().sample(Size([num_functions])))
-
-    def _mean_functions_of_batches(self) -> SampledFunctions:
-        """As the base class, but exactly."""
-        with torch.no_grad():
-            return self.functions(self.weights().mean.unsqueeze(0))
+            beta = self.weights()
+            drawn = beta.mean.unsqueeze(0) if number is None else beta.sample(Size([number]))
+            return self.functions(drawn)
 
     def _regression(self) -> WeightConditioning:
         return cast("WeightConditioning", self.conditioning())
@@ -312,11 +302,11 @@ def fourier_kernel(
         num_samples=half,
         ard_num_dims=num_inputs,
         batch_shape=batch_shape,
-        lengthscale_constraint=default_constraint(),
+        lengthscale_constraint=LogInterval(),
     )
     frequencies = torch.randn(num_inputs, half, generator=generator, dtype=torch.float64)
     base._init_weights(randn_weights=frequencies.repeat(*batch_shape, 1, 1))
-    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=default_constraint())
+    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=LogInterval())
 
 
 def regression(design: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -324,15 +314,7 @@ def regression(design: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor,
 
     With :math:`\begin{bmatrix} \Phi / \sigma \\ I \end{bmatrix} = Q R` the posterior of the weights
     is :math:`N(R^{-1} Q^T [r / \sigma; 0], \; R^{-1} R^{-T})`: no digits cancel, however small the
-    noise.
-
-    Args:
-        design: :math:`\Phi`, ``... x n x p``.
-        residual: Targets less their prior mean, ``... x n``; NaN where one is missing.
-        noise: Noise variances, ``... x n``.
-
-    Returns:
-        The mean ``... x p``, and the root :math:`R^{-1}` of the covariance, ``... x p x p``.
+    noise. The residual may be NaN. Returns the mean and the root :math:`R^{-1}`.
     """
     n, p = design.shape[-2:]
     weight = noise.rsqrt().masked_fill(residual.isnan(), 0.0)

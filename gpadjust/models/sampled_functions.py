@@ -28,14 +28,13 @@ class SampledFunctions(Module):
     .. math:: f(x) = m(x) + \varphi(x)^T w + k(x, X) v, \quad
         v = K^{-1} (y - f_{prior}(X) - \varepsilon).
 
-    They can be called anywhere, so that particles that follow one of them stay consistent along a
-    trajectory; gradients flow to the inputs as far as f_p allows, which is evaluated once a call.
+    Gradients flow to the inputs as far as f_p allows, which is evaluated once a call.
 
     Args:
         model: The model; later changes of it have no effect here.
         features: The features of each term, by its name.
-        weights: The weights w, ``k x batch_shape x (m) x D``.
-        train: Where the data are; None for functions that the weights say all about.
+        weights: w, ``k x batch_shape x (m) x D``.
+        train: Where the data are, if there are any for an update.
         update: v, ``k x batch_shape x (m) x n``.
     """
 
@@ -95,38 +94,26 @@ class SampledFunctions(Module):
         """Evaluate the functions at raw ``X`` (``... x q x d``): ``k x ... x q x m``."""
         lead = torch.broadcast_shapes(X.shape[:-2], self.batch_shape)
         extra = len(lead) - len(self.batch_shape)
-        inputs = self._inputs(X.expand(*lead, *X.shape[-2:]))
-        return self._to_user(self._values(inputs, extra))
+        return self._at(X.expand(*lead, *X.shape[-2:]), extra)
 
     def each(self, X: Tensor) -> Tensor:
-        """Evaluate each function at points of its own.
+        """Evaluate each function at points of its own, ``k x q x d``: ``k x q x m``.
 
-        Args:
-            X: Raw inputs, ``k x q x d``; of a model without a batch shape.
-
-        Returns:
-            ``k x q x m``: the i-th function at the i-th block of points.
-
-        Raises:
-            ValueError: If ``X`` has another shape.
+        Of a model without a batch shape; a ValueError if ``X`` has another shape.
         """
         check_each(X, len(self.weights))
-        return self._to_user(self._values(self._inputs(X)))
+        return self._at(X)
 
-    def _inputs(self, X: Tensor) -> Tensor:
+    def _at(self, X: Tensor, extra: int = 0) -> Tensor:
         X = X.unsqueeze(-3) if self.has_outputs else X
-        inputs: Tensor = X if self.input_transform is None else self.input_transform(X)
-        return inputs
-
-    def _to_user(self, values: Tensor) -> Tensor:
-        values = values * self.scale + self.shift
+        inputs = X if self.input_transform is None else self.input_transform(X)
+        values = self._values(inputs, extra) * self.scale + self.shift
         return values.mT if self.has_outputs else values.unsqueeze(-1)
 
     def _values(self, inputs: Tensor, extra: int = 0, among_reached: bool = False) -> Tensor:
         """The functions in model units, ``k x ... x (m) x q``, at ``... x (m) x q x (d + k)``.
 
-        So many dimensions of the inputs as ``extra`` says lead those of the model. They are of all
-        terms, or of those alone that the data reach.
+        ``extra`` dimensions of the inputs lead those of the model.
         """
         sought = self.sum.at(inputs, self._reached if among_reached else None)
         parts = self.weights.split([each.num_features for each in self.features.values()], dim=-1)
@@ -152,11 +139,7 @@ def _product(matrix: Tensor, vectors: Tensor, extra: int) -> Tensor:
 
 
 class FunctionPerBatch(Module):
-    """One function of each batch of a model, seen as so many functions of the same inputs.
-
-    Args:
-        functions: Functions of a model with ``k`` batches, one of each.
-    """
+    """One function of each of ``k`` batches of a model, as ``k`` functions of the same inputs."""
 
     def __init__(self, functions: SampledFunctions) -> None:
         super().__init__()

@@ -23,16 +23,14 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
     """Save a model: data, settings, hyper-parameters (or samples of them), and names.
 
     The physics is saved by its import path, if it is a function or object of a module. What cannot
-    be saved (a lambda, a kernel or transform of yours) is to be given to :func:`load` again. Of a
-    :class:`~gpadjust.StackedGP`, its models and weights.
+    be saved (a lambda, a kernel or transform of yours) is to be given to :func:`load` again.
 
     Args:
         model: The model.
         path: The file, which ``torch.load`` reads with ``weights_only=True``.
 
     Warns:
-        UserWarning: If another program cannot import the physics, so that :func:`load` asks for it:
-            a lambda, or a function of a script.
+        UserWarning: If another program cannot import the physics: a lambda, or one of a script.
 
     Raises:
         TypeError: If it is no model of this library, or the path none.
@@ -78,18 +76,13 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
 
 def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
     """What a file holds of a model; the errors are those of :func:`save`."""
-    if not isinstance(model, StackedGP):
-        return _content(model)
-    return {
-        "format": _FORMAT,
-        "models": {name: _content(part) for name, part in model.made_of.items()},
-        "weights": torch.tensor([*model.weights.values()], dtype=torch.float64),
-        "num_components": model.num_samples,
-    }
-
-
-def _content(model: Any) -> dict[str, Any]:
-    """What a file holds of a model of one structure."""
+    if isinstance(model, StackedGP):
+        return {
+            "format": _FORMAT,
+            "models": {name: content_of(part) for name, part in model.made_of.items()},
+            "weights": torch.tensor([*model.weights.values()], dtype=torch.float64),
+            "num_components": model.num_samples,
+        }
     if not isinstance(model, TermsModel):
         raise TypeError(f"Expected a model of gpadjust, got {type(model).__name__}.")
     name = f"{type(model).__module__}:{type(model).__qualname__}"
@@ -135,11 +128,7 @@ def load(path: str | Path, **objects: Any) -> Any:
     Args:
         path: The file.
         objects: ``physics`` and other arguments of the model that could not be saved; an error
-            says which. Of a mixture each goes to the models that have it; of several physics, by
-            their names, as the model was built with.
-
-    Returns:
-        The model, an :class:`~gpadjust.models.TermsModel` or a :class:`~gpadjust.StackedGP`.
+            says which. Of a mixture each goes to the models that have it.
 
     Raises:
         ValueError: If it is no such file, or damaged; if objects are missing, or given though the
@@ -185,7 +174,6 @@ def _loaded(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel | St
 
 
 def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
-    """The model of one structure."""
     missing = [name for name in content["missing"] if name not in objects]
     if missing:
         given = ", ".join(f"{name}=..." for name in missing)
@@ -198,10 +186,9 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
         way = "has no such model" if module in sys.modules else "was not imported: do so first"
         raise ValueError(f"it is of the class {content['class']}, but the module {module!r} {way}.")
-    own = _own(content, objects)
-    if content["physics"] is not None and "physics" not in own:
-        parts = {name: _named_physics(path) for name, path in content["physics"].items()}
-        own["physics"] = parts[""] if "" in parts else as_physics(parts)
+    own = {name: each for name, each in objects.items() if name in content["missing"]}
+    if content["physics"] is not None:
+        own["physics"] = _physics(content, objects)
     model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
     priors = {name: v for name, v in model.state_dict().items() if "_prior." in name}
     model.load_state_dict(content["state"] | priors)
@@ -239,16 +226,15 @@ def _named_physics(path: str) -> Physics:
 
 
 def _is_of_python(path: str) -> bool:
-    """Whether an import path begins in Python's standard library."""
     return path.partition(":")[0].partition(".")[0] in sys.stdlib_module_names
 
 
-def _own(content: dict[str, Any], objects: dict[str, Any]) -> dict[str, Any]:
-    """Those of the objects that a model is built with."""
-    own = {name: each for name, each in objects.items() if name in content["missing"]}
-    if "physics" not in objects or content["physics"] is None:
-        return own
+def _physics(content: dict[str, Any], objects: dict[str, Any]) -> Any:
+    """The physics that is given, of several the model's own, or else those that the file names."""
+    if "physics" not in objects:
+        parts = {name: _named_physics(path) for name, path in content["physics"].items()}
+        return parts[""] if "" in parts else as_physics(parts)
     physics, names = as_physics(objects["physics"]), content["physics_names"]
     if isinstance(physics, JoinedPhysics) and len(names) == 1 and names[0] in physics.names:
-        return {**own, "physics": physics.parts[physics.names.index(names[0])]}
-    return {**own, "physics": physics}
+        return physics.parts[physics.names.index(names[0])]
+    return physics

@@ -36,14 +36,7 @@ class SparseConditioning:
     :math:`a = A L^{-T}`, means are the prior's and :math:`a \mu`, covariances the prior's less
     :math:`a a^T - (a C)(a C)^T`. Terms that the sum at the points has not are as they were.
 
-    Args:
-        points: Where the values are, ``... x M x (d + k)``.
-        mean: :math:`\mu`, ``... x M``.
-        root: C, lower, ``... x M x M``.
-        kernel: The covariance of the sum.
-
-    Attributes:
-        mean_cache: The weights :math:`L^{-T} \mu` of the mean, ``... x M``.
+    The points are ``... x M x (d + k)``; ``mean`` and ``root`` are :math:`\mu` and C.
     """
 
     def __init__(self, points: Tensor, mean: Tensor, root: Tensor, kernel: SumOfTerms) -> None:
@@ -52,7 +45,7 @@ class SparseConditioning:
         with torch.no_grad():
             self._train = kernel.at(points)
             self._chol = inducing_root(self._train.covariance())
-            self.mean_cache = self._solve(self._mean).squeeze(-1)
+            self.mean_cache = self._solve(self._mean).squeeze(-1)  # the weights of the mean
 
     def mean(self, sought: WeightedSum, cross: Tensor | None = None) -> Tensor:
         """Posterior means of a weighted sum, ``... x q``."""

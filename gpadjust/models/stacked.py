@@ -22,12 +22,9 @@ from gpadjust.models.training_data import ArrayLike, check_noise, new_observatio
 
 
 class Part(Module):
-    """Components of the mixture of an output that are of one structure.
+    """The ``number`` components of an output's mixture that are of one structure.
 
-    Args:
-        name: The structure's name.
-        model: A model of that output alone.
-        number: Number of the components; a model without samples is all of them.
+    The model is of that output alone; one without samples is all of them.
     """
 
     def __init__(self, name: str, model: TermsGP, number: int) -> None:
@@ -57,21 +54,19 @@ class StackedGP(PredictiveModel):
 
     .. math:: p(f(x)) = \sum_k w_k \, p_k(f(x))
 
-    (Yao et al. 2018). Each output has weights of its own. The mixture is of equally likely
-    Gaussians: samples of each model's hyper-parameters, in proportion to its weight. To BoTorch it
-    is a fully Bayesian model, so that acquisition functions average over the components. As outputs
-    are independent, components of each structure of one meet those of all structures of another.
-    :func:`~gpadjust.compare` finds the weights; the hyper-parameters stay as they are. It predicts
-    as all models do; as it has no outcome transform, variances that are given to
+    (Yao et al. 2018), with weights for each output, which :func:`~gpadjust.compare` finds. The
+    mixture is of equally likely Gaussians: samples of each model's hyper-parameters, in proportion
+    to its weight. To BoTorch it is a fully Bayesian model, so that acquisition functions average
+    over the components. As outputs are independent, components of each structure of one meet those
+    of all structures of another. It has no outcome transform, so that variances given to
     :meth:`posterior` as ``observation_noise`` are in the square of the user's units, too.
 
     Args:
         models: Fitted models of the same data, by the names of their structures.
         weights: The weight of each model for each output, ``K x m``; in all 1 for each output.
         num_components: Number ``S`` of Gaussians; weights are rounded to multiples of ``1 / S``.
-            The time of a prediction grows with it, and that of some acquisition functions: the
-            noisy hypervolume improvement of two outputs took 64 s with 32, and 0.4 s of a fitted
-            CKA. Take fewer where that is too long.
+            The time of predictions grows with it, and that of some acquisition functions much
+            more: the noisy hypervolume improvement of two outputs took 64 s with 32.
 
     Attributes:
         parts: The parts of the mixture of each output, lists of :class:`Part`.
@@ -134,11 +129,7 @@ class StackedGP(PredictiveModel):
 
     @property
     def made_of(self) -> dict[str, TermsGP]:
-        """The models that it was made of, by the names of their structures.
-
-        Raises:
-            ValueError: If it is a subset of outputs, or was conditioned.
-        """
+        """The models by name; a ValueError if it is a subset of outputs, or was conditioned."""
         if self._made_of is None:
             raise ValueError(
                 "This mixture is of parts of models, a subset of their outputs or conditioned; "
@@ -157,11 +148,7 @@ class StackedGP(PredictiveModel):
         return Size([self.num_samples])
 
     def train(self, mode: bool = True) -> Self:
-        """Put the model in eval mode; it is not trained.
-
-        Raises:
-            RuntimeError: If it is to be in train mode.
-        """
+        """Put the model in eval mode; a RuntimeError for train mode, as it is not trained."""
         if mode:
             raise RuntimeError(
                 "A StackedGP is made of fitted models, and not trained: `gpadjust.fit` its models "
@@ -170,7 +157,6 @@ class StackedGP(PredictiveModel):
         return super().train(mode)
 
     def __repr__(self) -> str:
-        """One line; :meth:`summary` says more."""
         return f"StackedGP of {', '.join(self._structures)}: {self.num_samples} components"
 
     def summary(self) -> str:
@@ -243,9 +229,7 @@ class StackedGP(PredictiveModel):
             Y: Observations, ``k x m``, in the user's units; NaN where an output was not observed.
             noise: The variances of the new observations, of the shape of ``Y``, if they are known.
 
-        Raises:
-            TypeError: As :meth:`CKA.condition_on_observations`.
-            ValueError: As :meth:`CKA.condition_on_observations`.
+        The errors are those of :meth:`CKA.condition_on_observations`.
         """
         X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
         if X.dim() + Y.dim() > 4:
@@ -297,9 +281,7 @@ class StackedGP(PredictiveModel):
 class StackedFunctions(Module):
     """Functions drawn from a mixture, of several models for each output.
 
-    Args:
-        functions: The functions of the models of each output.
-        owners: Which of these models each function is of, ``m x k``.
+    The owners, ``m x k``, say which of these models each function is of.
     """
 
     owners: Tensor

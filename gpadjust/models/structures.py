@@ -30,11 +30,9 @@ class CKA(TermsGP):
         \rho \sim GP(1, k_\rho), \quad \delta \sim GP(0, k_\delta),
 
     so that :math:`f_a \sim GP(f_p, F_p k_\rho F_p^T + k_\delta)`: where there are no data, the
-    model falls back to the physics, and knows that it does.
-
-    Of several physics it is :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`. The prior means
-    of the :math:`\rho_i` are weights, unknown unless they are given: far from the data the model
-    falls back to the sum of the physics with the weights that the data suggest.
+    model falls back to the physics, and knows that it does. Of several physics it is :math:`f_a(x)
+    = \sum_i \rho_i(x) f_i(x) + \delta(x)`, and falls back to their sum with weights, the prior
+    means of the :math:`\rho_i`.
 
     A ``SingleTaskGP`` like any other: several columns of ``train_Y`` make independent outputs.
     Fit it with :func:`gpadjust.fit` or ``fit_gpytorch_mll``.
@@ -54,14 +52,13 @@ class CKA(TermsGP):
             function). Default: RBF with a lengthscale per input.
         delta_covar_module: The kernel :math:`k_\delta`. Default: likewise.
         rho_mean: The prior mean of :math:`\rho`: a number (of several physics, one each), or
-            ``"learn"`` for an unknown constant with a vague prior, as in universal kriging: for a
-            physics that is wrong by an unknown factor throughout, which then scales it far from the
-            data. Default: 1, of several ``"learn"``.
+            ``"learn"`` for an unknown constant with a vague prior, as in universal kriging, which
+            scales a physics that is wrong by a factor. Default: 1, of several ``"learn"``.
         delta_mean: The prior mean of :math:`\delta`, a number or ``"learn"``.
         center: The kernel is built on :math:`f_p - c`. By default, ``"learn"``, the constant c is a
-            hyper-parameter, so that a constant in both f_p and targets makes no difference, however
-            large; a point fit (``"map"``) leaves it at the mean of f_p at ``train_X``, where
-            ``"mean"`` keeps it. A number is c in the user's units; the literal model has 0.
+            hyper-parameter, so that a constant in both f_p and targets makes no difference; a point
+            fit (``"map"``) leaves it at the mean of f_p at ``train_X``, where ``"mean"`` keeps it.
+            A number is c in the user's units; the literal model has 0.
         likelihood: A Gaussian likelihood. Default: learnt noise, with a standard deviation of at
             least three millionths of the root mean square of ``train_Y - f_p``.
         outcome_transform: ``Standardize`` or None. Default: division by the root mean square of
@@ -69,8 +66,7 @@ class CKA(TermsGP):
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
 
     Warns:
-        UserWarning: Of more than 5,000 points, for which there is
-            :class:`~gpadjust.VariationalCKA`.
+        UserWarning: Of more than 5,000 points; take :class:`~gpadjust.VariationalCKA`.
 
     Raises:
         TypeError: If data are no float64 tensors, arrays or frames, or the physics is not callable.
@@ -219,10 +215,9 @@ class ScaleGP(TermsGP):
 class CalibratedPhysics(TermsGP):
     r"""The physics itself, :math:`y = f_p(x; \theta) + \epsilon`: nonlinear regression.
 
-    Its unknown parameters :math:`\theta` and the variance of the noise are learnt. What the physics
-    cannot say, whatever its parameters, is noise to it, so that intervals of the parameters are too
-    narrow where it is wrong: compare it with :class:`~gpadjust.PhysicsMeanGP` and
-    :class:`~gpadjust.CKA` of the same physics, which add what it lacks.
+    Its unknown parameters :math:`\theta` and the variance of the noise are learnt. Where the
+    physics is wrong, intervals of the parameters are too narrow: compare it with
+    :class:`~gpadjust.PhysicsMeanGP` and :class:`~gpadjust.CKA` of the same physics.
 
     The arguments and errors are those of :class:`~gpadjust.CKA`, without those about rho and delta.
 

@@ -41,7 +41,6 @@ def summary(model: Any) -> str:
 
 
 def _lines(model: Any) -> list[str]:
-    """What there is to say of one output."""
     scale, rows = model.units()[1].squeeze(-1), hyperparameters(model)
     evidence, value = model.log_evidence()
     lines = [f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
@@ -64,7 +63,6 @@ def _lines(model: Any) -> list[str]:
 
 
 def _of_physics(model: Any) -> list[str]:
-    """A line for each unknown parameter of the physics."""
     lines = []
     for name, unknown in model.physics_parameters.unknowns.items():
         draws = model.physics_parameters[name]
@@ -78,7 +76,6 @@ def _of_physics(model: Any) -> list[str]:
 
 
 def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str]:
-    """A line for each hyper-parameter of a term's kernel."""
     lines: list[str] = []
     for row in rows:
         value = row.parameter(row.raw)

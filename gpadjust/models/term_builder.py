@@ -30,13 +30,9 @@ from gpadjust.models.training_data import (
     training_data,
 )
 from gpadjust.physics import Physics, as_physics
+from gpadjust.physics.function import AnyPhysics, Parts
 
-PhysicsLike = (
-    Physics
-    | Callable[[Tensor], Tensor]
-    | Sequence[Physics | Callable[[Tensor], Tensor]]
-    | dict[str, Physics | Callable[[Tensor], Tensor]]
-)
+PhysicsLike = AnyPhysics | Parts
 KernelLike: TypeAlias = Kernel | Callable[[int, Size], Kernel]
 Kernels: TypeAlias = KernelLike | Sequence[KernelLike] | None
 Means = float | Sequence[float] | Literal["learn"]
@@ -59,7 +55,7 @@ class TermBuilder:
         input_transform: What makes the columns that terms read out of raw inputs, or None.
         units: Shift and scale of the targets, or None.
         num_inputs: Number ``d`` of these columns without those of the physics.
-        likelihood: The user's likelihood, or None for the default.
+        likelihood: The user's, or None.
 
     Attributes:
         batch_shape: That of the model with its outputs last, for its kernels.
@@ -119,10 +115,9 @@ class TermBuilder:
         The model's input transform appends all f_i to the inputs
         (:class:`~gpadjust.gp.PhysicsInput`), once; the terms read those columns.
 
-        With a center c the basis of rho is :math:`f_p - c`. The bias that makes :math:`f_a = \rho
-        f_p + \delta` is then :math:`\delta = \delta_0 - \sum_i c_i \rho_i` for the model's own term
-        :math:`\delta_0`. A centre that is learnt is a hyper-parameter, in standard deviations of
-        f_p from its mean; the prior mean stays.
+        With a center c the basis of rho is :math:`f_p - c`. The bias is then :math:`\delta =
+        \delta_0 - \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`. A centre that is
+        learnt is in standard deviations of f_p from its mean.
 
         The arguments are those of :class:`~gpadjust.CKA`; a model without physics has None.
         """
@@ -225,9 +220,8 @@ class TermBuilder:
         if len(each) != k or (k > 1 and isinstance(kernels, Module)):
             found = len(each) if isinstance(kernels, Sequence) else "one"
             raise ValueError(
-                f"Expected {k} kernels of rho, one for each physics, got {found}: pass a sequence "
-                "of kernels, or a function of the number of inputs and the batch shape that makes "
-                "one."
+                f"Expected {k} kernels of rho, one for each physics, got {found}: pass a sequence, "
+                "or a function of the number of inputs and the batch shape that makes one."
             )
         several = getattr(self.input_transform.physics, "names", ())
         names = [f"rho_{name}" for name in several] if k > 1 else ["rho"]

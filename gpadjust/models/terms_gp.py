@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from inspect import signature
 from typing import Any, ClassVar, Self
@@ -14,7 +14,6 @@ from botorch.models import SingleTaskGP
 from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.settings import validate_input_scaling
-from gpytorch.likelihoods import Likelihood
 from gpytorch.mlls import ExactMarginalLogLikelihood, MarginalLogLikelihood
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
 from torch import Size, Tensor
@@ -33,11 +32,7 @@ from gpadjust.models.hyperparameter_samples import (
 from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import ModelOptions, TermBuilder
 from gpadjust.models.terms_model import TermsModel
-from gpadjust.models.training_data import (
-    ArrayLike,
-    check_noise,
-    new_observations,
-)
+from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
 
 _MANY = 5_000  # points, above which an exact fit takes long
 # What a state has as many of as there were draws, samples or points.
@@ -47,8 +42,7 @@ _OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions")
 class TermsGP(TermsModel, SingleTaskGP):
     r"""The base of this library's exact models: a sum of terms, given as a list.
 
-    A ``SingleTaskGP`` with independent outputs, with the ends tied that BoTorch leaves loose: a
-    subset of its outputs can be fitted again, whatever its kernels and transforms; it can be
+    A ``SingleTaskGP`` with independent outputs, of which a subset can be fitted again; it can be
     conditioned on observations before any prediction was made, with gradients to where they are
     made; ``output_indices`` may come in any order; an output may be missing (NaN) in some rows.
 
@@ -67,6 +61,7 @@ class TermsGP(TermsModel, SingleTaskGP):
 
     prediction_strategy: Any
     conditioning_class: ClassVar[type[ExactConditioning]] = ExactConditioning
+    _learnt_noise = staticmethod(learnt_noise)
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
         data, likelihood = made.data, made.likelihood
@@ -76,15 +71,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         if unknown and data.X.shape[-2] < 2 + unknown:
             raise ValueError(
                 f"Expected at least {2 + unknown} points to learn {unknown} constant means and a "
-                f"variance, got {data.X.shape[-2]}; give the means instead: rho_mean=1.0 (a number "
-                "for each physics), delta_mean=0.0."
+                f"variance, got {data.X.shape[-2]}; give the means: rho_mean=1.0, delta_mean=0.0."
             )
         if (n := data.X.shape[-2]) > _MANY:
             warnings.warn(
                 f"{type(self).__name__} is exact: of {n} points a fit takes from many minutes to "
                 f"hours, and each covariance {8e-9 * n**2:.1f} GB. gpadjust.VariationalCKA takes "
                 "the arguments of CKA and learns from all of them in minutes.",
-                UserWarning,
                 stacklevel=3,
             )
         covar_module = SumOfTerms(terms)
@@ -116,14 +109,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         """Whether it was fitted, or has nothing to learn."""
         return self.was_fitted or not any(p.requires_grad for p in self.parameters())
 
-    def custom_fit(
-        self,
-        mll: MarginalLogLikelihood,
-        closure: Callable[[], Any] | None = None,
-        closure_kwargs: dict[str, Any] | None = None,
-        optimizer_kwargs: dict[str, Any] | None = None,
-        **options: Any,
-    ) -> MarginalLogLikelihood:
+    def custom_fit(self, mll: MarginalLogLikelihood, **options: Any) -> MarginalLogLikelihood:
         """BoTorch's hook: what ``fit_gpytorch_mll`` does to a model of this library.
 
         It is ``fit(model, "map")``, which keeps to priors and ``requires_grad``; with an optimizer,
@@ -131,35 +117,31 @@ class TermsGP(TermsModel, SingleTaskGP):
         """
         mll.train()  # an error, if the model holds samples
         plain = type(mll) is ExactMarginalLogLikelihood and mll.likelihood is self.likelihood
-        if not plain or closure or closure_kwargs or optimizer_kwargs or options:
-            return _fit_fallback(
-                mll,
-                closure=closure,
-                closure_kwargs=closure_kwargs,
-                optimizer_kwargs=optimizer_kwargs,
-                **options,
-            )
+        others = options.keys() - {"closure", "closure_kwargs", "optimizer_kwargs"}
+        if not plain or others or any(options.values()):
+            return _fit_fallback(mll, **options)
         # Without noise the likelihood has rounding errors at which SciPy's line search gives up,
         # and BoTorch throws away what was found. `fit` is asked for as a user would, by the name
         # of the package and at the call: rooms below are not imported here.
         gpadjust.fit(self, "map")
         return mll.eval()
 
-    @staticmethod
-    def _learnt_noise(batch_shape: Size) -> Likelihood:
-        """The default likelihood."""
-        return learnt_noise(batch_shape)
-
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the model at *transformed* inputs, as GPyTorch does."""
         if not self.training and self.train_inputs is not None and args:
-            self.check_transformed(args[0])
+            expected = self.train_inputs[0].shape[-1]
+            if args[0].shape[-1] != expected:
+                raise ValueError(
+                    "In eval mode the model itself takes transformed inputs with "
+                    f"{expected} columns, got shape {tuple(args[0].shape)}. Call "
+                    "`model.posterior(X)` on raw inputs, or `model(model.transform_inputs(X))`."
+                )
             if prior_mode.off():
                 self.conditioning()
         return super().__call__(*args, **kwargs)
 
     def conditioning(self) -> ExactConditioning:
-        """What the training data say of the terms; made if it is not there."""
+        """As the base class."""
         if self.prediction_strategy is None:
             self.prediction_strategy = self.conditioning_class(
                 self.train_inputs[0], self.train_targets, self.noise, self.covar_module
@@ -191,7 +173,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         return self.train_targets - factors.alpha * variance, variance
 
     def data(self) -> dict[str, Tensor | None]:
-        """The data that the model could be built on: raw inputs, targets and known variances."""
+        """As the base class."""
         self.eval()
         inputs = self._original_train_inputs
         inputs = self.train_inputs[0] if inputs is None else inputs
@@ -213,8 +195,7 @@ class TermsGP(TermsModel, SingleTaskGP):
     def hold_samples(self, samples: dict[str, Tensor]) -> None:
         """Make the model fully Bayesian: a batch of itself, one for each hyper-parameter sample.
 
-        Its posterior then is a Gaussian mixture, as that of BoTorch's fully Bayesian models.
-        :func:`gpadjust.fit` calls this.
+        Its posterior then is a mixture, as of BoTorch's fully Bayesian models.
 
         Args:
             samples: Raw parameters by their names, ``S x`` the parameter's shape.
@@ -230,12 +211,9 @@ class TermsGP(TermsModel, SingleTaskGP):
         self.was_fitted = True
 
     def release_samples(self) -> None:
-        """Make the model what it was before it held samples, with the first of them.
+        """Make the model, if it holds samples, what it was before, with the first of them.
 
-        It does nothing if the model holds none.
-
-        Raises:
-            RuntimeError: If it is a model of fantasies.
+        A model of fantasies raises a RuntimeError.
         """
         if self.num_samples is not None:
             release_samples(self)
@@ -272,7 +250,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         other = {n for n in other if n.rpartition(".")[-1] not in _OF_ANY_NUMBER}
         if samples:  # of which there are as many of each
             sizes = {len(values) for values in samples.values()}
-            other = {n for n in other if not _has_samples(state_dict[n], own[n], sizes)}
+            other = {n for n in other if state_dict[n].shape != (*sizes, *own[n].shape)}
         if other or (strict and own.keys() != state_dict.keys()):
             wrong = sorted(own.keys() ^ state_dict.keys()) or sorted(other)
             held = self.num_samples is not None
@@ -386,23 +364,12 @@ class TermsGP(TermsModel, SingleTaskGP):
                 Y = Y.expand(self.num_samples, *Y.shape)
         self.eval()
         self.conditioning()
-        # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
-        with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
-            return super(TermsGP, self._shell()).condition_on_observations(X, Y, **kwargs)
-
-    def _shell(self) -> Self:
-        """The same parts as another object: GPyTorch takes some of them off for a moment.
-
-        Meanwhile other threads may ask this model.
-        """
+        # GPyTorch takes parts of a model off for a moment, while other threads may ask this one.
         shell = copy(self)
         shell._modules = copy(self._modules)
-        return shell
-
-
-def _has_samples(values: Tensor, one: Tensor, sizes: set[int]) -> bool:
-    """Whether values are as many of one as there are samples."""
-    return len(sizes) == 1 and values.shape == (*sizes, *one.shape)
+        # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
+        with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
+            return super(TermsGP, shell).condition_on_observations(X, Y, **kwargs)
 
 
 def arguments_of(model: type) -> dict[str, bool]:

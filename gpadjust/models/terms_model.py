@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from inspect import signature
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from botorch.posteriors import Posterior
@@ -26,28 +26,13 @@ from gpadjust.models.training_data import ArrayLike, check_columns, to_tensor
 from gpadjust.physics import Physics
 
 
-class Conditioning(Protocol):
-    """What the data of a model say of its terms."""
-
-    def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
-        """Posterior means and variances of a weighted sum at each point, ``... x q``."""
-        ...
-
-    def joint(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
-        """Posterior means ``... x q`` and covariances ``... x q x q`` of a weighted sum."""
-        ...
-
-
 class TermsModel(PredictiveModel):
     r"""A model of a sum of terms, :math:`f(x) = \sum_t b_t(x) g_t(x)`, and of each of them.
 
-    All predictions are those of a weighted sum of the terms, of which :meth:`conditioning` knows
-    what the data say. It is the base of exact models and of sparse ones, beside BoTorch's own of
-    each.
-
-    In an adjusted physics :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)` the terms that scale
-    a physics are the rhos; with a centre c, :math:`f_p - c` is what they scale, and :math:`\delta =
-    \delta_0 - \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`.
+    The base of exact models and of sparse ones, beside BoTorch's own of each. In an adjusted
+    physics :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)` the terms that scale a physics are
+    the rhos; with a centre c, :math:`f_p - c` is what they scale, and :math:`\delta = \delta_0 -
+    \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`.
 
     Attributes:
         covar_module: The covariance of the sum, which holds the terms.
@@ -88,11 +73,13 @@ class TermsModel(PredictiveModel):
         return model
 
     def __repr__(self) -> str:
-        """One line; :meth:`summary` says more."""
         return title(self)
 
     def conditioning(self) -> Any:
-        """What the data say of the terms, a :class:`Conditioning`; made if it is not there."""
+        """What the data say of the terms; made if it is not there.
+
+        It has ``marginals`` and ``joint``: moments of a :class:`~gpadjust.gp.WeightedSum`.
+        """
         raise NotImplementedError
 
     def data(self) -> dict[str, Tensor | None]:
@@ -106,10 +93,7 @@ class TermsModel(PredictiveModel):
     def summary(self) -> str:
         """What the model has learnt, as a text in the user's units.
 
-        The structure; unknown parameters of the physics; the log marginal likelihood; means,
-        standard deviations and lengthscales of the terms; the noise as a standard deviation; and
-        what is at a bound. Of a model that holds samples, their medians and the ranges of 95 % of
-        them.
+        Of a model that holds samples, their medians and the ranges of 95 % of them.
         """
         return summary(self)
 
@@ -158,27 +142,18 @@ class TermsModel(PredictiveModel):
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
-        """What the model knows of the unknown parameters of the physics.
-
-        Raises:
-            ValueError: If the physics has none.
-        """
+        """What the model knows of the unknown parameters of the physics; an error without any."""
         return PhysicsParameters.of(self.input_transform if self.has_unknowns else None)
 
     def rho(self, X: ArrayLike, physics: str | int | None = None, mixed: bool = True) -> Posterior:
         r"""The posterior of the scaling :math:`\rho` at ``X``, ``q x m``; f_p is not evaluated.
 
-        After the default fit rho and delta apart are far less certain than their sum: observations
-        are of the sum alone, and how much of it is rho's depends on centre and sizes, which few
-        data tell.
+        Rho and delta apart are far less certain than their sum, which alone is observed.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
             physics: Which of several physics, by its name or number.
             mixed: As in :meth:`term`.
-
-        Returns:
-            A posterior over ``batch_shape x q x m``, without units.
 
         Raises:
             ValueError: If the model has no such rho.
@@ -186,16 +161,13 @@ class TermsModel(PredictiveModel):
         return self.term(self.rho_name(physics), X, mixed)
 
     def delta(self, X: ArrayLike, mixed: bool = True) -> Posterior:
-        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`.
-
-        Like rho it is far less certain than their sum.
-        """
+        r"""The posterior of the bias :math:`\delta`, in the targets' units; as :meth:`rho`."""
         return self.term("delta", X, mixed)
 
     def term(self, name: str, X: ArrayLike, mixed: bool = True) -> Posterior:
         """The posterior of a term's Gaussian process, ``q x m``; its basis is not evaluated.
 
-        It has no graph unless ``X`` asks for one.
+        A rho is without units, others are in the targets'. No graph unless ``X`` asks for one.
 
         Args:
             name: One of ``term_names``.
@@ -204,14 +176,16 @@ class TermsModel(PredictiveModel):
                 draws are those of the mixture, ``... x q x m``; else they are those of each sample,
                 ``... x S x q x m``, as :meth:`posterior` has them for BoTorch.
 
-        Returns:
-            A posterior over ``batch_shape x q x m``: of a rho without units, else in those of the
-            targets.
-
         Raises:
             ValueError: If there is no such term.
         """
-        term = self._unknown_term(name)
+        unknown = [term for term in self.terms if term.name == name and not term.is_known]
+        if not unknown:
+            raise ValueError(
+                f"{type(self).__name__} has no unknown term {name!r}; it has "
+                f"{', '.join(map(repr, self.term_names))}."
+            )
+        (term,) = unknown
         with self._graph_for(X):
             inputs = self.model_inputs(X, with_basis=False)
             mean, covariance = self.conditioning().joint(self._at(term, inputs))
@@ -309,33 +283,27 @@ class TermsModel(PredictiveModel):
         """The posterior mean, as a function to be called anywhere: faster than ``predict``.
 
         Args:
-            most: The most samples of the hyper-parameters to take, evenly of those held. Default:
-                all.
+            most: The most samples of the hyper-parameters to take, evenly of those held, at least
+                1. Default: all.
 
         Returns:
-            A module that maps raw ``... x q x d`` to ``S x ... x q x m`` in the user's units: a
-            mean for each sample of the hyper-parameters, or a single one. Gradients flow to the
-            inputs as far as f_p allows. Later fits of the model leave it as it is.
-
-        Raises:
-            ValueError: If ``most`` is no whole number of at least 1.
+            As of :meth:`sample_functions`: a mean for each sample of the hyper-parameters, or a
+            single one.
         """
         if most is not None:
             check_number(most, "most")
         self.eval()
         if self.num_samples is None:
-            return self._mean_functions_of_batches()
+            return self._functions_of_batches(None)
         taken = self.num_samples if most is None else min(most, self.num_samples)
         each = take_samples(self, torch.arange(taken) * self.num_samples // taken)
-        return FunctionPerBatch(each._mean_functions_of_batches())
+        return FunctionPerBatch(each._functions_of_batches(None))
 
-    def _functions_of_batches(self, num_functions: int, num_features: int) -> SampledFunctions:
-        """Functions drawn for each batch of the model."""
-        return SampledFunctions.by_matheron(self, num_functions, num_features)
-
-    def _mean_functions_of_batches(self) -> SampledFunctions:
-        """The posterior mean of each batch of the model."""
-        return SampledFunctions.mean(self)
+    def _functions_of_batches(self, number: int | None, num_features: int = 0) -> SampledFunctions:
+        """So many functions of each batch of the model, or its mean."""
+        if number is None:
+            return SampledFunctions.mean(self)
+        return SampledFunctions.by_matheron(self, number, num_features)
 
     def at(self, inputs: Tensor) -> WeightedSum:
         """The function itself at transformed inputs, ``... x n x (d + k)``."""
@@ -351,33 +319,18 @@ class TermsModel(PredictiveModel):
             self.eval()
         check_columns(X, self.input_names)
         X = to_tensor(X, "X")
-        if X.dim() < 2:
+        d = len(self.input_names)
+        if X.dim() < 2 or X.shape[-1] != d:
             raise ValueError(
-                f"Expected X with at least 2 dimensions (points x inputs), got {tuple(X.shape)}."
+                f"Expected X with {d} columns, the inputs that the model was built on, and with at "
+                f"least 2 dimensions (points x inputs), got shape {tuple(X.shape)}."
             )
         X = X if self.num_samples is None else X.unsqueeze(MCMC_DIM)
         X = X.unsqueeze(-3) if self._num_outputs > 1 else X
         transform = getattr(self, "input_transform", None)
         if isinstance(transform, PhysicsInput) and not with_basis:
-            inputs = transform.without_physics(X)
-        else:
-            inputs = self.transform_inputs(X)
-        if inputs.shape[-1] != self.train_inputs[0].shape[-1]:
-            raise ValueError(
-                f"Expected X with the {len(self.input_names)} columns that the model was built on, "
-                f"got shape {tuple(X.shape)}."
-            )
-        return inputs
-
-    def check_transformed(self, inputs: Tensor) -> None:
-        """Raise a ValueError if inputs of the model itself, in eval mode, are not transformed."""
-        expected = self.train_inputs[0].shape[-1]
-        if inputs.shape[-1] != expected:
-            raise ValueError(
-                f"In eval mode the model itself takes transformed inputs with {expected} columns, "
-                f"got shape {tuple(inputs.shape)}. Call `model.posterior(X)` on raw inputs, or "
-                "`model(model.transform_inputs(X))`."
-            )
+            return transform.without_physics(X)
+        return self.transform_inputs(X)
 
     def observation_noise(self, inputs: Tensor) -> Tensor:
         """The noise variances of observations at transformed inputs, ``... x (m) x q`` or 1.
@@ -409,15 +362,6 @@ class TermsModel(PredictiveModel):
     def outputs_first(self, values: Tensor) -> Tensor:
         """From ``... x q x m`` to ``... x (m) x q``."""
         return values.mT if self._num_outputs > 1 else values.squeeze(-1)
-
-    def _unknown_term(self, name: str) -> Term:
-        found = [term for term in self.terms if term.name == name and not term.is_known]
-        if not found:
-            raise ValueError(
-                f"{type(self).__name__} has no unknown term {name!r}; it has "
-                f"{', '.join(map(repr, self.term_names))}."
-            )
-        return found[0]
 
     def _at(self, term: Term, inputs: Tensor) -> WeightedSum:
         """A term in the user's meaning at transformed inputs: a bias has no centres beside it."""

@@ -95,12 +95,7 @@ def training_data(
 def new_observations(
     X: ArrayLike, Y: ArrayLike, input_names: tuple[str, ...], num_outputs: int
 ) -> tuple[Tensor, Tensor]:
-    """Further observations of a model as tensors ``... x k x d`` and ``... x k x m``, checked.
-
-    Raises:
-        TypeError: If one of them is not float64.
-        ValueError: If shapes disagree, ``X`` is not finite, or a row of ``Y`` holds nothing.
-    """
+    """Further observations of a model as tensors ``... x k x d`` and ``... x k x m``, checked."""
     check_columns(X, input_names)
     X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
     check_finite(X, "X")
@@ -117,11 +112,8 @@ def new_observations(
 def to_tensor(values: ArrayLike, name: str) -> Tensor:
     """Take a float64 tensor as it is, and make one of a NumPy array or a DataFrame.
 
-    Raises:
-        TypeError: If it is something else, or holds something else than real numbers: text (which
-            NumPy would read), complex numbers (cut to their real parts), dates or times
-            (nanoseconds).
-        ValueError: If values are masked.
+    A TypeError for anything else, also for what NumPy would turn into numbers: text, complex
+    numbers, dates or times. A ValueError if values are masked.
     """
     if isinstance(values, Tensor):
         if values.is_complex():
@@ -141,8 +133,7 @@ def to_tensor(values: ArrayLike, name: str) -> Tensor:
     if np.ma.is_masked(array):
         raise ValueError(
             f"Expected {name} without masked values, found {np.ma.count_masked(array)}. Leave "
-            "their rows out; targets that were not measured are NaN, which "
-            f"`{name}.filled(np.nan)` makes them."
+            f"their rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
         )
     found = {type(each) for each in array.flat} if array.dtype.kind == "O" else set()
     for what, (kinds, types, _) in _NO_NUMBERS.items():
@@ -253,10 +244,9 @@ def standardize(means: Tensor, stdvs: Tensor) -> Standardize:
 def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
     r"""The default outcome transform: divide by the root mean square of ``Y - mean``.
 
-    BoTorch's default takes shift and scale from the targets. A model with physics wants the scale
-    of the residual, so that a good physics does not push the noise under the likelihood's floor,
-    and no shift, so that :math:`\rho` keeps its meaning. Where the prior mean meets the targets but
-    for rounding, the scale is a millionth of theirs (or 1 if they are zero).
+    A good physics then does not push the noise under the likelihood's floor, and without a shift
+    :math:`\rho` keeps its meaning. Where the prior mean meets the targets but for rounding, the
+    scale is a millionth of theirs (or 1 if they are zero).
     """
 
     def rms(values: Tensor) -> Tensor:
@@ -268,19 +258,14 @@ def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
 
 
 def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Standardize | None:
-    """The user's outcome transform with shift and scale estimated from the targets.
-
-    Raises:
-        ValueError: If it is not a shift and scale of each output, or of another number of them.
-    """
+    """The user's outcome transform with shift and scale estimated from the targets."""
     if transform is None:
         return None
     if type(transform) is not Standardize:
         raise ValueError(
-            f"The outcome transform {type(transform).__name__} is not supported: f_p lives in the "
-            "units of the targets, so the transform must be one shift and scale per output. Use "
-            "Standardize, None, or the default, which divides by the residual's scale; to model "
-            "log(y), say, take the logarithm of both train_Y and the physics."
+            f"The outcome transform {type(transform).__name__} is not supported: it must be one "
+            "shift and scale per output, as the physics has the units of the targets. Use "
+            "Standardize, None, or the default; to model log(y), take both logarithms yourself."
         )
     transform.train()
     try:

@@ -42,18 +42,16 @@ NOTHING = -60.0
 class VariationalCKA(TermsModel, GPyTorchModel):
     r"""Co-kriging adjustment with inducing points, for up to some 100,000 observations.
 
-    The model is that of :class:`~gpadjust.CKA`, :math:`f_a(x) = \rho(x) f_p(x) + \delta(x)`, of
-    which a distribution over the values at ``num_inducing`` points stands for all observations
-    (Titsias 2009), so that learning takes :math:`O(n M^2)` instead of :math:`O(n^3)` operations.
-    What so many points cannot show has a term of its own, ``rest``: short-ranged variations of the
-    bias, of which nothing is known but how large they are. Without it intervals would be far too
-    narrow, as the points tie down the functions that they can show. Posteriors of ``f`` and of
-    :meth:`delta` have it in their variance.
+    The model is that of :class:`~gpadjust.CKA`, of which a distribution over the values at
+    ``num_inducing`` points stands for all observations (Titsias 2009), so that learning takes
+    :math:`O(n M^2)` instead of :math:`O(n^3)` operations. What the points cannot show, short-ranged
+    variations of the bias, has a term of its own, ``rest``, without which intervals would be far
+    too narrow. Posteriors of ``f`` and of :meth:`delta` have it in their variance.
 
     :func:`gpadjust.fit` finds hyper-parameters, points and the optimal distribution, in closed form
-    from all observations. Intervals are those of the most likely hyper-parameters, which so many
-    observations tell. It cannot be conditioned on further observations, which ``fantasize`` and
-    look-ahead acquisition functions want; the others take it.
+    from all observations; intervals are those of the most likely hyper-parameters. It cannot be
+    conditioned on further observations, which ``fantasize`` and look-ahead acquisition functions
+    want; the others take it.
 
     The arguments and errors are those of :class:`~gpadjust.CKA`, for one data set, and:
 
@@ -201,7 +199,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         return WeightedSum(f.x, [*f.parts, (self.rest, None)], f.shift)
 
     def conditioning(self) -> SparseConditioning:
-        """What is remembered of the inducing values to predict from; made if it is not there."""
+        """As the base class, by the inducing values."""
         known = self._conditioning
         if known is None or known.train_inputs[0] is not self.inducing_points:  # as after `.to`
             known = self._conditioning = SparseConditioning(
@@ -213,9 +211,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         """Forget what predictions are made of, after a change of parameters."""
         self._conditioning = None
 
-    def _revert_to_original_inputs(self) -> None:
-        """BoTorch's hook for train mode: inputs stay transformed, predictions are forgotten."""
-        self.forget()
+    _revert_to_original_inputs = forget  # BoTorch's hook for train mode: inputs stay transformed
 
     def ask_physics(self) -> None:
         """Ask the physics about the training inputs again, by what was learnt of its parameters."""
@@ -226,10 +222,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         """An exact model of the rows that are searched, in this model's units.
 
         It has the same terms and learnt noise, so that a fit of the one is a fit of the other;
-        with the physics, also the input transform and its parameters.
-
-        Raises:
-            ValueError: If this is a subset of a model's outputs.
+        with the physics, also the input transform. A ValueError of a subset of the outputs.
         """
         rows, noise = self.search_rows, self.noise.known
         if rows is None:
@@ -246,11 +239,10 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         return TermsGP(made, [*self.covar_module.terms])
 
     def data(self) -> dict[str, Tensor | None]:
-        """The data that the model was built on: raw inputs, targets and known variances."""
+        """As the base class."""
         return {"train_X": self._X, "train_Y": self._Y, "train_Yvar": self._Yvar}
 
     def _scale_known_noise(self) -> None:
-        """Bring known variances into the model's units."""
         if self._Yvar is not None:
             noise = self.outputs_first(self._Yvar) / self.units()[1].square()
             self.likelihood = FixedNoiseGaussianLikelihood(noise)
@@ -293,8 +285,8 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         """Refuse: inducing values that are optimal for further data are another fit."""
         raise NotImplementedError(
             "VariationalCKA cannot be conditioned on further observations, which fantasies and "
-            "look-ahead acquisition functions need: build it of all data and fit it again (a warm "
-            "start of few iterations will do), or take an exact CKA of some thousand."
+            "look-ahead acquisition functions need: build it of all data and fit it again, or take "
+            "an exact CKA of some thousand."
         )
 
     def fantasize(self, X: Tensor, sampler: Any, **kwargs: Any) -> NoReturn:

@@ -23,12 +23,9 @@ class Physics(torch.nn.Module, ABC):
     A subclass says in ``evaluate`` what the outputs of some rows are; calling the physics adds
     batch shapes, the choice of columns, and checks. It must be deterministic.
 
-    - *Unknown parameters.* ``unknowns`` names them and says what is known of them beforehand; then
-      ``evaluate`` is given their values, one for each row, and a model of the physics learns them
-      by :func:`gpadjust.fit` (other fits leave them at the guesses). Called without parameters the
-      physics takes their guesses.
-    - *Copies.* A deep copy of a physics without parameters and buffers is the physics itself, so
-      that a simulator's handle outlives the copies that GP libraries make of their models.
+    A model learns the ``unknowns`` by :func:`gpadjust.fit`; other fits leave them at the guesses. A
+    deep copy of a physics without parameters and buffers is the physics itself, so that a
+    simulator's handle outlives the copies that GP libraries make of their models.
 
     Args:
         unknowns: The unknown parameters by name, such as ``{"mass": Unknown(1.0, factor=1.5)}``.
@@ -41,7 +38,7 @@ class Physics(torch.nn.Module, ABC):
         unknowns: The unknown parameters, ``p`` of them.
 
     Raises:
-        TypeError: If ``inputs`` holds something else than whole numbers.
+        TypeError: If ``inputs`` are no whole numbers.
         ValueError: If ``inputs`` is empty.
 
     Example:
@@ -64,7 +61,17 @@ class Physics(torch.nn.Module, ABC):
         super().__init__()
         self.unknowns = Unknowns(unknowns)
         self._p = len(unknowns or ())
-        self.inputs = None if inputs is None else column_numbers(inputs)
+        self.inputs: tuple[int, ...] | None = None
+        if inputs is not None:
+            try:
+                self.inputs = tuple(map(index, inputs))
+            except TypeError:
+                raise TypeError(
+                    "inputs must be a sequence of column numbers, such as [0, 2]; found "
+                    f"{inputs!r}."
+                ) from None
+            if not self.inputs:
+                raise ValueError("inputs is empty; name at least one column of X, or None for all.")
         self.name = type(self).__name__ if name is None else name
         self.num_outputs: int | None = None
         self._warned: set[str] = set()
@@ -88,17 +95,15 @@ class Physics(torch.nn.Module, ABC):
         Args:
             X: ``batch_shape x n x d``, floating point.
             parameters: Values of the unknown parameters, ``... x p``, which broadcast with the
-                batch shape: one vector for all ``n`` rows. Default: the guesses.
+                batch shape. Default: the guesses.
 
         Returns:
             ``batch_shape x n x m``, of X's dtype. Dimensions along which X is expanded (stride 0)
-            are evaluated once, and the result is expanded along them; the gradient is then right
-            for the tensor that was expanded.
+            are evaluated once; the gradient is then right for the tensor that was expanded.
 
         Raises:
             TypeError: If X is not a floating-point tensor.
-            ValueError: If X has fewer than two dimensions or lacks a column of ``inputs``, or
-                parameters are not of that shape.
+            ValueError: If X lacks a dimension or column, or parameters are of another shape.
             PhysicsError: If the physics fails, or returns something else than finite outputs.
         """
         columns, shape = self.read(X), X.shape[:-1]
@@ -125,10 +130,6 @@ class Physics(torch.nn.Module, ABC):
 
     def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
         """As calling it, without gradient, NaN in rows at which the physics fails.
-
-        Args:
-            X: As there.
-            parameters: As there.
 
         Raises:
             PhysicsError: If it does not say where it fails, or fails everywhere before its number
@@ -169,8 +170,8 @@ class Physics(torch.nn.Module, ABC):
         if absent:
             raise ValueError(
                 f"Physics {self.name!r} reads the columns inputs={self.inputs}, but X of shape "
-                f"{tuple(X.shape)} has {d} column(s), so there is no column {absent}. Pass X with "
-                "all its columns, or correct inputs."
+                f"{tuple(X.shape)} has {d} column(s), no column {absent}. Pass all, or correct "
+                "inputs."
             )
         return X[..., list(self.inputs)]
 
@@ -192,7 +193,7 @@ class Physics(torch.nn.Module, ABC):
                     "known; call it on at least one row first."
                 )
             return rows.new_empty(0, self.num_outputs)
-        Y = self._checked_rows(rows)
+        Y = Physics.fresh_rows(self, rows)  # not a subclass's, which may leave evaluate out
         if not torch.is_grad_enabled():
             return Y
         if rows.requires_grad and not Y.requires_grad:
@@ -201,9 +202,8 @@ class Physics(torch.nn.Module, ABC):
                 "do not. Wrap the function as BlackBoxPhysics(function) for finite differences; "
                 "ignore this if the outputs do not depend on X."
             )
-        if not Y.requires_grad or rows.requires_grad:
-            return Y
-        if any(p.requires_grad for p in self.parameters()):
+        learns = any(p.requires_grad for p in self.parameters())
+        if learns or not Y.requires_grad or rows.requires_grad:
             return Y
         self._warn_once(
             f"Physics {self.name!r} depends on a tensor that requires grad but is not one of "
@@ -213,17 +213,9 @@ class Physics(torch.nn.Module, ABC):
         return Y.detach()
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
-        """As :meth:`of_rows`, evaluated whatever is remembered."""
-        return self._checked_rows(rows)
-
-    def _checked_rows(self, rows: Tensor) -> Tensor:
-        """Evaluate all rows, and check the outputs: ``N x m``, finite, of the rows' dtype."""
+        """As :meth:`of_rows`, evaluated whatever is remembered; checked, of the rows' dtype."""
         try:
-            if self._p:
-                d = rows.shape[-1] - self._p
-                Y = self.evaluate(rows[:, :d], self.unknowns.named(rows[:, d:]))
-            else:
-                Y = self.evaluate(rows)
+            Y = self.evaluate(*(self._arguments(rows) if self._p else (rows,)))
         except PhysicsError as error:
             if error.partial is not None:
                 error.partial = self._shaped(error.partial, len(rows)).to(rows)
@@ -241,12 +233,16 @@ class Physics(torch.nn.Module, ABC):
             if bad:
                 raise PhysicsError(
                     f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} "
-                    "row(s), expected finite numbers. Mend the physics there, or keep such inputs "
-                    "out:",
+                    "row(s), expected finite numbers. Mend it, or keep such inputs out:",
                     bad,
                     partial=Y.detach(),
                 )
         return Y
+
+    def _arguments(self, rows: Tensor) -> tuple[Tensor, *tuple[ParameterValues, ...]]:
+        """The arguments of :meth:`evaluate`, of rows ``N x (d + p)``."""
+        d = rows.shape[-1] - self._p
+        return (rows[:, :d], self.unknowns.named(rows[:, d:])) if self._p else (rows,)
 
     def forget(self) -> None:
         """Forget what is remembered of rows, if anything is."""
@@ -265,7 +261,6 @@ class Physics(torch.nn.Module, ABC):
         return copy
 
     def _checked_parameters(self, parameters: Tensor | None, X: Tensor) -> Tensor:
-        """Values of the unknown parameters, ``... x p``."""
         names = self.unknowns.names
         if parameters is None:
             return self.unknowns.guess.to(X)
@@ -364,35 +359,8 @@ def _beside(columns: Tensor, values: Tensor) -> Tensor:
 
 
 def whole_number(name: str, value: SupportsIndex) -> int:
-    """A setting as an int.
-
-    Raises:
-        TypeError: If it is no whole number.
-
-    Example:
-        >>> whole_number("memo", 1.5)
-        Traceback (most recent call last):
-        TypeError: memo must be a whole number; found 1.5.
-    """
+    """A setting as an int, or a TypeError."""
     try:
         return index(value)
     except TypeError:
         raise TypeError(f"{name} must be a whole number; found {value!r}.") from None
-
-
-def column_numbers(inputs: Sequence[int]) -> tuple[int, ...]:
-    """The setting ``inputs`` as a tuple.
-
-    Raises:
-        TypeError: If it holds something else than whole numbers.
-        ValueError: If it is empty.
-    """
-    try:
-        columns = tuple(index(i) for i in inputs)
-    except TypeError:
-        raise TypeError(
-            f"inputs must be a sequence of column numbers, such as [0, 2]; found {inputs!r}."
-        ) from None
-    if not columns:
-        raise ValueError("inputs is empty; name at least one column of X, or None for all.")
-    return columns

@@ -18,24 +18,20 @@ from gpadjust.physics.row_calls import call_rows, real_array
 from gpadjust.physics.unknown import ParameterValues, Unknown
 
 NumpyFunction = Callable[..., ArrayLike]
+Array = NDArray[np.float64]
 
 
 class BlackBoxPhysics(Physics):
     """Physics given as a NumPy function or a simulator.
 
-    Simulations of single rows (``batched=False``) run in parallel, with no change of code, inside
+    Simulations of single rows (``batched=False``) run in parallel inside ``with
+    joblib.parallel_config(backend="loky", n_jobs=4)``, or any other backend of joblib, a cluster's
+    included.
 
-        with joblib.parallel_config(backend="loky", n_jobs=4):
-            ...
-
-    or any other backend of joblib, a cluster's included. Rows that succeed are remembered even
-    when others fail.
-
-    A result is remembered, and each distinct row is evaluated once: fitting a model, predicting and
-    differentiating ask for the same rows again. The memory is dropped when a parameter or buffer of
-    the physics changes, or dtype and device of the inputs; it cannot see other changes, such as a
-    plain attribute: call ``forget()`` after those. Threads may share a physics if what it calls
-    allows that.
+    Each distinct row is evaluated once, and its result remembered, even when other rows fail. The
+    memory is dropped when a parameter or buffer of the physics changes, or dtype and device of the
+    inputs; it cannot see other changes, such as a plain attribute: call ``forget()`` after those.
+    Threads may share a physics if what it calls allows that.
 
     Args:
         function: Maps a float64 array of rows ``N x d`` to ``N x m``, or ``N`` if ``m`` is 1; with
@@ -99,14 +95,7 @@ class BlackBoxPhysics(Physics):
         self.fd_step = fd_step
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The function's outputs.
-
-        Args:
-            X: ``N x d``.
-            parameters: Those that are unknown, if there are any.
-
-        Returns:
-            ``N x m``, or ``N`` if the function returns such.
+        """The function's outputs, as :meth:`Physics.evaluate`.
 
         Raises:
             PhysicsError: If single rows fail. It carries the outputs of the others.
@@ -115,12 +104,9 @@ class BlackBoxPhysics(Physics):
         Y = real_array(self.function(rows, *more)) if self.batched else self._stack(rows, *more)
         return torch.from_numpy(Y).to(X.device)
 
-    def _stack(
-        self, rows: NDArray[np.float64], *parameters: ParameterValues
-    ) -> NDArray[np.float64]:
-        results = call_rows(
-            self.function, rows, *([p.row(i) for i in range(len(rows))] for p in parameters)
-        )
+    def _stack(self, rows: Array, *parameters: ParameterValues) -> Array:
+        more = ([p.row(i) for i in range(len(rows))] for p in parameters)
+        results = call_rows(self.function, rows, *more)
         errors = {i: y for i, y in enumerate(results) if isinstance(y, Exception)}
         outputs = {i: y for i, y in enumerate(results) if not isinstance(y, Exception)}
         lengths = {len(y) for y in outputs.values()}
@@ -137,16 +123,15 @@ class BlackBoxPhysics(Physics):
         if errors:
             first = next(iter(errors.values()))
             raise PhysicsError(
-                f"Physics {self.name!r} raised {described(first)}, in the first of "
-                f"{len(errors)} failed row(s) of {len(rows)}. Mend the function there, or keep "
-                "such inputs out; the other rows are done:",
+                f"Physics {self.name!r} raised {described(first)}, in the first of {len(errors)} "
+                f"failed row(s) of {len(rows)}. Mend it, or keep such inputs out:",
                 errors,
                 partial=torch.from_numpy(Y) if outputs else None,
             ) from first
         return Y
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, by the memory and with the gradient that was asked for."""
+        """As the base class, by the memory and with the gradient asked for."""
         if not torch.is_grad_enabled() or not rows.requires_grad or len(rows) == 0:
             return self._recall(rows.detach())
         if self.gradient is None:
@@ -201,17 +186,16 @@ class BlackBoxPhysics(Physics):
             raise
 
     def _user_jacobian(self, gradient: NumpyFunction, rows: Tensor) -> Tensor:
-        d = rows.shape[1] - self._p
-        given = [self.unknowns.named(rows[:, d:]).numpy()] if self._p else []
+        X, *parameters = self._arguments(rows)
         try:
-            J = real_array(gradient(_to_numpy(rows[:, :d]), *given))
+            J = real_array(gradient(_to_numpy(X), *(p.numpy() for p in parameters)))
         except PhysicsError:
             raise
         except Exception as error:
             raise PhysicsError(
                 f"The gradient of physics {self.name!r} raised {type(error).__name__}: {error}."
             ) from error
-        expected = (len(rows), self.num_outputs, d)
+        expected = (len(rows), self.num_outputs, X.shape[1])
         if J.shape != expected or not np.isfinite(J).all():
             raise PhysicsError(
                 f"The gradient of physics {self.name!r} returned a Jacobian of shape {J.shape}, "
@@ -224,6 +208,6 @@ def _same(a: Tensor, b: Tensor) -> bool:
     return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
 
 
-def _to_numpy(X: Tensor) -> NDArray[np.float64]:
+def _to_numpy(X: Tensor) -> Array:
     # A copy: a simulator may write to its input.
     return X.detach().cpu().double().numpy().copy()

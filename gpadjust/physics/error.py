@@ -18,7 +18,7 @@ class PhysicsError(RuntimeError):
         message: What was found, what was expected, and the way out.
         rows: The failing rows, as indices into the rows that were asked for.
         partial: ``N x m`` outputs when only some rows failed, not finite in those; the others are
-            memoised before the error is raised, so that the next attempt does not pay for them.
+            remembered.
 
     Attributes:
         rows: Indices of the failing rows, counted over the flattened leading dimensions of X;
@@ -44,16 +44,11 @@ class PhysicsError(RuntimeError):
         self.partial = partial
 
     def relocate(self, origin: Tensor) -> None:
-        """Restates ``rows`` as positions in a longer list, whose entry ``i`` is row ``origin[i]``.
-
-        Args:
-            origin: ``N`` integers; -1 marks an entry that is none of the rows.
-        """
+        """Restates ``rows`` as positions in a list whose entry ``i`` is row ``origin[i]`` or -1."""
         failed = torch.isin(origin, torch.tensor(self.rows, dtype=origin.dtype))
         self.rows = tuple(failed.nonzero().flatten().tolist())
 
     def __str__(self) -> str:
-        """The message, then the first failing rows with their inputs."""
         lines = [str(self.args[0])]
         for position, row in enumerate(self.rows[:_SHOWN]):
             values = "" if self.inputs is None else f": {self.inputs[position].tolist()}"

@@ -55,11 +55,7 @@ class FunctionPhysics(Physics):
         self.function = function
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The function's outputs, ``N x m`` or ``N``, of rows ``N x d`` (and parameters).
-
-        Raises:
-            PhysicsError: If the function computes with NumPy.
-        """
+        """The function's outputs; a PhysicsError if it computes with NumPy."""
         try:
             Y = self.function(X, *parameters)
             if not isinstance(Y, np.ndarray | np.generic):
@@ -78,8 +74,7 @@ class FunctionPhysics(Physics):
 class JoinedPhysics(Physics):
     """Several physics of the same inputs, their outputs side by side.
 
-    Each part reads its own columns of X, and has its own memory and gradient; it is asked once per
-    call.
+    Each part reads its own columns of X, and has its own memory and gradient.
 
     Args:
         physics: ``k`` physics or callables (see ``as_physics``), or a mapping from names to such.
@@ -92,8 +87,7 @@ class JoinedPhysics(Physics):
         num_outputs: ``k m``, for ``k`` parts of ``m`` outputs each; None until the first call.
 
     Raises:
-        TypeError: If ``physics`` is neither a sequence nor a mapping with text as keys, or a part
-            is no physics.
+        TypeError: If ``physics`` is no list, or no mapping with text as keys, of physics.
         ValueError: If ``physics`` is empty.
 
     Example:
@@ -122,24 +116,16 @@ class JoinedPhysics(Physics):
         self.parts = torch.nn.ModuleList(parts)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The outputs ``N x (k m)`` of the parts, those of the first part first.
-
-        Raises:
-            PhysicsError: If a part fails, or the parts differ in their number of outputs.
-        """
+        """The outputs ``N x (k m)`` of the parts, those of the first part first."""
         return self._of_parts(lambda part, own: part.of_rows(own), X, *parameters)
 
     def of_rows(self, rows: Tensor) -> Tensor:
         """As the base class; checks, memory and gradients are the parts'."""
-        d = rows.shape[-1] - self._p
-        given = [self.unknowns.named(rows[:, d:])] if self._p else []
-        return self._of_parts(lambda part, own: part.of_rows(own), rows[:, :d], *given)
+        return self.evaluate(*self._arguments(rows))
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
         """As :meth:`of_rows`, whatever the parts remember."""
-        d = rows.shape[-1] - self._p
-        given = [self.unknowns.named(rows[:, d:])] if self._p else []
-        return self._of_parts(lambda part, own: part.fresh_rows(own), rows[:, :d], *given)
+        return self._of_parts(lambda part, own: part.fresh_rows(own), *self._arguments(rows))
 
     def _of_parts(
         self, ask: Callable[[Physics, Tensor], Tensor], X: Tensor, *parameters: ParameterValues
@@ -217,9 +203,9 @@ def _in_common(parts: Sequence[Physics]) -> dict[str, Unknown]:
         for name, unknown in part.unknowns.items():
             if found.setdefault(name, unknown) != unknown:
                 raise ValueError(
-                    f"Several physics have an unknown parameter {name!r}, which is then one and "
-                    f"the same, but say different things of it: {found[name]} and {unknown}. Say "
-                    "the same, or give it another name."
+                    f"Several physics have an unknown parameter {name!r}, which is then one, but "
+                    f"say different things of it: {found[name]} and {unknown}. Say the same, or "
+                    "give it another name."
                 )
     return found
 

@@ -22,8 +22,7 @@ def central_difference(
             ``i // d % N`` of X, moved along column ``i % d``.
         X: ``N x d``.
         step: :math:`h`, broadcastable to ``N x d``, in the columns' units. Default:
-            :math:`\epsilon^{1/3} \max(1, |x|)`, which balances truncation against rounding for
-            functions that vary on the scale of 1 and :math:`|x|`.
+            :math:`\epsilon^{1/3} \max(1, |x|)`.
 
     Returns:
         ``N x m x d``.

@@ -17,10 +17,8 @@ from gpadjust.physics.function import FunctionPhysics, as_physics
 def import_path(physics: Physics | Callable[[Tensor], Tensor]) -> str | None:
     """The path of a physics, for ``physics_from_path``.
 
-    Args:
-        physics: A callable, or a physics. A ``FunctionPhysics`` without a path of its own has that
-            of its function if it was made of this alone. A physics or another object has a path if
-            it is an attribute of the module of its class, or of that of its callables.
+    A ``FunctionPhysics`` without a path of its own has that of its function if it was made of this
+    alone. Objects have a path if they are attributes of the module of their class or callables.
 
     Returns:
         ``"package.module:qualname"``; None for what has no name in a module, as lambdas and
@@ -43,13 +41,8 @@ def physics_from_path(path: str) -> Physics:
     Importing a module runs its code, so take paths from files that you trust only.
 
     Args:
-        path: ``"package.module:qualname"``.
-
-    Returns:
-        The physics, or the callable in a ``FunctionPhysics``.
-
-    Raises:
-        ValueError: If the path has another form, cannot be imported, or names something else.
+        path: ``"package.module:qualname"``; a ValueError if it has another form, cannot be
+            imported, or names something else.
 
     Example:
         >>> physics_from_path("torch:sin").name

@@ -14,13 +14,7 @@ from gpadjust.physics.error import PhysicsError
 
 
 def row_keys(rows: Tensor) -> list[bytes]:
-    """One hashable key for each of ``N x d`` rows: equal rows, and only those, have equal keys.
-
-    Example:
-        >>> keys = row_keys(torch.tensor([[0.0, 1.0], [-0.0, 1.0], [2.0, 1.0]]))
-        >>> keys[0] == keys[1], keys[0] == keys[2]
-        (True, False)
-    """
+    """One hashable key for each of ``N x d`` rows: equal rows, and only those, have equal keys."""
     # Adding zero turns -0.0 into 0.0: they are equal, but their bytes are not.
     table = np.ascontiguousarray(rows.detach().cpu().double().numpy() + 0.0)
     row_bytes = np.dtype((np.void, table.itemsize * table.shape[1]))
@@ -28,13 +22,10 @@ def row_keys(rows: Tensor) -> list[bytes]:
 
 
 class RowMemo:
-    """A dictionary from input rows to output rows, which threads may share.
+    """A dictionary of at most ``capacity`` input rows to output rows, which threads may share.
 
     When new rows do not fit, it forgets all and begins again with these. Rows that two threads ask
     for at the same moment may be evaluated by both.
-
-    Args:
-        capacity: The most rows it holds; 0 for none.
 
     Example:
         >>> memo = RowMemo(capacity=100)
@@ -55,7 +46,6 @@ class RowMemo:
         self._lock = RLock()
 
     def __len__(self) -> int:
-        """The number of rows remembered."""
         return len(self._rows)
 
     def recall(
@@ -66,25 +56,22 @@ class RowMemo:
         Args:
             rows: ``N x d``.
             evaluate: Maps the distinct unknown rows ``k x d`` to values ``k x m``. If it raises a
-                ``PhysicsError`` with a ``partial`` result, the finite rows of that are remembered.
+                ``PhysicsError``, the finite rows of its ``partial`` result are remembered, and its
+                ``rows`` restated.
             learn: Whether new values are remembered.
-
-        Returns:
-            ``N x m``, of the dtype and on the device of the rows.
-
-        Raises:
-            PhysicsError: That of ``evaluate``, its ``rows`` restated as indices into ``rows``.
         """
         if not len(rows):
             return evaluate(rows)
         keys = row_keys(rows)
         with self._lock:
             found = {key: self._rows[key] for key in keys if key in self._rows}
-        asked = {key: i for i, key in reversed([*enumerate(keys)]) if key not in found}
-        new = sorted(asked, key=asked.__getitem__)
-        if new:
+        first: dict[bytes, int] = {}  # where each new row is
+        for i, key in enumerate(keys):
+            if key not in found:
+                first.setdefault(key, i)
+        if new := [*first]:
             try:
-                values = evaluate(rows[[asked[key] for key in new]])
+                values = evaluate(rows[[*first.values()]])
             except PhysicsError as error:
                 partial, error.partial = error.partial, None
                 if partial is not None and learn:
@@ -110,12 +97,10 @@ class RowMemo:
             self._rows.update(pairs)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for a pickle, without the lock."""
         with self._lock:
             return {"capacity": self.capacity, "_rows": self._rows.copy()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of a pickle, with a lock of its own."""
         self.__dict__.update(state, _lock=RLock())
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RowMemo:

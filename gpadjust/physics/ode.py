@@ -36,8 +36,7 @@ class ODEPhysics(Physics):
         state_dim: The number of leading columns that hold the state; the others hold the action.
         substeps: Integration steps within the step, for the fixed-step methods.
         method: A method of ``torchdiffeq.odeint``. The adaptive ones control one step size for all
-            rows of a batch together, so that a row's result depends, within the tolerances, on
-            the rows it is evaluated with; hence the default.
+            rows of a batch, on which a row's result then depends within the tolerances.
         rtol: Relative tolerance of the adaptive methods.
         atol: Absolute tolerance of the adaptive methods, in the unit of the state.
         max_steps: The most steps that an adaptive method tries within ``step``.
@@ -51,10 +50,8 @@ class ODEPhysics(Physics):
         name: The name in messages. Default: that of ``rhs``.
 
     Raises:
-        TypeError: If ``rhs`` is not callable, or a setting is no number, or none that is whole
-            where it counts something.
-        ValueError: If ``step``, ``substeps``, ``state_dim`` or ``max_steps`` is not positive, a
-            tolerance is negative, or ``method`` or ``gradient`` is unknown.
+        TypeError: If ``rhs`` is not callable, or a setting is no number, or not whole.
+        ValueError: If a setting is out of range, or ``method`` or ``gradient`` is unknown.
 
     Example:
         >>> decay = ODEPhysics(lambda state, action: -state + action, step=1.0, state_dim=1)
@@ -102,31 +99,17 @@ class ODEPhysics(Physics):
             )
         name = name or getattr(rhs, "__name__", type(rhs).__name__)
         super().__init__(unknowns=unknowns, inputs=inputs, name=name)
-        self.rhs = rhs
-        self.step = float(step)
-        self.state_dim = state_dim
-        self.substeps = substeps
-        self.method = method
-        self.rtol = rtol
-        self.atol = atol
-        self.max_steps = max_steps
-        self.difference = difference
+        self.rhs, self.step, self.difference = rhs, float(step), difference
+        self.state_dim, self.substeps, self.max_steps = state_dim, substeps, max_steps
+        self.method, self.rtol, self.atol = method, rtol, atol
         self.gradient = gradient
         self.num_outputs = state_dim
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
-        """The state after the step, or its change.
+        """The state after the step or its change, ``N x state_dim``.
 
-        Args:
-            X: ``N x (state_dim + a)``, states and actions.
-            parameters: Those that are unknown, if there are any.
-
-        Returns:
-            ``N x state_dim``.
-
-        Raises:
-            PhysicsError: If X has fewer than ``state_dim`` columns, ``rhs`` returns something else
-                than one time derivative per state, or an adaptive method does not arrive.
+        A PhysicsError says that X has fewer columns, ``rhs`` returns something else than one time
+        derivative per state, or an adaptive method does not arrive.
         """
         if X.shape[1] < self.state_dim:
             raise PhysicsError(
@@ -166,9 +149,8 @@ class ODEPhysics(Physics):
                 raise
             raise PhysicsError(
                 f"The method {self.method!r} of physics {self.name!r} did not reach the end of the "
-                f"time step ({error}); expected it to within max_steps={self.max_steps}. The rhs "
-                "may be stiff, have jumps, or blow up: use a method with a fixed step, such as "
-                "'rk4' with many substeps, or larger rtol and atol, or more max_steps.",
+                f"time step ({error}) within max_steps={self.max_steps}. The rhs may be stiff: use "
+                "'rk4' with many substeps, larger rtol and atol, or more max_steps.",
                 range(len(X)),
             ) from error
         return path[-1] - state if self.difference else path[-1]
@@ -180,18 +162,17 @@ class ODEPhysics(Physics):
         if not by_differences or any(p.requires_grad for p in self.parameters()):
             return super().of_rows(rows)
 
+        slope: Tensor | None = None
         with torch.no_grad():
             try:
                 # In one call, as what it costs grows slowly with the rows.
                 values, slope = self.jacobian(rows.detach(), with_values=True)
             except PhysicsError:  # which rows they are, or that only those beside them failed
-                values, found = super().of_rows(rows.detach()), None
-            else:
-                found = slope
+                values = super().of_rows(rows.detach())
 
         def jacobian(rows: Tensor) -> Tensor:
             with torch.no_grad():
-                return self.jacobian(rows)[1] if found is None else found
+                return self.jacobian(rows)[1] if slope is None else slope
 
         return ExternalCall.apply(rows, lambda _: values, jacobian)
 
@@ -207,15 +188,7 @@ class ODEPhysics(Physics):
 
 
 def is_finite(name: str, value: float) -> bool:
-    """Whether a setting is finite.
-
-    Raises:
-        TypeError: If it is no number.
-
-    Example:
-        >>> is_finite("step", float("inf"))
-        False
-    """
+    """Whether a setting is finite; a TypeError if it is no number."""
     try:
         return math.isfinite(value)
     except TypeError:

@@ -16,18 +16,10 @@ RowFunction = Callable[..., ArrayLike]
 def call_rows(
     function: RowFunction, X: NDArray[np.float64], *more: Sequence[Any]
 ) -> list[NDArray[np.float64] | Exception]:
-    """Calls a function on each row; a row that fails does not stop the others.
+    """Calls a function on each row, in parallel if a ``joblib.parallel_config`` says so.
 
-    The calls go through ``joblib.Parallel(n_jobs=None)``: one after the other, unless a
-    ``joblib.parallel_config`` says otherwise.
-
-    Args:
-        function: Maps a row ``(d,)`` to a scalar or ``(m,)``.
-        X: ``N x d``.
-        more: Further arguments of the function, one for each row.
-
-    Returns:
-        For each row its outputs ``(m,)``, or the exception it raised.
+    It maps a row ``(d,)``, and ``more`` for each, to a scalar or ``(m,)``. For each row there are
+    its outputs ``(m,)``, or the exception it raised.
 
     Example:
         >>> call_rows(lambda x: 1 / int(x[0]), np.array([[2.0], [0.0]]))
@@ -40,18 +32,10 @@ def call_rows(
 
 
 def real_array(values: ArrayLike) -> NDArray[np.float64]:
-    """A copy of real numbers as a float64 array.
+    """A copy of real numbers as a float64 array; a TypeError if they are anything else.
 
-    Raises:
-        TypeError: If they are anything else. NumPy would drop the imaginary part of complex
-            numbers, and take None for NaN and text for numbers.
-
-    Example:
-        >>> real_array([1, 2])
-        array([1., 2.])
-        >>> real_array([1j])
-        Traceback (most recent call last):
-        TypeError: expected real numbers, found complex128
+    NumPy would drop the imaginary part of complex numbers, and take None for NaN and text for
+    numbers.
     """
     array = np.array(values)
     # Objects may be numbers, such as fractions.
@@ -70,13 +54,8 @@ def _call_row(function: RowFunction, *row: Any) -> NDArray[np.float64] | Excepti
             raise ValueError(f"expected a scalar or outputs of shape (m,), found {y.shape}")
         return y
     except Exception as error:
-        return error if _can_travel(error) else RuntimeError(f"{type(error).__name__}: {error}")
-
-
-def _can_travel(error: Exception) -> bool:
-    # An exception that does not survive a pickle would break the pool, and lose the other rows.
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return False
-    return True
+        try:  # one that does not survive a pickle would break the pool, and lose the other rows
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            return RuntimeError(f"{type(error).__name__}: {error}")
+        return error

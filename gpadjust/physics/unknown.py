@@ -52,7 +52,6 @@ class Unknown:
     unit: str = ""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         for name in ("guess", "sd", "factor"):
             value = getattr(self, name)
             if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):
@@ -127,7 +126,6 @@ class Unknown:
 
     @property
     def _is_cut(self) -> bool:
-        """Whether bounds cut a prior off."""
         low, high = self.bounds
         return not self._is_uniform and (high < math.inf or low > (-math.inf if self.sd else 0.0))
 
@@ -151,9 +149,7 @@ def _share(z: Tensor) -> Tensor:
 class ParameterValues(Mapping[str, Any]):
     """Values of parameters by their names, as items or attributes: ``p["mass"]``, ``p.mass``.
 
-    Args:
-        names: The names.
-        rows: The values side by side, ``N x p``, or ``p`` for a single row.
+    They are ``N`` each of ``rows``, ``N x p``, or numbers of a single row, ``p``.
     """
 
     def __init__(self, names: tuple[str, ...], rows: Any) -> None:
@@ -161,13 +157,11 @@ class ParameterValues(Mapping[str, Any]):
         self.rows = rows
 
     def __getitem__(self, name: str) -> Any:
-        """The values of a parameter, ``N``."""
         if name not in self._names:
             raise KeyError(f"There is no parameter {name!r}; there are {', '.join(self._names)}.")
         return self.rows[..., self._names.index(name)]
 
     def __getattr__(self, name: str) -> Any:
-        """The values of a parameter, ``N``."""
         if name.startswith("_"):  # also of a copy that has nothing yet
             raise AttributeError(name)
         if name not in self._names:
@@ -176,11 +170,9 @@ class ParameterValues(Mapping[str, Any]):
         return self[name]
 
     def __iter__(self) -> Iterator[str]:
-        """The names."""
         return iter(self._names)
 
     def __len__(self) -> int:
-        """How many there are."""
         return len(self._names)
 
     def numpy(self) -> ParameterValues:
@@ -192,16 +184,8 @@ class ParameterValues(Mapping[str, Any]):
         return ParameterValues(self._names, np.asarray(self.rows[i]))
 
 
-class Unknowns(Mapping[str, Unknown]):
-    """The unknown parameters of a physics, by name, and their coordinates.
-
-    Args:
-        given: The parameters; None for none.
-
-    Raises:
-        TypeError: If it is no mapping from names to :class:`Unknown`.
-        ValueError: If a name is none of an attribute.
-    """
+class Unknowns(dict[str, Unknown]):
+    """The unknown parameters of a physics, by name, and their coordinates."""
 
     def __init__(self, given: Mapping[str, Unknown] | None) -> None:
         given = {} if given is None else given
@@ -213,54 +197,34 @@ class Unknowns(Mapping[str, Unknown]):
                 f"{{'mass': Unknown(1.0, factor=1.5)}}; found {given!r}."
             )
         for name in given:
-            if not isinstance(name, str) or not _can_be_attribute(name):
+            is_word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
+            if not is_word or name.startswith("_") or hasattr(ParameterValues((), None), name):
                 raise ValueError(
                     f"Unknown parameters have names such as 'mass', that can be attributes; found "
                     f"{name!r}."
                 )
-        self._given = dict(given)
-
-    def __getitem__(self, name: str) -> Unknown:
-        """The parameter of a name."""
-        return self._given[name]
-
-    def __iter__(self) -> Iterator[str]:
-        """The names."""
-        return iter(self._given)
-
-    def __len__(self) -> int:
-        """Their number p."""
-        return len(self._given)
+        super().__init__(given)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names."""
-        return tuple(self._given)
+        return tuple(self)
 
     @property
     def guess(self) -> Tensor:
         """The guesses, ``p``."""
-        return torch.tensor([u.guess for u in self._given.values()], dtype=torch.float64)
+        return torch.tensor([u.guess for u in self.values()], dtype=torch.float64)
 
     def at(self, coordinates: Tensor) -> Tensor:
         """Values ``... x p`` at coordinates ``... x p``, standard normal by the prior."""
-        pairs = zip(self._given.values(), coordinates.unbind(-1), strict=True)
+        pairs = zip(self.values(), coordinates.unbind(-1), strict=True)
         return torch.stack([u.value(z) for u, z in pairs], dim=-1)
 
     def coordinates(self, values: Tensor) -> Tensor:
         """The reverse of :meth:`at`."""
-        pairs = zip(self._given.values(), values.unbind(-1), strict=True)
+        pairs = zip(self.values(), values.unbind(-1), strict=True)
         return torch.stack([u.coordinate(value) for u, value in pairs], dim=-1)
 
     def named(self, values: Tensor) -> ParameterValues:
         """Values ``N x p`` by name."""
         return ParameterValues(self.names, values)
-
-
-def _can_be_attribute(name: str) -> bool:
-    """Whether ``p.name`` can be a parameter's value."""
-    is_word = name.isidentifier() and not iskeyword(name) and not name.startswith("_")
-    return is_word and not hasattr(_NO_VALUES, name)
-
-
-_NO_VALUES = ParameterValues((), torch.zeros(0, 0))
