@@ -74,7 +74,7 @@ def _targets(runs: pd.DataFrame) -> list[list[str]]:
     for i, method in enumerate(ours, start=1):
         ratios = {p: median[method, p] / median["stgp", p] for p in MISLEADS if p in median["stgp"]}
         enter(
-            f"O{i}",
+            f"B{i}",
             f"{METHODS[method]}: median regret at most 1.1 times SingleTaskGP's, f_p misleads",
             met(all(ratio <= 1.1 for ratio in ratios.values())),
             [f"{p} {ratio:.2g}" for p, ratio in ratios.items()],
@@ -82,7 +82,7 @@ def _targets(runs: pd.DataFrame) -> list[list[str]]:
     for i, method in enumerate(ours, start=3):
         pairs = {p: (lost[method, p], lost["stgp", p]) for p in MISLEADS if p in median["stgp"]}
         enter(
-            f"O{i}",
+            f"B{i}",
             f"{METHODS[method]}: no run above 5 % where SingleTaskGP has none",
             met(all(own == 0 or other > 0 for own, other in pairs.values())),
             [f"{p} {own} ({other})" for p, (own, other) in pairs.items()],
@@ -90,7 +90,7 @@ def _targets(runs: pd.DataFrame) -> list[list[str]]:
     if "cka" in ours:
         both = {p: (found["cka", p], found["stgp", p]) for p in HELPS if p in median["stgp"]}
         enter(
-            "O5",
+            "B5",
             "CKA: at most half of SingleTaskGP's trials to 1 %, f_p helps",
             met(all(own <= 0.5 * other for own, other in both.values())),
             [f"{p} {_trials(own)} ({_trials(other)})" for p, (own, other) in both.items()],
