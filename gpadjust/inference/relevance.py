@@ -56,14 +56,6 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     return other
 
 
-@torch.no_grad()
-def uses_physics(model: TermsGP) -> Tensor:
-    """Which samples that a model holds have its physics, ``S x batch_shape x (m)``."""
-    known = [term for term in model.terms if not term.learns_mean]
-    same = [(term.mean == term.given_mean).squeeze(-1) for term in known]
-    return torch.stack(same).all(0) if same else model.terms[0].mean.squeeze(-1).isfinite()
-
-
 def _of_scaled(model: TermsGP) -> list[Hyperparameter]:
     """The rows of the hyper-parameters of functions that scale a physics."""
     own = {id(p) for t in model.terms if is_scaled(t) for p in t.parameters()}

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from gpadjust.gp import AppendedPhysics
-from gpadjust.inference.relevance import uses_physics
 from gpadjust.models import TermsGP, TermsModel, VariationalCKA
+from gpadjust.models.hyperparameter_samples import uses_physics
 from gpadjust.models.parameters import hyperparameters
 
 

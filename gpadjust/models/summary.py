@@ -9,6 +9,7 @@ from botorch.models.transforms.input import Normalize
 from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics, PhysicsInput, Unit
+from gpadjust.models.hyperparameter_samples import take_samples, uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
 _ROUNDING = 1e-12  # of a term's unit
@@ -36,7 +37,15 @@ def summary(model: Any) -> str:
     if model.has_unknowns:
         lines += ["parameters of the physics:", *_of_physics(model)]
     for i, name in enumerate(model.output_names):
-        lines += [f"{name}:", *_lines(model.subset_output([i]))]
+        own = model.subset_output([i])
+        lines.append(f"{name}:")
+        has_physics = None if own.num_samples is None else uses_physics(own).flatten()
+        if has_physics is not None and not has_physics.all():
+            out, held = int((~has_physics).sum()), len(has_physics)
+            lines.append(f"  the physics is left out in {out} of {held} samples")
+            if out < held:  # what follows is of the others
+                own = take_samples(own, has_physics.nonzero().flatten(), as_mixture=True)
+        lines += _lines(own)
     return "\n".join(lines)
 
 
@@ -46,7 +55,9 @@ def _lines(model: Any) -> list[str]:
     lines = [f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
     for term in model.terms:
         variance = None if term.form is None else term.form.variance()
-        if variance is not None and (variance < _ROUNDING**2).all():
+        is_left_out = isinstance(term.basis, AppendedPhysics) and not term.mean.any()
+        is_left_out = is_left_out and bool(term.given_mean.any())
+        if is_left_out or (variance is not None and (variance < _ROUNDING**2).all()):
             lines.append(f"  {term.name}: none")
             continue
         unit = torch.ones_like(scale) if term.unit is Unit.NONE else scale

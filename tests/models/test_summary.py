@@ -139,3 +139,20 @@ def test_a_kernel_that_reads_some_inputs(uniform, normalize):
     for i in (2, 0):
         assert f"lengthscale of x{i + 1}: {0.5 * ranges[i]:.4g}" in text
     assert "lengthscale of x2" not in text
+
+
+def test_samples_without_the_physics_are_said():
+    generator = torch.Generator().manual_seed(0)
+    X = torch.rand(15, 1, generator=generator, dtype=torch.float64)
+    Y = torch.cat([(6 * X).sin() + X, 2 * (6 * X).sin() + X], -1)
+
+    def physics(X):
+        return torch.cat([3 * (1e4 * X).sin(), (6 * X).sin()], -1)
+
+    model = CKA(X, Y, physics=physics)
+    fit(model)
+    first, second = model.summary().split("y2:")
+    assert "the physics is left out in 16 of 16 samples" in first
+    assert "rho: none" in first
+    assert "left out" not in second
+    assert "rho: mean 1" in second
