@@ -45,8 +45,13 @@ class PhysicsInUnits(Physics):
         raw = self.units.raw(X, self.reads)
         Y = self.inner.of_rows(self.inner.read_rows(raw, *parameters))
         if Y.shape[-1] != 1:
-            raise PhysicsError(
-                f"The physics {self.name!r} returned {Y.shape[-1]} columns for the metric "
-                f"{self.metric!r}, expected one; give each metric a physics of its own."
-            )
+            raise several_outputs(self.name, self.metric, Y.shape[-1])
         return self.units.metric(Y, self.metric)
+
+
+def several_outputs(name: str, metric: str, count: int) -> PhysicsError:
+    """The error of a physics with several outputs."""
+    return PhysicsError(
+        f"The physics {name!r} returned {count} columns for the metric {metric!r}, expected one; "
+        "give each metric a physics of its own."
+    )

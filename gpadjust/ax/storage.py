@@ -10,17 +10,19 @@ from ax.storage.json_store.registry import CORE_DECODER_REGISTRY, CORE_ENCODER_R
 from ax.storage.transform_registry import register_transform
 
 from gpadjust.ax.parameter_physics import ParameterPhysics
+from gpadjust.ax.physics_optimum_node import PhysicsOptimumNode
 from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.models import CKA, RRA, CalibratedPhysics, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 
 
 def register() -> None:
-    """Enter models, transform and physics in Ax's registries."""
+    """Enter models, transform, node and physics in Ax's registries."""
     for model in (CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, CalibratedPhysics):
         register_model(model)
     register_transform(TellPhysics)
     CORE_ENCODER_REGISTRY[ParameterPhysics] = as_dict
     CORE_DECODER_REGISTRY[ParameterPhysics.__name__] = ParameterPhysics
+    CORE_DECODER_REGISTRY[PhysicsOptimumNode.__name__] = PhysicsOptimumNode
 
 
 def as_dict(physics: ParameterPhysics) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 from ax.adapter.base import Adapter
 from ax.adapter.data_utils import ExperimentData
 from ax.adapter.transforms.base import Transform
-from ax.core.parameter import RangeParameter
+from ax.core.parameter import ChoiceParameter, ParameterType, RangeParameter
 from ax.core.search_space import SearchSpace
 from ax.generators.torch.botorch_modular.generator import BoTorchGenerator
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
@@ -65,7 +65,15 @@ class TellPhysics(Transform):
             for p in given.parameters.values()
             if isinstance(p, RangeParameter)
         }
-        units = Units(before, [*search_space.parameters], ranges)
+        whole = [
+            name for name in ranges if given.parameters[name].parameter_type is ParameterType.INT
+        ]
+        choices = {
+            p.name: [float(value) for value in p.values]
+            for p in given.parameters.values()
+            if isinstance(p, ChoiceParameter) and p.is_numeric
+        }
+        units = Units(before, [*search_space.parameters], ranges, whole, choices)
         observed = set(experiment_data.metric_signatures)
         metrics = observed | {each.signature for each in adapter._experiment.metrics.values()}
         told = _Told(units, [*given.parameters], observed, metrics)

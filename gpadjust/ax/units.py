@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -29,18 +29,23 @@ from torch import Tensor
 
 Columns = dict[str, Tensor]
 
+_NEXT_TO = 1e-6  # of a whole number
+
 
 class Units:
     """From what a model in Ax sees to the units of the search space, and back for the metrics.
 
-    It is differentiable but for choices, and holds plain values, not Ax's objects, so that models
-    can be copied and pickled.
+    It is differentiable but for coded choices, and holds plain values, not Ax's objects, so
+    that models can be copied and pickled.
 
     Args:
         transforms: Ax's transforms, initialised, in the order in which they were applied.
         names: The columns that the model sees.
         ranges: Lower and upper bounds of parameters, within which a physics is asked: BoTorch also
             looks around the data, beyond them.
+        whole: Those whose values are whole numbers, to which what is next to one is rounded: Ax and
+            the models scale them, so that 8 comes back as 7.999999999999999.
+        choices: The numbers of choices, of which a physics is asked the nearest.
 
     Raises:
         ValueError: If there is a transform that it does not know.
@@ -51,6 +56,8 @@ class Units:
         transforms: Sequence[Transform],
         names: Sequence[str],
         ranges: Mapping[str, tuple[float, float]],
+        whole: Collection[str] = (),
+        choices: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         known = (*_BACK, *_FORTH, *_NEITHER)
         unknown = [type(t).__name__ for t in transforms if type(t) not in known]
@@ -61,6 +68,11 @@ class Units:
                 "out: transforms=gpadjust.ax.TRANSFORMS."
             )
         self.names, self.ranges = tuple(names), dict(ranges)
+        self.whole = frozenset(whole)
+        self.choices = {
+            name: torch.tensor(values, dtype=torch.float64)
+            for name, values in (choices or {}).items()
+        }
         self._back: list[Callable[[Columns], None]] = []
         for t in reversed(transforms):
             self._back += _BACK[type(t)](t) if type(t) in _BACK else []
@@ -84,19 +96,20 @@ class Units:
             step(columns)
         lost = [name for name in names if name not in columns]
         if lost:
-            raise ValueError(
-                f"The physics reads the parameter(s) {', '.join(lost)}, which are text, derived, "
-                "or no part of the model. Make choices numbers, or let the physics name the "
-                "parameters that it reads as its arguments: def f_p(x1, x2)."
-            )
+            raise no_numbers(lost)
         return torch.stack([self._within(name, columns[name].expand(len(X))) for name in names], -1)
 
     def _within(self, name: str, values: Tensor) -> Tensor:
-        """Values in the range of a parameter; their derivative is kept, as that at a bound is."""
-        if name not in self.ranges:
-            return values
-        lower, upper = self.ranges[name]
-        return values.detach().clamp(lower, upper) + (values - values.detach())
+        """The nearest values that a parameter can have; their derivative is kept."""
+        near = values.detach()
+        if name in self.choices:
+            listed = self.choices[name].to(near)
+            near = listed[(near.unsqueeze(-1) - listed).abs().argmin(-1)]
+        if name in self.whole:
+            near = near.where((near - near.round()).abs() > _NEXT_TO, near.round())
+        if name in self.ranges:
+            near = near.clamp(*self.ranges[name])
+        return near + (values - values.detach())
 
     def metric(self, Y: Tensor, metric: str) -> Tensor:
         """Values of a metric, in its units, as the model is to see them."""
@@ -122,11 +135,21 @@ def _value_of(name: str, values: Sequence[Any], one_hot: Sequence[str], columns:
         index = torch.stack([columns.pop(each) for each in one_hot], dim=-1).argmax(-1)
     else:
         index = columns.pop(name).round().long().clamp(0, len(values) - 1)
-    if _are_numbers(values):
+    if are_numbers(values):
         columns[name] = torch.tensor(values, dtype=torch.float64)[index]
 
 
-def _are_numbers(values: Sequence[Any]) -> bool:
+def no_numbers(names: Sequence[str]) -> ValueError:
+    """The error of a physics that reads parameters whose values are no numbers."""
+    return ValueError(
+        f"The physics reads the parameter(s) {', '.join(names)}, which are text, derived, or no "
+        "part of the model. Make choices numbers, or let the physics name the parameters that it "
+        "reads as its arguments: def f_p(x1, x2)."
+    )
+
+
+def are_numbers(values: Sequence[Any]) -> bool:
+    """Whether values of a parameter are numbers, as a physics reads them."""
     return all(isinstance(value, bool | int | float) for value in values)
 
 
@@ -165,7 +188,7 @@ def _fixed(t: RemoveFixed) -> list[Callable[[Columns], None]]:
     values: dict[str, Any] = {
         n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
     }
-    return [partial(_constant, n, float(v)) for n, v in values.items() if _are_numbers([v])]
+    return [partial(_constant, n, float(v)) for n, v in values.items() if are_numbers([v])]
 
 
 def _clip(t: Winsorize) -> dict[str, Callable[[Tensor], Tensor]]:

@@ -76,6 +76,9 @@ def choose(
         return
     fit_options = {"method": "map"} if learner == "map" else None
     strategy: GenerationStrategy = generation_strategy(
-        system.physics, fit_options=fit_options, **options
+        system.physics,
+        fit_options=fit_options,
+        initialize_with_center=True,  # as Ax's default, with which it is compared
+        **options,
     )
     client.set_generation_strategy(strategy)

@@ -154,6 +154,53 @@ def test_gradients_pass_the_transforms():
         assert slope.abs().min() > 1e-3
 
 
+@pytest.mark.parametrize(
+    "config",
+    [
+        ChoiceParameterConfig(
+            name="width", parameter_type="int", values=[1, 2, 4, 8], is_ordered=True
+        ),
+        ChoiceParameterConfig(
+            name="width", parameter_type="float", values=[1.0, 2.0, 4.0, 8.0], is_ordered=True
+        ),
+        RangeParameterConfig(name="width", parameter_type="int", bounds=(1, 8)),
+        RangeParameterConfig(name="width", parameter_type="int", bounds=(1, 8), scaling="log"),
+    ],
+    ids=["choice", "choice of floats", "range", "log"],
+)
+def test_whole_numbers_reach_the_physics_as_they_are_listed(config):
+    table = torch.arange(9).double()
+    asked = []
+
+    def f_p(width, x):
+        asked.append(width.detach())
+        return table[width.long()] + x
+
+    values = [1, 2, 4, 8] if isinstance(config, ChoiceParameterConfig) else [*range(1, 9)]
+    kind = float if config.parameter_type == "float" else int
+    arms = [{"width": kind(n), "x": 0.2 * i - 1} for i, n in enumerate(values)]
+    fitted = adapter(experiment([config, PARAMETERS[2]], arms), f_p, metrics=["cost"])
+    assert asked[0].tolist() == values
+    X = models(fitted)["cost"].data()["train_X"]
+    near = X + 1e-12 * torch.randn(X.shape, dtype=torch.float64)
+    asked.clear()
+    models(fitted)["cost"].physics(near)
+    assert asked[0].tolist() == values
+
+
+def test_between_choices_the_nearest_is_asked():
+    parameters = [PARAMETERS[4], PARAMETERS[2]]
+    arms = [{"size": arm["size"], "x": arm["x"]} for arm in ARMS]
+    fitted = adapter(experiment(parameters, arms), lambda size, x: size * x, metrics=["cost"])
+    units = models(fitted)["cost"].physics.units
+    between = torch.tensor([[0.0, 0.0], [1.2, 0.0], [1.3, 0.0], [9.0, 0.0]], dtype=torch.float64)
+    between.requires_grad_()
+    raw = units.raw(between, ["size"])
+    assert raw.flatten().tolist() == [0.5, 0.5, 2.0, 8.0]
+    (slope,) = torch.autograd.grad(raw.sum(), between)
+    assert (slope[:, 0] == 1).all()
+
+
 def test_a_tensor_has_the_columns_of_the_search_space():
     parameters = [PARAMETERS[2], PARAMETERS[0]]
     arms = [{"x": arm["x"], "rate": arm["rate"]} for arm in ARMS]
