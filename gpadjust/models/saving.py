@@ -13,7 +13,7 @@ import torch
 from gpadjust.gp import PhysicsInput
 from gpadjust.models.stacked import StackedGP
 from gpadjust.models.terms_model import TermsModel
-from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, as_physics
+from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, PhysicsWarning, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
 _FORMAT = 2
@@ -202,7 +202,9 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     if content["physics"] is not None and "physics" not in own:
         parts = {name: _named_physics(path) for name, path in content["physics"].items()}
         own["physics"] = parts[""] if "" in parts else as_physics(parts)
-    model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PhysicsWarning)  # it was said when the model was built
+        model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
     priors = {name: v for name, v in model.state_dict().items() if "_prior." in name}
     model.load_state_dict(content["state"] | priors)
     learnt = {*content["learnt"]}

@@ -87,6 +87,7 @@ class TermsGP(TermsModel, SingleTaskGP):
                 UserWarning,
                 stacklevel=3,
             )
+        made.warn_of_physics(stacklevel=3)
         covar_module = SumOfTerms(terms)
         Y, Yvar = data.Y, data.Yvar
         noise = likelihood
