@@ -19,6 +19,7 @@ _FACTOR = 10.0  # a smaller factor is crudeness
 _TINY = 20.0  # times too small: next to nothing, so that the error is that of no physics
 _HUGE = 100.0  # times as large as the targets, whatever its shape
 _EXPLAINS = 1 / 3  # of the error is left, where its cause is found
+_FITS = 0.6  # standard deviations of the targets, that a factor below 100 leaves
 _LIKE = 0.8  # of the error is left by the opposite, at most
 _FOLLOWS = 0.5  # correlation of a physics that has anything to do with the targets
 _SHOWN = 3.0  # standard errors of a correlation
@@ -160,10 +161,11 @@ def _fit(y: Tensor, f: Tensor, scaled: bool, shifted: bool) -> _Fit:
     varies = spread > _ROUNDING * _rms(f) and sd > 0
     correlation = float(y_c @ f_c) / ((len(y) - 1) * sd * spread) if varies else 0.0
     by_factor, affine = _rms(y - slope * f), sd * max(0.0, 1 - correlation**2) ** 0.5
-    if abs(correlation) > _FOLLOWS and by_factor > 1.5 * affine:  # beside an offset
+    if affine < _FITS * sd and by_factor > 1.5 * affine:  # beside an offset
         slope = correlation * sd / spread
-    elif by_factor > sd:  # a constant is no worse
+    elif by_factor > _FITS * sd:
         slope = size / _rms(f) if _rms(f) > _HUGE * size else 0.0
+        slope = -slope if correlation < -_FOLLOWS else slope
     factor = 1 / slope if slope else 0.0
     error, sum_of_both = f - y, f + y
     by_offset = _rms(error - error.mean())

@@ -94,6 +94,7 @@ def test_a_crude_physics_is_not_warned_of(X, Y):
         "constant": lambda X: 0 * X,
         "another law": lambda X: X,
         "falls instead": lambda X: 0.3 - X,
+        "large, and another law": lambda X: 15 * torch.sin(9 * X).abs(),
         "a tenth too low": lambda X: 90 + law(X),
     }
     for name, physics in crude.items():
