@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         ODEPhysics,
         Physics,
         PhysicsError,
+        PhysicsWarning,
         Unknown,
     )
     from gpadjust.validation import Comparison, compare
@@ -47,6 +48,7 @@ __all__ = [
     "Physics",
     "PhysicsError",
     "PhysicsMeanGP",
+    "PhysicsWarning",
     "SampleResult",
     "ScaleGP",
     "StackedGP",

@@ -13,7 +13,7 @@ import torch
 from gpadjust.gp import PhysicsInput
 from gpadjust.models.stacked import StackedGP
 from gpadjust.models.terms_model import TermsModel
-from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, as_physics
+from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, PhysicsWarning, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
 _FORMAT = 2
@@ -189,7 +189,9 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     own = {name: each for name, each in objects.items() if name in content["missing"]}
     if content["physics"] is not None:
         own["physics"] = _physics(content, objects)
-    model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PhysicsWarning)  # it was said when the model was built
+        model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
     priors = {name: v for name, v in model.state_dict().items() if "_prior." in name}
     model.load_state_dict(content["state"] | priors)
     learnt = {*content["learnt"]}

@@ -66,6 +66,7 @@ class CKA(TermsGP):
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
 
     Warns:
+        PhysicsWarning: If f_p is obviously off at the training inputs, and shows why.
         UserWarning: Of more than 5,000 points; take :class:`~gpadjust.VariationalCKA`.
 
     Raises:

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from botorch.models.transforms.input import Normalize
+from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics, PhysicsInput, Unit
@@ -52,7 +53,7 @@ def summary(model: Any) -> str:
 def _lines(model: Any) -> list[str]:
     scale, rows = model.units()[1].squeeze(-1), hyperparameters(model)
     evidence, value = model.log_evidence()
-    lines = [f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
+    lines = [*_alone(model), f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
     for term in model.terms:
         variance = None if term.form is None else term.form.variance()
         is_left_out = isinstance(term.basis, AppendedPhysics) and not term.mean.any()
@@ -71,6 +72,25 @@ def _lines(model: Any) -> list[str]:
     noise = model.noise.at(model.train_inputs[0]).mean(-1)
     at = [_at_bound(noise, row.limits()) for row in rows if row.kind == "noise"]
     return [*lines, f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}"]
+
+
+def _alone(model: Any) -> list[str]:
+    """How far off each physics is by itself, at the observations of one output."""
+    shift, scale = model.units()
+    inputs, y = model.train_inputs[0], model.train_targets * scale + shift
+    named = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
+    fitted = ", with these parameters" if model.has_unknowns else ""
+    lines = []
+    for term in named:
+        f_p = (inputs[..., term.basis.num_inputs :] * term.basis.select).sum(-1)
+        f_p = f_p if model.num_samples is None else f_p.mean(0)
+        rmse = (y - f_p).square().nanmean().sqrt()
+        spread = float(nanstd(y.reshape(-1, y.shape[-1]), dim=-1).mean())
+        of = f" of {term.name.removeprefix('rho_')}" if len(named) > 1 else ""
+        lines.append(
+            f"  physics alone{of}{fitted}: RMSE {rmse:.3g} (sd of the targets {spread:.3g})"
+        )
+    return lines
 
 
 def _of_physics(model: Any) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Literal, TypeAlias, TypedDict
 
@@ -22,6 +23,7 @@ from gpadjust.gp.gaussian import least_squares
 from gpadjust.gp.noise import Noise
 from gpadjust.gp.physics_columns import check_one_to_one
 from gpadjust.models.parameters import scaled_rbf
+from gpadjust.models.plausibility import complaint
 from gpadjust.models.training_data import (
     ArrayLike,
     TrainingData,
@@ -29,7 +31,7 @@ from gpadjust.models.training_data import (
     residual_scale,
     training_data,
 )
-from gpadjust.physics import Physics, as_physics
+from gpadjust.physics import Physics, PhysicsWarning, as_physics
 from gpadjust.physics.function import AnyPhysics, Parts
 
 PhysicsLike = AnyPhysics | Parts
@@ -94,7 +96,8 @@ class TermBuilder:
         self.f: list[Tensor] = []
         self._means: list[Tensor] = []
         self._centers: list[Tensor] = []
-        self._learns_mean = self._learns_center = False
+        self._learns_mean = self._learns_center = self._learns_offset = False
+        self._offset = 0.0
 
     @classmethod
     def of_adjustment(
@@ -256,10 +259,38 @@ class TermBuilder:
         known = 0.0 if mean == "learn" else mean
         if not isinstance(known, int | float):
             raise ValueError(f"Expected delta_mean to be 'learn' or a number, got {known!r}.")
+        self._offset, self._learns_offset = known, mean == "learn"
         # f = sum rho_i (f_i - c_i) + delta_0, so that delta_0 has the mean sum rho_i c_i.
         offset = sum(c * w for c, w in zip(self._centers, self._means, strict=True))
         mean_0 = (self._zero + known + offset - self._shift) / self._scale
         return self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+
+    def warn_of_physics(self, stacklevel: int) -> None:
+        """Warn if the physics is obviously off at the training inputs, after all terms are made.
+
+        Of a physics with unknown or trainable parameters nothing is said: they are to be learnt.
+
+        Args:
+            stacklevel: Of the caller, as ``warnings.warn`` has it.
+        """
+        transform = self.input_transform
+        if not (self.f and isinstance(transform, PhysicsInput)):
+            return
+        physics = transform.physics
+        if physics.unknowns or any(p.requires_grad for p in physics.parameters()):
+            return
+        with torch.no_grad():
+            f = sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
+            shifted = self._learns_center or self._learns_offset
+            text = complaint(self.data, f + self._offset, self._learns_mean, shifted)
+        if text:
+            warnings.warn(
+                f"Physics {physics.name!r}: {text} Look at `physics(train_X) - train_Y`, and mend "
+                "f_p rather than leave that to the fit: away from the data the model falls back "
+                "to f_p as it is.",
+                PhysicsWarning,
+                stacklevel=stacklevel + 1,
+            )
 
     def _of_outputs(self, values: Tensor) -> Tensor:
         """From ``batch_shape x 1 x m``, or what broadcasts to it, to ``... x (m) x 1``."""

@@ -80,6 +80,7 @@ class TermsGP(TermsModel, SingleTaskGP):
                 "the arguments of CKA and learns from all of them in minutes.",
                 stacklevel=3,
             )
+        made.warn_of_physics(stacklevel=3)
         covar_module = SumOfTerms(terms)
         Y, Yvar = data.Y, data.Yvar
         noise = likelihood

@@ -93,7 +93,10 @@ class TermsModel(PredictiveModel):
     def summary(self) -> str:
         """What the model has learnt, as a text in the user's units.
 
-        Of a model that holds samples, their medians and the ranges of 95 % of them.
+        The structure; unknown parameters of the physics; of each output the root mean square error
+        of the physics alone at the observations; the log marginal likelihood; means, standard
+        deviations and lengthscales of the terms; the noise as a standard deviation; and what is at
+        a bound. Of a model that holds samples, their medians and the ranges of 95 % of them.
         """
         return summary(self)
 

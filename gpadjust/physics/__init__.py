@@ -6,6 +6,7 @@ from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.function import FunctionPhysics, JoinedPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
 from gpadjust.physics.unknown import ParameterValues, Unknown
+from gpadjust.physics.warning import PhysicsWarning
 
 __all__ = [
     "BlackBoxPhysics",
@@ -15,6 +16,7 @@ __all__ = [
     "ParameterValues",
     "Physics",
     "PhysicsError",
+    "PhysicsWarning",
     "Unknown",
     "as_physics",
 ]

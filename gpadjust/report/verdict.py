@@ -10,9 +10,8 @@ from gpadjust.models import StackedGP
 from gpadjust.report.markup import Markup, bullets, join, table, tag
 from gpadjust.report.numbers import listed, name_and_unit, number, percent, plural, with_unit
 from gpadjust.report.subject import Subject
-from gpadjust.validation import Candidate, Gain
 from gpadjust.validation.ranking import ENOUGH, sign_of
-from gpadjust.validation.structures import STACKED
+from gpadjust.validation.structures import ALONE, STACKED
 
 _WHAT = {
     "zero mean": "no physics: a Gaussian process of the data alone",
@@ -20,8 +19,10 @@ _WHAT = {
     "constant rho": "rho f_p + mu + delta(x): a fitted scale and offset, and a bias",
     "CKA": "rho(x) f_p + delta(x): a scale and a bias that depend on the inputs",
     "calibrated physics": "f_p with fitted parameters, and nothing else",
+    ALONE: "f_p as it is, with noise that the other observations tell; no candidate",
     STACKED: "the mixture of all structures with the weights of the table",
 }
+_ERRORS = {ALONE: "your formula", "calibrated physics": "your formula, calibrated"}
 COMPARE = "report(compare(train_X, train_Y, physics))"
 _ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
@@ -40,7 +41,7 @@ def verdicts(subject: Subject, how: str = COMPARE) -> Markup:
         heading = [tag("h3", name)] if several else []
         body = [tag("p", sentence) for sentence in sentences]
         big = tag("p", answer, class_="answer")
-        cards.append(tag("div", *heading, big, *body, class_=f"card {kind}"))
+        cards.append(tag("div", *heading, *_errors(subject, j), big, *body, class_=f"card {kind}"))
     return tag("div", *cards, class_="cards")
 
 
@@ -86,7 +87,7 @@ def structures(subject: Subject) -> Markup:
     if comparison is None:
         return _weights(subject)
     parts = []
-    for j, (output, ranked) in enumerate(comparison.table.items()):
+    for j, output in enumerate(comparison.table):
         unit = name_and_unit(output)[1]
         head = ["structure", "elpd", "less the best", "its error", "weight"]
         head += [f"RMSE [{unit}]" if unit else "RMSE", "RMSE / sd", "in 95 %"]
@@ -97,15 +98,15 @@ def structures(subject: Subject) -> Markup:
                 f"{row.elpd:.4g}",
                 f"{row.elpd_diff:.3g}",
                 f"{row.se_diff:.2g}",
-                f"{row.weight:.2f}",
+                "-" if row.structure.startswith(ALONE) else f"{row.weight:.2f}",
                 number(row.rmse * spread),
                 f"{row.rmse:.3g}",
                 percent(row.coverage),
             ]
-            for row in ranked
+            for row in comparison.rows(output)
         ]
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
-    names = {row.structure: None for rows in comparison.table.values() for row in rows}
+    names = {row.structure: None for output in comparison.table for row in comparison.rows(output)}
     terms = [join([tag("dt", name), tag("dd", _what(name))]) for name in names]
     parts.append(
         tag(
@@ -150,14 +151,12 @@ def _answer(subject: Subject, output: int, how: str) -> tuple[str, str, list[str
         return "No physics", "open", [f"The model of {name} has no physics to be judged."]
     gain = None if comparison is None else comparison.gain.get(name)
     if comparison is None or gain is None:
-        return "Not asked", "open", [_not_asked(subject, how), *_errors(subject, output)]
+        return "Not asked", "open", [_not_asked(subject, how)]
     ratio = math.exp(max(-50.0, min(50.0, gain.elpd / n)))
-    rows = {row.structure: row for row in comparison.table[name]}
     numbers = (
         f"Log score of {plural(n, 'left-out observation')}, with the physics ({gain.structure}) "
         f"less without ({gain.without}): {gain.elpd:+.1f} ± {gain.se:.1f} nats (sum and standard "
-        f"error), which makes each {number(ratio)} times as likely in geometric mean. "
-        f"{_rmse(rows, gain, name, spread_of(subject, output))}"
+        f"error), which makes each {number(ratio)} times as likely in geometric mean."
     )
     if gain.shown > 0:
         first = f"The physics helps to predict {name}."
@@ -191,14 +190,6 @@ def _answer(subject: Subject, output: int, how: str) -> tuple[str, str, list[str
     return _ANSWERS[gain.shown], kind, [first, *rest]
 
 
-def _rmse(rows: dict[str, Candidate], gain: Gain, name: str, spread: float) -> str:
-    with_it, without = (rows[s].rmse * spread for s in (gain.structure, gain.without))
-    return (
-        f"Root mean square errors: {with_unit(number(with_it), name)} with it, "
-        f"{with_unit(number(without), name)} without."
-    )
-
-
 def _not_asked(subject: Subject, how: str) -> str:
     if subject.comparison is None:
         return (
@@ -211,14 +202,32 @@ def _not_asked(subject: Subject, how: str) -> str:
     )
 
 
-def _errors(subject: Subject, output: int) -> list[str]:
+def _errors(subject: Subject, output: int) -> list[Markup]:
+    """How far off the formula, its adjustment and the data alone are, in a line."""
     name = subject.outputs[output]
-    errors = [f"{with_unit(number(float(subject.loo.rmse[output])), name)} by the model"]
-    Y = subject.Y[:, output]
-    for physics, values in subject.physics_at(subject.X, output):
-        error = float((Y - values).square().nanmean().sqrt())
-        errors.append(f"{with_unit(number(error), name)} by the {physics} ({subject.as_it_is})")
-    return [f"Root mean square error of left-out {name}: {listed(errors)}."]
+    if subject.comparison is not None:
+        errors = subject.comparison.errors()[name]
+    else:
+        Y, shown = subject.Y[:, output], subject.physics_at(subject.X, output)
+        errors = {
+            ALONE if len(shown) == 1 else f"{ALONE} of {physics}": float(
+                (Y - values).square().nanmean().sqrt()
+            )
+            for physics, values in shown
+        }
+        own = "adjusted" if subject.physics or subject.is_sampled else "data alone"
+        errors[own] = float(subject.loo.rmse[output])
+    if not errors:
+        return []
+    fitted = ", with fitted parameters" if subject.as_it_is != "as it is" else ""
+    told = []
+    for what, rmse in errors.items():
+        short, of, physics = what.partition(" of ")
+        label = _ERRORS.get(short, short) + (fitted if short == ALONE else "")
+        told.append(f"{label}{f' {physics}' * bool(of)}: {with_unit(number(rmse), name)}")
+    text = "; ".join(told)
+    note = tag("span", " (root mean square errors of left-out observations)", class_="note")
+    return [tag("p", text[0].upper() + text[1:], note, class_="errors")]
 
 
 def _weights(subject: Subject) -> Markup:

@@ -28,11 +28,13 @@ def report(
 ) -> Path:
     """Write a page that shows what a model or a comparison says, for those who decide.
 
-    The page says in words whether the physics helps, and how sure that is; what is recommended and
-    why; where the physics is wrong (rho and delta along each input), and where predictions rest on
-    it; how well left-out observations are predicted, and whether intervals hold what they promise;
-    parameters, advice, data and settings; and how to load the model, which is saved beside it
-    (``report.pt`` beside ``report.html``). It is one file, without scripts and links.
+    The page begins with the root mean square errors of your formula, of the adjustment and of the
+    data alone, of left-out observations. It says in words whether the physics helps, and how sure
+    that is; what is recommended and why; where the physics is wrong (rho and delta along each
+    input), and where predictions rest on it; how well left-out observations are predicted, and
+    whether intervals hold what they promise; parameters, advice, data and settings; and how to load
+    the model, which is saved beside it (``report.pt`` beside ``report.html``). It is one file,
+    without scripts and links.
 
     Whether the physics helps takes a comparison with a model that has none, so report on what
     :func:`~gpadjust.compare` returns. Units are read from names such as ``"head [m]"``, the columns

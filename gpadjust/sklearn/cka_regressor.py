@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from copy import deepcopy
 from numbers import Integral
 from typing import Any, Literal, Self
@@ -28,8 +29,10 @@ from gpadjust.models import (
     VariationalCKA,
     ZeroMeanGP,
 )
+from gpadjust.models.plausibility import is_standardised
 from gpadjust.models.terms_gp import arguments_of
 from gpadjust.models.training_data import column_names
+from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.array_physics import array_physics
 
 Array = NDArray[np.float64]
@@ -135,6 +138,9 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Returns:
             The regressor.
+
+        Warns:
+            PhysicsWarning: If the physics is obviously off at X, as after a scaler.
 
         Raises:
             ValueError: If data are not finite real numbers, or shapes disagree (scikit-learn says
@@ -258,7 +264,13 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                     "model='zero_mean'."
                 )
             options["physics"] = array_physics(self.physics, X)
-        return model_class(X, Y, **options)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", PhysicsWarning)
+            model = model_class(X, Y, **options)
+        for each in caught:
+            hints = _hints(X, Y) if issubclass(each.category, PhysicsWarning) else ""
+            warnings.warn(f"{each.message}{hints}", each.category, stacklevel=3)
+        return model
 
     def _inputs(self, X: Any) -> Tensor:
         check_is_fitted(self)
@@ -275,6 +287,22 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 covariance = (covariance + spread @ spread.mT).mean(0)
             covariances.append(covariance)
         return torch.stack(covariances, dim=-1)
+
+
+def _hints(X: Array, Y: Array) -> str:
+    """What to do about scaled data in the terms of scikit-learn."""
+    hints = ""
+    if is_standardised(torch.tensor(X)):
+        hints += (
+            " X is scaled, as by a StandardScaler before this step of a pipeline: leave it out, as "
+            "the model finds its own scales, or undo it in the physics, scaler.inverse_transform."
+        )
+    if is_standardised(torch.tensor(Y)):
+        hints += (
+            " y is scaled, as by a TransformedTargetRegressor, which does not transform the "
+            "physics: leave it out, too."
+        )
+    return hints
 
 
 def _array(values: Tensor, dim: int = -1) -> Array:

@@ -18,12 +18,12 @@ from tqdm import tqdm
 from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
-from gpadjust.models import StackedGP, TermsGP
+from gpadjust.models import CalibratedPhysics, StackedGP, TermsGP
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.parameters import shared_parameters
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
-from gpadjust.physics import as_physics
+from gpadjust.physics import PhysicsWarning, as_physics
 from gpadjust.validation.advice import advice, gains
 from gpadjust.validation.gain import Gain
 from gpadjust.validation.leave_one_out import (
@@ -31,9 +31,11 @@ from gpadjust.validation.leave_one_out import (
     leave_one_out,
     mixture_of,
 )
-from gpadjust.validation.ranking import Candidate, densities, is_clear, ranking
+from gpadjust.validation.physics_alone import physics_alone
+from gpadjust.validation.ranking import Candidate, beside, densities, is_clear, ranking
 from gpadjust.validation.refitting import LEAST, refitted
 from gpadjust.validation.structures import (
+    ALONE,
     STACKED,
     STRUCTURES,
     Structure,
@@ -63,6 +65,8 @@ class Comparison:
             structure that uses none.
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
+        alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
+            candidates (:meth:`rows`), and no part of what is recommended.
     """
 
     models: dict[str, TermsGP]
@@ -71,6 +75,7 @@ class Comparison:
     advice: list[str]
     gain: dict[str, Gain] = field(default_factory=dict)
     left_out: dict[str, LeaveOneOut] = field(default_factory=dict)
+    alone: dict[str, LeaveOneOut] = field(default_factory=dict)
 
     @property
     def chosen(self) -> str:
@@ -105,15 +110,57 @@ class Comparison:
         mean, variance, density = mixture_of(mean, variance, density, weight)
         return replace(each[0], mean=mean, variance=variance, log_density=density)
 
+    def errors(self) -> dict[str, dict[str, float]]:
+        """Root mean square errors of left-out observations of each output, in its units.
+
+        ``"physics alone"``, of several each (of one with unknown parameters ``"calibrated
+        physics"``); ``"adjusted"``, what is recommended, or the best structure that adjusts the
+        physics if that does not; ``"data alone"``, the best structure without it. What was not
+        fitted is not there.
+        """
+        if not self.left_out:
+            return {output: {} for output in self.table}
+        recommended = self.leave_one_out()
+        calibrated = {n for n, model in self.models.items() if isinstance(model, CalibratedPhysics)}
+        using = {name for name, model in self.models.items() if model.rho_names} - calibrated
+        found: dict[str, dict[str, float]] = {}
+        for j, (output, rows) in enumerate(self.table.items()):
+            rmse = {row.structure: self.left_out[row.structure].rmse[j].item() for row in rows}
+            own = {name: loo.rmse[j].item() for name, loo in self.alone.items()}
+            own |= {name: rmse[name] for name in rmse if name in calibrated}
+            if self.chosen in using or (self.chosen == STACKED and using):
+                own["adjusted"] = recommended.rmse[j].item()
+            elif using:
+                own["adjusted"] = next(rmse[name] for name in rmse if name in using)
+            without = next((name for name in rmse if name not in using | calibrated), None)
+            if without is not None:
+                own["data alone"] = rmse[without]
+            found[output] = own
+        return found
+
+    def rows(self, output: str) -> list[Candidate]:
+        """The table of an output, and a row for each physics alone, without weight."""
+        if not self.alone:
+            return self.table[output]
+        beneath = beside(self.alone, self.left_out, [*self.table].index(output))
+        return [*self.table[output], *beneath]
+
     def __str__(self) -> str:
-        width = max(len(row.structure) for rows in self.table.values() for row in rows)
+        shown = {output: self.rows(output) for output in self.table}
+        width = max(len(row.structure) for rows in shown.values() for row in rows)
         head = ("elpd", "elpd diff", "its error", "weight", "RMSE/sd", "coverage")
         lines: list[str] = []
-        for output, rows in self.table.items():
+        for output, errors in self.errors().items():
+            where = f"{output}: " if len(self.table) > 1 else ""
+            each = "; ".join(f"{_told(name)}: RMSE {rmse:.3g}" for name, rmse in errors.items())
+            lines += [where + each] if each else []
+        lines += [""] if lines else []
+        for output, rows in shown.items():
             lines.append(f"{output:{width}}" + "".join(f"  {name:>9}" for name in head))
             lines += [
                 f"{row.structure:{width}}  {row.elpd:>9.4g}  {row.elpd_diff:>9.3g}"
-                f"  {row.se_diff:>9.2g}  {row.weight:>9.2f}  {row.rmse:>9.3g}  {row.coverage:>9.2f}"
+                f"  {row.se_diff:>9.2g}  {_weight_of(row):>9}  {row.rmse:>9.3g}"
+                f"  {row.coverage:>9.2f}"
                 for row in rows
             ]
             lines.append("")
@@ -156,6 +203,11 @@ def compare(
     structure with too many unknown constants for the points is left out of models and tables,
     unless there is no other.
 
+    Beneath each table is ``"physics alone"``, f_p as it is, whose noise is told by the other
+    observations: no candidate, but what an adjustment has to be better than. The text begins with
+    the errors of the physics alone, adjusted, and of the data alone
+    (:meth:`Comparison.errors`).
+
     A physics with unknown parameters is calibrated by each structure that uses it: then
     ``"physics mean"`` is the calibrated physics and a delta (Kennedy and O'Hagan 2001), ``"CKA"``
     that with rho and delta, and ``"calibrated physics"`` is one more structure without either,
@@ -181,6 +233,9 @@ def compare(
     Returns:
         The fitted models, the rankings, the recommended model, and advice in words: whether the
         physics is shown to help, and whether scaling it is better than taking it as the mean.
+
+    Warns:
+        PhysicsWarning: As :class:`~gpadjust.CKA`, once for all structures.
 
     Raises:
         TypeError: As :class:`~gpadjust.CKA` and :func:`~gpadjust.fit`.
@@ -210,38 +265,46 @@ def compare(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
             "the data sets of a batch one by one."
         )
-    found = candidates(asked, as_physics(physics), len(data.X))
+    given_physics = as_physics(physics)
+    found = candidates(asked, given_physics, len(data.X))
     models: dict[str, TermsGP] = {}
     left_out: dict[str, LeaveOneOut] = {}
     converged: dict[str, Tensor] = {}
+    said: set[str] = set()
     for structure, part in tqdm(found, disable=not progress, unit="structure"):
-        try:
-            model = structure.build(
-                train_X,
-                train_Y,
-                train_Yvar,
-                physics=deepcopy(part),
-                input_transform=deepcopy(input_transform),
-            )
-            with (
-                warnings.catch_warnings(record=True) as caught,
-                threads_for(len(data.X)),
-            ):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", PhysicsWarning)
+            try:
+                model = structure.build(
+                    train_X,
+                    train_Y,
+                    train_Yvar,
+                    physics=deepcopy(part),
+                    input_transform=deepcopy(input_transform),
+                )
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
-                result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
-                apart = not shared_parameters(model) and not model.has_unknowns
-                again = apart and _can_be_left_out(data)
-                left_out[structure.name] = (
-                    refitted(structure, data, part, input_transform, **{**_REFIT, **given})
-                    if again
-                    else leave_one_out(model)
-                )
-        except Exception as error:
-            error.add_note(f"This is of the structure {structure.name!r}.")
-            raise
+                warnings.simplefilter("ignore", PhysicsWarning)  # of models without an observation
+                with threads_for(len(data.X)):
+                    result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
+                    apart = not shared_parameters(model) and not model.has_unknowns
+                    again = apart and _can_be_left_out(data)
+                    left_out[structure.name] = (
+                        refitted(structure, data, part, input_transform, **{**_REFIT, **given})
+                        if again
+                        else leave_one_out(model)
+                    )
+            except Exception as error:
+                error.add_note(f"This is of the structure {structure.name!r}.")
+                raise
         for each in caught:
-            warnings.warn(f"{structure.name}: {each.message}", each.category, stacklevel=2)
+            text = str(each.message)
+            if not issubclass(each.category, PhysicsWarning):
+                text = f"{structure.name}: {text}"
+            elif text in said:
+                continue
+            said.add(text)
+            warnings.warn(text, each.category, stacklevel=2)
         converged[structure.name] = result.converged.flatten()
         models[structure.name] = _thinned(model, _HELD)
     by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
@@ -250,7 +313,18 @@ def compare(
     fitted = [structure for structure, _ in found]
     sentences = advice(fitted, models, left_out, converged, table, data.X)
     gain = gains(fitted, left_out, table)
-    return Comparison(models, stacked, table, sentences, gain, left_out)
+    alone = physics_alone(given_physics, data)
+    return Comparison(models, stacked, table, sentences, gain, left_out, alone)
+
+
+def _told(name: str) -> str:
+    """What an error is of; the physics alone is the same, left out or not."""
+    return name if name.startswith(ALONE) else f"{name}, left out"
+
+
+def _weight_of(row: Candidate) -> str:
+    """The weight of a candidate; the physics alone is none."""
+    return "-" if row.structure.startswith(ALONE) else f"{row.weight:.2f}"
 
 
 def _number(num_points: int) -> int:

@@ -52,23 +52,40 @@ def ranking(left_out: dict[str, LeaveOneOut], output: int) -> list[Candidate]:
     density = densities(left_out, output)
     weights = stacking_weights(density).tolist()
     order = density.sum(0).argsort(descending=True, stable=True).tolist()
-    names, rows = [*left_out], []
-    for k in order:
-        loo = left_out[names[k]]
-        elpd_diff, se_diff = difference(density[:, k], density[:, order[0]])
-        spread = float(nanstd(loo.Y[:, output : output + 1], dim=0))
-        rows.append(
-            Candidate(
-                names[k],
-                density[:, k].sum().item(),
-                elpd_diff,
-                se_diff,
-                weights[k],
-                loo.rmse[output].item() / (spread if spread > 0 else 1.0),
-                loo.coverage()[output].item(),
-            )
-        )
-    return rows
+    names, best = [*left_out], density[:, order[0]]
+    return [
+        _row(names[k], left_out[names[k]], output, density[:, k], best, weights[k]) for k in order
+    ]
+
+
+def beside(
+    alone: dict[str, LeaveOneOut], left_out: dict[str, LeaveOneOut], output: int
+) -> list[Candidate]:
+    """Rows of what is no candidate, beside the best structure for one output.
+
+    Args:
+        alone: The leave-one-out predictions of each.
+        left_out: Those of each structure.
+        output: The number of the output.
+    """
+    density = densities(left_out, output)
+    best = density[:, int(density.sum(0).argmax())]
+    each = {name: densities({name: loo}, output).squeeze(-1) for name, loo in alone.items()}
+    return [_row(name, loo, output, each[name], best, 0.0) for name, loo in alone.items()]
+
+
+def _row(
+    name: str, loo: LeaveOneOut, output: int, density: Tensor, best: Tensor, weight: float
+) -> Candidate:
+    spread = float(nanstd(loo.Y[:, output : output + 1], dim=0))
+    return Candidate(
+        name,
+        density.sum().item(),
+        *difference(density, best),
+        weight,
+        loo.rmse[output].item() / (spread if spread > 0 else 1.0),
+        loo.coverage()[output].item(),
+    )
 
 
 def densities(left_out: dict[str, LeaveOneOut], output: int) -> Tensor:

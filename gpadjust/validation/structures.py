@@ -11,6 +11,7 @@ from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.physics import JoinedPhysics, Physics
 
 STACKED = "stacked"  # what a comparison calls the mixture of all structures
+ALONE = "physics alone"  # and f_p as it is
 
 
 class Structure(NamedTuple):
@@ -64,10 +65,12 @@ def known_structures(structures: Sequence[str | Structure]) -> list[Structure]:
         )
     found = [s if isinstance(s, Structure) else names[s] for s in given]
     named = {structure.name: structure for structure in found}
-    if any(named[structure.name] != structure for structure in found) or STACKED in named:
+    differ = all(named[structure.name] == structure for structure in found)
+    if not differ or {STACKED, ALONE} & named.keys():
         raise ValueError(
-            f"Expected structures of different names, none of them {STACKED!r} (their mixture), "
-            f"got {[structure.name for structure in found]}; give yours a name of its own."
+            f"Expected structures of different names, none of them {STACKED!r} (their mixture) or "
+            f"{ALONE!r}, got {[structure.name for structure in found]}; give yours a name of its "
+            "own."
         )
     return list(named.values())
 

@@ -139,6 +139,7 @@ def test_declared_states_are_checked_where_they_were_measured():
         dynamics.update(states, actions, following)
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_a_physics_of_differences_is_still_found_out(cart_pole_system, make, holed):
     system = cart_pole_system
 

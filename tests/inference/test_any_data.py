@@ -113,6 +113,7 @@ def profile(max_examples):
     )
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @profile(8)
 @given(kind=st.sampled_from(list(BUILD)), problem=problems())
 def test_any_data(kind, problem):
@@ -120,6 +121,7 @@ def test_any_data(kind, problem):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @profile(400)
 @given(kind=st.sampled_from(list(BUILD)), problem=problems())
 def test_any_data_at_length(kind, problem):

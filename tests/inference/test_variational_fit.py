@@ -401,6 +401,7 @@ def test_inputs_that_repeat_or_rest():
         assert model.evidence.isfinite().all()
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_outputs_with_observations_of_their_own():
     X, f, Y = problem(160)
     Y = torch.cat([Y, -Y], dim=-1)

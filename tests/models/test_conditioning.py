@@ -57,6 +57,7 @@ def test_conditioning_is_rebuilding(
     assert torch.equal(model.posterior(Z).mean, before)
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_known_noise_is_in_the_units_of_the_targets(data, build, kind, close):
     X, Y = data()
     model = build(kind, X, 100 * Y, 25.0).eval()

@@ -43,10 +43,10 @@ def test_integers_and_series(data, build, uniform):
     whole = (10 * X).round()
     series = pd.Series(Y.squeeze(-1).numpy(), name="u")
     with pytest.raises(ValueError, match=r"train_Y with at least 2 dimensions.*reshape\(-1, 1\)"):
-        CKA(whole.numpy().astype(int), series, physics=lambda X: 2 + X.sum(-1))
-    model = CKA(whole.numpy().astype(int), series.to_frame(), physics=lambda X: 2 + X.sum(-1))
+        CKA(whole.numpy().astype(int), series, physics=lambda X: 2 + X.sum(-1) / 10)
+    model = CKA(whole.numpy().astype(int), series.to_frame(), physics=lambda X: 2 + X.sum(-1) / 10)
     assert model.output_names == ("u",)
-    expected = CKA(whole, Y, physics=lambda X: 2 + X.sum(-1))
+    expected = CKA(whole, Y, physics=lambda X: 2 + X.sum(-1) / 10)
     Z = uniform(5, 2)
     torch.testing.assert_close(model.posterior(Z).mean, expected.posterior(Z).mean)
 

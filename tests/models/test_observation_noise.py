@@ -8,6 +8,9 @@ from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust import CKA, PhysicsMeanGP, StackedGP
 
+# The targets are 60 times those of the physics, so that their units matter.
+pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
+
 
 def added(model, Z, noise, **options):
     """What the noise adds to the variance of the posterior."""

@@ -31,6 +31,7 @@ def numbers(text, label):
     return [float(found) for found in re.findall(label + r" (-?[\d.e+-]+)", text)]
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_numbers_are_in_the_users_units(uniform):
     X = torch.stack([100 * uniform(8, 2)[:, 0], uniform(8, 2)[:, 1]], dim=-1)
     Y = 1e3 * (crude(X) + uniform(8, 1))
@@ -52,6 +53,9 @@ def test_numbers_are_in_the_users_units(uniform):
         covariance = model.covar_module(inputs).to_dense() + model.likelihood.noise * torch.eye(8)
         targets = MultivariateNormal(crude(X)[:, 0], scale**2 * covariance)
         expected = targets.log_prob(Y[:, 0]).item()
+        alone = (Y - crude(X)).square().mean().sqrt().item()
+    assert numbers(text, "physics alone: RMSE") == pytest.approx([alone], rel=5e-3)
+    assert text.splitlines()[2].endswith(f"(sd of the targets {Y.std():.3g})")
     assert numbers(text, "log likelihood") == pytest.approx([expected], rel=1e-3)
 
 
@@ -130,7 +134,7 @@ def test_a_kernel_that_reads_some_inputs(uniform, normalize):
     ranges = X.amax(0) - X.amin(0)
     kernel = ScaleKernel(RBFKernel(ard_num_dims=2, active_dims=(2, 0))).double()
     options = {"input_transform": Normalize(3)} if normalize else {}
-    model = CKA(X, X[:, :1], physics=lambda X: X[:, 1:2], delta_covar_module=kernel, **options)
+    model = CKA(X, X[:, :1], physics=lambda X: X[:, 1:2] / 10, delta_covar_module=kernel, **options)
     rows = [row for row in hyperparameters(model) if row.kind == "lengthscale"]
     typical = torch.ones(2).double() if normalize else ranges[[2, 0]]
     torch.testing.assert_close(rows[-1].size.flatten(), typical)

@@ -352,7 +352,8 @@ def test_bad_input(one):
 def test_texts(one):
     assert repr(one) == "VariationalCKA of 'wave': 120 points, 1 input, 1 output"
     lines = one.summary().splitlines()
-    assert lines[2].startswith("  evidence lower bound ")
+    assert lines[2].startswith("  physics alone: RMSE ")
+    assert lines[3].startswith("  evidence lower bound ")
     assert "  rest: none" in lines
     give_rest(one)
     assert any(line.startswith("    sd") for line in one.summary().split("  rest: ")[1].split("\n"))

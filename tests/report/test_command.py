@@ -212,7 +212,8 @@ def test_one_model_is_told_with_the_command_that_compares(folder, read, capsys, 
     how = f"python -m gpadjust {' '.join([*COMMAND[:-2], *given])}"
     assert f"has none: {how}\n" in capsys.readouterr().out
     page = read(folder / "report.html")
-    assert f"has none: {how} Root" in page.text
+    assert f"has none: {how} Recommendation" in page.text
+    assert re.search(r"Your formula: [\d.e-]+ m; adjusted: [\d.e-]+ m \(root mean", page.text)
     assert "report(compare(" not in page.text
 
 

@@ -31,7 +31,7 @@ def test_a_comparison(comparison, tmp_path, read):
     assert all(len(image["alt"]) > 10 for image in page.images)
     _the_table_is_that_of(comparison, page)
     (gain,) = comparison.gain.values()
-    assert "Yes The physics helps to predict y." in page.text
+    assert f"{_three(comparison)} Yes The physics helps to predict y." in page.text
     assert f"{gain.elpd:+.1f} ± {gain.se:.1f} nats" in page.text
     for sentence in comparison.advice:
         assert sentence.replace("+-", "±") in page.text
@@ -41,13 +41,21 @@ def test_a_comparison(comparison, tmp_path, read):
     assert settings["physics"] == "f_p (FunctionPhysics)"
 
 
+def _three(comparison):
+    alone, adjusted, data = map(number, comparison.errors()["y"].values())
+    words = f"Your formula: {alone}; adjusted: {adjusted}; data alone: {data}"
+    return f"{words} (root mean square errors of left-out observations)"
+
+
 def _the_table_is_that_of(comparison, page):
     head, *rows = page.tables["Left-out predictions of y, best first"]
     assert head[0] == "structure"
-    for row, expected in zip(rows, comparison.table["y"], strict=True):
+    assert rows[-1][0] == "physics alone"
+    assert rows[-1][4] == "-"
+    for row, expected in zip(rows, comparison.rows("y"), strict=True):
         assert row[0] == expected.structure
-        numbers = [float(text) for text in row[1:5]]
-        assert numbers == pytest.approx(expected[1:5], rel=0.06, abs=0.006)
+        numbers = [float(text) for text in row[1:5] if text != "-"]
+        assert numbers == pytest.approx(expected[1 : 1 + len(numbers)], rel=0.06, abs=0.006)
         assert float(row[6]) == pytest.approx(expected.rmse, rel=0.01)
         assert row[7] == f"{100 * expected.coverage:.0f} %"
 
@@ -87,7 +95,8 @@ def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undraw
     assert "Not asked" in page.text
     assert "report(compare(train_X, train_Y, physics))" in page.text
     rmse = number(float(subject_of(model).loo.rmse[0]))
-    assert f"Root mean square error of left-out p [Pa]: {rmse} Pa by the model" in page.text
+    alone = number(float((X.sum(-1).sin() - X[:, 0]).square().mean().sqrt()))
+    assert f"Your formula: {alone} Pa; adjusted: {rmse} Pa (root mean square" in page.text
     monkeypatch.chdir(tmp_path)
     (code,) = [text for text in page.codes if "load(" in text]
     names = {"f_p": lambda X: X[:, :1]}
@@ -101,6 +110,8 @@ def test_a_model_without_physics(tmp_path, read, undrawn):
     fit(model, "map", num_starts=1, num_screened=4)
     page = read(report(model, tmp_path / "report.html"))
     assert "has no physics to be judged" in page.text
+    assert "Data alone: " in page.text
+    assert "Your formula" not in page.text
     assert "There is no physics that could be adjusted, trusted or overridden" in page.text
     assert dict(page.tables["How this page came about"])["physics"] == "none"
     assert load(tmp_path / "report.pt").output_names == ("y",)
@@ -118,7 +129,7 @@ def test_a_model_without_physics(tmp_path, read, undrawn):
 def test_what_is_not_shown_is_not_denied(comparison, gain, answer, says):
     subject = subject_of(dataclasses.replace(comparison, gain={"y": gain}))
     page = Page(verdicts(subject))
-    assert page.text.startswith(answer)
+    assert page.text.startswith(f"{_three(comparison)} {answer}")
     assert says in page.text
     assert ("not to say" in page.text) == (gain.shown == 0 and gain.elpd < 2)
     assert headline(subject).startswith(answer)

@@ -22,6 +22,7 @@ from gpadjust import (
     BlackBoxPhysics,
     PhysicsError,
     PhysicsMeanGP,
+    PhysicsWarning,
     Unknown,
     ZeroMeanGP,
     fit,
@@ -251,12 +252,27 @@ def test_the_physics_sees_what_the_regressor_is_given(data):
         seen.append(X.copy())
         return wave(X)
 
-    pipeline = make_pipeline(StandardScaler(), fast(records)).fit(X, y)
+    pipeline = make_pipeline(StandardScaler(), fast(records))
+    with pytest.warns(PhysicsWarning, match=r"inputs scaled\? .*X is scaled, as by") as warned:
+        pipeline.fit(X, y)
+    assert len(warned) == 1
     scaled = StandardScaler().fit_transform(X)
     assert any(len(rows) == 10 and np.allclose(rows, scaled) for rows in seen)
     assert all(np.isin(rows.round(9), scaled.round(9)).all() for rows in seen)
     mean, std = pipeline.predict(Z, return_std=True)
     assert mean.shape == std.shape == (7,)
+
+
+def test_a_physics_that_is_off_is_said_to_be(data):
+    X, y = data
+    with pytest.warns(PhysicsWarning, match="times too large") as caught:
+        fast(lambda X: 1000 * wave(X)).fit(X, y)
+    assert [each.filename for each in caught] == [__file__]
+    assert "is scaled" not in str(caught[0].message)
+    large = fast(lambda X: 1000 * wave(X))
+    scaled = TransformedTargetRegressor(large, transformer=StandardScaler())
+    with pytest.warns(PhysicsWarning, match="y is scaled, as by a TransformedTargetRegressor"):
+        scaled.fit(X, y)
 
 
 def test_grid_search_over_models_and_physics(data):

@@ -8,10 +8,22 @@ import pytest
 import torch
 from botorch.models.transforms import Normalize
 
-from gpadjust import CKA, FunctionPhysics, StackedGP, Unknown, ZeroMeanGP, compare, fit
+from gpadjust import (
+    CKA,
+    FunctionPhysics,
+    PhysicsWarning,
+    StackedGP,
+    Unknown,
+    ZeroMeanGP,
+    compare,
+    fit,
+)
 from gpadjust.inference import bayes
+from gpadjust.models.training_data import training_data
+from gpadjust.physics import as_physics
 from gpadjust.validation import STRUCTURES, Gain, Structure, leave_one_out, stacking_weights
 from gpadjust.validation.gain import physics_gain
+from gpadjust.validation.physics_alone import physics_alone
 from gpadjust.validation.ranking import Candidate, is_clear, ranking
 
 comparison_of = sys.modules["gpadjust.validation.comparison"]
@@ -95,9 +107,14 @@ def test_the_best_structure_is_recommended_where_it_is_clear(scaled):
         assert each.se_diff > 0
     assert comparison.advice[1].startswith("Scaling the physics helps: elpd +")
     lines = str(comparison).splitlines()
-    assert lines[0].split()[:2] == ["y", "elpd"]
-    assert [line.split("  ")[0] for line in lines[1:3]] == [row.structure for row in rows]
-    assert len({len(line) for line in lines[:3]}) == 1
+    errors = comparison.errors()["y"]
+    assert [*errors] == ["physics alone", "adjusted"]
+    told = f"RMSE {errors['physics alone']:.3g}; adjusted, left out: RMSE {errors['adjusted']:.3g}"
+    assert lines[:2] == [f"physics alone: {told}", ""]
+    assert lines[2].split()[:2] == ["y", "elpd"]
+    names = [*(row.structure for row in rows), "physics alone"]
+    assert [line.split("  ")[0] for line in lines[3:6]] == names
+    assert len({len(line) for line in lines[2:6]}) == 1
 
 
 def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
@@ -148,6 +165,73 @@ def test_what_is_left_out_is_what_the_tables_tell_of(scaled, noise):
         torch.testing.assert_close(whole.mean, sum(means))
     else:
         assert whole is comparison.left_out[comparison.chosen]
+
+
+class TestPhysicsAlone:
+    def test_its_errors_are_those_of_f_p_and_it_has_no_weight(self, scaled, noise):
+        X, Y = scaled
+        comparison = compare(X, Y + noise, crude, structures=["zero mean", "CKA"], **QUICK)
+        *candidates, alone = comparison.rows("y")
+        assert candidates == comparison.table["y"]
+        assert alone.structure == "physics alone"
+        assert "physics alone" not in {*comparison.models, *comparison.stacked.weights}
+        rmse = (Y + noise - crude(X)).square().mean().sqrt().item()
+        errors = comparison.errors()["y"]
+        assert errors["physics alone"] == pytest.approx(rmse)
+        assert alone.rmse == pytest.approx(rmse / (Y + noise).std().item())
+        assert errors["adjusted"] == comparison.leave_one_out().rmse.item()
+        assert errors["data alone"] == comparison.left_out["zero mean"].rmse.item()
+        best = comparison.table["y"][0]
+        assert alone.elpd_diff == pytest.approx(alone.elpd - best.elpd)
+        assert alone.weight == 0
+
+    def test_its_densities_are_those_of_an_unknown_variance(self, X, noise):
+        Y = torch.cat([crude(X) + noise, 2 * crude(X)], -1)
+        Y[3, 0] = torch.nan
+        data = training_data(X, Y)
+        (loo,) = physics_alone(as_physics(lambda X: crude(X).expand(-1, 2)), data).values()
+        rest = [i for i in range(8) if i not in (3, 5)]
+        errors = (Y - crude(X))[:, 0]
+        scales = torch.linspace(-8, 2, 4001, dtype=torch.float64).exp()  # even in their logarithm
+        weight = torch.distributions.Normal(0.0, scales).log_prob(errors[rest, None]).sum(0)
+        weight = weight.softmax(0)
+        density = torch.distributions.Normal(0.0, scales).log_prob(errors[5]).exp()
+        torch.testing.assert_close(loo.log_density[5, 0].exp(), weight @ density)
+        torch.testing.assert_close(loo.variance[5, 0], weight @ scales.square())
+        assert loo.log_density[3, 0].isnan()
+        assert loo.log_density[:, 1].isfinite().all()
+
+    @pytest.mark.parametrize("n", [2, 3, 8])
+    def test_an_exact_physics_of_any_number_of_points(self, X, n):
+        data = training_data(X[:n], crude(X[:n]))
+        (loo,) = physics_alone(as_physics(crude), data).values()
+        assert loo.log_density.isfinite().all()
+        assert loo.coverage().item() == 1
+        assert not loo.variance.isnan().any()
+
+    def test_known_variances_are_its_noise(self, X, noise):
+        data = training_data(X, crude(X) + noise, 0.04)
+        (loo,) = physics_alone(as_physics(crude), data).values()
+        expected = torch.distributions.Normal(crude(X), 0.2).log_prob(crude(X) + noise)
+        torch.testing.assert_close(loo.log_density, expected)
+
+    def test_each_of_several_and_none_of_unknown_parameters(self, X):
+        unknown = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
+        physics = as_physics({"wave": crude, "line": lambda X: X, "slope": unknown})
+        found = physics_alone(physics, training_data(X, crude(X)))
+        assert [*found] == ["physics alone of wave", "physics alone of line"]
+        torch.testing.assert_close(found["physics alone of line"].mean, X)
+
+    def test_without_a_structure_that_adjusts_there_is_no_such_error(self, scaled):
+        comparison = compare(*scaled, crude, structures=["zero mean"], **QUICK)
+        assert [*comparison.errors()["y"]] == ["physics alone", "data alone"]
+
+    def test_a_physics_that_is_off_is_said_to_be_once(self, scaled):
+        X, Y = scaled
+        structures = ["zero mean", "physics mean", "constant rho", "CKA"]
+        with pytest.warns(PhysicsWarning, match="about 330 times too large") as caught:
+            compare(X, Y, lambda X: 1000 * crude(X), structures=structures, **QUICK)
+        assert [each.filename for each in caught] == [__file__]
 
 
 def test_warnings_say_of_which_structure(scaled, monkeypatch):
@@ -355,6 +439,7 @@ def test_bad_input(scaled):
         ((X, Y), {"structures": []}, "structures"),
         ((X, Y), {"structures": ["CKA", "kriging"]}, "structures"),
         ((X, Y), {"structures": [Structure("stacked", CKA)]}, "none of them 'stacked'"),
+        ((X, Y), {"structures": [Structure("physics alone", CKA)]}, "or 'physics alone', got"),
         ((X.expand(2, -1, -1), Y.expand(2, -1, -1)), {}, "one data set"),
         ((X, Y[:5]), {}, "train_Y"),
         *(((X, Y), {n: -1}, f"Expected {n}") for n in ("num_starts", "num_screened", "seed")),
@@ -375,6 +460,9 @@ def test_a_physics_with_unknown_parameters_is_calibrated_by_each_structure():
         assert ((low < torch.tensor([5.0, 1.0])) & (torch.tensor([5.0, 1.0]) < high)).all()
     (rows,) = comparison.table.values()
     assert {row.structure for row in rows} == {"calibrated physics", "physics mean"}
+    errors = comparison.errors()["y"]
+    assert [*errors] == ["calibrated physics", "adjusted"]
+    assert comparison.rows("y") == rows
     with pytest.raises(ValueError, match="has no unknown parameter for 'calibrated physics'"):
         compare(X, Y, torch.sin, structures="calibrated physics")
 
