@@ -61,8 +61,8 @@ def log_likelihood(model):
         prior = model.likelihood(model(*model.train_inputs), *model.train_inputs)
         covariance = prior.covariance_matrix
         n = covariance.shape[-1]
-        size = nugget(n) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1)
-        covariance = covariance + size[..., None, None] * torch.eye(n, dtype=torch.float64)
+        size = nugget(n) * covariance.diagonal(dim1=-1, dim2=-2)
+        covariance = covariance + torch.diag_embed(size)
         value = MultivariateNormal(prior.mean, covariance).log_prob(model.train_targets)
     model.eval()
     return value
