@@ -193,7 +193,8 @@ class TestManyPoints:
         model = problem()
         good = fit(model, "map", **QUICK).log_likelihood
         again = fit(model, "map", **QUICK, seed=1).log_likelihood
-        assert (again >= good - 1e-6 * good.abs()).all()
+        # With little noise the likelihood itself has rounding errors of some hundredths.
+        assert (again >= good - 3e-5 * good.abs()).all()
 
 
 class Pendulum(torch.nn.Module):
