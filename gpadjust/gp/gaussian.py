@@ -16,6 +16,7 @@ from torch import Tensor
 
 _limiting = Lock()  # held by the thread that limits those of other libraries
 _setting = Lock()  # held by the thread that sets PyTorch's number of threads
+_FAINT = 1e-10  # of the mean variance: what a point has at least, for its nugget
 _TRIES = 8  # each with ten times the nugget of the one before
 _controller = cache(ThreadpoolController)  # it lists the process's libraries, once
 _SMALL = 256  # points of a covariance up to which a second thread costs more than it brings
@@ -24,8 +25,10 @@ _SMALL = 256  # points of a covariance up to which a second thread costs more th
 def nugget(n: int) -> float:
     r"""The nugget of every factorised covariance of ``n`` points, :math:`\max(100 n, n^2)\epsilon`.
 
-    It is relative to the mean of the diagonal. With less, rounding errors, of the order of :math:`n
-    \epsilon` of the prior variance, would decide what a model without noise knows.
+    It is relative to each point's own variance, in fits and in predictions alike. With less,
+    rounding errors, of the order of :math:`n \epsilon` of the prior variance, would decide what a
+    model without noise knows. These errors are relative to each point's variance, too (Higham 2002,
+    theorem 10.7): those of a large part of a function do not blur a small one.
     """
     return max(100 * n, n**2) * torch.finfo(torch.float64).eps
 
@@ -45,14 +48,12 @@ def cholesky(
         The Cholesky factors, and which of them failed with the largest nugget, too, ``...``.
     """
     n = covariance.shape[-1] if n is None else n
-    if observed is None:
-        added = nugget(n) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1, keepdim=True)
-    else:
+    if observed is not None:
         pairs = observed.unsqueeze(-1) & observed.unsqueeze(-2)
         covariance = covariance.where(pairs, torch.zeros_like(covariance))
-        diagonal = covariance.diagonal(dim1=-1, dim2=-2)
-        count = observed.sum(-1, keepdim=True).clamp_min(1)
-        added = nugget(n) * diagonal.sum(-1, keepdim=True) / count
+    diagonal = covariance.diagonal(dim1=-1, dim2=-2)
+    added = nugget(n) * diagonal.maximum(_FAINT * diagonal.mean(-1, keepdim=True))
+    if observed is not None:
         covariance = covariance + torch.diag_embed((~observed).to(covariance))
     step = added
     for _ in range(_TRIES):
@@ -171,9 +172,7 @@ def negative_log_likelihood(
     if not everything:
         by_covariance = by_covariance * observed.unsqueeze(-1) * observed.unsqueeze(-2)
     diagonal = by_covariance.diagonal(dim1=-1, dim2=-2)
-    # The nugget follows the covariance's mean diagonal.
-    share = nugget(size) * diagonal.sum(-1, keepdim=True) / n.unsqueeze(-1)
-    diagonal.add_(share * observed)
+    diagonal.mul_(1 + nugget(size))  # as the nugget is a share of it
     by_scale = None if least_scale is None else 0.5 * (n - square / scale)
     # LAPACK's matrices are stored by columns, ours by rows: mixing them would be slow.
     return LikelihoodValue(value, scale, -weight, by_covariance.mT, by_scale, coefficients)

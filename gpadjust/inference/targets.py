@@ -25,6 +25,7 @@ from gpadjust.gp.gaussian import (
 )
 from gpadjust.gp.kernels import Pairs, Profile, Stationary, stationary_parts
 from gpadjust.gp.noise import Noise
+from gpadjust.models import TermsGP
 from gpadjust.models.parameters import LogPriors, Parameters, Values
 from gpadjust.physics import PhysicsError
 
@@ -113,7 +114,7 @@ class Target:
         found = stationary_terms(*args) if self.parameters.is_batched else None
         self.distribution: StationaryTerms | ByModules = found or ByModules(*args)
         vague = self.of_logs and marginalized is None
-        self._trend = _trend(self._raw_inputs, self.targets) if vague else None
+        self._trend = _trends(model, self._raw_inputs, self.targets) if vague else None
         self._log_priors: LogPriors | None = None
         if self.of_logs or next(iter(model.named_priors()), None) is not None:
             self._log_priors = LogPriors(model, self.parameters, self.of_logs)
@@ -540,6 +541,21 @@ def _constant_means(residual: Tensor, covariance: Tensor, basis: Tensor) -> tupl
     pivot = chol.diagonal(dim1=-1, dim2=-2).amin(-1, keepdim=True).square()
     size = basis.square().amax(-2).clamp_min(torch.finfo(chol.dtype).tiny)
     return means, vague.minimum(pivot / (nugget(chol.shape[-1]) * size))
+
+
+def _trends(
+    model: BatchedMultiOutputGPyTorchModel, inputs: Tensor, targets: Tensor
+) -> Tensor | None:
+    """The trends of all groups of observations that have their own: ``... x n x q``, or None."""
+    if not isinstance(model, TermsGP):
+        return _trend(inputs, targets)
+    inputs, groups = model.trend_inputs(inputs)
+    each = [
+        _trend(inputs, targets.where(rows > 0, math.nan))
+        for rows in groups.expand(*targets.shape, -1).unbind(-1)
+    ]
+    found = [trend for trend in each if trend is not None]
+    return torch.cat(found, dim=-1) if found else None
 
 
 def _trend(inputs: Tensor, targets: Tensor) -> Tensor | None:

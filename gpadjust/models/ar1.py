@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gpytorch
 import torch
@@ -72,16 +72,23 @@ class Level(Batched, gpytorch.Module):
     r"""The basis of a term of two levels l, the last input: :math:`\rho^{[l=1]}`, or :math:`[l=1]`.
 
     Args:
-        batch_shape: Batch shape of the constant :math:`\rho`, or None for the basis without.
+        ratio: Standard deviation of the high level's targets over that of the low one's,
+            ``batch_shape x 1``, for a basis with the constant :math:`\rho`; None for that without.
     """
 
-    prior_of_learnt = (1.0, 1.0)  # mean and standard deviation of the constant's prior
+    ratio: Tensor
 
-    def __init__(self, batch_shape: Size | None = None) -> None:
+    def __init__(self, ratio: Tensor | None = None) -> None:
         super().__init__()
         self.rho: Parameter | None = None
-        if batch_shape is not None:
-            self.rho = Parameter(torch.ones(*batch_shape, 1, dtype=torch.float64))
+        if ratio is not None:
+            self.rho = Parameter(torch.ones_like(ratio))
+            self.register_buffer("ratio", ratio.clone())
+
+    @property
+    def prior_of_learnt(self) -> tuple[float, Tensor]:
+        """Mean and standard deviation of the prior of the constant."""
+        return 1.0, (1 + self.ratio.square()).sqrt()
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the basis at ``x`` (``... x n x (d + 1)``) as ``... x n``."""
@@ -132,6 +139,7 @@ class AR1(TermsGP):
     """
 
     data_arguments = (*TermsGP.data_arguments, "low_X", "low_Y")
+    own_priors: ClassVar[dict[str, tuple[float, float]]] = {"noise": (1e-4, 5.0)}
 
     def __init__(
         self,
@@ -178,8 +186,7 @@ class AR1(TermsGP):
         at_low = torch.nn.functional.pad(low.X, (0, 1))
         X = torch.cat([at_low, transform.with_level(high.X)], dim=-2)
         Y = torch.cat([low.Y, high.Y], dim=-2)
-        count, mean = (~low.Y.isnan()).sum(-2, keepdim=True), low.Y.nanmean(-2, keepdim=True)
-        variance = (low.Y - mean).square().nansum(-2, keepdim=True) / (count - 1)
+        mean, variance = low.Y.nanmean(-2, keepdim=True), _variance(low.Y)
         if isinstance(outcome_transform, _DefaultType):
             spread = variance.sqrt().where(variance > 0, torch.ones_like(variance))
             units: Standardize | None = standardize(mean, spread)
@@ -193,7 +200,9 @@ class AR1(TermsGP):
             Yvar = torch.cat([low_Yvar.expand_as(low.Y), high.Yvar], dim=-2)
         data = high._replace(X=X, Y=Y, Yvar=Yvar)
         make = TermBuilder(data, transform, units, transformed(X, transform).shape[-1] - 1)
-        low_term = make.term("low", low_covar_module or scaled_rbf, Level(make.batch_shape))
+        ratio = (_variance(high.Y) / variance).sqrt().nan_to_num(0.0, posinf=0.0)
+        ratio = ratio.mT if m > 1 else ratio.squeeze(-1)
+        low_term = make.term("low", low_covar_module or scaled_rbf, Level(ratio))
         delta = make.term("delta", delta_covar_module or scaled_rbf, Level())
         super().__init__(make, [low_term, delta])
 
@@ -219,6 +228,11 @@ class AR1(TermsGP):
         """Inputs without their level, and the rows of the high level."""
         return inputs[..., :-1], slice(int((inputs[..., -1] == 0).sum(-1).max()), None)
 
+    def trend_inputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """As the base class: each level has a trend of its own, as f_p and delta have."""
+        level = inputs[..., -1:]
+        return inputs[..., :-1], torch.cat([1 - level, level], dim=-1)
+
     def measured(self) -> Tensor:
         """As the base class: targets of the high level."""
         return super().measured() & (self.train_inputs[0][..., -1] == 1)
@@ -226,6 +240,12 @@ class AR1(TermsGP):
     def _new_inputs(self, X: Tensor) -> Tensor:
         raw = X.shape[-1] == self.input_transform.num_inputs
         return self.input_transform.with_level(X) if raw else super()._new_inputs(X)
+
+
+def _variance(Y: Tensor) -> Tensor:
+    """The variance of ``... x n x m`` values of which some are NaN, ``... x 1 x m``."""
+    count, mean = (~Y.isnan()).sum(-2, keepdim=True), Y.nanmean(-2, keepdim=True)
+    return (Y - mean).square().nansum(-2, keepdim=True) / (count - 1)
 
 
 def _samples(train_X: Tensor, bounds: Tensor | None, num_low: int, seed: int) -> Tensor:

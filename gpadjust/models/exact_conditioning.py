@@ -106,9 +106,7 @@ class Factors(NamedTuple):
         else:
             cross = cross * observed.unsqueeze(-1)
         border = self.whiten(cross)
-        size = corner.diagonal(dim1=-1, dim2=-2).mean(-1)
-        identity = torch.eye(k, dtype=corner.dtype, device=corner.device)
-        corner = corner + nugget(n + k) * size[..., None, None] * identity
+        corner = corner + nugget(n + k) * torch.diag_embed(corner.diagonal(dim1=-1, dim2=-2))
         chol, _ = cholesky(corner - border @ border.mT, None if observed.all() else observed, n + k)
         chol = _without(chol, observed).expand(*border.shape[:-1], k)
         rows = torch.cat([border, chol], dim=-1)

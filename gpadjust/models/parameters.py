@@ -295,9 +295,10 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     that are nearly polynomial (long lengthscales, a large variance), a rho that is nearly constant,
     and data without noise are not ruled out. They were chosen on other data sets
     than those that are reported. A centre that is learnt has N(0, 3^2), in standard deviations of
-    f_p from its mean. The constant rho of an
-    :class:`~gpadjust.AR1` has N(1, 1). Give a kernel or likelihood priors of your own
-    (``lengthscale_prior=...``, or ``register_prior``) to replace them.
+    f_p from its mean. The constant rho of an :class:`~gpadjust.AR1` has N(1, 1 + r^2) for levels
+    whose targets have standard deviations of the ratio r, high to low; the logarithms of its noises
+    have N(log(10^{-4} v), 5^2), as the low level mostly has none. Give a kernel or likelihood
+    priors of your own (``lengthscale_prior=...``, or ``register_prior``) to replace them.
 
     Args:
         model: A model of this library. They are made for sampling: :func:`gpadjust.fit` with
@@ -322,11 +323,12 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         if not row.raw.requires_grad or f"{name}_prior" in getattr(owner, "_priors", ()):
             continue
         if row.kind == "constant":
-            mean, sd = (torch.full_like(row.raw, number) for number in owner.prior_of_learnt)
+            given = (torch.as_tensor(number).to(row.raw) for number in owner.prior_of_learnt)
+            mean, sd = (number.expand_as(row.raw).clone() for number in given)
             owner.register_prior(f"{name}_prior", NormalPrior(mean, sd), name)
         elif row.size is not None:
             kind, size = KINDS[row.kind], row.size
-            median, spread = kind.prior
+            median, spread = getattr(model, "own_priors", {}).get(row.kind, kind.prior)
             median *= math.sqrt(size.shape[-1]) if row.kind == "lengthscale" else 1.0
             location = (size if kind.has_unit else torch.ones_like(size)).log() + math.log(median)
             prior = LogNormalPrior(location, torch.full_like(location, spread))

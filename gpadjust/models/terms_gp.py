@@ -62,6 +62,8 @@ class TermsGP(TermsModel, SingleTaskGP):
     prediction_strategy: Any
     conditioning_class: ClassVar[type[ExactConditioning]] = ExactConditioning
     _learnt_noise = staticmethod(learnt_noise)
+    own_priors: ClassVar[dict[str, tuple[float, float]]] = {}
+    """Priors of kinds of hyper-parameters that are other than those of ``KINDS``."""
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
         data, likelihood = made.data, made.likelihood
@@ -192,6 +194,17 @@ class TermsGP(TermsModel, SingleTaskGP):
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
         """Raw training inputs without what the model added to them, and the user's rows of them."""
         return inputs, slice(None)
+
+    def trend_inputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """What a trend in the targets is linear in, and which trend each row has one of.
+
+        Args:
+            inputs: Raw training inputs, ``... x n x d``, with what the model added to them.
+
+        Returns:
+            Inputs, and a column of ones and zeros for each trend, ``... x n x g``.
+        """
+        return inputs, torch.ones_like(inputs[..., :1])
 
     def hold_samples(self, samples: dict[str, Tensor]) -> None:
         """Make the model fully Bayesian: a batch of itself, one for each hyper-parameter sample.

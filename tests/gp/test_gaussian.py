@@ -155,10 +155,12 @@ def test_the_nugget_is_always_there_and_follows_the_diagonal(scale):
     size = 4
     ones = torch.full((2, size, size), scale, dtype=torch.float64)
     ones[1] += scale * torch.eye(size, dtype=torch.float64)
-    mean = ones.diagonal(dim1=-1, dim2=-2).mean(-1)[..., None, None]
-    chol, failed = cholesky(ones.clone())
+    sd = scale * torch.tensor([1.0, 1.0, 1.0, 1e-3], dtype=torch.float64)
+    covariance = ones / scale * sd.unsqueeze(-1) * sd
+    chol, failed = cholesky(covariance.clone())
     assert not failed.any()
-    added = (chol @ chol.mT - ones) / mean
+    variance = covariance.diagonal(dim1=-1, dim2=-2)
+    added = (chol @ chol.mT - covariance) / (variance.unsqueeze(-1) * variance.unsqueeze(-2)).sqrt()
     expected = nugget(size) * torch.eye(size, dtype=torch.float64).expand(2, size, size)
     torch.testing.assert_close(added, expected, rtol=0, atol=1e-15)
 

@@ -343,9 +343,8 @@ def test_it_is_the_textbooks(XY):
     with torch.no_grad():
         covariance = model.covar_module(inputs).to_dense() + torch.diag_embed(model.noise.known)
         residual = model.train_targets - model.mean_module(inputs)
-        added = nugget(len(XY[0])) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1)
-        identity = torch.eye(len(XY[0]), dtype=torch.float64)
-        expected = log_likelihood(residual, covariance + added[:, None, None] * identity)
+        added = nugget(len(XY[0])) * covariance.diagonal(dim1=-1, dim2=-2)
+        expected = log_likelihood(residual, covariance + torch.diag_embed(added))
         value = target(target.parameters.current())[0]
     torch.testing.assert_close(-value, expected, rtol=1e-12, atol=1e-12)
     fast = negative_log_likelihood(residual, covariance.clone()).value

@@ -42,14 +42,20 @@ def test_densities(build, data, num_outputs):
         torch.testing.assert_close(actual, expected)
 
 
-def test_constant_rho_of_ar1(build, data):
-    model = build("AR1", *data())
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_of_ar1(build, data, num_outputs, unit):
+    X, Y = data(num_outputs=num_outputs)
+    model = build("AR1", X, unit * Y)
     register_priors(model)
-    rho = torch.tensor([2.5], dtype=torch.float64)
-    expected = Normal(1.0, 1.0).log_prob(rho)
-    torch.testing.assert_close(
-        priors(model)["covar_module.terms.0.basis.rho_prior"].log_prob(rho), expected
-    )
+    ratio = model.data()["train_Y"].std(0) / model.data()["low_Y"].std(0)
+    expected = Normal(1.0, (1 + ratio.square()).sqrt()).log_prob(2.5 * ratio)
+    prior = priors(model)["covar_module.terms.0.basis.rho_prior"]
+    actual = prior.log_prob((2.5 * ratio).reshape(prior.loc.shape))
+    torch.testing.assert_close(actual.flatten(), expected)
+    noise = priors(model)["likelihood.noise_covar.noise_prior"]
+    initial = model.likelihood.noise.detach()  # a hundredth of the typical size
+    torch.testing.assert_close(noise.loc, (1e-2 * initial).log())
+    assert (noise.scale == 5).all()
 
 
 def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics):

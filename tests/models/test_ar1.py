@@ -6,6 +6,7 @@ import torch
 from botorch.models.transforms import Normalize
 
 from gpadjust import AR1, fit
+from gpadjust.inference.targets import LogPosterior
 
 
 @pytest.fixture
@@ -169,3 +170,57 @@ def test_what_a_transform_learnt_stays(uniform, crude_physics):
     model.train()
     model.eval()
     torch.testing.assert_close(model.predict(Z).mean, before.mean)
+
+
+def test_the_prior_of_rho_is_each_outputs_own(levels):
+    X, Y, low_X, low_Y = levels
+    both = AR1(X, torch.cat([Y, 9 * Y], -1), low_X=low_X, low_Y=low_Y.expand(-1, 2))
+    own = AR1(X, 9 * Y, low_X=low_X, low_Y=low_Y)
+    part = both.subset_output([1])
+    torch.testing.assert_close(part.terms[0].basis.ratio, own.terms[0].basis.ratio)
+
+
+def test_a_low_level_that_does_not_vary_says_nothing_of_rho():
+    X = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)
+    model = AR1(X, X, low_X=X, low_Y=torch.full_like(X, 3.0))
+    assert model.terms[0].basis.prior_of_learnt[1].item() == 1.0
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_the_size_of_a_trend_of_either_level_has_no_vote(which):
+    low_X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
+    X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+    low, high = 1 - 2 * low_X, 3 + 2 * X
+    if which == 1:  # it is delta that has a trend
+        low, high = (5 * low_X).sin(), high + 2 * (5 * X).sin()
+    model = AR1(X, high, low_X=low_X, low_Y=low)
+    kernel = model.terms[which].kernel
+    with torch.no_grad():
+        kernel.base_kernel.raw_lengthscale.fill_(np.log(100.0))
+        model.rho_constant.fill_(2.0)
+        model.likelihood.noise_covar.raw_noise.fill_(np.log(1e-2))
+    values = []
+    for variance in (1e5, 1e7):
+        kernel.outputscale = variance
+        objective = LogPosterior(model)
+        vector = objective.parameters.current()
+        values.append(objective(vector).item() + vector[0, 0, :].sum().item())
+    assert (values[1] - values[0]) / np.log(100) == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_a_discrepancy_that_is_nearly_polynomial(unit):
+    """Of Forrester et al. (2007): the function, and a quarter of it with a parabola."""
+
+    def high(X):
+        return (6 * X - 2).square() * (12 * X - 4).sin()
+
+    X = torch.linspace(0.05, 0.95, 6, dtype=torch.float64).unsqueeze(-1)
+    low_X = torch.cat([X, torch.linspace(0, 1, 15, dtype=torch.float64).unsqueeze(-1)])
+    low_Y = unit * (0.25 * high(low_X) + 20 * low_X.square() - 10)
+    model = AR1(X, high(X), low_X=low_X, low_Y=low_Y)
+    fit(model)
+    Z = torch.linspace(0, 1, 50, dtype=torch.float64).unsqueeze(-1)
+    assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.1 * high(Z).std()
+    lower, upper = model.interval(Z)
+    assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9

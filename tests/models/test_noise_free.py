@@ -32,7 +32,7 @@ def variances(model, X, Z):
     K = f * covariance(rho, x, x) * f + covariance(delta, x, x)
     K += mp.mpf(model.likelihood.noise.item()) * mp.eye(n)
     if type(model) is CKA:
-        K += mp.mpf(nugget(n)) * sum(K[i, i] for i in range(n)) / n * mp.eye(n)
+        K += mp.mpf(nugget(n)) * mp.diag([K[i, i] for i in range(n)])
     inverse = mp.inverse(K)
     with_rho, with_delta = covariance(rho, z, x) * f, covariance(delta, z, x)
     k_rho, k_delta = covariance(rho, z, z), covariance(delta, z, z)

@@ -39,8 +39,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/gp/gaussian.py",
-        "added = nugget(n) * covariance.diagonal(dim1=-1, dim2=-2).mean(-1, keepdim=True)",
-        "added = torch.full_like(covariance[..., :1, 0], nugget(n))",
+        "added = nugget(n) * diagonal.maximum(_FAINT * diagonal.mean(-1, keepdim=True))",
+        "added = torch.full_like(diagonal, nugget(n))",
         "The nugget has no units: targets of a tiny scale drown in it.",
     ),
     Fault(
