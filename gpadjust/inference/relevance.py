@@ -51,6 +51,7 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     mean = model.train_targets.nanmean(-1, keepdim=True)
     for term in other.terms:
         term.mean.copy_(torch.zeros_like(mean) if is_scaled(term) else mean)
+        term.given_mean.copy_(term.mean)  # of which typical sizes are
         if is_scaled(term) and term.basis.learns_center:
             term.basis.center.zero_()  # or it would move the mean
     return other

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from torch import Size, Tensor
 from torch.func import functional_call
 from torch.nn import Module, Parameter
 
-from gpadjust.gp import OrthogonalKernel, PhysicsScaledKernel, Unit
+from gpadjust.gp import OrthogonalKernel, PhysicsScaledKernel, SumOfTerms, Unit
 from gpadjust.gp.noise import Noise
 
 
@@ -187,7 +187,12 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
     inputs = inputs if model._has_transformed_inputs else model.transform_inputs(inputs)
     ranges = inputs.amax(-2, keepdim=True) - inputs.amin(-2, keepdim=True)
     ranges = ranges.where(ranges > 0, torch.ones_like(ranges))
-    unit = (targets - model.mean_module(inputs)).square().nanmean(-1)
+    kernel = model.covar_module
+    if isinstance(kernel, SumOfTerms):  # unknown means, which fits move, have no vote
+        mean = kernel.at(inputs).combine({term.name: term.given_mean for term in kernel.terms})
+    else:
+        mean = model.mean_module(inputs)
+    unit = (targets - mean).square().nanmean(-1)
     # A physics that misleads says nothing of how large functions and noise are.
     spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1)
     is_constant = spread <= _ROUNDING**2 * targets.square().nanmean(-1)
@@ -382,12 +387,6 @@ class Parameters:
             raise ValueError(
                 "The model has no learnable parameter: all have `requires_grad=False`."
             )
-        if any(row.kind == "mean" for row in every):
-            # A fit moves unknown means, and so the residual; bounds are what a new model had.
-            for i, row in enumerate(self.rows):
-                if row.is_default and row.size is not None:
-                    least = row.constraint.lower_bound / KINDS[row.kind].bounds[0]
-                    self.rows[i] = replace(row, size=row.size.maximum(least))
         self.names = [row.name for row in self.rows]
         self.learns_inputs = any(row.kind == "physics" for row in self.rows)
         self.is_batched = not any(row.is_shared for row in self.rows)

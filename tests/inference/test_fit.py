@@ -18,6 +18,8 @@ from gpadjust.inference import optimise
 from gpadjust.models import PaperRRA
 from gpadjust.models.parameters import LogInterval
 
+pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
+
 QUICK = {"num_screened": 16, "num_starts": 2}
 
 
@@ -186,7 +188,7 @@ class TestManyPoints:
     @pytest.mark.slow
     def test_it_is_as_good_as_a_search_on_all(self, problem, monkeypatch):
         found = fit(problem(), "map").log_likelihood
-        monkeypatch.setattr(optimise, "_MANY", 1000)
+        monkeypatch.setattr(optimise, "MANY", 1000)
         assert (found >= fit(problem(), "map").log_likelihood - 0.1).all()
 
     def test_it_is_never_worse_than_the_start(self, problem):

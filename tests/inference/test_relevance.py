@@ -16,6 +16,8 @@ from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.validation import trust
 
+# Physics of no use is what this is about.
+pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 SHORT = {"num_draws": 64, "num_starts": 1, "num_screened": 8}
 quick = pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # few draws
 
