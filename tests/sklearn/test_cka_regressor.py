@@ -84,6 +84,7 @@ def test_scikit_learn_accepts_it(estimator, check):
     check(estimator)
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @pytest.mark.slow
 @parametrize_with_checks(
     [CKARegressor(), fast(Named(wave)), CKARegressor(Named(torch_wave))],
