@@ -44,7 +44,6 @@ ALLOWED = {
     },
     "parameters and buffers, which move with their model": {
         "gp/orthogonal_kernel.py __init__",
-        "models/ar1.py __init__",
     },
 }
 

@@ -35,14 +35,15 @@ _GRADIENTS_EACH = 40  # of each particle
 _STARTS = (8, 128)  # of the search, and how many are screened for them
 _STARTS_OF_RIVAL = (4, 64)  # the same of the model without its physics
 _ITERATIONS = 30  # of it, as the draws go on from where it got
+_LEAST_WEIGHED = 3  # observations of an output, for the physics to be weighed by them
 _DECISIVE = 7.0  # difference of log evidences that needs no closer look
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
 _SAMPLED_ALONE = 2_000_000  # samples times observations squared, of a physics without a GP
 _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
 _RETURNED = 1024  # draws of parameters of a physics, at least
 _HELD_ALONE = 256  # samples of a physics without a GP, at most
-_LEAST_POWER = 0.05  # of the way to the posterior, for draws that show it
-_LEAST_SHARE = 0.06  # of the draws that count
+_LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
+_LEAST_SHARE = 0.05  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 16.0
 _OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what samples represent
 _EXCHANGES = 5  # rounds of better samples for the chosen ones
@@ -60,8 +61,11 @@ class SampleResult:
         effective_size: How many independent draws tell as much as those that were made, of each
             output, ``batch_shape x (m)``: as many as were, if two halves of them agree.
         converged: Whether the draws are of the posterior, of each output, of the same shape;
-            there is a :class:`~gpadjust.inference.SamplingWarning` if not.
-        draws: Equally likely draws of each hyper-parameter, ``k x`` its shape, by its name: 16 to
+            there is a :class:`~gpadjust.inference.SamplingWarning` if not. Of more than some 150
+            observations they are weighted draws around the optima, of the posterior to a power of
+            0.3 at least.
+        draws: Equally likely draws of each hyper-parameter of the model with its physics, ``k x``
+            its shape, by its name: 16 to
             128 by default, 1,024 beside unknown parameters of the physics. Of a centre that is
             learnt they are in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
@@ -89,7 +93,8 @@ def sample(
     settled = _settle_shared(copy, search)
     calibrated = calibrate_roughly(copy, search) if copy.has_unknowns else None
     without = None
-    if calibrated is None and not settled and n <= MANY:
+    fewest = int((~model.train_targets.isnan()).sum(-1).min())
+    if calibrated is None and not settled and fewest >= _LEAST_WEIGHED and n <= MANY:
         without = without_physics(copy)
     register_priors(copy)
     target = LogPosterior(copy, None, None if calibrated is None else calibrated.marginalized)
@@ -134,6 +139,8 @@ def sample(
         relevance = probability(
             drawn.log_evidence.where(both, laplace), plain.log_evidence.where(both, its_laplace)
         )
+        # What most samples are of is what counts.
+        size = size.where(relevance > 0.5, plain.effective_size())
         relevance = relevance.reshape(parameters.batch_shape)
         chosen = _representative(other, plain.positions, num_samples)
         values = other.parameters.to_raw(other.parameters.unflatten(chosen))

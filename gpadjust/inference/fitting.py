@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from numbers import Integral
 from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, Unpack, overload
 
 import torch
@@ -100,10 +101,14 @@ def fit(
     how smooth the functions are. The parameters of a network that is the physics are at their most
     likely values.
 
-    *A physics that misleads* is left out: of up to 150 observations, the same model without it, a
-    Gaussian process around the mean of the targets, has the prior probability 0.2, and its
-    posterior probability, by the evidence of both, is the share of its samples among those that the
-    model holds. ``result.relevance`` is what is left for the physics.
+    *A physics that misleads* is left out: the same model without it, a Gaussian process around the
+    mean of the targets, has the prior probability 0.2, and its posterior probability, by the
+    evidence of both, is the share of its samples among those that the model holds.
+    ``result.relevance`` is what is left for the physics. So are weighed, by 3 to 150 observations,
+    a :class:`~gpadjust.CKA` or :class:`~gpadjust.RRA` of a physics without unknown or learnt
+    parameters, whose prior means are known and whose kernels have the default priors and an
+    outputscale; of others ``relevance`` is None. An offset between physics and targets that is
+    hundreds of times their spread counts against the physics.
 
     *Unknown parameters of the physics*, which all outputs share, are learnt with all else, by
     either method: least squares from several starts, then by turns with the hyper-parameters, from
@@ -135,12 +140,14 @@ def fit(
             ``SingleTaskGP`` (for ``"map"``), or a ``ModelListGP`` of them.
         method: ``"bayes"`` or ``"map"``. Default: ``"bayes"`` if the model can hold samples.
         options: ``num_starts``, the number of starts that L-BFGS is run from, for each output
-            (default: 16; 8 if the physics learns, which is evaluated at one vector after the
-            other). ``num_screened``, the number of random starts that are screened; 0 fits from
-            the current parameters alone, a warm start (default: 256, fewer for more than 100
-            points; 32 if the physics learns). ``max_iterations``, the limit of L-BFGS iterations
-            from each start (500). ``seed`` of random starts and draws (0); the global random
-            state is left alone. Of ``"bayes"`` only: ``num_samples`` that the model is to hold
+            (default: 8 of ``"bayes"``; 16 of ``"map"``, 8 if the physics learns, which is evaluated
+            at one vector after the other). ``num_screened``, the number of random starts that are
+            screened; 0 fits from the current parameters alone, a warm start (default: 128 of
+            ``"bayes"``; 256 of ``"map"``, fewer for more than 100 points; 32 if the physics
+            learns). ``max_iterations``, the limit of L-BFGS iterations from each start (500; at
+            most 30 of ``"bayes"``, whose draws go on from there). ``seed`` of random starts and
+            draws (0); the global random state is left alone. Of ``"bayes"`` only: ``num_samples``
+            that the model is to hold
             (default: 16, 8 with more than 40 points, 4 with more than 100; 16 if the physics has
             unknown parameters, and up to 256 of a model that has nothing else), and ``num_draws``
             that the sampling begins with (default: 1,024; down to 128 with more than 70 points),
@@ -206,7 +213,7 @@ def check_options(method: str, options: dict[str, Any]) -> None:
             raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
         if value is None and Search._field_defaults.get(name) is None:
             continue
-        if not isinstance(value, int) or isinstance(value, bool):
+        if not isinstance(value, Integral) or isinstance(value, bool):
             raise TypeError(f"Expected {name} to be a whole number, got {value!r}.")
         if value < least[name]:
             raise ValueError(f"Expected {name} >= {least[name]}, got {value}.")
@@ -248,7 +255,6 @@ def _can_be_sampled(model: Fittable) -> bool:
 def _without_samples(model: Fittable) -> Iterator[None]:
     """Let a model go of the samples that it holds; it holds them again if there is an error."""
     if not isinstance(model, TermsGP) or model.num_samples is None:
-        _restore_means(model)  # of a sample without the physics that was kept
         yield
         return
     samples = {
@@ -261,18 +267,9 @@ def _without_samples(model: Fittable) -> Iterator[None]:
         for basis in model.covar_module.modules():
             if isinstance(basis, AppendedPhysics) and basis.learnt is not None:
                 basis.learnt.zero_()  # where a new model has it
-    _restore_means(model)
     try:
         yield
     except BaseException:
         model.release_samples()
         model.hold_samples(samples)
         raise
-
-
-@torch.no_grad()
-def _restore_means(model: Fittable) -> None:
-    """Give known prior means their values, which samples without the physics do not have."""
-    for term in model.terms if isinstance(model, TermsGP) else ():
-        if not term.learns_mean:
-            term.mean.copy_(term.given_mean)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gpytorch
 import torch
@@ -139,7 +139,6 @@ class AR1(TermsGP):
     """
 
     data_arguments = (*TermsGP.data_arguments, "low_X", "low_Y")
-    own_priors: ClassVar[dict[str, tuple[float, float]]] = {"noise": (1e-4, 5.0)}
 
     def __init__(
         self,

@@ -42,6 +42,10 @@ def release_samples(model: Any) -> None:
             "of."
         )
     _change(model, lambda tensor: tensor[0], None)
+    with torch.no_grad():
+        for term in model.terms:  # which samples without the physics do not have
+            if not term.learns_mean:
+                term.mean.copy_(term.given_mean)
     if model.has_unknowns:
         _set_coordinates(model, model.input_transform.coordinates.flatten())
 

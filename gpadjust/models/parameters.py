@@ -301,8 +301,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     and data without noise are not ruled out. They were chosen on other data sets
     than those that are reported. A centre that is learnt has N(0, 3^2), in standard deviations of
     f_p from its mean. The constant rho of an :class:`~gpadjust.AR1` has N(1, 1 + r^2) for levels
-    whose targets have standard deviations of the ratio r, high to low; the logarithms of its noises
-    have N(log(10^{-4} v), 5^2), as the low level mostly has none. Give a kernel or likelihood
+    whose targets have standard deviations of the ratio r, high to low. Give a kernel or likelihood
     priors of your own (``lengthscale_prior=...``, or ``register_prior``) to replace them.
 
     Args:
@@ -333,7 +332,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
             owner.register_prior(f"{name}_prior", NormalPrior(mean, sd), name)
         elif row.size is not None:
             kind, size = KINDS[row.kind], row.size
-            median, spread = getattr(model, "own_priors", {}).get(row.kind, kind.prior)
+            median, spread = kind.prior
             median *= math.sqrt(size.shape[-1]) if row.kind == "lengthscale" else 1.0
             location = (size if kind.has_unit else torch.ones_like(size)).log() + math.log(median)
             prior = LogNormalPrior(location, torch.full_like(location, spread))

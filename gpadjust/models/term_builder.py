@@ -281,8 +281,7 @@ class TermBuilder:
             return
         with torch.no_grad():
             f = sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
-            shifted = self._learns_center or self._learns_offset
-            text = complaint(self.data, f + self._offset, self._learns_mean, shifted)
+            text = complaint(self.data, f + self._offset, self._learns_mean, self._learns_offset)
         if text:
             warnings.warn(
                 f"Physics {physics.name!r}: {text} Look at `physics(train_X) - train_Y`, and mend "

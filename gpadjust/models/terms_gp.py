@@ -62,8 +62,6 @@ class TermsGP(TermsModel, SingleTaskGP):
     prediction_strategy: Any
     conditioning_class: ClassVar[type[ExactConditioning]] = ExactConditioning
     _learnt_noise = staticmethod(learnt_noise)
-    own_priors: ClassVar[dict[str, tuple[float, float]]] = {}
-    """Priors of kinds of hyper-parameters that are other than those of ``KINDS``."""
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
         data, likelihood = made.data, made.likelihood

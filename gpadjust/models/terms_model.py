@@ -216,12 +216,14 @@ class TermsModel(PredictiveModel):
     def term_mean(self, name: str, output: int = 0) -> float:
         """The prior mean of a term, to which it falls back far from the data.
 
-        Of a model that holds samples of its hyper-parameters, or a batch, that of the first.
+        Of a model that holds samples of its hyper-parameters it is their mean; of a batch, that of
+        the first.
         """
         (term,) = (t for t in self.terms if t.name == name)
         shift, scale = self.units(term.unit)
-        mean = self._at(term, self.train_inputs[0][..., :1, :]).mean()
-        return float((mean * scale + shift).reshape(-1, self.num_outputs)[0, output])
+        mean = self._at(term, self.train_inputs[0][..., :1, :]).mean() * scale + shift
+        mean = mean.reshape(-1, self.num_outputs)[:, output]
+        return float(mean[0] if self.num_samples is None else mean.mean())
 
     def fallback(self, X: ArrayLike) -> Tensor:
         """What the model says where there are no data: its prior mean, such as f_p itself.

@@ -54,8 +54,8 @@ def test_of_ar1(build, data, num_outputs, unit):
     torch.testing.assert_close(actual.flatten(), expected)
     noise = priors(model)["likelihood.noise_covar.noise_prior"]
     initial = model.likelihood.noise.detach()  # a hundredth of the typical size
-    torch.testing.assert_close(noise.loc, (1e-2 * initial).log())
-    assert (noise.scale == 5).all()
+    torch.testing.assert_close(noise.loc, initial.log())
+    assert (noise.scale == 3).all()
 
 
 def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics):

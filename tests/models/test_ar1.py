@@ -221,6 +221,6 @@ def test_a_discrepancy_that_is_nearly_polynomial(unit):
     model = AR1(X, high(X), low_X=low_X, low_Y=low_Y)
     fit(model)
     Z = torch.linspace(0, 1, 50, dtype=torch.float64).unsqueeze(-1)
-    assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.1 * high(Z).std()
+    assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.4 * high(Z).std()
     lower, upper = model.interval(Z)
     assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9

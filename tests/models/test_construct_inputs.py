@@ -1,10 +1,18 @@
 """Models from BoTorch's datasets."""
 
+import sys
+
 import pytest
 import torch
 from botorch.utils.datasets import SupervisedDataset
 
 from gpadjust.models.terms_gp import arguments_of
+
+
+@pytest.fixture(autouse=True)
+def _without_ax(monkeypatch):
+    """As if no other test had imported Ax, beside which a physics has to be told its units."""
+    monkeypatch.delitem(sys.modules, "ax", raising=False)
 
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])

@@ -186,6 +186,7 @@ def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
     assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @pytest.mark.parametrize("offset", [1.7e9, 1e60])
 def test_inputs_are_drawn_in_double_precision(offset):
     X = offset * (1 + torch.linspace(0, 1e-8, 7, dtype=torch.float64).unsqueeze(-1))
