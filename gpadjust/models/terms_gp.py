@@ -150,6 +150,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         strategy: ExactConditioning = self.prediction_strategy
         return strategy
 
+    @torch.no_grad()
     def log_evidence(self) -> tuple[str, Tensor]:
         """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
         train, (_, scale) = self.at(self.train_inputs[0]), self.units()

@@ -228,6 +228,7 @@ def test_an_input_that_never_changed(known):
 
 
 def test_figures_refuse_what_they_cannot_draw(half, known):
+    before = plt.get_fignums()
     for call, error, says in (
         (lambda: plot_trust(half), TypeError, r"Expected a Trust, got CKA; pass `trust\(model\)`"),
         (lambda: plot_trust(known, output=2), ValueError, "There is no output 2"),
@@ -238,4 +239,4 @@ def test_figures_refuse_what_they_cannot_draw(half, known):
     ):
         with pytest.raises(error, match=says):
             call()
-    assert not plt.get_fignums()
+    assert plt.get_fignums() == before
