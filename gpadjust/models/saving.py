@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from gpytorch.kernels import Kernel
 
 from gpadjust.gp import PhysicsInput
 from gpadjust.models.stacked import StackedGP
@@ -111,6 +112,7 @@ def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
         "physics_names": names,
         "physics_values": f_p,
         "data": data,
+        "kernels": _kernels(model),
         "names": [list(model.input_names), list(model.output_names)],
         "was_fitted": getattr(model, "was_fitted", True),
         "learnt": [name for name, p in model.named_parameters() if p.requires_grad],
@@ -192,6 +194,11 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # it was said when the model was built
         model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
+    if (found := _kernels(model)) != content["kernels"]:
+        raise ValueError(
+            f"it was saved with other kernels: expected {', '.join(content['kernels'])}, found "
+            f"{', '.join(found)}. Give those that the model was built with."
+        )
     priors = {name: v for name, v in model.state_dict().items() if "_prior." in name}
     model.load_state_dict(content["state"] | priors)
     learnt = {*content["learnt"]}
@@ -200,10 +207,10 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     expected: Any = content["physics_values"]
     if expected is not None:
         with torch.no_grad():
-            found = model.input_transform.values(content["data"]["train_X"])
+            values = model.input_transform.values(content["data"]["train_X"])
         tiny = 1e-9 * expected.abs().amax(-2, keepdim=True)
-        if found.shape != expected.shape or bool(
-            ((found - expected).abs() > 1e-6 * expected.abs() + tiny).any()
+        if values.shape != expected.shape or bool(
+            ((values - expected).abs() > 1e-6 * expected.abs() + tiny).any()
         ):
             raise ValueError(
                 "it was saved with another physics: its values at the training inputs differ. "
@@ -213,6 +220,12 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     model.input_names, model.output_names = (tuple(names) for names in content["names"])
     model.was_fitted = content["was_fitted"]
     return model.eval()
+
+
+def _kernels(model: TermsModel) -> list[str]:
+    """The kernels of a model, by their classes and what tells kernels of one class apart."""
+    kernels = [each for each in model.covar_module.modules() if isinstance(each, Kernel)]
+    return [f"{type(k).__qualname__} {getattr(k, 'nu', '')}".strip() for k in kernels]
 
 
 def _named_physics(path: str) -> Physics:

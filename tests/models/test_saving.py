@@ -11,6 +11,7 @@ from torch.nn.functional import relu, silu
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, StackedGP, ZeroMeanGP, load, save
 from gpadjust.inference import register_priors
+from gpadjust.models.parameters import scaled_rbf
 from gpadjust.physics import as_physics
 
 
@@ -161,6 +162,8 @@ def test_a_kernel_is_given_again(uniform, path, name):
     with pytest.raises(ValueError, match=f"could not hold {name}"):
         load(path)
     same(model, load(path, **{name: kernel}), Z)
+    with pytest.raises(ValueError, match=r"other kernels: expected .*MaternKernel 0\.5.*RBFKernel"):
+        load(path, **{name: scaled_rbf})
     save(AR1(X, Y, physics=relu, low_X=X + 0.1), path)
     with pytest.raises(ValueError, match=rf"model\.pt: it does not take {name}, but .*: nothing"):
         load(path, **{name: kernel})
