@@ -18,7 +18,7 @@ ALLOWED = {
         "physics/error.py relocate",
         "physics/memo.py recall",
         "inference/bayes.py _representative",
-        "inference/bayes.py sample",
+        "inference/bayes.py _with_parameters",
         "inference/calibrate.py density",
         "inference/calibrate.py draw_parameters",
         "inference/optimise.py _optima_of_some",

@@ -6,6 +6,7 @@ import math
 import warnings
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
 from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.models import TermsGP, TermsModel
-from gpadjust.models.parameters import register_priors, shared_parameters
+from gpadjust.models.parameters import Parameters, register_priors, shared_parameters
 
 _STEP = 0.1  # of differences, in logarithms
 _WIDEST = 4.0  # standard deviation of Laplace's approximation, in logarithms
@@ -78,6 +79,40 @@ class SampleResult:
     relevance: Tensor | None = None
 
 
+class _Draws(NamedTuple):
+    """Draws of the hyper-parameters of a model with ``B`` outputs.
+
+    Attributes:
+        target: What they are drawn from.
+        particles: The draws.
+        laplace: Log evidences by Laplace's approximation, ``B``.
+    """
+
+    target: LogPosterior
+    particles: Particles
+    laplace: Tensor
+
+    def is_good(self) -> Tensor:
+        """Whether they show the posterior, ``B``."""
+        size, number = self.particles.effective_size(), len(self.particles.positions)
+        return (self.particles.power >= _LEAST_POWER) & (size >= _LEAST_SHARE * number)
+
+    def relevance(self, rival: _Draws) -> Tensor:
+        """Posterior probability of this model beside one without the physics, ``B``."""
+        own, other = self.particles, rival.particles
+        both = (own.power == 1) & (other.power == 1)  # or evidences are those on the way
+        return probability(
+            own.log_evidence.where(both, self.laplace),
+            other.log_evidence.where(both, rival.laplace),
+        )
+
+    def representative(self, number: int) -> dict[str, Tensor]:
+        """Raw parameters of a few that predict as all do, ``number x`` their shape, by name."""
+        parameters = self.target.parameters
+        chosen = _representative(self.target, self.particles.positions, number)
+        return parameters.to_raw(parameters.unflatten(chosen))
+
+
 def sample(
     model: TermsGP,
     search: Search,
@@ -89,87 +124,117 @@ def sample(
     The draws begin around the optima that the search finds; its seed is that of both.
     """
     _check(model)
-    copy, n = deepcopy(model), model.train_targets.shape[-1]
-    settled = _settle_shared(copy, search)
-    calibrated = calibrate_roughly(copy, search) if copy.has_unknowns else None
-    without = None
-    fewest = int((~model.train_targets.isnan()).sum(-1).min())
-    if calibrated is None and not settled and fewest >= _LEAST_WEIGHED and n <= MANY:
-        without = without_physics(copy)
-    register_priors(copy)
-    target = LogPosterior(copy, None, None if calibrated is None else calibrated.marginalized)
-    parameters, generator = target.parameters, torch.Generator().manual_seed(search.seed)
+    n, generator = model.train_targets.shape[-1], torch.Generator().manual_seed(search.seed)
     if num_draws is None:
         num_draws = max(_DRAWS[0], min(_DRAWS[1], _COST // n**2))
-    if num_samples is None:
-        num_samples = default_num_samples(n)
-        if calibrated is not None:
-            alone = all(term.is_known for term in model.terms)
-            least = min(_HELD_ALONE, _SAMPLED_ALONE // n**2) if alone else 0
-            num_samples = max(num_samples, _SAMPLES_OF_PARAMETERS, least)
-    drawn, relevance = None, None
-    if parameters.names:
-        drawn, laplace = _draw(target, search, num_draws, generator)
-        vectors, size = drawn.positions, drawn.effective_size()
-        is_good = (drawn.power >= _LEAST_POWER) & (size >= _LEAST_SHARE * len(vectors))
-    else:  # all is known but the parameters of the physics
-        vectors = parameters.current()
-        size = vectors.new_full((parameters.num_problems,), math.inf)
-        is_good = size > 0
-    if calibrated is None:
-        chosen = _representative(target, vectors, num_samples)
-    else:
-        vectors, coordinates, own = draw_parameters(
-            calibrated,
-            parameters,
-            vectors,
-            _log_densities(target, drawn, vectors),
-            max(_RETURNED, num_samples),
-            generator,
-        )
-        size, is_good = size.minimum(own), is_good & (own >= _LEAST_SIZE_OF_PARAMETERS)
-        rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
-        chosen = vectors[rows]
-    held = parameters.to_raw(parameters.unflatten(chosen))
-    if without is not None and drawn is not None:
+    if model.has_unknowns:
+        return _with_parameters(model, search, num_samples, num_draws, generator)
+    copy = deepcopy(model)
+    settled = _settle_shared(copy, search)
+    without = None if settled or not _can_be_weighed(model) else without_physics(copy)
+    register_priors(copy)
+    num_samples = num_samples or default_num_samples(n)
+    draws = _draw(LogPosterior(copy), search, num_draws, generator)
+    held, relevance = draws.representative(num_samples), None
+    size, is_good = draws.particles.effective_size(), draws.is_good()
+    if without is not None:
         register_priors(without)
-        other = LogPosterior(without)
-        plain, its_laplace = _draw(other, search, num_draws // 2, generator, drawn.log_evidence)
-        both = (drawn.power == 1) & (plain.power == 1)  # or evidences are those on the way
-        relevance = probability(
-            drawn.log_evidence.where(both, laplace), plain.log_evidence.where(both, its_laplace)
-        )
+        evidence = draws.particles.log_evidence
+        plain = _draw(LogPosterior(without), search, num_draws // 2, generator, evidence)
+        share = draws.relevance(plain)
         # What most samples are of is what counts.
-        size = size.where(relevance > 0.5, plain.effective_size())
-        relevance = relevance.reshape(parameters.batch_shape)
-        chosen = _representative(other, plain.positions, num_samples)
-        values = other.parameters.to_raw(other.parameters.unflatten(chosen))
-        held = mixed(held, values, copy, without, relevance)
-    raw = parameters.to_raw(parameters.unflatten(vectors))
-    named = {r.name.replace("raw_", ""): r.parameter(raw[r.name]) for r in parameters.rows}
+        size = size.where(share > 0.5, plain.particles.effective_size())
+        is_good = is_good.where(share > 0.5, plain.is_good())
+        relevance = share.reshape(model._aug_batch_shape)
+        held = mixed(held, plain.representative(num_samples), copy, without, relevance)
+    _hold(model, held, settled)
+    named = _named(draws.target.parameters, draws.particles.positions)
+    return _result(size, is_good, named, draws.target.parameters, relevance)
+
+
+def _with_parameters(
+    model: TermsGP,
+    search: Search,
+    num_samples: int | None,
+    num_draws: int,
+    generator: torch.Generator,
+) -> SampleResult:
+    """As :func:`sample`, of a model whose physics has unknown parameters."""
+    copy, n = deepcopy(model), model.train_targets.shape[-1]
+    settled = _settle_shared(copy, search)
+    calibrated = calibrate_roughly(copy, search)
+    register_priors(copy)
+    target = LogPosterior(copy, None, calibrated.marginalized)
+    parameters = target.parameters
+    if num_samples is None:
+        alone = all(term.is_known for term in model.terms)
+        least = min(_HELD_ALONE, _SAMPLED_ALONE // n**2) if alone else 0
+        num_samples = max(default_num_samples(n), _SAMPLES_OF_PARAMETERS, least)
+    vectors = parameters.current()  # if all is known but the parameters of the physics
+    log_densities = vectors.new_zeros(1)
+    size = vectors.new_full((parameters.num_problems,), math.inf)
+    is_good = size > 0
+    if parameters.names:
+        draws = _draw(target, search, num_draws, generator)
+        size, is_good = draws.particles.effective_size(), draws.is_good()
+        vectors = draws.particles.positions
+        # What is not done of the way to the posterior leaves a part.
+        left = (1 - draws.particles.power) * draws.particles.log_ratio
+        log_densities = (target.log_likelihood(vectors) - left).sum(-1)
+    vectors, coordinates, own = draw_parameters(
+        calibrated, parameters, vectors, log_densities, max(_RETURNED, num_samples), generator
+    )
+    size, is_good = size.minimum(own), is_good & (own >= _LEAST_SIZE_OF_PARAMETERS)
+    rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
+    held = parameters.to_raw(parameters.unflatten(vectors[rows]))
+    held["input_transform.coordinates"] = coordinates[rows]
+    named = _named(parameters, vectors) | model.input_transform.remember(coordinates)
+    _hold(model, held, settled)
+    calibrated.calibration.direct(model, coordinates[rows])
+    warn_of_parameters(calibrated)
+    return _result(size, is_good, named, parameters)
+
+
+def _hold(model: TermsGP, samples: dict[str, Tensor], settled: dict[str, Tensor]) -> None:
+    """Put samples into a model, beside values of what outputs share."""
     if settled:
         model.train()  # its inputs are then transformed again, with what they are at now
     with torch.no_grad():
         for name, value in settled.items():
             model.get_parameter(name).copy_(value)
-    if calibrated is not None:
-        held["input_transform.coordinates"] = coordinates[rows]
-        named |= model.input_transform.remember(coordinates)
-    model.hold_samples(held)
-    if calibrated is not None:
-        calibrated.calibration.direct(model, coordinates[rows])
-        warn_of_parameters(calibrated)
-    size = size.reshape(parameters.batch_shape)
-    converged = is_good.reshape(parameters.batch_shape)
+    model.hold_samples(samples)
+
+
+def _named(parameters: Parameters, vectors: Tensor) -> dict[str, Tensor]:
+    """The parameters themselves of vectors ``k x B x p``, by their names."""
+    raw = parameters.to_raw(parameters.unflatten(vectors))
+    return {r.name.replace("raw_", ""): r.parameter(raw[r.name]) for r in parameters.rows}
+
+
+def _result(
+    size: Tensor,
+    is_good: Tensor,
+    draws: dict[str, Tensor],
+    parameters: Parameters,
+    relevance: Tensor | None = None,
+) -> SampleResult:
+    """The result of a fit, with a warning if draws do not show the posterior."""
+    size, converged = (each.reshape(parameters.batch_shape) for each in (size, is_good))
     if not converged.all():
         warnings.warn(
             f"The draws of {int((~converged).sum())} of {converged.numel()} outputs do not show "
             f"the posterior (effective sample size {size.min():.2g}). Raise num_draws, or give "
             "narrower priors, that of the noise above all.",
             SamplingWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
-    return SampleResult(size, converged, named, relevance)
+    return SampleResult(size, converged, draws, relevance)
+
+
+def _can_be_weighed(model: TermsGP) -> bool:
+    """Whether there are enough observations to weigh a model without its physics, or too many."""
+    fewest = int((~model.train_targets.isnan()).sum(-1).min())
+    return fewest >= _LEAST_WEIGHED and model.train_targets.shape[-1] <= MANY
 
 
 def default_num_samples(num_points: int) -> int:
@@ -207,35 +272,25 @@ def _draw(
     num_draws: int,
     generator: torch.Generator,
     rival: Tensor | None = None,
-) -> tuple[Particles, Tensor]:
-    """Draws of the hyper-parameters, and the log evidence by Laplace's approximation, ``B``.
+) -> _Draws:
+    """Draws of the hyper-parameters; an error if the likelihood is nowhere finite.
 
-    There is an error if the likelihood is nowhere finite. Of a model that is weighed against the
-    log evidence of a ``rival``, the search takes fewer starts, and rough draws do where it is far
-    behind.
+    Of a model that is weighed against the log evidence of a ``rival``, the search takes fewer
+    starts, and rough draws do where it is far behind.
     """
     starts = _STARTS if rival is None else _STARTS_OF_RIVAL
-    proposal, log_evidence = _around_optima(target, search, starts)
+    proposal, laplace = _around_optima(target, search, starts)
     gradients = min(_GRADIENTS * num_draws, _COST_OF_GRADIENTS // target.num_points**2)
-    if rival is not None and (rival - log_evidence > _DECISIVE).all():
+    if rival is not None and (rival - laplace > _DECISIVE).all():
         gradients = 0
     number = min(num_draws // _DRAWS_EACH, gradients // _GRADIENTS_EACH)
     number = max(_LEAST_PARTICLES, number)
+    number += number % 2
     try:
-        number += number % 2
-        drawn = annealing.sample(target, proposal, num_draws, number, gradients, generator)
-        return drawn, log_evidence
+        particles = annealing.sample(target, proposal, num_draws, number, gradients, generator)
     except FloatingPointError:
         raise RuntimeError(NOWHERE) from None
-
-
-def _log_densities(target: LogPosterior, drawn: Particles | None, vectors: Tensor) -> Tensor:
-    """Log densities of what vectors were drawn from, less those of their priors, ``N``."""
-    if drawn is None:
-        return vectors.new_zeros(len(vectors))
-    # What is not done of the way to the posterior leaves a part.
-    log_densities = target.log_likelihood(vectors) - (1 - drawn.power) * drawn.log_ratio
-    return log_densities.sum(-1)
+    return _Draws(target, particles, laplace)
 
 
 def _around_optima(
