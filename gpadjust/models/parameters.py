@@ -50,7 +50,7 @@ KINDS = {
     # That of a rho, whose prior is one of rho itself, which has no units.
     "scaling": Kind(0.5, prior=(0.01, 4.0), has_unit=False),
     # v. Noise with an sd of less than three millionths of the residual is not told from none.
-    "noise": Kind(1e-2, bounds=(1e-11, 1e1), starts=(1e-6, 1.0), prior=(1e-2, 3.0)),
+    "noise": Kind(1e-2, bounds=(1e-11, 1e1), starts=(1e-6, 1.0), prior=(1e-3, 4.0)),
     # As an outputscale: the prior variance of an unknown mean before a fit.
     "mean": Kind(1e2),
 }
@@ -294,7 +294,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         \log \ell &\sim N(\log 3 + \tfrac12 \log d, \; 2^2) \\
         \log s_\delta &\sim N(\log v, \; 6^2), \quad
         \log s_\rho \sim N(\log 10^{-2}, \; 4^2) \\
-        \log \sigma^2 &\sim N(\log(10^{-2} v), \; 3^2)
+        \log \sigma^2 &\sim N(\log(10^{-3} v), \; 4^2)
 
     The lengthscales grow with the dimension after Hvarfner et al. (2024). All are wide: functions
     that are nearly polynomial (long lengthscales, a large variance), a rho that is nearly constant,

@@ -29,7 +29,7 @@ def test_densities(build, data, num_outputs):
     length = (X.amax(0) - X.amin(0)) * math.sqrt(2) * 3
     lengths, rho, delta = length.repeat(num_outputs), "terms.0.kernel", "terms.1.kernel"
     medians = {
-        "likelihood.noise_covar.noise_prior": (1e-2 * v, 3),
+        "likelihood.noise_covar.noise_prior": (1e-3 * v, 4),
         f"covar_module.{delta}.outputscale_prior": (v, 6),
         f"covar_module.{rho}.outputscale_prior": (v * 0 + 0.01, 4),
         f"covar_module.{delta}.base_kernel.lengthscale_prior": (lengths, 2),
@@ -54,8 +54,8 @@ def test_of_ar1(build, data, num_outputs, unit):
     torch.testing.assert_close(actual.flatten(), expected)
     noise = priors(model)["likelihood.noise_covar.noise_prior"]
     initial = model.likelihood.noise.detach()  # a hundredth of the typical size
-    torch.testing.assert_close(noise.loc, initial.log())
-    assert (noise.scale == 3).all()
+    torch.testing.assert_close(noise.loc, (0.1 * initial).log())
+    assert (noise.scale == 4).all()
 
 
 def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics):
