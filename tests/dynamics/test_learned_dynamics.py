@@ -363,6 +363,7 @@ def test_a_warning_of_the_model_is_given_once(recwarn):
     assert not recwarn.list
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_the_model_has_the_names_of_the_spec(uniform):
     spec = StateSpec(
         ["theta", "omega", "last"], ["torque"], angles=["theta"], previous={"last": "torque"}
