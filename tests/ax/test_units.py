@@ -201,6 +201,7 @@ def test_between_choices_the_nearest_is_asked():
     assert (slope[:, 0] == 1).all()
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_a_tensor_has_the_columns_of_the_search_space():
     parameters = [PARAMETERS[2], PARAMETERS[0]]
     arms = [{"x": arm["x"], "rate": arm["rate"]} for arm in ARMS]
@@ -215,6 +216,7 @@ def test_a_tensor_has_the_columns_of_the_search_space():
     torch.testing.assert_close(torch.from_numpy(asked[0]), expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 def test_a_fixed_parameter_is_a_column_too():
     parameters = [
         PARAMETERS[2],
