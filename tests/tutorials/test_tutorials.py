@@ -38,7 +38,9 @@ def test_a_tutorial_runs_without_a_warning(path):
     execute(notebook)  # raises what a cell raises
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
-            assert output.get("name") != "stderr", output.text
+            # Where SQLAlchemy is installed Ax says so as it is imported.
+            is_news = output.get("text", "").startswith("[INFO")
+            assert output.get("name") != "stderr" or is_news, output.text
 
 
 def test_there_are_tutorials_and_their_settings():
