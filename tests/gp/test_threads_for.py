@@ -124,7 +124,14 @@ def test_fits_in_two_threads(uniform):
         fit(model, "map", num_starts=2, num_screened=8)
         return torch.get_num_threads()
 
-    with ThreadPoolExecutor(2) as pool:
+    # A thread that asks for its number first while another sets its own may begin with that.
+    begun = Barrier(2)
+
+    def begin():
+        torch.get_num_threads()
+        begun.wait()
+
+    with ThreadPoolExecutor(2, initializer=begin) as pool:
         assert set(pool.map(work, range(6))) == {2}
 
 
