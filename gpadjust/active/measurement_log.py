@@ -12,6 +12,8 @@ from typing import Any, NoReturn
 
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
+from gpadjust.files import sync_folder
+
 Record = dict[str, Any]
 
 _FORMAT = "gpadjust measurements, version 1"
@@ -79,7 +81,7 @@ class MeasurementLog:
             if _line(header).startswith(content):
                 self._size, self._torn = 0, True
                 self.append([header])
-                _sync_folder(self.path.parent)
+                sync_folder(self.path.parent)
                 return []
         *lines, tail = content.split(b"\n")
         records = [self._record(line, number) for number, line in enumerate(lines, start=1)]
@@ -199,13 +201,3 @@ def _line(record: Record) -> bytes:
 
 def _refuse(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no JSON")
-
-
-def _sync_folder(path: Path) -> None:
-    # The file's name is in its folder, which has to be on the disk, too.
-    if os.name == "posix":
-        folder = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)

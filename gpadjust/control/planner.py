@@ -57,7 +57,9 @@ class Planner:
         search: How the sequences are improved: :class:`CrossEntropy` or :class:`PathIntegral`.
         horizon: The most steps to look ahead. Default: to the end of the episode.
         num_functions: How many functions of the posterior each sequence is followed through; None
-            for the mean of the model alone, which takes least time.
+            for the mean of the model alone, which takes least time. (Of a sampled model it is the
+            mean of some samples, two or more, see
+            :meth:`~gpadjust.dynamics.LearnedDynamics.mean_function`.)
         num_random: Number of random sequences, or of those drawn about an earlier plan.
         num_policy: Number of sequences by the policy, if there is one.
         max_hold: The most steps that a random sequence holds an action.

@@ -20,11 +20,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from gpadjust.control import Task
-from gpadjust.rl.agents import DynaSAC, DynaTD3
+from gpadjust.files import sync_folder
 from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.rl.model_learner import ModelLearner
-from gpadjust.rl.mpc_agent import MPCAgent
-from gpadjust.rl.policy_search_agent import PolicySearchAgent
 from gpadjust.rl.random_state import RandomState
 
 _FORMAT = "gpadjust episode checkpoint, version 2"
@@ -143,6 +141,7 @@ def _write(agent: ModelLearner, path: Path) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync_folder(path.absolute().parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -168,8 +167,8 @@ def resume(
         env: The environment, made and wrapped as for the first part of the run. What it wraps is
             replaced by the one of the checkpoint, in its state.
         task: The task of the run, its dynamics fitted or not.
-        algorithm: The class of the agent. Default: the one of the library that the checkpoint
-            names; give one of your own.
+        algorithm: The class of the agent. Default: the one that the checkpoint names, of the
+            library or of what you have imported.
 
     Returns:
         The agent. ``learn`` restores the random generators; until then you may use them.
@@ -181,7 +180,7 @@ def resume(
     """
     manifest, parts = _read(path)
     if algorithm is None:
-        algorithm = _of_the_library(manifest["algorithm"])
+        algorithm = _known(manifest["algorithm"])
     vec_env = algorithm._wrap_env(env, verbose=0)
     _check(path, manifest, vec_env, task, algorithm)
     agent = algorithm.load(
@@ -197,13 +196,18 @@ def resume(
     return agent
 
 
-def _of_the_library(name: str) -> type[ModelLearner]:
-    """The class of an agent by its name."""
-    known = {each.__name__: each for each in (DynaSAC, DynaTD3, MPCAgent, PolicySearchAgent)}
+def _known(name: str) -> type[ModelLearner]:
+    """The class of an agent by its name, of all that are imported."""
+    known: dict[str, type[ModelLearner]] = {}
+    waiting: list[type[ModelLearner]] = [ModelLearner]
+    while waiting:
+        for each in waiting.pop().__subclasses__():
+            known.setdefault(each.__name__, each)
+            waiting.append(each)
     if name not in known:
         raise ValueError(
-            f"The checkpoint is of the class {name!r}, which is none of {', '.join(known)}; pass "
-            "algorithm, the class of the agent."
+            f"The checkpoint is of the class {name!r}, which is none of {', '.join(known)}; import "
+            "it, or pass algorithm, the class of the agent."
         )
     return known[name]
 

@@ -46,7 +46,9 @@ class ModelLearner(TaskLearner):
     Attributes:
         num_episodes: Real episodes that have ended and were learnt from.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"``, ``"update"`` and ``"plan"``.
-        promised_reward: What the model promised of a step of the next real episode, or None.
+        promised_reward: What the model had promised of a step of the newest real episodes that were
+            learnt from, or None, as of random actions.
+        promise: What it promises of a step of the policy's next episodes, or None.
         promises: What it had promised of those that have ended and were not learnt from yet.
         planned: The real episodes that go by plans; ``planned.num_planned`` is their number.
     """
@@ -58,6 +60,7 @@ class ModelLearner(TaskLearner):
         self.num_episodes = 0
         self.planned = PlannedEpisodes()
         self.promised_reward: float | None = None
+        self.promise: float | None = None
         self.promises: list[float | None] = []
         self.model_hooks: list[DynaCallback] = []
         super().__init__(task, *args, **kwargs)
@@ -136,11 +139,11 @@ class ModelLearner(TaskLearner):
         """
         real = float(new.rewards.mean())
         self.logger.record("model/real_reward", real)
-        promises, self.promises = self.promises, []
+        promises, self.promises, self.promised_reward = self.promises, [], None
         kept = [each for each in promises if each is not None]
         if not kept or len(kept) < len(promises):
             return  # of actions that were random, say
-        promised = sum(kept) / len(kept)
+        promised = self.promised_reward = sum(kept) / len(kept)
         self.logger.record("model/promised_reward", promised)
         recorded = self.recorded_episodes().rewards
         span = max(float(recorded.max()), promised) - float(recorded.min())
@@ -217,7 +220,7 @@ class ModelLearner(TaskLearner):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         for i in map(int, dones.nonzero()[0]):
             episode = self.planned.under_way.get(i)
-            self.promises.append(self.promised_reward if episode is None else episode.promise)
+            self.promises.append(self.promise if episode is None else episode.promise)
             self.planned.end(i)
 
     def environments_reset(self) -> None:

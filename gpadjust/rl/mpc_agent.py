@@ -90,6 +90,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         self.each_step = each_step
         self.first = first
         self.tolerance = tolerance
+        self._mpc: tuple[Task, tuple[Any, ...], MPC | None] | None = None
         super().__init__(
             task,
             ModelOptions() if options is None else options,
@@ -105,7 +106,17 @@ class MPCAgent(ModelLearner, EpisodeLoop):
 
     @property
     def mpc(self) -> MPC | None:
-        """The policy, in the newest model, or the physics; None if nothing is known yet."""
+        """The policy, in the newest model, or the physics; None if nothing is known yet.
+
+        It is made again where an episode has ended, or the agent was given something else.
+        """
+        task, num_ended = self.ready_task(), self.num_episodes + self.replay_buffer.num_ended
+        made_of = (num_ended, task.dynamics.is_fitted, self.each_step, self.first, self.tolerance)
+        if self._mpc is None or (task, made_of) != self._mpc[:2]:
+            self._mpc = (task, made_of, self._new_mpc())
+        return self._mpc[2]
+
+    def _new_mpc(self) -> MPC | None:
         task = self.model_task()
         dynamics = task.dynamics.before_data()
         if dynamics is None:
@@ -160,7 +171,7 @@ class MPCAgent(ModelLearner, EpisodeLoop):
             plan = episode.planned = mpc.plan(state, earlier)
         if begins:
             whole = len(plan.promised) >= self.episode_length()
-            episode.promise = self.promised_reward = plan.reward if whole else None
+            episode.promise = plan.reward if whole else None
             self.logger.record("model/plan_left_bounds", plan.left_bounds)
             if plan.left_bounds > 0.1:
                 warnings.warn(
@@ -178,6 +189,9 @@ class MPCAgent(ModelLearner, EpisodeLoop):
             noise = torch.from_numpy(drawn[episode.environment % len(drawn)]).double()
             actions[0] = torch.clamp(actions[0] + noise * (high - low) / 2, low, high)
         return actions
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_mpc"]
 
     def _policy_actions(
         self, learning_starts: int, action_noise: ActionNoise | None, n_envs: int

@@ -171,7 +171,7 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
                 module, task, guided=not self.is_trained, progress=self._report
             )
         self.is_trained = True
-        self.promised_reward = result.reward
+        self.promise = result.reward
         self.logger.record("model/search_left_bounds", result.left_bounds)
         self.logger.record("model/search_seconds", result.seconds)
         if result.left_bounds > 0.1:

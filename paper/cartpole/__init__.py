@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 MODEL_FREE_UPDATES = 100  # per episode, of all episodes; the best of 25, 50, 100, 200
 SUBSET = 4  # seeds of some scenarios
 STALE = 3  # seeds of those without refreshed model data
+NUM_STARTS = 20  # of the evaluation
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,12 +24,10 @@ from gpadjust.envs import (
 from gpadjust.envs.cart_pole.system import START_MEAN, START_STD
 from gpadjust.physics import ODEPhysics
 from gpadjust.rl import DynaSAC, ModelVecEnv
-from paper.cartpole import Settings
+from paper.cartpole import NUM_STARTS, Settings
 from paper.control import Scenario
 from paper.control.learner import System, dynamics
 from paper.control.recorder import Recorder
-
-NUM_STARTS = 20
 
 
 def system(scenario: Scenario, settings: Settings, seed: int) -> System:

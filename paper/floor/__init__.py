@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from paper.cartpole import NUM_STARTS
 from paper.common.experiment import Experiment, Task
 
 SYSTEMS = ("mean-start", "fixed-starts", "arm")
@@ -43,6 +44,14 @@ class Floor(Experiment):
     name: ClassVar[str] = "floor"
     key: ClassVar[tuple[str, ...]] = ("system", "seed")
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
+
+    def check(self) -> None:
+        """Refuse more fixed starts than there are."""
+        if self.seeds.start < 0 or self.seeds.stop > NUM_STARTS:
+            raise ValueError(
+                f"There are {NUM_STARTS} fixed starts, of the seeds 0 to {NUM_STARTS - 1}; found "
+                f"the seeds {self.seeds.start} to {self.seeds.stop - 1}."
+            )
 
     def tasks(self) -> list[Task]:
         """The cheap ones first."""

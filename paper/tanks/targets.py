@@ -26,7 +26,10 @@ def verdicts(runs: pd.DataFrame, chosen: str) -> list[Judged]:
         runs: A row for each run.
         chosen: The candidate that cross-validation chose.
     """
-    all_chosen = "free run of the validation record, every choice on the estimation record"
+    all_chosen = (
+        "free run of the validation record, by the fit that the estimation record chooses, of "
+        "structures from a search that had looked at both"
+    )
     return [
         _judged("T1", f"{all_chosen}: at most 0.28 V", runs, chosen, 0.28),
         _judged("T2", "the same: at most 0.19 V", runs, chosen, 0.19),
@@ -40,6 +43,8 @@ def _judged(name: str, claim: str, runs: pd.DataFrame, learner: str, most: float
         return Judged(name, claim, "not run", f"no results of {learner}")
     mean = sum(own) / len(own)
     text = f"{learner} {mean:.3f}"
+    if not runs.loc[runs["learner"] == learner, "settled"].fillna(True).all():
+        text += ", a fit that had not settled"
     if learner not in CANDIDATES:
         held = sum(error <= most for error in own)
         text += f" in the mean of {counted(len(own))}, {held} of which are at most that"

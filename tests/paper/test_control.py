@@ -368,6 +368,8 @@ def test_floors(tmp_path, capsys):
         found = rounded(experiment.run(*task, unfinished=tmp_path / "x"))
         assert 0.2 < found["found"] < 1
         assert len(found["forces"]) == 25
+    with pytest.raises(ValueError, match=r"20 fixed starts, .* found the seeds 0 to 24"):
+        Floor(runs=25).check()
 
 
 @pytest.mark.slow

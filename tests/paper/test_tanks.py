@@ -42,6 +42,8 @@ def test_runs_and_their_tables(tmp_path):
     tables = experiment.tables(records)
     assert tables.keys() == {"targets", "candidates", "learners", "parameters"}
     assert tables["targets"].text.count("\n") == 4
+    unsettled = [{**record, "settled": False} for record in records]
+    assert "not settled" in experiment.tables(unsettled)["targets"].text
     assert label_of(by[TENTH], by[TENTH]) in tables["learners"].text
     assert [path.name for path in experiment.draw(records)] == ["tanks.png"]
 

@@ -258,6 +258,25 @@ def test_what_a_killed_writer_left_does_not_pile_up(point_agent, tmp_path, monke
     assert {*tmp_path.iterdir()} == {path, path.with_name("run.ckpt.lock")}
 
 
+@pytest.mark.skipif(os.name != "posix", reason="folders cannot be synchronised there")
+def test_the_name_of_a_checkpoint_is_on_the_disk(point_agent, tmp_path, monkeypatch):
+    """After the file itself, its folder is synchronised, or a power cut could lose the new name."""
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
+    save_checkpoint(point_agent().learn(5), tmp_path / "run.ckpt")
+    assert synced == [(tmp_path / "run.ckpt").stat().st_ino, tmp_path.stat().st_ino]
+
+
+class OwnAgent(DynaSAC):
+    """An agent that the library does not know."""
+
+
+def test_an_agent_of_ones_own_is_resumed_by_its_name(point_agent, point_env, point_task, tmp_path):
+    path = tmp_path / "run.ckpt"
+    save_checkpoint(point_agent(algorithm=OwnAgent).learn(5), path)
+    assert type(resume(path, point_env(), point_task())) is OwnAgent
+
+
 def test_a_folder_is_made(point_agent, tmp_path):
     save_checkpoint(point_agent().learn(5), tmp_path / "new" / "run.ckpt")
     assert (tmp_path / "new" / "run.ckpt").exists()

@@ -196,7 +196,7 @@ def test_a_promise_that_data_made_against_the_physics_is_told(make_agent, dynami
     """After an episode the model knows that the point moves some ten times as far."""
     known = dynamics(lambda X: X[:, :1] + 0.05 * X[:, 1:])
     agent = make_agent(PolicySearchAgent, dynamics=known, options=ModelOptions()).learn(5)
-    agent.promised_reward = 10.0
+    agent.promise = 10.0
     with pytest.warns(UserWarning, match="In 100% of its predictions data had overridden the phys"):
         agent.learn(5, reset_num_timesteps=False)
     assert agent.logger.name_to_value["model/overrides"] == 1
@@ -238,6 +238,33 @@ def test_what_is_promised_and_found_is_logged(make_agent):
     agent = make_agent(PolicySearchAgent).learn(10)
     found = agent.logger.name_to_value
     assert {"model/real_reward", "model/promised_reward", "model/search_left_bounds"} <= {*found}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_promise_is_of_the_episode_that_was_learnt(make_agent, kind):
+    """Also where the policy was improved since, and promises something else of the next one."""
+    agent = make_agent(kind)
+    agent.first = replace(PLAN, horizon=None)  # of an agent that plans
+    for _ in range(2):
+        agent.learn(5, reset_num_timesteps=False)
+        logged = agent.logger.name_to_value
+        assert agent.promised_reward == logged["model/promised_reward"]
+    if kind is PolicySearchAgent:
+        assert agent.promise != agent.promised_reward
+
+
+def test_a_controller_is_made_once_an_episode(make_agent, monkeypatch):
+    made = []
+    task = MPCAgent.model_task
+    monkeypatch.setattr(MPCAgent, "model_task", lambda self: made.append(1) or task(self))
+    agent = make_agent(MPCAgent).learn(10)
+    state, before = agent.mpc, len(made)
+    for _ in range(3):
+        agent.predict(np.array([0.5]))
+    assert len(made) == before <= 6  # two episodes, of which each is learnt, too
+    assert agent.mpc is state
+    agent.tolerance = None
+    assert agent.mpc.tolerance is None
 
 
 def test_plans_that_leave_the_bounds_are_told(make_agent, dynamics):
