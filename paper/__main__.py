@@ -17,7 +17,6 @@ EXPERIMENTS = {
     "active": ("Active", "error over measurements, by who chooses them"),
     "cartpole": ("CartPole", "learners that swing up a cart-pole"),
     "arm": ("Arm", "learners that reach with a muscle arm"),
-    "exploration": ("Exploration", "cart-poles whose trials are random, SAC's or informative"),
     "foresight": ("Foresight", "do dynamics foresee the next trial, and know how well?"),
     "planning": ("Planning", "cart-poles that are swung up by planning in several models"),
     "reaching": ("Reaching", "muscle arms that reach after a few trials, by several models"),

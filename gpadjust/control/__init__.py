@@ -1,7 +1,7 @@
 """Tasks, and planning in dynamics models; Stable-Baselines3 is not needed."""
 
 from gpadjust.control.mpc import MPC, Planned
-from gpadjust.control.objectives import Information, Objective, Return
+from gpadjust.control.objectives import Objective, Return
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy, rbf_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
@@ -13,7 +13,6 @@ __all__ = [
     "MPC",
     "BoundedPolicy",
     "CrossEntropy",
-    "Information",
     "InitialStates",
     "Objective",
     "PathIntegral",

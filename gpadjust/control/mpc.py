@@ -23,7 +23,6 @@ EACH_STEP = Planner(
     search=CrossEntropy(1, num_elites=12, correlation=0.5),
     horizon=_SHORTEST,
     num_random=128,
-    num_policy=0,
     spread=0.15,
 )
 """The default plan of a step: two looks at 128 sequences, of eight steps or more."""
@@ -31,7 +30,6 @@ EACH_STEP = Planner(
 FIRST = Planner(
     search=CrossEntropy(12, num_elites=12, correlation=0.5),
     num_random=128,
-    num_policy=0,
     restarts=3,
 )
 """The default plan of an episode that begins: the whole of it, in some seconds."""

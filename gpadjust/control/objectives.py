@@ -13,14 +13,10 @@ from torch import Tensor
 from gpadjust.control.option_checks import check_fraction
 from gpadjust.control.rollouts import Rollout
 from gpadjust.control.task import Task, per_row
-from gpadjust.dynamics.trajectory_information import TrajectoryInformation, check_informative
 
 _BACK = 10.0  # largest rewards of a step: few episodes of a policy must outweigh those that stay
 
-Past = tuple[Tensor, Tensor]
-"""States ``t x state_dim`` and actions ``t x action_dim`` of an episode so far."""
-
-Score = Callable[[Rollout, Past | None], Tensor]
+Score = Callable[[Rollout], Tensor]
 """The worth ``n`` of the ``n`` sequences of a rollout, higher is better."""
 
 
@@ -32,51 +28,12 @@ class Objective(ABC):
         """Whether it matters that the functions are followed from the same starts."""
         return True
 
-    def check(self, task: Task) -> None:  # noqa: B027 - most need nothing
-        """Raise a TypeError if the task's dynamics cannot tell this worth."""
-
-    def check_functions(self, num_functions: int | None) -> None:  # noqa: B027 - as above
+    def check_functions(self, num_functions: int | None) -> None:  # noqa: B027 - most need nothing
         """Raise a ValueError if it means nothing of so many functions; None for the mean."""
 
     @abstractmethod
     def of(self, task: Task) -> Score:
         """The worth of rollouts in a task, as its dynamics stand."""
-
-
-@dataclass(frozen=True)
-class Information(Objective):
-    """What the transitions of an episode would tell about the dynamics, in nats.
-
-    It is :class:`~gpadjust.dynamics.TrajectoryInformation`, averaged over the functions; steps of
-    the past, which were made and not learnt yet, count with those ahead.
-
-    What is informative need not matter for the task: bound the states that are worth knowing
-    (``state_bounds`` of the task).
-    """
-
-    def check(self, task: Task) -> None:
-        """Raise a TypeError unless the dynamics can tell what transitions teach."""
-        check_informative(task.dynamics)
-
-    def of(self, task: Task) -> Score:
-        """The information of rollouts.
-
-        Raises:
-            TypeError: If the dynamics cannot tell what transitions teach.
-            RuntimeError: If they have learnt nothing yet.
-        """
-        information = TrajectoryInformation(task.dynamics)
-
-        def score(rollout: Rollout, past: Past | None) -> Tensor:
-            steps = _without_failures(rollout)
-            if not rollout.made.any():
-                return torch.zeros(rollout.made.shape[1], dtype=torch.float64)
-            if past is not None:
-                done = (*past, torch.ones(len(past[0]), dtype=torch.bool))
-                steps = tuple(_prepend(*parts) for parts in zip(done, steps, strict=True))
-            return information(*steps).mean(0)
-
-        return score
 
 
 @dataclass(frozen=True)
@@ -135,10 +92,10 @@ class Return(Objective):
             )
 
     def of(self, task: Task) -> Score:
-        """The return of rollouts; what has been is the same for all."""
+        """The return of rollouts."""
         largest = torch.zeros((), dtype=torch.float64)
 
-        def score(rollout: Rollout, past: Past | None) -> Tensor:
+        def score(rollout: Rollout) -> Tensor:
             nonlocal largest
             rewards = rollout.rewards.double()
             if self.effort:
@@ -166,19 +123,3 @@ class Return(Objective):
             return torch.zeros(made.shape, dtype=torch.float64)
         values = per_row(self.terminal_value(last.flatten(0, 1)), made.numel(), "terminal_value")
         return values.double().unflatten(0, made.shape).masked_fill(~made, 0.0)
-
-
-def _without_failures(rollout: Rollout) -> tuple[Tensor, ...]:
-    """States, actions and which were made; others are put where the physics does not fail."""
-    states, actions, made = rollout.states, rollout.actions, rollout.made
-    if made.all() or not made.any():
-        return states, actions, made
-    working = tuple(made.nonzero()[0])
-    lost = ~made.unsqueeze(-1)
-    states = torch.where(lost, states[working], states)
-    return states, torch.where(lost, actions[working], actions), made
-
-
-def _prepend(done: Tensor, ahead: Tensor) -> Tensor:
-    """Steps ``t x ...`` before those of all episodes, ``k x n x T x ...``."""
-    return torch.cat([done.expand(*ahead.shape[:2], *done.shape), ahead], dim=2)

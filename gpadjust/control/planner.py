@@ -10,14 +10,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.control.objectives import Objective, Past, Return
+from gpadjust.control.objectives import Objective, Return
 from gpadjust.control.option_checks import (
     ArrayLike,
     check_fraction,
     check_whole,
     checked_action_bounds,
 )
-from gpadjust.control.rollouts import Policy, Rollouts
+from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
 from gpadjust.control.task import Task
 
@@ -44,16 +44,15 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True)
 class Planner:
-    """Plans actions by an objective, such as return or information, in a model of the system.
+    """Plans actions by an objective, such as the return, in a model of the system.
 
     Sequences of actions are proposed; each is followed through the model, along its mean or
     through functions drawn from its posterior; and a search improves them. At first they are random
-    piecewise constant ones and a policy's own. Where there is an earlier plan, most are drawn about
-    it. :class:`MPC` plans again at every step; as ``exploration`` of
-    :class:`~gpadjust.rl.DynaSAC` it plans whole episodes.
+    piecewise constant ones; where there is an earlier plan, they are drawn about it. :class:`MPC`
+    plans again at every step.
 
     Args:
-        objective: What to look for: :class:`Return`, :class:`Information`, or your own.
+        objective: What to look for: :class:`Return`, or your own.
         search: How the sequences are improved: :class:`CrossEntropy` or :class:`PathIntegral`.
         horizon: The most steps to look ahead. Default: to the end of the episode.
         num_functions: How many functions of the posterior each sequence is followed through; None
@@ -61,16 +60,11 @@ class Planner:
             mean of some samples, two or more, see
             :meth:`~gpadjust.dynamics.LearnedDynamics.mean_function`.)
         num_random: Number of random sequences, or of those drawn about an earlier plan.
-        num_policy: Number of sequences by the policy, if there is one.
         max_hold: The most steps that a random sequence holds an action.
         spread: Standard deviation of what is drawn about an earlier plan, as a share of the range
             of the actions.
         restarts: How many searches there are, of which the best is taken; one where there is an
             earlier plan.
-        replan_every: Number of steps after which the rest of a real episode is planned anew, from
-            where it is and with what it has already told. Default: the episode goes by the first
-            plan, but with :class:`~gpadjust.rl.MPCAgent`, which plans each step. (:class:`MPC` by
-            itself plans whenever it is asked.)
         seconds: After so many seconds of a plan no further round of a search begins, and no further
             search.
 
@@ -95,47 +89,33 @@ class Planner:
     _: KW_ONLY
     horizon: int | None = None
     num_functions: int | None = None
-    num_random: int = 64
-    num_policy: int = 16
+    num_random: int = 80
     max_hold: int = 5
     spread: float = 0.1
     restarts: int = 1
-    replan_every: int | None = None
     seconds: float | None = None
 
     def __post_init__(self) -> None:
         """Check objective, search and numbers."""
         if not isinstance(self.objective, Objective):
             raise TypeError(
-                "objective must be an object of an Objective, such as Information() or Return(); "
-                f"found {self.objective!r}."
+                "objective must be an object of an Objective, such as Return(); found "
+                f"{self.objective!r}."
             )
         if not isinstance(self.search, Search):
             raise TypeError(
                 "search must be an object of a Search, such as CrossEntropy() or PathIntegral(); "
                 f"found {self.search!r}."
             )
-        for name in ("num_random", "num_policy"):
-            check_whole(name, getattr(self, name), 0)
-        for name in ("max_hold", "restarts"):
+        for name in ("num_random", "max_hold", "restarts"):
             check_whole(name, getattr(self, name), 1)
-        for name in ("horizon", "num_functions", "replan_every"):
+        for name in ("horizon", "num_functions"):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), 1)
         self.objective.check_functions(self.num_functions)
-        if (self.replan_every or 1) > (self.horizon or math.inf):
-            raise ValueError(
-                f"replan_every={self.replan_every} is beyond horizon={self.horizon}, so that there "
-                "would be steps without a plan; raise the horizon, or plan more often."
-            )
         check_fraction("spread", self.spread, zero=False)
         if self.seconds is not None:
             check_fraction("seconds", self.seconds, most=math.inf, zero=False)
-        if not self.num_random + self.num_policy:
-            raise ValueError(
-                "num_random and num_policy are both 0, so that there is no sequence of actions to "
-                "choose; raise one of them."
-            )
 
     @torch.no_grad()
     def plan(
@@ -145,8 +125,6 @@ class Planner:
         action_bounds: ArrayLike,
         num_steps: int | None = None,
         *,
-        policy: Policy | None = None,
-        past: Past | None = None,
         known: Tensor | None = None,
     ) -> Plan:
         """Choose the actions of the next steps; the randomness is PyTorch's global generator.
@@ -158,14 +136,9 @@ class Planner:
             action_bounds: Lower and upper bounds of the actions, ``2 x action_dim``, finite.
             num_steps: How many steps are ahead; the plan is of these or of the horizon, ``T``.
                 Default: the episode length of the task.
-            policy: Draws actions ``N x action_dim`` at states ``N x state_dim``. Default: none, and
-                random sequences in the place of its own.
-            past: States and actions of the episode so far, ``t x state_dim`` and
-                ``t x action_dim``, which are not learnt yet.
             known: An earlier plan, ``t x action_dim``; its last action is held where it is shorter.
 
         Raises:
-            TypeError: If the dynamics cannot tell what the objective asks.
             ValueError: If ``state`` or ``action_bounds`` have another shape, bounds are not finite,
                 or nobody says how many steps there are.
             RuntimeError: If the dynamics have learnt nothing yet.
@@ -187,9 +160,9 @@ class Planner:
                 rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
                 left, made = (part.double().mean(0) for part in (rollout.left_bounds, rollout.made))
                 asked.append((sequences, rewards, left, made))
-                return self._checked_scores(score(rollout, past), len(sequences))
+                return self._checked_scores(score(rollout), len(sequences))
 
-            first = self._proposed(rollouts, state, num_steps, action_bounds, policy, known)
+            first = self._proposed(num_steps, action_bounds, known)
             actions, value = self.search.best(scored, first, action_bounds, deadline)
             columns = (torch.cat(column) for column in zip(*asked, strict=True))
             sequences, rewards, left, made = columns
@@ -203,31 +176,14 @@ class Planner:
             plans.append(search())
         return max(plans, key=lambda plan: plan.value)
 
-    def _proposed(
-        self,
-        rollouts: Rollouts,
-        state: Tensor,
-        num_steps: int,
-        bounds: Tensor,
-        policy: Policy | None,
-        known: Tensor | None,
-    ) -> Tensor:
+    def _proposed(self, num_steps: int, bounds: Tensor, known: Tensor | None) -> Tensor:
         """The sequences that a search begins with, ``n x num_steps x action_dim``."""
-        first = []
-        num_random = self.num_random
-        if policy is None:
-            num_random += self.num_policy
-        elif self.num_policy:
-            proposed = rollouts.propose(state, num_steps, policy, self.num_policy)
-            first.append(proposed.clamp(bounds[0], bounds[1]))
         if known is None:
-            first.append(random_sequences(num_random, num_steps, bounds, self.max_hold))
-        else:
-            known = _resized(known, num_steps, bounds.shape[-1])
-            noise = correlated_noise(torch.Size((num_random, *known.shape)), 0.5)
-            drawn = known + self.spread * (bounds[1] - bounds[0]) * noise
-            first += [known.unsqueeze(0), torch.clamp(drawn, bounds[0], bounds[1])]
-        return torch.cat(first)
+            return random_sequences(self.num_random, num_steps, bounds, self.max_hold)
+        known = _resized(known, num_steps, bounds.shape[-1])
+        noise = correlated_noise(torch.Size((self.num_random, *known.shape)), 0.5)
+        drawn = known + self.spread * (bounds[1] - bounds[0]) * noise
+        return torch.cat([known.unsqueeze(0), torch.clamp(drawn, bounds[0], bounds[1])])
 
     def _checked_scores(self, scores: Tensor, n: int) -> Tensor:
         """What the objective says of ``n`` sequences; -inf is a score, too."""

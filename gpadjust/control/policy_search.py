@@ -191,7 +191,7 @@ class PolicySearch:
             if i % self.redraw_every == 0:
                 rollouts = Rollouts(task, self.num_functions)
             rollout = rollouts.act(self._starts(task, rollouts.num_functions), policy, length)
-            value = score(rollout, None).mean() / length
+            value = score(rollout).mean() / length
             if not value.requires_grad:
                 raise RuntimeError(
                     "No gradient flows from the rewards to the policy: the task's reward or the "

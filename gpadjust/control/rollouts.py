@@ -90,11 +90,6 @@ class Rollouts:
 
         return self._run(states, num_steps, choose)
 
-    def propose(self, state: Tensor, num_steps: int, policy: Policy, n: int) -> Tensor:
-        """The actions that a policy takes in ``n`` episodes, ``n x num_steps x action_dim``."""
-        each = -(-n // self.num_functions)
-        return self.act(state.expand(each, -1), policy, num_steps).actions.flatten(0, 1)[:n]
-
     def _run(
         self, starts: Tensor, num_steps: int, choose: Callable[[int, Tensor], Tensor]
     ) -> Rollout:

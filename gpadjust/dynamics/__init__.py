@@ -10,7 +10,6 @@ from gpadjust.dynamics.record import Record
 from gpadjust.dynamics.records import Records, Windows
 from gpadjust.dynamics.smoothed_records import SmoothedRecords, smooth
 from gpadjust.dynamics.smoothing import SmoothingWarning
-from gpadjust.dynamics.trajectory_information import TrajectoryInformation
 from gpadjust.dynamics.trajectory_scores import TrajectoryScores
 from gpadjust.dynamics.transition_scores import TransitionScores
 from gpadjust.dynamics.transitions import Transitions
@@ -28,7 +27,6 @@ __all__ = [
     "SmoothedRecords",
     "SmoothingWarning",
     "StateSpec",
-    "TrajectoryInformation",
     "TrajectoryScores",
     "TransitionFunctions",
     "TransitionScores",

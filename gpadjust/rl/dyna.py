@@ -9,20 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import (
-    GymEnv,
-)
-from torch import Tensor
+from stable_baselines3.common.type_aliases import GymEnv
 
 from gpadjust.control import Task
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.model_learner import ModelLearner
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
-from gpadjust.rl.planned_episodes import PlannedEpisode
 
 
 class Dyna(ModelLearner):
@@ -65,8 +60,7 @@ class Dyna(ModelLearner):
 
     Attributes:
         num_episodes: Real episodes that have ended and were learnt from.
-        wall_time: Seconds spent on ``"fit"``, ``"rollout"``, ``"update"`` and ``"plan"``.
-        planned: The real episodes that go by plans; ``planned.num_planned`` is their number.
+        wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"update"``.
         notes: What you want to keep with the agent, in plain values; saved and resumed with it.
 
     Raises:
@@ -74,8 +68,7 @@ class Dyna(ModelLearner):
             entries, n-step returns are asked for, or a number is out of range; when learning
             starts, if the task's functions do not return what they should; after a real episode,
             if its rewards or terminations are not those of the task.
-        TypeError: If task or options are of another kind, or ``exploration`` asks of the dynamics
-            what they cannot tell.
+        TypeError: If task or options are of another kind.
         AssertionError: By Stable-Baselines3, if the actions are no box.
     """
 
@@ -253,60 +246,6 @@ class Dyna(ModelLearner):
         vectorised.reset()
         return vectorised
 
-    # Planned episodes
-
-    @property
-    def replan_every(self) -> int | None:
-        """Steps after which a planned episode is planned anew; None: it goes by one plan."""
-        planner = self.options.exploration
-        return None if planner is None else planner.replan_every
-
-    def _plans(self) -> bool:
-        """Whether an episode that begins is to be planned."""
-        if self.options.exploration is None:
-            return False
-        # The first is the policy's, even of dynamics that have learnt from other data.
-        ready = self.num_episodes > 0 and self.ready_task().dynamics.is_fitted
-        left = self.options.explore_episodes - self.planned.num_planned
-        return ready and left > 0 and self.options.uses_model(self.num_episodes)
-
-    def _plan(self, episode: PlannedEpisode, state: Tensor) -> Tensor:
-        """Plan the steps that are left of an episode, from where it is."""
-        planner, task = self.options.exploration, self.model_task()
-        num_steps = self.episode_length() - len(episode.states)
-        if num_steps < 1 or planner is None:
-            return episode.ahead
-
-        def policy(states: Tensor) -> Tensor:
-            seen = task.dynamics.spec.observe(states).numpy()
-            return _doubles(self.act_in_model(seen.astype(self.observation_space.dtype)))
-
-        bounds = self.action_bounds()
-        with self.timed("plan"):
-            plan = planner.plan(
-                task,
-                state,
-                bounds,
-                num_steps,
-                policy=policy,
-                past=(episode.states, episode.actions) if len(episode.states) else None,
-                known=episode.ahead if len(episode.ahead) else None,
-            )
-        self.logger.record("model/planned_value", plan.value)
-        return plan.actions.clamp(bounds[0], bounds[1])
-
-    def ready_task(self) -> Task:
-        """The task, if the agent can learn with it; see :class:`TaskLearner`.
-
-        Raises:
-            TypeError: If options are of another kind, or the dynamics cannot tell what
-                ``exploration`` asks.
-        """
-        task = super().ready_task()
-        if self.options.exploration is not None:
-            self.options.exploration.objective.check(task)
-        return task
-
     def _setup_model(self) -> None:
         self.replay_buffer_kwargs |= {
             "real_fraction": self.options.real_fraction,
@@ -320,7 +259,3 @@ class Dyna(ModelLearner):
         """As in SB3, for both buffers; the file is a pickle: open only one that you trust."""
         super().load_replay_buffer(path, truncate_last_traj)
         self.replay_buffer.model_buffer.device = self.device
-
-
-def _doubles(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.asarray(values, dtype=np.float64))

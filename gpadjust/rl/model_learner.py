@@ -50,7 +50,7 @@ class ModelLearner(TaskLearner):
             learnt from, or None, as of random actions.
         promise: What it promises of a step of the policy's next episodes, or None.
         promises: What it had promised of those that have ended and were not learnt from yet.
-        planned: The real episodes that go by plans; ``planned.num_planned`` is their number.
+        planned: The real episodes under way that go by plans.
     """
 
     options_class: ClassVar[type[ModelOptions]] = ModelOptions
@@ -163,11 +163,6 @@ class ModelLearner(TaskLearner):
 
     # Real steps
 
-    @property
-    def replan_every(self) -> int | None:
-        """Steps after which a planned episode is planned anew; None: it goes by one plan."""
-        return None
-
     def _plans(self) -> bool:
         """Whether an episode that begins is to be planned."""
         return False
@@ -176,7 +171,7 @@ class ModelLearner(TaskLearner):
         """The actions ahead, ``T x action_dim``, of an episode; random ones, unless overridden."""
         if len(episode.ahead):
             return episode.ahead
-        num_steps = max(self.episode_length() - len(episode.states), 1)
+        num_steps = max(self.episode_length() - episode.steps_done, 1)
         return random_sequences(1, num_steps, self.action_bounds(), _MAX_HOLD)[0]
 
     def _policy_actions(
@@ -192,7 +187,7 @@ class ModelLearner(TaskLearner):
         actions, scaled = self._policy_actions(learning_starts, action_noise, n_envs)
         rows = zip(self.last_states(), torch.from_numpy(actions), strict=True)
         taken = [
-            self.planned.act(i, state, action, self._plans, self._plan, self.replan_every)
+            self.planned.act(i, state, action, self._plans, self._plan)
             for i, (state, action) in enumerate(rows)
         ]
         if not any(self.planned.is_planned(i) for i in range(n_envs)):

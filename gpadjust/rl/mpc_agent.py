@@ -149,17 +149,12 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         with self.timed("plan"):
             return mpc.predict(seen, state, episode_start, deterministic)
 
-    @property
-    def replan_every(self) -> int | None:
-        """Steps between two plans: one, unless the planner says otherwise."""
-        return 1 if self.each_step is None else self.each_step.replan_every or 1
-
     def _plans(self) -> bool:
         return True
 
     def _plan(self, episode: PlannedEpisode, state: Tensor) -> Tensor:
         """Plan the steps ahead, or draw them, if nothing is known."""
-        mpc, steps_done = self.mpc, len(episode.states)
+        mpc, steps_done = self.mpc, episode.steps_done
         begins = not steps_done
         at_random = self.begins_at_random() if begins else episode.planned is None
         if mpc is None or at_random:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import get_args
 
-from gpadjust.control import Planner
 from gpadjust.dynamics.trajectory_scores import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
@@ -16,7 +15,6 @@ _WHOLE = {  # the least of each
     "last_model_episode": 0,
     "model_buffer_size": 1,
     "num_particles": 1,
-    "explore_episodes": 0,
 }
 _FRACTIONAL = {"updates_per_model_step": math.inf, "real_fraction": 1}
 
@@ -77,10 +75,6 @@ class DynaOptions(ModelOptions):
         num_particles: Model episodes that run side by side. Default: all.
         sampling: How they are sampled, by ``"step"`` or ``"trajectory"``, see
             :class:`ModelVecEnv`.
-        exploration: Plans real episodes, for example by what they teach the dynamics. Default: the
-            policy acts in all.
-        explore_episodes: How many episodes after the first are planned, if there is an
-            ``exploration``.
 
     Raises:
         TypeError: If something is of another kind.
@@ -96,8 +90,6 @@ class DynaOptions(ModelOptions):
     model_buffer_size: int | None = None
     num_particles: int | None = None
     sampling: Sampling = "step"
-    exploration: Planner | None = None
-    explore_episodes: int = 3
 
     def __post_init__(self) -> None:
         """Check them."""
@@ -118,8 +110,6 @@ class DynaOptions(ModelOptions):
                 raise TypeError(f"{name} must be True or False; found {getattr(self, name)!r}.")
         if self.sampling not in get_args(Sampling):
             raise ValueError(f"Unknown sampling {self.sampling!r}; use 'step' or 'trajectory'.")
-        if not isinstance(self.exploration, (Planner, type(None))):
-            raise TypeError(f"exploration must be a Planner, or None; found {self.exploration!r}.")
 
     def uses_model(self, num_episodes: int) -> bool:
         """Whether the model serves after so many real episodes."""

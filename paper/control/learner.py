@@ -14,7 +14,6 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 import gpadjust.models
-from gpadjust.control import Planner
 from gpadjust.control import Task as ControlTask
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
@@ -35,15 +34,11 @@ class System(NamedTuple):
         env: The real system; an environment that can be pickled.
         task: What is known of it.
         recorder: Writes down what happens.
-        exploration: Plans real episodes, if any.
-        explore_episodes: How many after the first.
     """
 
     env: gym.Env[Any, Any]
     task: ControlTask
     recorder: Recorder
-    exploration: Planner | None = None
-    explore_episodes: int = 0
 
 
 def dynamics(
@@ -148,8 +143,6 @@ def _options(experiment: Control, name: str, system: System) -> DynaOptions:
         last_model_episode=0 if model_free else settings.last_model_episode,
         refresh_model_data=settings.refresh_model_data,
         num_particles=settings.num_particles,
-        exploration=system.exploration,
-        explore_episodes=system.explore_episodes,
         score_horizons=(),
     )
 

@@ -33,7 +33,6 @@ def run(experiment: Floor, system: str, seed: int, *, unfinished: Path) -> Recor
         Return(),
         CrossEntropy(settings.rounds, num_elites=settings.elites),
         num_random=settings.sequences,
-        num_policy=0,
     )
     bounds = torch.tensor([[-MAX_FORCE], [MAX_FORCE]], dtype=torch.float64)
     length = Settings().episode_length

@@ -101,13 +101,11 @@ def planners(settings: Settings) -> tuple[Planner, Planner]:
         search=CrossEntropy(settings.rounds, num_elites=elites, correlation=correlation),
         horizon=settings.horizon,
         num_random=settings.sequences,
-        num_policy=0,
         spread=settings.spread,
     )
     first = Planner(
         search=CrossEntropy(settings.first_rounds, num_elites=elites, correlation=correlation),
         num_random=settings.first_sequences,
-        num_policy=0,
         restarts=settings.restarts,
     )
     return each_step, first

@@ -50,9 +50,7 @@ def main() -> None:
         (12, 128, 0.15, "2", two),
     ]
     for horizon, number, spread, name, search in tried:
-        each = Planner(
-            search=search, horizon=horizon, num_random=number, num_policy=0, spread=spread
-        )
+        each = Planner(search=search, horizon=horizon, num_random=number, spread=spread)
         costs, begin = [], time.perf_counter()
         for seed in seeds:
             torch.manual_seed(seed)

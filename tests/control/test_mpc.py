@@ -25,7 +25,7 @@ def task():
 
 
 def quick(rounds=3, **options):
-    return Planner(search=CrossEntropy(rounds), num_random=48, num_policy=0, max_hold=1, **options)
+    return Planner(search=CrossEntropy(rounds), num_random=48, max_hold=1, **options)
 
 
 @pytest.mark.parametrize("search", [CrossEntropy(3), PathIntegral(3)])
@@ -145,7 +145,7 @@ def test_returns_are_as_described(task, objective, expected):
     from gpadjust.control import Rollouts
 
     rollout = Rollouts(task, None).follow(torch.zeros(1).double(), torch.zeros(1, 3, 1).double())
-    assert objective.of(task)(rollout, None).item() == pytest.approx(expected)
+    assert objective.of(task)(rollout).item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,7 @@ def test_gradients_are_those_of_finite_differences(learnt):
         found = torch.func.functional_call(policy, {"body.0.weight": weight}, at)
         del found
         policy.body[0].weight.data.copy_(weight)
-        return score(rollouts.act(at, policy, 3), None).sum()
+        return score(rollouts.act(at, policy, 3)).sum()
 
     weight = torch.tensor([[0.3]], dtype=torch.float64)
     value(weight).backward()
@@ -166,7 +166,7 @@ def test_a_guide_shows_what_gradients_do_not_find():
         initial_states=lambda n: starts(n) / 10,
         episode_length=5,
     )
-    guide = Planner(search=CrossEntropy(4), num_random=64, num_policy=0)
+    guide = Planner(search=CrossEntropy(4), num_random=64)
     values = {}
     for name, each in (("alone", None), ("guided", guide)):
         policy = mlp_policy(SPEC, BOUNDS, (16,))

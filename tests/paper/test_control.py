@@ -1,4 +1,4 @@
-"""The experiments on control: cart-pole, arm, exploration, floors."""
+"""The experiments on control: cart-pole, arm, floors."""
 
 from dataclasses import replace
 
@@ -8,9 +8,6 @@ import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from gpadjust.control import Planner
-from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.envs import CART_POLE_SPEC, cart_pole_cost, random_cart_pole_physics
 from gpadjust.rl.random_state import RandomState
 from paper.arm import Arm
 from paper.arm import Settings as ArmSettings
@@ -22,17 +19,13 @@ from paper.arm.tables import load_evaluations, load_maps
 from paper.cartpole import CartPole
 from paper.cartpole import Settings as CartPoleSettings
 from paper.cartpole.claims import CLAIMS, TARGETS
-from paper.cartpole.system import evaluate, fixed_starts, true_physics
+from paper.cartpole.system import evaluate, fixed_starts
 from paper.cartpole.tables import holds_from
 from paper.common.claims import judge
 from paper.common.curves import Curves
 from paper.common.runner import Refused, main, rounded, run_missing, runs_file
 from paper.control.learner import described, make_agent, run
 from paper.control.tables import load_episodes
-from paper.exploration import Exploration
-from paper.exploration import Settings as ExplorationSettings
-from paper.exploration.held_out import KINDS, NUM_STARTS, NUM_STEPS, PATH, errors, held_out, make
-from paper.exploration.tables import MEASURES
 from paper.floor import Floor
 from paper.floor import Settings as FloorSettings
 
@@ -50,16 +43,6 @@ TINY_ARM = ArmSettings(
     last_model_episode=2,
     evaluate_every=1,
     map_after=1,
-)
-TINY_PLANS = ExplorationSettings(
-    **SHORT,
-    last_model_episode=3,
-    updates_per_model_step=0.2,
-    num_random=3,
-    num_policy=1,
-    num_functions=1,
-    rounds=1,
-    num_elites=2,
 )
 
 
@@ -95,7 +78,6 @@ def _few_targets(monkeypatch):
     [
         (CartPole(settings=TINY), "mf", 10),
         (CartPole(settings=TINY), "cka", 24),
-        pytest.param(Exploration(settings=TINY_PLANS), "gp-info", 24, marks=pytest.mark.slow),
         pytest.param(Arm(settings=TINY_ARM), "cka-memory", 7, marks=pytest.mark.slow),
     ],
 )
@@ -303,59 +285,6 @@ def arm_verdicts(**curves):
     claims = arm_claims(load_episodes(records, experiment), load_maps(records, experiment))
     every = Curves(load_evaluations(records, experiment), "all_steps")
     return {claim.id: claim for claim in judge(claims, every, 30)}
-
-
-class TestExploration:
-    def test_the_held_out_episodes_are_of_the_real_system(self):
-        real = PhysicsDynamics(CART_POLE_SPEC, true_physics())
-        for data in held_out().values():
-            assert len(data.states) == NUM_STARTS * NUM_STEPS
-            following = real.sample(data.states, data.actions)
-            assert real.spec.change(following, data.next_states).abs().max() < 1e-5
-        cost = {
-            kind: cart_pole_cost(data.next_states).reshape(NUM_STARTS, NUM_STEPS)
-            for kind, data in held_out().items()
-        }
-        assert cost["swing-up"].amin(1).max() < 0.1  # all get there
-        assert cost["random"].mean(1).min() > 0.8
-
-    def test_held_out_episodes_are_made_anew_alike(self):
-        made = [make(num_starts=2, rounds=1, num_sequences=3) for _ in range(2)]
-        pd.testing.assert_frame_equal(*made)
-        assert list(made[0].columns) == list(pd.read_csv(PATH).columns)
-
-    def test_errors_are_relative_to_no_change(self):
-        assert max(errors(PhysicsDynamics(CART_POLE_SPEC, true_physics())).values()) < 1e-5
-        still = PhysicsDynamics(CART_POLE_SPEC, lambda X: X[:, :4])
-        assert errors(still) == pytest.approx(dict.fromkeys(KINDS, 1.0))
-        crude = errors(PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)))
-        assert all(0.01 < error < 0.5 for error in crude.values())
-
-    @pytest.mark.slow
-    def test_smoke(self, tmp_path, capsys):
-        experiment = Exploration(
-            out=tmp_path, runs=2, jobs=1, scenarios=("gp-sac", "gp-info"),
-            settings=replace(TINY_PLANS, episodes=2)
-        )  # fmt: skip
-        main(experiment)
-        assert "Mean error on swing-ups, after trials" in capsys.readouterr().out
-        assert (tmp_path / "curves.png").stat().st_size > 5_000
-        sac, info = (
-            runs_file(experiment).read()[name, 0]["episodes"] for name in ("gp-sac", "gp-info")
-        )
-        assert all(value > 0 for name in MEASURES for value in info[name])
-        assert info["error"][0] == sac["error"][0]
-        assert info["error"][1] != sac["error"][1]
-        assert info["plan_seconds"][0] == 0 < info["plan_seconds"][1]
-
-    def test_who_plans(self):
-        experiment = Exploration()
-        assert experiment.system("cka-sac", 0).exploration is None
-        for name, episodes in (("cka-info", 14), ("cka-info-3", 3), ("cka-random", 14)):
-            system = experiment.system(name, 0)
-            assert isinstance(system.exploration, Planner)
-            assert system.explore_episodes == episodes
-        assert experiment.system("cka-random", 0).exploration.search.rounds == 0
 
 
 def test_floors(tmp_path, capsys):

@@ -22,7 +22,7 @@ from gpadjust.rl import (
 
 pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
 QUICK = {"method": "map", "num_starts": 1, "num_screened": 0}
-PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, num_policy=0, max_hold=1)
+PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, max_hold=1)
 SEARCH = PolicySearch(updates=12, num_starts=6, num_functions=2, learning_rate=0.05)
 KINDS = [MPCAgent, PolicySearchAgent]
 
@@ -129,6 +129,29 @@ def test_an_interrupted_run_ends_as_another(make_agent, kind, step, tmp_path, te
     agent.learn(15 - agent.num_timesteps, EpisodeCheckpoint(path), reset_num_timesteps=False)
     expected, found = tensors_of(whole), tensors_of(agent)
     assert expected.keys() == found.keys()
+    for name, value in expected.items():
+        same = torch.equal(value, found[name]) if torch.is_tensor(value) else value == found[name]
+        assert same, name
+
+
+def test_two_environments_go_on_within_their_plans(make_agent, point_env, tmp_path, tensors_of):
+    """Checkpoints lie in the middle of episodes, which go on by the plans that they had."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    def make():
+        env = DummyVecEnv([point_env, point_env])
+        return make_agent(MPCAgent, env, train_freq=(3, "step"))
+
+    path = tmp_path / "run.ckpt"
+    whole = make().learn(36)
+    with pytest.raises(PowerCutError):
+        make().learn(36, callback=[EpisodeCheckpoint(path), as_callback(cut_at(28))])
+    fresh = make()
+    agent = resume(path, fresh.get_env(), fresh.task)
+    assert agent.num_timesteps == 24
+    assert [episode.steps_done for episode in agent.planned.under_way.values()] == [2, 2]
+    agent.learn(12, reset_num_timesteps=False)
+    expected, found = tensors_of(whole), tensors_of(agent)
     for name, value in expected.items():
         same = torch.equal(value, found[name]) if torch.is_tensor(value) else value == found[name]
         assert same, name
