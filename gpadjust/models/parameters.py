@@ -42,7 +42,7 @@ class Kind:
 
 KINDS = {
     # Typical size: the range of the input. Priors are longer in more dimensions, by sqrt(d).
-    "lengthscale": Kind(0.5, bounds=(1e-2, 1e3), starts=(0.05, 50.0), prior=(3.0, 2.0)),
+    "lengthscale": Kind(0.5, bounds=(1e-2, 1e3), starts=(0.05, 50.0), prior=(1.0, 2.0)),
     # The mean square of the targets' residual from the prior mean, v, over that of the basis. The
     # prior is all but flat, so that near-polynomial functions, of long lengthscales and large
     # variance, are not ruled out.
@@ -291,7 +291,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     :math:`v` the mean square of the targets' residual from the prior mean:
 
     .. math::
-        \log \ell &\sim N(\log 3 + \tfrac12 \log d, \; 2^2) \\
+        \log \ell &\sim N(\tfrac12 \log d, \; 2^2) \\
         \log s_\delta &\sim N(\log v, \; 6^2), \quad
         \log s_\rho \sim N(\log 10^{-2}, \; 4^2) \\
         \log \sigma^2 &\sim N(\log(10^{-3} v), \; 4^2)
