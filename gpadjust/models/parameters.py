@@ -41,8 +41,8 @@ class Kind:
 
 
 KINDS = {
-    # Typical size: the range of the input. Priors are longer in more dimensions, by sqrt(d).
-    "lengthscale": Kind(0.5, bounds=(1e-2, 1e3), starts=(0.05, 50.0), prior=(3.0, 2.0)),
+    # Typical size: the range of the input. Priors are longer in more dimensions, by d.
+    "lengthscale": Kind(0.5, bounds=(1e-2, 1e3), starts=(0.05, 50.0), prior=(1.0, 2.0)),
     # The mean square of the targets' residual from the prior mean, v, over that of the basis. The
     # prior is all but flat, so that near-polynomial functions, of long lengthscales and large
     # variance, are not ruled out.
@@ -291,15 +291,16 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     :math:`v` the mean square of the targets' residual from the prior mean:
 
     .. math::
-        \log \ell &\sim N(\log 3 + \tfrac12 \log d, \; 2^2) \\
+        \log \ell &\sim N(\log d, \; 2^2) \\
         \log s_\delta &\sim N(\log v, \; 6^2), \quad
         \log s_\rho \sim N(\log 10^{-2}, \; 4^2) \\
         \log \sigma^2 &\sim N(\log(10^{-3} v), \; 4^2)
 
-    The lengthscales grow with the dimension after Hvarfner et al. (2024). All are wide: functions
-    that are nearly polynomial (long lengthscales, a large variance), a rho that is nearly constant,
-    and data without noise are not ruled out. They were chosen on other data sets
-    than those that are reported. A centre that is learnt has N(0, 3^2), in standard deviations of
+    The lengthscales grow with the dimension, after Hvarfner et al. (2024), and faster: in eight
+    dimensions short ones take noise for a function. All are wide: functions that are nearly
+    polynomial (long lengthscales, a large variance), a rho that is nearly constant, and data
+    without noise are not ruled out. They were chosen on other data sets than those that are
+    reported. A centre that is learnt has N(0, 3^2), in standard deviations of
     f_p from its mean. The constant rho of an :class:`~gpadjust.AR1` has N(1, 1 + r^2) for levels
     whose targets have standard deviations of the ratio r, high to low. Give a kernel or likelihood
     priors of your own (``lengthscale_prior=...``, or ``register_prior``) to replace them.
@@ -333,7 +334,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
         elif row.size is not None:
             kind, size = KINDS[row.kind], row.size
             median, spread = kind.prior
-            median *= math.sqrt(size.shape[-1]) if row.kind == "lengthscale" else 1.0
+            median *= size.shape[-1] if row.kind == "lengthscale" else 1.0
             location = (size if kind.has_unit else torch.ones_like(size)).log() + math.log(median)
             prior = LogNormalPrior(location, torch.full_like(location, spread))
             read, write = getattr(owner, f"_{name}_param"), getattr(owner, f"_{name}_closure")

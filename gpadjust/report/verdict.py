@@ -55,17 +55,10 @@ def recommendation(subject: Subject) -> Markup:
     if len(comparison.models) == 1:
         return tag("p", f"Only {rows[0][0].structure} was fitted: {_what(rows[0][0].structure)}.")
     if comparison.chosen != STACKED:
-        why = (
-            "It has nearly all the weight, and each other structure is worse by more than two "
-            "standard errors."
-        )
         name = comparison.chosen
+        why = "It has nearly all the weight."
         return tag("p", "Recommended: ", tag("strong", name), f", {_what(name)}. {why}")
-    few = int((~subject.Y.isnan()).sum(0).min())
-    why = "No structure is clearly best" + " for all outputs" * (len(subject.outputs) > 1)
-    if few < ENOUGH:
-        why = f"{plural(few, 'observation')} cannot show a structure to be clearly best"
-    why += ": the mixture keeps the doubt between them in its intervals."
+    why = "It keeps the doubt between them in its intervals."
     weights = []
     for name, ranked in comparison.table.items():
         shares = listed(

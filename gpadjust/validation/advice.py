@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -12,7 +12,6 @@ from gpadjust.models.parameters import shared_parameters
 from gpadjust.validation.gain import Gain, physics_gain
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, difference, sign_of
-from gpadjust.validation.refitting import LEAST
 from gpadjust.validation.structures import Structure
 
 _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
@@ -23,6 +22,7 @@ def advice(
     models: dict[str, TermsGP],
     left_out: dict[str, LeaveOneOut],
     converged: dict[str, Tensor],
+    relevance: dict[str, Tensor],
     table: dict[str, list[Candidate]],
     X: Tensor,
 ) -> list[str]:
@@ -33,29 +33,22 @@ def advice(
         models: The models by the names of their structures.
         left_out: Their leave-one-out predictions.
         converged: Whether their samples are of the posterior, ``m`` each.
+        relevance: Probabilities that the physics is of use, ``m``, of the structures that say it.
         table: The rankings, by the names of the outputs.
         X: Training inputs, ``n x d``.
     """
     by_name = {structure.name: structure for structure in structures}
-    sentences, fewest = [], len(X)
+    sentences = []
     for j, (output, rows) in enumerate(table.items()):
         where = f"{output}: " if len(table) > 1 else ""
         density = _density(left_out, j)
-        fewest = min(fewest, len(density[rows[0].structure]))
-        found = [_best(rows), *_gains(by_name, [row.structure for row in rows], density)]
+        probable = {name: float(each[j]) for name, each in relevance.items()}
+        order = [row.structure for row in rows]
+        found = [_best(rows), *_gains(by_name, order, density, probable.values())]
+        found += [_of_use(name, probability) for name, probability in probable.items()]
         found += _preferred(models[rows[0].structure], X, j)
         found += _unsampled(rows, converged, j)
         sentences += [where + sentence for sentence in found]
-    if fewest < ENOUGH and len(models) > 1:
-        sentences.append(
-            f"{fewest} observations (of {ENOUGH} at least) cannot show a structure to be clearly "
-            "best: what is recommended is the mixture."
-        )
-    if fewest < LEAST:
-        sentences.append(
-            f"{fewest} observations are too few to fit again without each: they have had their say "
-            "in their own predictions, so that these elpd are too high."
-        )
     flattered = [name for name, model in models.items() if shared_parameters(model)]
     if flattered:
         sentences.append(
@@ -82,6 +75,7 @@ def _best(rows: list[Candidate]) -> str:
 def gains(
     structures: Sequence[Structure],
     left_out: dict[str, LeaveOneOut],
+    relevance: dict[str, Tensor],
     table: dict[str, list[Candidate]],
 ) -> dict[str, Gain]:
     """What the physics is worth to each output, if there are structures with and without it."""
@@ -89,7 +83,8 @@ def gains(
     found = {}
     for j, (output, rows) in enumerate(table.items()):
         order = [row.structure for row in rows]
-        found[output] = physics_gain(by_name, order, _density(left_out, j))
+        probable = [float(each[j]) for each in relevance.values()]
+        found[output] = physics_gain(by_name, order, _density(left_out, j), probable)
     return {output: gain for output, gain in found.items() if gain is not None}
 
 
@@ -98,12 +93,19 @@ def _density(left_out: dict[str, LeaveOneOut], output: int) -> dict[str, Tensor]
     return dict(zip(left_out, densities(left_out, output).unbind(-1), strict=True))
 
 
+def _of_use(structure: str, probability: float) -> str:
+    return f"By the evidence of {structure} with and without it, f_p is of use: {probability:.2f}."
+
+
 def _gains(
-    structures: dict[str, Structure], order: list[str], density: dict[str, Tensor]
+    structures: dict[str, Structure],
+    order: list[str],
+    density: dict[str, Tensor],
+    relevance: Iterable[float] = (),
 ) -> list[str]:
     """Whether the physics helps, and whether scaling it does."""
     sentences = []
-    physics = physics_gain(structures, order, density)
+    physics = physics_gain(structures, order, density, relevance)
     if physics is not None:
         text = _elpd(physics.elpd, physics.se, physics.structure, "without it", physics.without)
         if physics.shown <= 0:

@@ -20,9 +20,8 @@ from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
 from gpadjust.models import CalibratedPhysics, StackedGP, TermsGP
 from gpadjust.models.hyperparameter_samples import take_samples
-from gpadjust.models.parameters import shared_parameters
 from gpadjust.models.term_builder import PhysicsLike
-from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
+from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
 from gpadjust.validation.advice import advice, gains
 from gpadjust.validation.gain import Gain
@@ -32,8 +31,7 @@ from gpadjust.validation.leave_one_out import (
     mixture_of,
 )
 from gpadjust.validation.physics_alone import physics_alone
-from gpadjust.validation.ranking import Candidate, beside, densities, is_clear, ranking
-from gpadjust.validation.refitting import LEAST, refitted
+from gpadjust.validation.ranking import Candidate, beside, ranking
 from gpadjust.validation.structures import (
     ALONE,
     STACKED,
@@ -43,11 +41,10 @@ from gpadjust.validation.structures import (
     known_structures,
 )
 
-_FEW = 24  # observations, up to which each structure is fitted again without each of them
-_REFIT = {"num_draws": 512, "num_samples": 64, "num_starts": 4, "num_screened": 64}
 _DRAWS = (32, 256)  # of the hyper-parameters, the least and the most
 _MEMORY = 20_000  # observations times draws
 _HELD = 32  # samples of a model, and components of the stacked one
+_ALL = 0.95  # weight of a structure that needs no others
 
 
 @dataclass(frozen=True)
@@ -79,19 +76,13 @@ class Comparison:
 
     @property
     def chosen(self) -> str:
-        """The structure that is clearly best for all outputs, otherwise ``"stacked"``.
-
-        It has nearly all weight, and all others are worse by more than two standard errors, by
-        observations of eight different inputs or more.
-        """
-        numbers = [len(densities(self.left_out, j)) for j in range(len(self.table))]
-        names = {rows[0].structure for rows in self.table.values()}
-        clear = all(map(is_clear, self.table.values(), numbers))
-        return names.pop() if clear and len(names) == 1 else STACKED
+        """The structure that has 0.95 of the weight of all outputs, otherwise ``"stacked"``."""
+        least = _weights(self.models, [*self.table.values()]).amin(-1).tolist()
+        return next((n for n, w in zip(self.models, least, strict=True) if w >= _ALL), STACKED)
 
     @property
     def recommended(self) -> TermsGP | StackedGP:
-        """The fitted model of the structure that is clearly best, otherwise the stacked one."""
+        """The fitted model of the structure that has nearly all weight, otherwise the mixture."""
         return self.models.get(self.chosen, self.stacked)
 
     def leave_one_out(self) -> LeaveOneOut:
@@ -189,13 +180,16 @@ def compare(
     ``"CKA"``           :math:`\rho(x) (f_p - c) + \delta(x)` with learnt c, :class:`~gpadjust.CKA`
     ==================  ===========================================================================
 
-    All are fitted by full Bayes. Each output is judged by itself, by the *expected log predictive
-    density* (elpd) of left-out observations, of which each is out of the hyper-parameters, too: up
-    to 24 observations, by fitting again without each of them, and with more by the weights of
-    :func:`leave_one_out`. A difference of less than two standard errors shows nothing. Where no
-    structure is clearly best (:attr:`Comparison.chosen`), the recommended model is their mixture, a
-    :class:`~gpadjust.StackedGP` with the weights of :func:`stacking_weights`. Fitting again takes
-    its time: some 30 seconds of 24 observations of three outputs, on one core.
+    All are fitted by full Bayes, once. Each output is judged by itself, by the *expected log
+    predictive density* (elpd) of left-out observations, which are out of the hyper-parameters, too,
+    by the weights of :func:`leave_one_out`: of few observations it is rather high. A difference of
+    less than two standard errors shows nothing.
+
+    What is recommended is the mixture of all, a :class:`~gpadjust.StackedGP` with the weights of
+    :func:`stacking_weights`, or the structure that has nearly all weight
+    (:attr:`Comparison.chosen`). ``"CKA"``, whose fit leaves a physics of no use out by itself, has
+    the weight of four observations beforehand: the others have to earn theirs by predictions, and
+    few observations change little.
 
     Of several physics each structure is fitted to each of them alone, ``"CKA of coarse"`` and so
     on, and to all at once, ``"CKA of all"``; the advice says which physics the data prefer, and
@@ -211,11 +205,10 @@ def compare(
     A physics with unknown parameters is calibrated by each structure that uses it: then
     ``"physics mean"`` is the calibrated physics and a delta (Kennedy and O'Hagan 2001), ``"CKA"``
     that with rho and delta, and ``"calibrated physics"`` is one more structure without either,
-    :class:`~gpadjust.CalibratedPhysics`. Left-out observations are then predicted by weights,
-    however few there are.
+    :class:`~gpadjust.CalibratedPhysics`.
 
-    The parameters of a network that learns are not fitted again, so that left-out observations have
-    had their say in them. The advice says so.
+    Of a network that learns, left-out observations have had their say in the parameters. The advice
+    says so.
 
     Args:
         train_X: Inputs, ``n x d``, as in :class:`~gpadjust.CKA`.
@@ -258,7 +251,6 @@ def compare(
     asked = known_structures(structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
-    given = {name: value for name, value in search.items() if value is not None}
     data = training_data(train_X, train_Y, train_Yvar)
     if data.X.dim() > 2:
         raise ValueError(
@@ -270,6 +262,7 @@ def compare(
     models: dict[str, TermsGP] = {}
     left_out: dict[str, LeaveOneOut] = {}
     converged: dict[str, Tensor] = {}
+    relevance: dict[str, Tensor] = {}
     said: set[str] = set()
     for structure, part in tqdm(found, disable=not progress, unit="structure"):
         with warnings.catch_warnings(record=True) as caught:
@@ -284,16 +277,9 @@ def compare(
                 )
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
-                warnings.simplefilter("ignore", PhysicsWarning)  # of models without an observation
                 with threads_for(len(data.X)):
                     result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
-                    apart = not shared_parameters(model) and not model.has_unknowns
-                    again = apart and _can_be_left_out(data)
-                    left_out[structure.name] = (
-                        refitted(structure, data, part, input_transform, **{**_REFIT, **given})
-                        if again
-                        else leave_one_out(model)
-                    )
+                    left_out[structure.name] = leave_one_out(model)
             except Exception as error:
                 error.add_note(f"This is of the structure {structure.name!r}.")
                 raise
@@ -306,13 +292,16 @@ def compare(
             said.add(text)
             warnings.warn(text, each.category, stacklevel=2)
         converged[structure.name] = result.converged.flatten()
+        if result.relevance is not None:
+            relevance[structure.name] = result.relevance.flatten()
         models[structure.name] = _thinned(model, _HELD)
-    by_output = [ranking(left_out, j) for j in range(data.Y.shape[-1])]
+    prior = [structure.prior for structure, _ in found]
+    by_output = [ranking(left_out, j, prior) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))
     stacked = StackedGP(models, _weights(models, by_output), _HELD)
     fitted = [structure for structure, _ in found]
-    sentences = advice(fitted, models, left_out, converged, table, data.X)
-    gain = gains(fitted, left_out, table)
+    sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
+    gain = gains(fitted, left_out, relevance, table)
     alone = physics_alone(given_physics, data)
     return Comparison(models, stacked, table, sentences, gain, left_out, alone)
 
@@ -331,12 +320,6 @@ def _number(num_points: int) -> int:
     """How many samples of the hyper-parameters leave-one-out is told by."""
     least, most = _DRAWS
     return max(least, min(most, _MEMORY // num_points))
-
-
-def _can_be_left_out(data: TrainingData) -> bool:
-    """Whether each structure can be fitted again without each observation."""
-    observed = (~data.Y.isnan()).sum(-2)
-    return len(data.X) <= _FEW and int(observed.min()) >= LEAST
 
 
 def _thinned(model: TermsGP, number: int) -> TermsGP:

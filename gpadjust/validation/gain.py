@@ -21,9 +21,10 @@ class Gain(NamedTuple):
         structure: The structure with the physics; one without unknown constants, which may help by
             themselves, if that is shown to be better.
         without: The structure without the physics.
-        shown: 1 if the physics is shown to help, -1 if it is shown to make predictions worse, and
-            0 if neither is, by two standard errors, or there are observations of fewer than eight
-            different inputs.
+        shown: 1 if the physics is shown to help, by two standard errors and by the evidence of
+            models that were weighed without it; -1 if it is shown to make predictions worse, where
+            no model leaves it out by itself; 0 if neither is, or there are observations of fewer
+            than eight different inputs.
     """
 
     elpd: float
@@ -34,7 +35,10 @@ class Gain(NamedTuple):
 
 
 def physics_gain(
-    structures: Mapping[str, Structure], order: Iterable[str], density: Mapping[str, Tensor]
+    structures: Mapping[str, Structure],
+    order: Iterable[str],
+    density: Mapping[str, Tensor],
+    relevance: Iterable[float] = (),
 ) -> Gain | None:
     """What the physics is worth; None if there is nothing with it, or nothing without it.
 
@@ -42,6 +46,7 @@ def physics_gain(
         structures: The structures by their names.
         order: The names, best first.
         density: The log predictive densities of left-out observations by each, ``n``.
+        relevance: Probabilities that the physics is of use, of models that were weighed without it.
     """
     names = [*order]
     physical = [name for name in names if structures[name].uses_physics]
@@ -49,9 +54,11 @@ def physics_gain(
     if not (physical and others):
         return None
     shows = len(density[physical[0]]) >= ENOUGH  # of fewer the error is itself unknown
+    probable = [probability > 0.5 for probability in relevance]
     fair = next((name for name in physical if not structures[name].unknowns), physical[0])
     elpd, se = difference(density[fair], density[others[0]])
-    if shows and sign_of(elpd, se) > 0:
+    if shows and all(probable) and sign_of(elpd, se) > 0:
         return Gain(elpd, se, fair, others[0], 1)
     elpd, se = difference(density[physical[0]], density[others[0]])
+    shows = shows and not probable
     return Gain(elpd, se, physical[0], others[0], min(sign_of(elpd, se), 0) if shows else 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -14,8 +15,7 @@ from gpadjust.validation.leave_one_out import LeaveOneOut
 _BOOTSTRAPS = 200
 _STEPS = 300
 SURE = 2.0  # standard errors that a difference takes to be real
-ENOUGH = 8  # observations of different inputs, for a structure to be clearly best
-_CLEAR = 0.95  # weight of a structure that needs no others
+ENOUGH = 8  # observations of different inputs, for a difference to be shown
 _LEAST = 1e-6  # nats; less is rounding
 _WORST = -1e6  # nats; a density of zero would make others' differences infinite
 
@@ -42,15 +42,18 @@ class Candidate(NamedTuple):
     coverage: float
 
 
-def ranking(left_out: dict[str, LeaveOneOut], output: int) -> list[Candidate]:
+def ranking(
+    left_out: dict[str, LeaveOneOut], output: int, prior: Sequence[float] | None = None
+) -> list[Candidate]:
     """The structures for one output, best first.
 
     Args:
         left_out: The leave-one-out predictions of each structure.
         output: The number of the output.
+        prior: As in :func:`stacking_weights`.
     """
     density = densities(left_out, output)
-    weights = stacking_weights(density).tolist()
+    weights = stacking_weights(density, prior).tolist()
     order = density.sum(0).argsort(descending=True, stable=True).tolist()
     names, best = [*left_out], density[:, order[0]]
     return [
@@ -116,24 +119,21 @@ def sign_of(value: float, error: float) -> int:
     return 0 if not shown else 1 if value > 0 else -1
 
 
-def is_clear(rows: list[Candidate], number: int) -> bool:
-    """Whether the first of the rows needs no others, by this number of observations."""
-    best, *others = rows
-    worse = all(sign_of(row.elpd_diff, row.se_diff) < 0 for row in others)
-    return not others or (number >= ENOUGH and best.weight >= _CLEAR and worse)
-
-
-def stacking_weights(density: Tensor, seed: int = 0) -> Tensor:
+def stacking_weights(
+    density: Tensor, prior: Sequence[float] | None = None, seed: int = 0
+) -> Tensor:
     r"""Weights of structures whose mixture predicts left-out observations best, ``K``.
 
-    .. math:: w = E_\alpha \arg\max_w \sum_i \alpha_i \log \sum_k w_k \exp(\ell_{ik}),
-        \quad \alpha \sim Dirichlet(1, \dots, 1)
+    .. math:: w = E_\alpha \arg\max_w \sum_i n \alpha_i \log \sum_k w_k \exp(\ell_{ik})
+        + \sum_k c_k \log w_k, \quad \alpha \sim Dirichlet(1, \dots, 1)
 
     (Yao et al. 2018, eq. 4). The Bayesian bootstrap over the observations (Rubin 1981) keeps few of
-    them from being too sure.
+    them from being too sure, and so does what is known beforehand, the numbers c.
 
     Args:
         density: Log predictive densities of left-out observations, ``n x K``.
+        prior: How many observations the weight of each structure is worth beforehand, ``K``.
+            Default: none.
         seed: Of the bootstrap.
     """
     n, K = density.shape
@@ -141,8 +141,10 @@ def stacking_weights(density: Tensor, seed: int = 0) -> Tensor:
     drawn = torch.rand(_BOOTSTRAPS, n, generator=generator, dtype=torch.float64)
     share = -torch.log1p(-drawn)  # exponential
     share = (share / share.sum(-1, keepdim=True)).to(density)
+    known = density.new_tensor([0.0] * K if prior is None else [*prior]) / n
     likelihood = (density - density.amax(-1, keepdim=True)).exp()
     weights = density.new_full((_BOOTSTRAPS, K), 1 / K)
     for _ in range(_STEPS):  # expectation maximisation, which keeps to the simplex
-        weights = weights * ((share / (weights @ likelihood.mT)) @ likelihood)
+        found = weights * ((share / (weights @ likelihood.mT)) @ likelihood)
+        weights = (found + known) / (1 + known.sum())
     return weights.mean(0)

@@ -26,6 +26,8 @@ class Structure(NamedTuple):
         adjusts: Whether it does more than to take the physics as a mean.
         joins: Whether it takes several physics at once.
         calibrates: Whether it is of a physics with unknown parameters only.
+        prior: How many observations its weight is worth beforehand, see
+            :func:`~gpadjust.validation.stacking_weights`; of several physics, that of all at once.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Structure(NamedTuple):
     adjusts: bool = True
     joins: bool = True
     calibrates: bool = False
+    prior: float = 0.0
 
 
 def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> TermsGP:
@@ -48,7 +51,7 @@ STRUCTURES = (
     Structure(
         "constant rho", partial(PhysicsMeanGP, rho_mean="learn", delta_mean="learn"), unknowns=2
     ),
-    Structure("CKA", CKA),
+    Structure("CKA", CKA, prior=4.0),
 )
 """The structures that :func:`gpadjust.compare` knows; add your own to them."""
 
@@ -98,7 +101,9 @@ def candidates(
         parts = cast(Iterable[Physics], physics.parts)
         of: list[tuple[str, Physics]] = [*zip(physics.names, parts, strict=True)]
         for name, part in of:
-            found.append((structure._replace(name=f"{structure.name} of {name}"), part))
+            alone = 0.0 if structure.joins else structure.prior
+            own = structure._replace(name=f"{structure.name} of {name}", prior=alone)
+            found.append((own, part))
         if structure.joins:
             several = structure.unknowns + len(of) - 1
             joined = structure._replace(name=f"{structure.name} of all", unknowns=several)

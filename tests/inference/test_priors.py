@@ -1,6 +1,5 @@
 """The default priors, and densities of priors in an objective."""
 
-import math
 
 import pytest
 import torch
@@ -26,7 +25,7 @@ def test_densities(build, data, num_outputs):
     register_priors(model)
     found = priors(model)
     v = (Y - 3 - X[:, :1]).square().mean(0).minimum(Y.var(0, correction=0))
-    length = (X.amax(0) - X.amin(0)) * math.sqrt(2) * 3
+    length = (X.amax(0) - X.amin(0)) * 2
     lengths, rho, delta = length.repeat(num_outputs), "terms.0.kernel", "terms.1.kernel"
     medians = {
         "likelihood.noise_covar.noise_prior": (1e-3 * v, 4),

@@ -11,7 +11,12 @@ from gpytorch.priors import LogNormalPrior
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit, load, save
 from gpadjust.inference import FitResult, register_priors
-from gpadjust.inference.relevance import mixed, probability, without_physics
+from gpadjust.inference.relevance import (
+    cost_of_constant,
+    mixed,
+    probability,
+    without_physics,
+)
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.validation import trust
@@ -210,6 +215,26 @@ def test_probability():
     far = torch.tensor([1e4, -1e4])
     assert probability(far, torch.zeros(2)).tolist() == [1.0, 0.0]
     torch.testing.assert_close(probability(far - 1e4, far - 1e4), torch.full((2,), 0.8))
+
+
+class TestConstant:
+    """A constant between physics and targets, which a model without physics has for free."""
+
+    def test_its_cost(self):
+        targets = torch.tensor([[0.0, 2.0, math.nan], [5.0, 7.0, 6.0]], dtype=torch.float64)
+        spread = torch.tensor([1.0, math.sqrt(2 / 3)], dtype=torch.float64)
+        mean = torch.tensor([[-9.0, -7.0, 0.0], [5.5, 7.0, 6.0]], dtype=torch.float64)
+        expected = torch.stack([(9 / spread[0]).log(), spread[1] * 0])
+        torch.testing.assert_close(cost_of_constant(targets, mean), expected)
+        assert cost_of_constant(torch.ones(3), torch.zeros(3)) == 0
+
+    @pytest.mark.parametrize("offset", [0.0, 1e3, 1e5])
+    def test_it_does_not_count_against_the_physics(self, data, offset):
+        X, Y, _ = data
+        generator = torch.Generator().manual_seed(1)
+        Y = Y + 0.1 * torch.randn(Y.shape, generator=generator, dtype=torch.float64) + offset
+        assert fit(CKA(X, Y, physics=double)).relevance > 0.8
+        assert fit(CKA(X, Y, physics=unrelated)).relevance < 0.5
 
 
 class TestMixed:
