@@ -1,6 +1,8 @@
-"""Where left-out observations are missed by more than predicted, and what that says of variances."""
+"""Where left-out observations are missed by more than predicted: larger variances nearby."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Size, Tensor
@@ -8,7 +10,7 @@ from torch.nn import Module
 
 from gpadjust.gp.kernels import RBF, Stationary
 
-_EXPECTED = 2.0  # observations that err as predicted, added to those near a point
+_EXPECTED = 1.0  # observations that err as predicted, beside those near a point
 
 
 class LocalErrors(Module):
@@ -20,24 +22,30 @@ class LocalErrors(Module):
 
     .. math:: \max\Big(1, \frac{a + \sum_i k(x, x_i) z_i^2}{a + \sum_i k(x, x_i)}\Big),
 
-    with an RBF kernel k of the shortest lengthscale of all terms, input by input. It is a normalised
-    form of conformal prediction by local left-out residuals (Lei et al. 2018, sec. 5.2), smoothed.
+    with an RBF kernel k of the shortest lengthscale of all terms, input by input, and a = 1. Locally
+    weighted conformal prediction (Lei et al. 2018) has such a scale, too, by a model of residuals;
+    here there is no guarantee, as the left-out observations had their say in the hyper-parameters.
 
     Args:
         outputs: The batch shape of a model with its outputs last, ``batch_shape x (m)``.
-        num_points: Number ``n`` of observations.
         num_inputs: Number ``d`` of inputs that kernels read.
+
+    Attributes:
+        squares: Squared errors of ``n`` left-out observations, in predicted variances,
+            ``batch_shape x (m) x n``; none before a fit.
+        points: Where they were observed, ``n x d``.
+        lengthscale: That of k, ``batch_shape x (m) x 1 x d``.
     """
 
     squares: Tensor
     points: Tensor
     lengthscale: Tensor
 
-    def __init__(self, outputs: Size, num_points: int, num_inputs: int) -> None:
+    def __init__(self, outputs: Size, num_inputs: int) -> None:
         super().__init__()
         one = torch.ones((), dtype=torch.float64)
-        self.register_buffer("squares", one.expand(*outputs, num_points).clone())
-        self.register_buffer("points", one.expand(num_points, num_inputs).clone())
+        self.register_buffer("squares", one.expand(*outputs, 0).clone())
+        self.register_buffer("points", one.expand(0, num_inputs).clone())
         self.register_buffer("lengthscale", one.expand(*outputs, 1, num_inputs).clone())
 
     @property
@@ -52,19 +60,24 @@ class LocalErrors(Module):
         return ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0)
 
     def learn(self, squares: Tensor, points: Tensor, lengthscale: Tensor) -> None:
-        """Take squared errors in predicted variances, where they are, and the lengthscale."""
-        for old, new in ((self.squares, squares), (self.points, points)):
-            old.copy_(new)
-        self.lengthscale.copy_(lengthscale)
+        """Take what is said above."""
+        self.squares, self.points, self.lengthscale = squares, points, lengthscale
 
     def forget(self) -> None:
-        """Take errors as expected."""
-        self.squares.fill_(1.0)
+        """Let variances be what kernels say."""
+        self.squares, self.points = self.squares[..., :0], self.points[:0]
 
     def of_outputs(self, numbers: list[int]) -> LocalErrors:
         """Those of some of several outputs."""
         taken = numbers if len(numbers) > 1 else numbers[0]
         squares, lengthscale = self.squares[..., taken, :], self.lengthscale[..., taken, :, :]
-        found = LocalErrors(squares.shape[:-1], squares.shape[-1], lengthscale.shape[-1])
-        found.to(squares).learn(squares, self.points, lengthscale)
+        found = LocalErrors(squares.shape[:-1], lengthscale.shape[-1])
+        found.learn(squares, self.points, lengthscale)
         return found
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        """Take errors, however many there are."""
+        for name in ("squares", "points"):
+            if f"{prefix}{name}" in state_dict:
+                setattr(self, name, torch.empty_like(state_dict[f"{prefix}{name}"]))
+        super()._load_from_state_dict(state_dict, prefix, *args)

@@ -39,7 +39,7 @@ from gpadjust.models.training_data import ArrayLike, check_noise, new_observatio
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
 _MANY = 5_000  # points, above which an exact fit takes long
 # What a state has as many of as there were draws, samples or points.
-_OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions")
+_OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions", "squares")
 
 
 class TermsGP(TermsModel, SingleTaskGP):
@@ -104,7 +104,7 @@ class TermsGP(TermsModel, SingleTaskGP):
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it anew
             self.outcome_transform = made.units
-        self.local_errors = LocalErrors(made.batch_shape, data.X.shape[-2], made.num_inputs)
+        self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
         set_initial_values(self, *made.given)
