@@ -27,6 +27,7 @@ EXPERIMENTS = {
     "optimisation": ("Optimisation", "trials of Bayesian optimisation in Ax, with and without f_p"),
     "misled": ("Misled", "Bayesian optimisation with a physics that misleads, or helps"),
     "choice": ("Choice", "a physics of no use, and what compare recommends"),
+    "kinks": ("Kinks", "next states of systems with dry friction, impacts, gaps and switches"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

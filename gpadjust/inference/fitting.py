@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from numbers import Integral
 from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, Unpack, overload
 
@@ -192,6 +193,8 @@ def fit(
             result = METHODS[method].run(model, search, **own)
             if isinstance(model, TermsGP):
                 model.was_fitted = True
+                model.eval()
+                model.learn_local_errors()
             return result
         finally:
             model.eval()
@@ -262,6 +265,7 @@ def _without_samples(model: Fittable) -> Iterator[None]:
         for name, parameter in model.named_parameters()
         if parameter.shape[:1] == (model.num_samples,)
     }
+    errors = deepcopy(model.local_errors)
     model.release_samples()
     with torch.no_grad():
         for basis in model.covar_module.modules():
@@ -272,4 +276,5 @@ def _without_samples(model: Fittable) -> Iterator[None]:
     except BaseException:
         model.release_samples()
         model.hold_samples(samples)
+        model.local_errors = errors
         raise

@@ -36,6 +36,8 @@ class SampledFunctions(Module):
         weights: w, ``k x batch_shape x (m) x D``.
         train: Where the data are, if there are any for an update.
         update: v, ``k x batch_shape x (m) x n``.
+        alpha: v of the mean, ``1 x batch_shape x (m) x n``, for functions to be farther from it
+            where the model's variances are larger than the kernels'.
     """
 
     shift: Tensor
@@ -43,6 +45,7 @@ class SampledFunctions(Module):
     weights: Tensor
     points: Tensor | None
     update: Tensor
+    alpha: Tensor | None
 
     def __init__(
         self,
@@ -51,6 +54,7 @@ class SampledFunctions(Module):
         weights: Tensor,
         train: Tensor | None = None,
         update: Tensor | None = None,
+        alpha: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.input_transform = deepcopy(getattr(model, "input_transform", None))
@@ -59,10 +63,11 @@ class SampledFunctions(Module):
         # Together, as the features read the kernels of the terms.
         self.sum, self.features = deepcopy((SumOfTerms(model.terms), features))
         self._reached = {term.name for term in model.covar_module.terms}
-        tensors = (*model.units(), weights, update, train)
-        names = ("shift", "scale", "weights", "update", "points")
+        tensors = (*model.units(), weights, update, train, alpha)
+        names = ("shift", "scale", "weights", "update", "points", "alpha")
         for name, tensor in zip(names, tensors, strict=True):
             self.register_buffer(name, tensor)
+        self.local_errors = None if alpha is None else deepcopy(model.local_errors)
         self.requires_grad_(False).eval()
         self._data: WeightedSum | None = None
 
@@ -79,7 +84,9 @@ class SampledFunctions(Module):
             weights = torch.cat(drawn, dim=-1).to(train)
             prior = cls(model, features, weights)._values(train, among_reached=True)
             update = conditioning.pathwise_update(prior)
-            return cls(model, features, weights, train, update)
+            errs = not model.local_errors.are_expected
+            alpha = conditioning.mean_cache.unsqueeze(0) if errs else None
+            return cls(model, features, weights, train, update, alpha)
 
     @classmethod
     def mean(cls, model: Any) -> SampledFunctions:
@@ -125,7 +132,13 @@ class SampledFunctions(Module):
         if self.points is not None:
             if self._data is None or self._data.x is not self.points:  # also after .to(device)
                 self._data = self.sum.at(self.points, self._reached)
-            total = total + _product(sought.cross(self._data, is_data=True), self.update, extra)
+            cross = sought.cross(self._data, is_data=True)
+            total = total + _product(cross, self.update, extra)
+            if self.local_errors is not None and self.alpha is not None:
+                means = sought.combine({term.name: term.mean for term, _ in sought.parts})
+                mean = means + _product(cross, self.alpha, extra)
+                x = inputs[..., : self.local_errors.points.shape[-1]]
+                total = mean + self.local_errors(x).sqrt() * (total - mean)
         return total
 
 

@@ -17,7 +17,7 @@ from gpadjust.models.terms_model import TermsModel
 from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, PhysicsWarning, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
-_FORMAT = 2
+_FORMAT = 3
 
 
 def save(model: TermsModel | StackedGP, path: str | Path) -> None:

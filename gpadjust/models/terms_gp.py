@@ -21,6 +21,7 @@ from torch import Size, Tensor
 import gpadjust
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
+from gpadjust.gp.kernels import Stationary
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -29,14 +30,16 @@ from gpadjust.models.hyperparameter_samples import (
     release_samples,
     transform_training_inputs,
 )
+from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import ModelOptions, TermBuilder
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
 
+_ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
 _MANY = 5_000  # points, above which an exact fit takes long
 # What a state has as many of as there were draws, samples or points.
-_OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions")
+_OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions", "squares")
 
 
 class TermsGP(TermsModel, SingleTaskGP):
@@ -101,6 +104,8 @@ class TermsGP(TermsModel, SingleTaskGP):
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it anew
             self.outcome_transform = made.units
+        self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
+        self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
         set_initial_values(self, *made.given)
         self.was_fitted = False
@@ -174,6 +179,40 @@ class TermsGP(TermsModel, SingleTaskGP):
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
         return self.train_targets - factors.alpha * variance, variance
 
+    @torch.no_grad()
+    def learn_local_errors(self) -> None:
+        """Let variances be larger near what was missed when it was left out.
+
+        Of a model that holds samples, with kernels in closed form and their lengthscales: as
+        :class:`~gpadjust.models.local_errors.LocalErrors` says. :func:`~gpadjust.fit` does this.
+        """
+        forms = [term.form for term in self.terms if term.kernel is not None]
+        lengthscales = [form.lengthscale for form in forms if isinstance(form, Stationary)]
+        if self.num_samples is None or not forms or len(lengthscales) < len(forms):
+            return
+        d, train = self.terms[0].num_inputs, self.train_inputs[0]
+        lengthscales = [each.expand(*each.shape[:-1], d) for each in lengthscales]
+        shortest = torch.stack(lengthscales).amin(0).log().mean(0).exp()
+        mean, variance = self.left_out()
+        spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
+        least = spread.square().nanmean(-1, keepdim=True)
+        squares = (self.train_targets - mean).square().mean(0) / variance.maximum(least).mean(0)
+        _, rows = self.measured_rows(train)
+        found = torch.ones_like(squares)
+        found[..., rows] = squares[..., rows].nan_to_num(nan=1.0, posinf=1.0)
+        points = train[..., :d].reshape(-1, *train.shape[-2:-1], d)[0]
+        self.local_errors.learn(found, points, shortest)
+
+    def widening(self, inputs: Tensor) -> Tensor | None:
+        """As the base class."""
+        if self.local_errors.are_expected:
+            return None
+        x = inputs[..., : self.terms[0].num_inputs]
+        if self.num_samples is not None:  # that differ in the parameters of the physics alone
+            x = x.narrow(MCMC_DIM - (self._num_outputs > 1), 0, 1)
+        wider: Tensor = self.local_errors(x)
+        return wider
+
     def data(self) -> dict[str, Tensor | None]:
         """As the base class."""
         self.eval()
@@ -230,6 +269,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         """
         if self.num_samples is not None:
             release_samples(self)
+            self.local_errors.forget()
 
     def check_can_be_sampled(self) -> None:
         """Raise a ValueError if the model cannot hold samples of its hyper-parameters."""
@@ -314,6 +354,8 @@ class TermsGP(TermsModel, SingleTaskGP):
             # BoTorch subsets the transformed inputs only, and a later fit starts from these.
             subset._original_train_inputs = original[..., idcs if len(idcs) > 1 else idcs[0], :, :]
         subset.output_names = tuple(self.output_names[i] for i in idcs)
+        if m > 1:
+            subset.local_errors = self.local_errors.of_outputs(idcs)
         match_parameters(subset)
         return subset
 

@@ -253,6 +253,9 @@ class TermsModel(PredictiveModel):
             shift, scale = self.units()
             mean, variance = mean * scale + shift, variance * scale.square()
             noise = self._noise(inputs, observation_noise)
+            wider = self.widening(inputs)
+            if wider is not None:
+                variance = variance * wider
             if noise is not None:  # given variances are in the user's units
                 unit = scale.square() if observation_noise is True else 1.0
                 variance = variance + noise * unit
@@ -271,10 +274,18 @@ class TermsModel(PredictiveModel):
         inputs = self.model_inputs(X)
         mean, covariance = self.conditioning().joint(self.at(inputs))
         noise = self._noise(inputs, observation_noise)
+        wider = self.widening(inputs)
+        if wider is not None:
+            root = wider.sqrt()
+            covariance = covariance * root.unsqueeze(-1) * root.unsqueeze(-2)
         if noise is not None:
             covariance = covariance + torch.diag_embed(noise.expand(mean.shape))
         shift, scale = self.units()
         return mean * scale + shift, covariance * scale.square().unsqueeze(-1)
+
+    def widening(self, inputs: Tensor) -> Tensor | None:
+        """What variances at transformed inputs are multiplied by, ``... x (m) x q``; None for 1."""
+        return None
 
     def draw_functions(self, num_functions: int, num_features: int) -> Module:
         """The functions of :meth:`sample_functions`, spread over samples of hyper-parameters."""
@@ -387,7 +398,8 @@ class TermsModel(PredictiveModel):
         if observation_noise is False:
             return None
         if observation_noise is True:
-            return self.observation_noise(inputs)
+            noise, wider = self.observation_noise(inputs), self.widening(inputs)
+            return noise if wider is None or self.noise.is_known else noise * wider
         given = given_noise(observation_noise, inputs.shape[-2], self.num_outputs)
         given = given if self.num_samples is None else given.unsqueeze(MCMC_DIM)
         return self.outputs_first(given)

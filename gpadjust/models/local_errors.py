@@ -1,0 +1,83 @@
+"""Where left-out observations are missed by more than predicted: larger variances nearby."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Size, Tensor
+from torch.nn import Module
+
+from gpadjust.gp.kernels import RBF, Stationary
+
+_EXPECTED = 1.0  # observations that err as predicted, beside those near a point
+
+
+class LocalErrors(Module):
+    r"""How much larger errors are near a point than a Gaussian process of stationary kernels says.
+
+    Where a function has a kink or a jump, as by dry friction or an impact, such a process is too
+    sure nearby. With :math:`z_i^2` the squared error of a left-out observation over its predicted
+    variance, variances at x are multiplied by
+
+    .. math:: \max\Big(1, \frac{a + \sum_i k(x, x_i) z_i^2}{a + \sum_i k(x, x_i)}\Big),
+
+    with an RBF kernel k of the shortest lengthscale of all terms, input by input, and a = 1. Locally
+    weighted conformal prediction (Lei et al. 2018) has such a scale, too, by a model of residuals;
+    here there is no guarantee, as the left-out observations had their say in the hyper-parameters.
+
+    Args:
+        outputs: The batch shape of a model with its outputs last, ``batch_shape x (m)``.
+        num_inputs: Number ``d`` of inputs that kernels read.
+
+    Attributes:
+        squares: Squared errors of ``n`` left-out observations, in predicted variances,
+            ``batch_shape x (m) x n``; none before a fit.
+        points: Where they were observed, ``n x d``.
+        lengthscale: That of k, ``batch_shape x (m) x 1 x d``.
+    """
+
+    squares: Tensor
+    points: Tensor
+    lengthscale: Tensor
+
+    def __init__(self, outputs: Size, num_inputs: int) -> None:
+        super().__init__()
+        one = torch.ones((), dtype=torch.float64)
+        self.register_buffer("squares", one.expand(*outputs, 0).clone())
+        self.register_buffer("points", one.expand(0, num_inputs).clone())
+        self.register_buffer("lengthscale", one.expand(*outputs, 1, num_inputs).clone())
+
+    @property
+    def are_expected(self) -> bool:
+        """Whether no error is larger than predicted, so that no variance is changed."""
+        return bool((self.squares <= 1).all())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """What variances are multiplied by at inputs ``... x (m) x q x d``, ``... x (m) x q``."""
+        near = Stationary(self.lengthscale, x.new_ones(()), RBF).covariance(x, self.points)
+        total = (near @ self.squares.unsqueeze(-1)).squeeze(-1)
+        return ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0)
+
+    def learn(self, squares: Tensor, points: Tensor, lengthscale: Tensor) -> None:
+        """Take what is said above."""
+        self.squares, self.points, self.lengthscale = squares, points, lengthscale
+
+    def forget(self) -> None:
+        """Let variances be what kernels say."""
+        self.squares, self.points = self.squares[..., :0], self.points[:0]
+
+    def of_outputs(self, numbers: list[int]) -> LocalErrors:
+        """Those of some of several outputs."""
+        taken = numbers if len(numbers) > 1 else numbers[0]
+        squares, lengthscale = self.squares[..., taken, :], self.lengthscale[..., taken, :, :]
+        found = LocalErrors(squares.shape[:-1], lengthscale.shape[-1])
+        found.learn(squares, self.points, lengthscale)
+        return found
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        """Take errors, however many there are."""
+        for name in ("squares", "points"):
+            if f"{prefix}{name}" in state_dict:
+                setattr(self, name, torch.empty_like(state_dict[f"{prefix}{name}"]))
+        super()._load_from_state_dict(state_dict, prefix, *args)
