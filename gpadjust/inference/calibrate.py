@@ -21,14 +21,16 @@ from gpadjust.models import TermsGP
 from gpadjust.models.parameters import Parameters
 
 _STEP = 1e-4  # of differences, in standard deviations of the prior
-_GUESSES = 255  # of the parameters, of which the best are started from
-_STARTS = 16
+_GUESSES = 512  # of the parameters, of which the best are started from
+_STARTS = 32
+_ROUNDS_OF_SEARCHES = 4  # at most
+_UNSEEN = 0.02  # of the posterior, near optima that searches have not come to
 _ITERATIONS = 60  # of least squares
 _ARRIVED = 1e-4  # decrease of a negative log density at which they stop
-_TRIED = 8  # of them, after which the best go on
-_KEPT = 6  # of these
-_WORSE = 12.0  # negative log density, beside the best, of an optimum that does not count
 _BESIDE = 0.5  # standard deviations, within which starts or optima are one
+_REACHED = 2.0  # standard deviations from an optimum, within which a search came to it
+_WORSE = 12.0  # negative log density, beside the best, of an optimum that does not count
+_KEPT = 12  # of these
 _STUCK = 1e8  # damping of a search that finds nothing better
 _SILENT = 1e-14  # the mean square of residuals, relative to that of the targets, that is none
 _AT_ONCE = 2**22  # numbers in the covariances of a batch
@@ -68,6 +70,21 @@ class LinearizedMean(NamedTuple):
     point: Tensor
     residual: Tensor
     slope: Tensor
+
+
+class Optima(NamedTuple):
+    """Where least squares came to.
+
+    Attributes:
+        points: Coordinates of all optima that count, the best first, ``k x p``.
+        variances: Mean squares of the residuals at the best, ``B``.
+        unseen: About the share of the posterior near others that no search came to: that of those
+            that one alone did (after Good and Turing), and of what is too many.
+    """
+
+    points: Tensor
+    variances: Tensor
+    unseen: float
 
 
 class Information(NamedTuple):
@@ -193,50 +210,64 @@ class Calibration:
             )
 
     @torch.no_grad()
-    def least_squares(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        r"""The parameters that fit best without any Gaussian process, by Levenberg and Marquardt.
+    def least_squares(self, generator: torch.Generator) -> Optima:
+        r"""The parameters that fit best without any Gaussian process.
 
         They minimise :math:`\sum_j \tfrac{n_j}{2} \log |r_j|^2 + \tfrac12 |z|^2`, with the variance
-        of each output's residuals at its best, from several starts at once.
+        of each output's residuals at its best. Where a single search came to an optimum, there are
+        likely others that none did, so that more begin.
+        """
+        guesses, found = self.point.unsqueeze(0), []  # where it works, as the model was built there
+        for _ in range(_ROUNDS_OF_SEARCHES):
+            others = _spread_normal((_GUESSES, guesses.shape[-1]), generator).to(guesses)
+            found.append(self._descend(torch.cat([guesses, others])))
+            points, values, variances, hessians = map(torch.cat, zip(*found, strict=True))
+            kept, square = _apart(points, values, hessians)
+            share = (values[kept].min() - values[kept]).exp()
+            alone = (square < _REACHED**2).sum(-1) == 1
+            alone[_KEPT:] = True
+            unseen = (share * alone).sum() / share.sum()
+            if unseen < _UNSEEN:
+                break
+            guesses = guesses[:0]
+        kept = kept[:_KEPT]
+        kept = kept[values[kept] < values[kept[0]] + _WORSE]
+        return Optima(points[kept], variances[kept[0]], unseen.item())
+
+    def _descend(self, guesses: Tensor) -> tuple[Tensor, ...]:
+        """Searches by Levenberg and Marquardt, which begin at the best of guesses ``... x p``.
 
         Returns:
-            Coordinates of all optima that count, the best first, ``k x p``, and the mean squares
-            of the residuals at the best, ``B``.
+            Where they came to, ``k x p``, what they minimise there, ``k``, variances of residuals,
+            ``k x B``, and about the second derivatives, ``k x p x p``.
         """
-        current = self.point.unsqueeze(0)  # where it works, as the model was built there
-        others = _spread_normal((_GUESSES, current.shape[-1]), generator).to(current)
-        guesses = torch.cat([current, others])
         values = self._misfit(guesses, self._residuals(guesses))[0]
         prior = torch.eye(guesses.shape[-1]).to(guesses).expand(len(guesses), -1, -1)
-        best = _apart(guesses, values, prior)[:_STARTS]
+        best = _apart(guesses, values, prior)[0][:_STARTS]
         near = self.linearized(guesses[best[values[best].isfinite()]])
         values, variances = self._misfit(near.point, near.residual)
         damping = values.new_full((len(values), 1, 1), 1e-3)
-        going = torch.ones_like(values, dtype=torch.bool)
-        for iteration in range(_ITERATIONS):
-            z, slope = near.point, near.slope / variances[..., None, None]
-            gradient = (slope.mT @ near.residual.unsqueeze(-1)).sum(-3).squeeze(-1) - z
-            hessian = (slope.mT @ near.slope).sum(-3) + torch.eye(z.shape[-1]).to(z)
-            damped = hessian + damping * torch.diag_embed(hessian.diagonal(dim1=-1, dim2=-2))
+        hessians = torch.empty_like(damping).expand(-1, *prior.shape[1:]).clone()
+        going = torch.arange(len(values), device=values.device)
+        for _ in range(_ITERATIONS):
+            z, slope = near.point[going], near.slope[going]
+            weighted = slope / variances[going][..., None, None]
+            residual = near.residual[going].unsqueeze(-1)
+            gradient = (weighted.mT @ residual).sum(-3).squeeze(-1) - z
+            hessian = hessians[going] = (weighted.mT @ slope).sum(-3) + prior[0]
+            damped = hessian + damping[going] * torch.diag_embed(hessian.diagonal(dim1=1, dim2=2))
             moved = self.linearized(z + torch.linalg.solve(damped, gradient))
             found, others = self._misfit(moved.point, moved.residual)
-            better = found < values
-            stops = better & (values - found < _ARRIVED)
-            going &= ~stops & (damping.flatten() < _STUCK)
-            pairs = zip((*moved, others, found), (*near, variances, values), strict=True)
-            *parts, variances, values = (_where(better, new, old) for new, old in pairs)
-            near = LinearizedMean(*parts)
-            damping = damping * torch.where(better, 0.2, 5.0)[:, None, None]
-            if iteration == _TRIED or not going.any():
-                kept = _apart(near.point, values, hessian)[:_KEPT]
-                near = LinearizedMean(*(part[kept] for part in near))
-                values, variances, damping = values[kept], variances[kept], damping[kept]
-                going = going[kept]
-            if not going.any():
+            better = found < values[going]
+            arrived = better & (values[going] - found < _ARRIVED)
+            damping[going] *= torch.where(better, 0.2, 5.0)[:, None, None]
+            pairs = zip((*near, variances, values), (*moved, others, found), strict=True)
+            for old, new in pairs:
+                old[going[better]] = new[better]
+            going = going[~arrived & (damping[going].flatten() < _STUCK)]
+            if not len(going):
                 break
-        kept = values.argsort()
-        kept = kept[values[kept] < values.min() + _WORSE]
-        return near.point[kept], variances[kept[0]]
+        return near.point, values, variances, hessians
 
     def information(self, near: LinearizedMean, chol: Tensor) -> Information:
         """What targets say whose covariances have the factors ``... x B x n x n``."""
@@ -506,6 +537,7 @@ class Calibrated(NamedTuple):
         marginalized: What they add to the distribution of the targets.
         result: What the fit of the hyper-parameters reached.
         places: All of their optima, that best fit first, ``k x p``.
+        unseen: As in :class:`Optima`.
     """
 
     calibration: Calibration
@@ -514,6 +546,7 @@ class Calibrated(NamedTuple):
     marginalized: MarginalizedParameters
     result: FitResult
     places: Tensor
+    unseen: float
 
 
 def calibrate(model: TermsGP, search: Search) -> Calibrated:
@@ -537,7 +570,7 @@ def calibrate(model: TermsGP, search: Search) -> Calibrated:
 
 def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
     model, generator = calibration.model, torch.Generator().manual_seed(search.seed)
-    (point, *others), variances = calibration.least_squares(generator)
+    (point, *others), variances, unseen = calibration.least_squares(generator)
     near = calibration.linearized(point)
     calibration.check_slope(near)
     independent = torch.diag_embed(variances.unsqueeze(-1).expand(near.residual.shape))
@@ -563,7 +596,7 @@ def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
     with torch.no_grad():
         others = [calibration.newton(calibration.linearized(z), covariance[0]) for z in others]
     places = torch.stack([point, *others])
-    return Calibrated(calibration, near, information, marginalized, result, places)
+    return Calibrated(calibration, near, information, marginalized, result, places, unseen)
 
 
 def calibrate_roughly(model: TermsGP, search: Search) -> Calibrated:
@@ -649,23 +682,21 @@ def _spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor
     return torch.special.ndtri(shares[order]).reshape(shape)
 
 
-def _apart(points: Tensor, values: Tensor, hessians: Tensor) -> Tensor:
-    """Numbers of points ``k x p`` that are not beside a better one, the best first.
+def _apart(points: Tensor, values: Tensor, hessians: Tensor) -> tuple[Tensor, Tensor]:
+    """Points ``k x p`` that are not beside a better one.
 
     Args:
         points: The points.
         values: Negative log densities there, ``k``; ``hessians`` theirs, ``k x p x p``.
+
+    Returns:
+        Their numbers, ``K``, the best first, and squares of their distances to all, ``K x k``.
     """
     order = values.argsort()
     away = points[order].unsqueeze(0) - points[order].unsqueeze(1)
     square = torch.einsum("ijp,ipq,ijq->ij", away, hessians[order], away)
-    beside = (square < _BESIDE**2).tril(-1).any(-1)  # of a later one by the metric of its own
-    return order[~beside]
-
-
-def _where(which: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Rows of the one or of the other."""
-    return torch.where(which.reshape(-1, *[1] * (new.dim() - 1)), new, old)
+    first = ~(square < _BESIDE**2).tril(-1).any(-1)
+    return order[first], square[first]
 
 
 def _or_infinite(values: Tensor) -> Tensor:

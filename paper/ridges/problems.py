@@ -183,6 +183,13 @@ PROBLEMS = {
         14,
         0.01,
     ),
+    "radar": Problem(
+        _alias,
+        {"size": Unknown(1.0, sd=0.3), "rate": Unknown(20.0, sd=12.0)},
+        ((0.0,), (3.0,)),
+        12,
+        0.4,
+    ),
     "alias": Problem(
         _alias,
         {"size": Unknown(1.0, sd=0.3), "rate": Unknown(6.0, sd=4.0)},
