@@ -82,12 +82,14 @@ class OrthogonalKernel(CompositeKernel):
         return torch.linalg.solve_triangular(self.factor(), cross.mT, upper=False).mT
 
     def factor(self) -> Tensor:
-        """The Cholesky factor of the covariance of what is zero, ``... x p x p``."""
+        """The Cholesky factor of the covariance of what is zero, ``... x p x p``; NaN if none."""
         own = to_dense(self.base_kernel(self.points, self.points))
         square = self.directions.mT @ own @ self.directions
         size = square.diagonal(dim1=-1, dim2=-2).mean(-1)[..., None, None]
         identity = torch.eye(square.shape[-1]).to(square)
-        return torch.linalg.cholesky(square + _ROUNDING * size.detach() * identity)
+        factor, failed = torch.linalg.cholesky_ex(square + _ROUNDING * size.detach() * identity)
+        # Variances beyond what numbers hold have no covariance, and so no density.
+        return factor.masked_fill(failed[..., None, None] > 0, torch.nan)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         """Take points and directions, however many there are."""

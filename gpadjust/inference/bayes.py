@@ -45,7 +45,8 @@ _RETURNED = 1024  # draws of parameters of a physics, at least
 _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
 _LEAST_SHARE = 0.05  # of the draws that count
-_LEAST_SIZE_OF_PARAMETERS = 16.0
+_LEAST_SIZE_OF_PARAMETERS = 64.0
+_UNSEEN = 0.05  # of the posterior of parameters, near optima that no search came to
 _OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what samples represent
 _EXCHANGES = 5  # rounds of better samples for the chosen ones
 
@@ -187,7 +188,8 @@ def _with_parameters(
     vectors, coordinates, own = draw_parameters(
         calibrated, parameters, vectors, log_densities, max(_RETURNED, num_samples), generator
     )
-    size, is_good = size.minimum(own), is_good & (own >= _LEAST_SIZE_OF_PARAMETERS)
+    is_good = is_good & (own >= _LEAST_SIZE_OF_PARAMETERS) & (calibrated.unseen < _UNSEEN)
+    size = size.minimum(own)
     rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
     held = parameters.to_raw(parameters.unflatten(vectors[rows]))
     held["input_transform.coordinates"] = coordinates[rows]

@@ -14,19 +14,23 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.gp import AppendedPhysics, OrthogonalKernel
 from gpadjust.gp.gaussian import cholesky, negative_log_likelihood
-from gpadjust.inference.annealing import raised, resampled
+from gpadjust.inference.annealing import Mixture, raised, resampled
 from gpadjust.inference.optimise import FitResult, Search, maximise
 from gpadjust.inference.targets import ByModules, MarginalizedParameters
 from gpadjust.models import TermsGP
 from gpadjust.models.parameters import Parameters
 
 _STEP = 1e-4  # of differences, in standard deviations of the prior
-_GUESSES = 255  # of the parameters, of which the best are started from
-_STARTS = 16
+_GUESSES = 512  # of the parameters, of which the best are started from
+_STARTS = 32
+_ROUNDS_OF_SEARCHES = 4  # at most
+_UNSEEN = 0.02  # of the posterior, near optima that searches have not come to
 _ITERATIONS = 60  # of least squares
 _ARRIVED = 1e-4  # decrease of a negative log density at which they stop
-_TRIED = 8  # of them, after which the best go on
-_KEPT = 6  # of these
+_BESIDE = 0.5  # standard deviations, within which starts or optima are one
+_REACHED = 2.0  # standard deviations from an optimum, within which a search came to it
+_WORSE = 12.0  # negative log density, beside the best, of an optimum that does not count
+_KEPT = 12  # of these
 _STUCK = 1e8  # damping of a search that finds nothing better
 _SILENT = 1e-14  # the mean square of residuals, relative to that of the targets, that is none
 _AT_ONCE = 2**22  # numbers in the covariances of a batch
@@ -42,6 +46,8 @@ _STEPS = 4  # from where the mean is linear to a draw
 _POLISHES = 3  # steps after these
 _TINY = 1e-300
 _SOLVED = 1e-2  # standard deviations that a draw may be from its aim
+_FOLDED = 0.05  # of the draws without a solution, above which others are taken
+_WIDER = 1.5  # than the posterior of a linear mean, these
 _UNTOLD = 0.15  # of the prior's precision: what else is known of a direction is next to nothing
 _TAKES_PART = 0.3  # cosine of a parameter and such a direction
 _FAR = 3.0  # standard deviations of the prior
@@ -64,6 +70,21 @@ class LinearizedMean(NamedTuple):
     point: Tensor
     residual: Tensor
     slope: Tensor
+
+
+class Optima(NamedTuple):
+    """Where least squares came to.
+
+    Attributes:
+        points: Coordinates of all optima that count, the best first, ``k x p``.
+        variances: Mean squares of the residuals at the best, ``B``.
+        unseen: About the share of the posterior near others that no search came to: that of those
+            that one alone did (after Good and Turing), and of what is too many.
+    """
+
+    points: Tensor
+    variances: Tensor
+    unseen: float
 
 
 class Information(NamedTuple):
@@ -189,51 +210,67 @@ class Calibration:
             )
 
     @torch.no_grad()
-    def least_squares(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        r"""The parameters that fit best without any Gaussian process, by Levenberg and Marquardt.
+    def least_squares(self, generator: torch.Generator) -> Optima:
+        r"""The parameters that fit best without any Gaussian process.
 
         They minimise :math:`\sum_j \tfrac{n_j}{2} \log |r_j|^2 + \tfrac12 |z|^2`, with the variance
-        of each output's residuals at its best, from several starts at once.
+        of each output's residuals at its best. Where a single search came to an optimum, there are
+        likely others that none did, so that more begin.
+        """
+        guesses, found = self.point.unsqueeze(0), []  # where it works, as the model was built there
+        for _ in range(_ROUNDS_OF_SEARCHES):
+            others = _spread_normal((_GUESSES, guesses.shape[-1]), generator).to(guesses)
+            found.append(self._descend(torch.cat([guesses, others])))
+            points, values, variances, hessians = map(torch.cat, zip(*found, strict=True))
+            kept, square = _apart(points, values, hessians)
+            share = (values[kept].min() - values[kept]).exp()
+            alone = (square < _REACHED**2).sum(-1) == 1
+            alone[_KEPT:] = True
+            unseen = (share * alone).sum() / share.sum()
+            if unseen < _UNSEEN:
+                break
+            guesses = guesses[:0]
+        kept = kept[:_KEPT]
+        kept = kept[values[kept] < values[kept[0]] + _WORSE]
+        return Optima(points[kept], variances[kept[0]], unseen.item())
+
+    def _descend(self, guesses: Tensor) -> tuple[Tensor, ...]:
+        """Searches by Levenberg and Marquardt, which begin at the best of guesses ``... x p``.
 
         Returns:
-            Their coordinates, ``p``, and the mean squares of the residuals, ``B``.
+            Where they came to, ``k x p``, what they minimise there, ``k``, variances of residuals,
+            ``k x B``, and about the second derivatives, ``k x p x p``.
         """
-        current = self.point.unsqueeze(0)  # where it works, as the model was built there
-        others = _spread_normal((_GUESSES, current.shape[-1]), generator).to(current)
-        guesses = torch.cat([current, others])
         values = self._misfit(guesses, self._residuals(guesses))[0]
-        best = torch.cat([values.new_zeros(1).long(), values[1:].argsort()[: _STARTS - 1] + 1])
+        prior = torch.eye(guesses.shape[-1]).to(guesses).expand(len(guesses), -1, -1)
+        best = _apart(guesses, values, prior)[0][:_STARTS]
         near = self.linearized(guesses[best[values[best].isfinite()]])
         values, variances = self._misfit(near.point, near.residual)
         damping = values.new_full((len(values), 1, 1), 1e-3)
-        going = torch.ones_like(values, dtype=torch.bool)
-        for iteration in range(_ITERATIONS):
-            if iteration == _TRIED:
-                best = values.argsort()[:_KEPT]
-                near = LinearizedMean(*(part[best] for part in near))
-                values, variances = values[best], variances[best]
-                damping, going = damping[best], going[best]
-            z, slope = near.point, near.slope / variances[..., None, None]
-            gradient = (slope.mT @ near.residual.unsqueeze(-1)).sum(-3).squeeze(-1) - z
-            hessian = (slope.mT @ near.slope).sum(-3) + torch.eye(z.shape[-1]).to(z)
-            hessian = hessian + damping * torch.diag_embed(hessian.diagonal(dim1=-1, dim2=-2))
-            moved = self.linearized(z + torch.linalg.solve(hessian, gradient))
+        hessians = torch.empty_like(damping).expand(-1, *prior.shape[1:]).clone()
+        going = torch.arange(len(values), device=values.device)
+        for _ in range(_ITERATIONS):
+            z, slope = near.point[going], near.slope[going]
+            weighted = slope / variances[going][..., None, None]
+            residual = near.residual[going].unsqueeze(-1)
+            gradient = (weighted.mT @ residual).sum(-3).squeeze(-1) - z
+            hessian = hessians[going] = (weighted.mT @ slope).sum(-3) + prior[0]
+            damped = hessian + damping[going] * torch.diag_embed(hessian.diagonal(dim1=1, dim2=2))
+            moved = self.linearized(z + torch.linalg.solve(damped, gradient))
             found, others = self._misfit(moved.point, moved.residual)
-            better = found < values
-            stops = better & (values - found < _ARRIVED)
-            going &= ~stops & (damping.flatten() < _STUCK)
-            pairs = zip((*moved, others, found), (*near, variances, values), strict=True)
-            *parts, variances, values = (_where(better, new, old) for new, old in pairs)
-            near = LinearizedMean(*parts)
-            damping = damping * torch.where(better, 0.2, 5.0)[:, None, None]
-            if not going.any():
+            better = found < values[going]
+            arrived = better & (values[going] - found < _ARRIVED)
+            damping[going] *= torch.where(better, 0.2, 5.0)[:, None, None]
+            pairs = zip((*near, variances, values), (*moved, others, found), strict=True)
+            for old, new in pairs:
+                old[going[better]] = new[better]
+            going = going[~arrived & (damping[going].flatten() < _STUCK)]
+            if not len(going):
                 break
-        i = values.argmin()
-        return near.point[i], variances[i]
+        return near.point, values, variances, hessians
 
-    def information(self, near: LinearizedMean, covariance: Tensor) -> Information:
-        """What targets say of covariances ``... x B x n x n``."""
-        chol = self._factor(covariance)
+    def information(self, near: LinearizedMean, chol: Tensor) -> Information:
+        """What targets say whose covariances have the factors ``... x B x n x n``."""
         # What the slopes times the parameters are to make.
         target = near.residual.unsqueeze(-1) + near.slope @ near.point[..., None, :, None]
         columns = torch.cat([near.slope, target], dim=-1)
@@ -242,6 +279,10 @@ class Calibration:
         )
         slope, target = white[..., :-1], white[..., -1:]
         return Information(slope.mT @ slope, (slope.mT @ target).squeeze(-1))
+
+    def factor(self, covariance: Tensor) -> Tensor:
+        """Factors of covariances of the targets, ``... x n x n``."""
+        return cholesky(covariance.clone(), None if self._all else self._observed)[0]
 
     def marginalized(
         self, near: LinearizedMean, information: Information
@@ -273,15 +314,16 @@ class Calibration:
     @torch.no_grad()
     def newton(self, near: LinearizedMean, covariance: Tensor) -> Tensor:
         """The most likely parameters, ``p``, at a covariance ``B x n x n``: a step of Newton's."""
-        target, _ = self.information(near, covariance).posterior()
+        chol = self.factor(covariance)
+        target, _ = self.information(near, chol).posterior()
         shares = torch.tensor([1.0, 0.5, 0.25, 0.1, 0.0]).to(target).unsqueeze(-1)
         points = near.point + shares * (target - near.point)
-        return points[self._at_covariance(points, self._factor(covariance)).argmin()]
+        return points[self._at_covariance(points, chol).argmin()]
 
     @torch.no_grad()
     def draw(
         self,
-        near: LinearizedMean,
+        places: Tensor,
         parameters: Parameters,
         vectors: Tensor,
         log_densities: Tensor,
@@ -291,9 +333,10 @@ class Calibration:
         """Draw parameters and hyper-parameters jointly, by importance sampling.
 
         Parameters are drawn for each of some vectors (:meth:`_randomized`), and the pairs weighted.
+        Where they have several optima, each draws what is nearer to it than to the others.
 
         Args:
-            near: The prior mean near the most likely parameters.
+            places: Optima of the parameters, ``k x p``.
             parameters: The learnable hyper-parameters.
             vectors: Vectors of them, ``H x B x q``.
             log_densities: Of what these were drawn from, less that of their priors, ``H``.
@@ -304,18 +347,25 @@ class Calibration:
             Equally likely pairs, numbers of the vectors, ``K``, and coordinates, ``K x p``; and the
             effective sample size.
         """
-        _, covariance = self.moments(parameters, vectors, near.point.unsqueeze(0))
-        chol = self._factor(covariance)
-        density = self._density_given(parameters, vectors, chol)
-        found, log_weights = near.point[None][:0], log_densities[:0]
+        each, straight = [], [False] * len(places)
+        for place in places:
+            chol = self.factor(self.moments(parameters, vectors, place.unsqueeze(0))[1])
+            density = self._density_given(parameters, vectors, chol)
+            each.append((self.linearized(place), chol, density))
+        found, log_weights = places[:0], log_densities[:0]
         size = log_densities.new_zeros(())
         most = max(_ROUND, min(_MOST_DRAWS, _ROWS // len(self._raw)))
         while len(found) < most:
-            z, log_q = self._randomized(near, chol, _ROUND, generator)
-            log_w = -density(z.unflatten(0, (-1, len(vectors)))) - log_densities
-            found = torch.cat([found, z])
-            log_w = (log_w.flatten() - log_q).nan_to_num(nan=-math.inf, posinf=-math.inf)
-            log_weights = torch.cat([log_weights, log_w])
+            for i, (near, chol, density) in enumerate(each):
+                if not straight[i]:
+                    z, log_q = self._randomized(near, chol, _ROUND, generator)
+                    straight[i] = bool((log_q == math.inf).double().mean() > _FOLDED)
+                if straight[i]:
+                    z, log_q = self._straight(near, chol, _ROUND, generator)
+                log_w = -density(z.unflatten(0, (-1, len(vectors)))) - log_densities
+                log_w = (log_w.flatten() - log_q).nan_to_num(nan=-math.inf, posinf=-math.inf)
+                log_w[torch.cdist(z, places).argmin(-1) != i] = -math.inf
+                found, log_weights = torch.cat([found, z]), torch.cat([log_weights, log_w])
             if not log_weights.isfinite().any():
                 continue
             size = log_weights.softmax(0).square().sum().reciprocal()
@@ -397,7 +447,20 @@ class Calibration:
         value = value_of(found, around.residual, every)
         log_q = torch.linalg.slogdet(by_z).logabsdet - 0.5 * value.square().sum(-1)
         log_q[unsolved] = math.inf
-        return found, log_q
+        return found, log_q - 0.5 * p * math.log(2 * math.pi)
+
+    def _straight(
+        self, near: LinearizedMean, chol: Tensor, number: int, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """As :meth:`_randomized`, of Student's t about the posterior of a linear mean.
+
+        Where a mean folds, randomised equations have no solution beyond the fold.
+        """
+        mean, factor = self.information(near, chol).posterior()
+        root = _WIDER * torch.linalg.cholesky(torch.cholesky_inverse(factor))
+        student = Mixture(mean[None], torch.ones_like(mean[None, :, 0]), root[None])
+        z = student.sample(number // len(mean), generator)
+        return z.flatten(0, 1), -student.value_and_gradient(z)[0].flatten()
 
     def _density_given(
         self, parameters: Parameters, vectors: Tensor, chol: Tensor
@@ -458,9 +521,6 @@ class Calibration:
         value = (0.5 * count * variances.log()).sum(-1) + 0.5 * z.square().sum(-1)
         return _or_infinite(value), variances
 
-    def _factor(self, covariance: Tensor) -> Tensor:
-        return cholesky(covariance.clone(), None if self._all else self._observed)[0]
-
     def _text(self, values: Tensor) -> str:
         """Parameters ``p`` in words."""
         named = zip(self.unknowns.names, values.tolist(), strict=True)
@@ -476,6 +536,8 @@ class Calibrated(NamedTuple):
         information: What the targets of each output say of them.
         marginalized: What they add to the distribution of the targets.
         result: What the fit of the hyper-parameters reached.
+        places: All of their optima, that best fit first, ``k x p``.
+        unseen: As in :class:`Optima`.
     """
 
     calibration: Calibration
@@ -483,6 +545,8 @@ class Calibrated(NamedTuple):
     information: Information
     marginalized: MarginalizedParameters
     result: FitResult
+    places: Tensor
+    unseen: float
 
 
 def calibrate(model: TermsGP, search: Search) -> Calibrated:
@@ -506,11 +570,11 @@ def calibrate(model: TermsGP, search: Search) -> Calibrated:
 
 def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
     model, generator = calibration.model, torch.Generator().manual_seed(search.seed)
-    point, variances = calibration.least_squares(generator)
+    (point, *others), variances, unseen = calibration.least_squares(generator)
     near = calibration.linearized(point)
     calibration.check_slope(near)
     independent = torch.diag_embed(variances.unsqueeze(-1).expand(near.residual.shape))
-    information = calibration.information(near, independent)
+    information = calibration.information(near, calibration.factor(independent))
     for _ in range(_ROUNDS):
         calibration.move_to(point)
         result = maximise(model, search, calibration.marginalized(near, information))
@@ -519,16 +583,20 @@ def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
         parameters = Parameters(model)
         _, covariance = calibration.moments(parameters, parameters.current(), point.unsqueeze(0))
         target = calibration.newton(near, covariance[0])
-        _, chol = calibration.information(near, covariance[0]).posterior()
+        factor = calibration.factor(covariance[0])
+        _, chol = calibration.information(near, factor).posterior()
         moved = (chol.mT @ (target - point)).norm()
         point, near = target, calibration.linearized(target)
-        information = calibration.information(near, covariance[0])
+        information = calibration.information(near, factor)
         if moved < _SETTLED * len(point) ** 0.5:
             break
     calibration.move_to(point)
     model.input_transform.remember(point.unsqueeze(0))
     marginalized = calibration.marginalized(near, information)
-    return Calibrated(calibration, near, information, marginalized, result)
+    with torch.no_grad():
+        others = [calibration.newton(calibration.linearized(z), covariance[0]) for z in others]
+    places = torch.stack([point, *others])
+    return Calibrated(calibration, near, information, marginalized, result, places, unseen)
 
 
 def calibrate_roughly(model: TermsGP, search: Search) -> Calibrated:
@@ -569,7 +637,7 @@ def draw_parameters(
     count = 2 ** int(math.log2(min(count, len(vectors))))  # a round of draws has them equally often
     rows = torch.linspace(0, len(vectors) - 1, count).round().long()
     which, coordinates, size = calibrated.calibration.draw(
-        calibrated.near, parameters, vectors[rows], log_densities[rows], number, generator
+        calibrated.places, parameters, vectors[rows], log_densities[rows], number, generator
     )
     return vectors[rows][which], coordinates, size
 
@@ -614,9 +682,21 @@ def _spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor
     return torch.special.ndtri(shares[order]).reshape(shape)
 
 
-def _where(which: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Rows of the one or of the other."""
-    return torch.where(which.reshape(-1, *[1] * (new.dim() - 1)), new, old)
+def _apart(points: Tensor, values: Tensor, hessians: Tensor) -> tuple[Tensor, Tensor]:
+    """Points ``k x p`` that are not beside a better one.
+
+    Args:
+        points: The points.
+        values: Negative log densities there, ``k``; ``hessians`` theirs, ``k x p x p``.
+
+    Returns:
+        Their numbers, ``K``, the best first, and squares of their distances to all, ``K x k``.
+    """
+    order = values.argsort()
+    away = points[order].unsqueeze(0) - points[order].unsqueeze(1)
+    square = torch.einsum("ijp,ipq,ijq->ij", away, hessians[order], away)
+    first = ~(square < _BESIDE**2).tril(-1).any(-1)
+    return order[first], square[first]
 
 
 def _or_infinite(values: Tensor) -> Tensor:
