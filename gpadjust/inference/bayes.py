@@ -16,7 +16,7 @@ from gpadjust.inference import annealing
 from gpadjust.inference.annealing import Mixture, Particles
 from gpadjust.inference.calibrate import calibrate_roughly, draw_parameters, warn_of_parameters
 from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
-from gpadjust.inference.relevance import cost_of_constant, mixed, probability, without_physics
+from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.models import TermsGP, TermsModel
 from gpadjust.models.parameters import Parameters, register_priors, shared_parameters
@@ -102,12 +102,13 @@ class _Draws(NamedTuple):
         """Posterior probability of this model beside one without the physics, ``B``."""
         own, other = self.particles, rival.particles
         both = (own.power == 1) & (other.power == 1)  # or evidences are those on the way
-        parameters = self.target.parameters
+        parameters, targets = self.target.parameters, self.target.targets
         mean, *_ = self.target.distribution(parameters.unflatten(parameters.current()))
+        spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
         return probability(
             own.log_evidence.where(both, self.laplace),
             other.log_evidence.where(both, rival.laplace),
-            cost_of_constant(self.target.targets, mean.squeeze(0)),
+            (targets - mean.squeeze(0)).nanmean(-1).abs() / spread,
         )
 
     def representative(self, number: int) -> dict[str, Tensor]:

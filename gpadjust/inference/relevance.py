@@ -64,23 +64,20 @@ def _of_scaled(model: TermsGP) -> list[Hyperparameter]:
     return [row for row in rows if row.kind != "other"]
 
 
-def probability(log_evidence: Tensor, without: Tensor, constant: Tensor | float = 0.0) -> Tensor:
+def probability(log_evidence: Tensor, without: Tensor, away: Tensor | float = 0.0) -> Tensor:
     """Posterior probability that the physics is of use, of log evidences with and without it.
 
-    A model without physics has for free the ``constant`` that the other has to pay for, in nats.
+    The model without has a constant for free. The other draws it from a distribution as wide as
+    the constant itself, which costs the logarithm of that over the width of what varies.
+
+    Args:
+        log_evidence: Of the model with its physics.
+        without: Of that without.
+        away: The constant between targets and their prior mean, in spreads of the targets. Below
+            one it is not told from what varies.
     """
+    constant = torch.as_tensor(away).nan_to_num(nan=1.0, posinf=1.0).clamp_min(1.0).log()
     return (log_evidence - without + constant + math.log(1 / _DOUBT - 1)).sigmoid()
-
-
-def cost_of_constant(targets: Tensor, mean: Tensor) -> Tensor:
-    """What a constant between targets and their prior mean, ``... x n``, costs a model, in nats.
-
-    It is drawn from a distribution as wide as itself, in place of one that is as wide as the
-    targets vary. Up to that it is not told from what varies, and costs nothing.
-    """
-    away = (targets - mean).nanmean(-1).abs()
-    spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
-    return (away / spread).where((spread > 0) & (away > spread), torch.ones_like(away)).log()
 
 
 @torch.no_grad()

@@ -109,6 +109,7 @@ def test_a_warning_when_the_draws_are_not_of_the_posterior(XY, monkeypatch):
     assert not again.converged.any()
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # of one of six
 @pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
     # A quadratic function, of which the physics has another one; eleven points in two dimensions.

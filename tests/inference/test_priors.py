@@ -1,6 +1,5 @@
 """The default priors, and densities of priors in an objective."""
 
-
 import pytest
 import torch
 from gpytorch.kernels import RBFKernel, ScaleKernel

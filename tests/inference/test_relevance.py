@@ -11,12 +11,7 @@ from gpytorch.priors import LogNormalPrior
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit, load, save
 from gpadjust.inference import FitResult, register_priors
-from gpadjust.inference.relevance import (
-    cost_of_constant,
-    mixed,
-    probability,
-    without_physics,
-)
+from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.validation import trust
@@ -221,12 +216,10 @@ class TestConstant:
     """A constant between physics and targets, which a model without physics has for free."""
 
     def test_its_cost(self):
-        targets = torch.tensor([[0.0, 2.0, math.nan], [5.0, 7.0, 6.0]], dtype=torch.float64)
-        spread = torch.tensor([1.0, math.sqrt(2 / 3)], dtype=torch.float64)
-        mean = torch.tensor([[-9.0, -7.0, 0.0], [5.5, 7.0, 6.0]], dtype=torch.float64)
-        expected = torch.stack([(9 / spread[0]).log(), spread[1] * 0])
-        torch.testing.assert_close(cost_of_constant(targets, mean), expected)
-        assert cost_of_constant(torch.ones(3), torch.zeros(3)) == 0
+        zero = torch.zeros(5)
+        away = torch.tensor([0.0, 1.0, 10.0, torch.inf, torch.nan])
+        expected = (torch.tensor([1.0, 1.0, 10.0, 1.0, 1.0]) * 4).log().sigmoid()
+        torch.testing.assert_close(probability(zero, zero, away), expected)
 
     @pytest.mark.parametrize("offset", [0.0, 1e3, 1e5])
     def test_it_does_not_count_against_the_physics(self, data, offset):
