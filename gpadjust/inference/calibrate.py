@@ -42,7 +42,7 @@ _COUNTED = 64  # draws, at least, by weights that are tempered if need be
 _ROUND = 256  # draws at once
 _MOST_DRAWS = 2048  # about each optimum
 _MOVED = 512  # draws, where these are not enough
-_MOVES = 20  # of each, for each parameter
+_MOVES = 10  # of each, for each parameter, and as many again
 _JUMPS = 0.1  # of these by a whole difference
 _JITTER = 1e-4
 _ROWS = 1_000_000  # draws times observations
@@ -384,9 +384,9 @@ class Calibration:
         rows = resampled(weights, number + number % 2 if enough else _MOVED, generator)[:, 0]
         which, found = rows % count, found[rows]
         if not enough:
-            which, found = self._moved(which, found, density, count, generator)
-            none = found.new_zeros(len(found), 1)
-            size = Particles(found.unsqueeze(1), none, none[0], none[0]).effective_size()[0]
+            which, before = self._moved(which, found, density, count, generator)
+            which, found = self._moved(which, before.clone(), density, count, generator)
+            size = _size_of_moved(before, found)
             again = torch.arange(number, device=rows.device) % len(found)
             which, found = which[again], found[again]
         return which[:number], found[:number], size
@@ -738,6 +738,17 @@ def _spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor
     shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
     order = torch.randperm(number, generator=generator)
     return torch.special.ndtri(shares[order]).reshape(shape)
+
+
+def _size_of_moved(before: Tensor, after: Tensor) -> Tensor:
+    """About the effective size of draws ``N x p`` that moved, by how much they remember."""
+    one, two = before - before.mean(0), after - after.mean(0)
+    tiny = torch.finfo(one.dtype).tiny
+    memory = (one * two).mean(0) / (one.var(0) * two.var(0)).sqrt().clamp_min(tiny)
+    memory = memory.amax().clamp(0, 1)
+    none = after.new_zeros(len(after), 1)
+    size = Particles(after.unsqueeze(1), none, none[0], none[0]).effective_size()[0]
+    return size * (1 - memory) / (1 + memory)
 
 
 def _apart(points: Tensor, values: Tensor, hessians: Tensor) -> tuple[Tensor, Tensor]:
