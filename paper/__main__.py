@@ -28,6 +28,7 @@ EXPERIMENTS = {
     "misled": ("Misled", "Bayesian optimisation with a physics that misleads, or helps"),
     "choice": ("Choice", "a physics of no use, and what compare recommends"),
     "kinks": ("Kinks", "next states of systems with dry friction, impacts, gaps and switches"),
+    "ridges": ("Ridges", "intervals of parameters on a ridge, or of which several values do"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
@@ -14,7 +14,7 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.gp import AppendedPhysics, OrthogonalKernel
 from gpadjust.gp.gaussian import cholesky, negative_log_likelihood
-from gpadjust.inference.annealing import Mixture, raised, resampled
+from gpadjust.inference.annealing import Mixture, Particles, raised, resampled
 from gpadjust.inference.optimise import FitResult, Search, maximise
 from gpadjust.inference.targets import ByModules, MarginalizedParameters
 from gpadjust.models import TermsGP
@@ -40,7 +40,11 @@ _GIVEN = {128: 256, 512: 64, math.inf: 16}  # hyper-parameters of up to so many 
 _ENOUGH = 512  # effective sample size of the parameters that is enough
 _COUNTED = 64  # draws, at least, by weights that are tempered if need be
 _ROUND = 256  # draws at once
-_MOST_DRAWS = 8192
+_MOST_DRAWS = 2048  # about each optimum
+_MOVED = 512  # draws, where these are not enough
+_MOVES = 10  # of each, for each parameter, and as many again
+_JUMPS = 0.1  # of these by a whole difference
+_JITTER = 1e-4
 _ROWS = 1_000_000  # draws times observations
 _STEPS = 4  # from where the mean is linear to a draw
 _POLISHES = 3  # steps after these
@@ -347,23 +351,23 @@ class Calibration:
             Equally likely pairs, numbers of the vectors, ``K``, and coordinates, ``K x p``; and the
             effective sample size.
         """
-        each, straight = [], [False] * len(places)
+        count, each, straight = len(vectors), [], [False] * len(places)
         for place in places:
             chol = self.factor(self.moments(parameters, vectors, place.unsqueeze(0))[1])
-            density = self._density_given(parameters, vectors, chol)
-            each.append((self.linearized(place), chol, density))
+            each.append((self.linearized(place), chol))
+        density = self._density_of_pairs(parameters, vectors, each[0][1], log_densities)
         found, log_weights = places[:0], log_densities[:0]
         size = log_densities.new_zeros(())
         most = max(_ROUND, min(_MOST_DRAWS, _ROWS // len(self._raw)))
-        while len(found) < most:
-            for i, (near, chol, density) in enumerate(each):
+        while len(found) < most * len(places):
+            for i, (near, chol) in enumerate(each):
                 if not straight[i]:
                     z, log_q = self._randomized(near, chol, _ROUND, generator)
                     straight[i] = bool((log_q == math.inf).double().mean() > _FOLDED)
                 if straight[i]:
                     z, log_q = self._straight(near, chol, _ROUND, generator)
-                log_w = -density(z.unflatten(0, (-1, len(vectors)))) - log_densities
-                log_w = (log_w.flatten() - log_q).nan_to_num(nan=-math.inf, posinf=-math.inf)
+                log_w = -density(z, torch.arange(_ROUND, device=z.device) % count) - log_q
+                log_w = log_w.nan_to_num(nan=-math.inf, posinf=-math.inf)
                 log_w[torch.cdist(z, places).argmin(-1) != i] = -math.inf
                 found, log_weights = torch.cat([found, z]), torch.cat([log_weights, log_w])
             if not log_weights.isfinite().any():
@@ -373,11 +377,63 @@ class Calibration:
                 break
         if not log_weights.isfinite().any():
             raise FloatingPointError("The density of the parameters is zero at all draws.")
-        # Weights are tempered as far as few would have them all.
+        # Weights are tempered as far as few would have them all, and draws then moved.
         least, start = min(_COUNTED, len(found) / 4), log_weights.new_zeros(1)
         _, weights, _ = raised(log_weights.unsqueeze(1), start, least)
-        rows = resampled(weights, number + number % 2, generator)[:number, 0]
-        return rows % len(vectors), found[rows], size
+        enough = bool(size >= _ENOUGH)
+        rows = resampled(weights, number + number % 2 if enough else _MOVED, generator)[:, 0]
+        which, found = rows % count, found[rows]
+        if not enough:
+            which, before = self._moved(which, found, density, count, generator)
+            which, found = self._moved(which, before.clone(), density, count, generator)
+            size = _size_of_moved(before, found)
+            again = torch.arange(number, device=rows.device) % len(found)
+            which, found = which[again], found[again]
+        return which[:number], found[:number], size
+
+    def _moved(
+        self,
+        which: Tensor,
+        z: Tensor,
+        density: Callable[[Tensor, Tensor], Tensor],
+        count: int,
+        generator: torch.Generator,
+    ) -> tuple[Tensor, Tensor]:
+        """Move pairs by Metropolis' rule, so that they become draws of a density.
+
+        Parameters go by differences of others (ter Braak 2006), each fourth time hyper-parameters
+        by the draws of them. Pairs of even and odd number tell nothing of each other.
+
+        Args:
+            which: Numbers of vectors of hyper-parameters, ``N``.
+            z: Coordinates, ``N x p``.
+            density: Its negative logarithm, ``N``, at coordinates and numbers.
+            count: How many vectors there are.
+            generator: Source of randomness.
+        """
+        n, p = z.shape
+        value, quarter = density(z, which), n // 4
+        every = torch.arange(n).view(quarter, 4)
+        options: Any = {"generator": generator, "dtype": z.dtype}
+        for step in range(_MOVES * p):
+            for own, others in ((every[:, :2], every[:, 2:]), (every[:, 2:], every[:, :2])):
+                one, two = torch.randint(quarter, (2, quarter, 2), generator=generator)
+                pair = [others.gather(0, row).flatten() for row in (one, two)]
+                rows, size = own.flatten(), 2 * quarter
+                new, vectors = z[rows], which[rows]
+                if step % 4 == 3:
+                    vectors = torch.randint(count, (size,), generator=generator).to(which)
+                else:
+                    length = 2.38 / math.sqrt(2 * p) * (0.2 + torch.rand(size, 1, **options))
+                    length[torch.rand(size, **options) < _JUMPS] = 1.0
+                    jitter = _JITTER * torch.randn(size, p, **options)
+                    new = new + length.to(z) * (z[pair[0]] - z[pair[1]]) + jitter.to(z)
+                found = density(new, vectors)
+                chance = (value[rows] - found).exp().nan_to_num(nan=0.0)
+                taken = torch.rand(size, **options).to(z) < chance
+                kept = rows.to(z.device)[taken]
+                z[kept], which[kept], value[kept] = new[taken], vectors[taken], found[taken]
+        return which, z
 
     def _randomized(
         self, near: LinearizedMean, chol: Tensor, number: int, generator: torch.Generator
@@ -462,24 +518,26 @@ class Calibration:
         z = student.sample(number // len(mean), generator)
         return z.flatten(0, 1), -student.value_and_gradient(z)[0].flatten()
 
-    def _density_given(
-        self, parameters: Parameters, vectors: Tensor, chol: Tensor
-    ) -> Callable[[Tensor], Tensor]:
-        """Negative log densities ``k x H`` of targets and parameters ``k x H x p``.
+    def _density_of_pairs(
+        self, parameters: Parameters, vectors: Tensor, chol: Tensor, log_densities: Tensor
+    ) -> Callable[[Tensor, Tensor], Tensor]:
+        """Negative log densities ``N`` of coordinates ``N x p`` and numbers of vectors ``N``.
 
-        They are given each of the ``H`` vectors of hyper-parameters, of which ``chol`` is the
-        factor of the targets' covariance, up to a constant.
+        Less those that the ``H`` vectors were drawn from. ``chol`` has the factors of the targets'
+        covariance at these, if parameters do not move it.
         """
-        if not self._moves_covariance:
-            log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum((-1, -2))
-            return lambda z: self._at_covariance(z, chol) + log_det
         at_once = max(1, _AT_ONCE // chol[0].numel())
+        log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum((-1, -2))
 
-        def density(z: Tensor) -> Tensor:
-            flat, which = z.flatten(0, 1), torch.arange(len(vectors)).repeat(len(z))
-            parts = zip(flat.split(at_once), which.split(at_once), strict=True)
-            found = [self._density(part, parameters, vectors[rows]) for part, rows in parts]
-            return torch.cat(found).view(z.shape[:2])
+        def density(z: Tensor, which: Tensor) -> Tensor:
+            found = []
+            for part, rows in zip(z.split(at_once), which.split(at_once), strict=True):
+                if self._moves_covariance:
+                    value = self._density(part, parameters, vectors[rows])
+                else:
+                    value = self._at_covariance(part.unsqueeze(0), chol[rows])[0] + log_det[rows]
+                found.append(value + log_densities[rows])
+            return torch.cat(found)
 
         return density
 
@@ -680,6 +738,17 @@ def _spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor
     shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
     order = torch.randperm(number, generator=generator)
     return torch.special.ndtri(shares[order]).reshape(shape)
+
+
+def _size_of_moved(before: Tensor, after: Tensor) -> Tensor:
+    """About the effective size of draws ``N x p`` that moved, by how much they remember."""
+    one, two = before - before.mean(0), after - after.mean(0)
+    tiny = torch.finfo(one.dtype).tiny
+    memory = (one * two).mean(0) / (one.var(0) * two.var(0)).sqrt().clamp_min(tiny)
+    memory = memory.amax().clamp(0, 1)
+    none = after.new_zeros(len(after), 1)
+    size = Particles(after.unsqueeze(1), none, none[0], none[0]).effective_size()[0]
+    return size * (1 - memory) / (1 + memory)
 
 
 def _apart(points: Tensor, values: Tensor, hessians: Tensor) -> tuple[Tensor, Tensor]:

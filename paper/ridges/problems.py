@@ -1,4 +1,4 @@
-"""Laws whose parameters observations tell apart badly, and laws that fold: cases drawn from the prior."""
+"""Laws whose parameters observations tell apart badly, or that fold: cases from their priors."""
 
 from __future__ import annotations
 
@@ -92,9 +92,7 @@ def _inhibited(X: Tensor, p: ParameterValues) -> Tensor:
 def _spectrum(X: Tensor, p: ParameterValues) -> Tensor:
     """Three peaks."""
     peaks = ((p[f"a{i}"], p[f"c{i}"], p[f"w{i}"]) for i in (1, 2, 3))
-    return sum(
-        (a * (-0.5 * ((X[:, 0] - c) / w).square()).exp() for a, c, w in peaks), 0 * X[:, 0]
-    )
+    return sum((a * (-0.5 * ((X[:, 0] - c) / w).square()).exp() for a, c, w in peaks), 0 * X[:, 0])
 
 
 def _pendulum(X: Tensor, p: ParameterValues) -> Tensor:
@@ -105,12 +103,6 @@ def _pendulum(X: Tensor, p: ParameterValues) -> Tensor:
 def _square(X: Tensor, p: ParameterValues) -> Tensor:
     """A lens that is out of focus either way, by aperture."""
     return (p.focus - 1).square() * X[:, 0] + p.rest
-
-
-def _absorption(X: Tensor, p: ParameterValues) -> Tensor:
-    """Concentration in blood by time, of which absorption and elimination may change places."""
-    into, out = p.absorption, p.elimination * (1 + 1e-9)
-    return into / (p.V * (into - out)) * ((-out * X[:, 0]).exp() - (-into * X[:, 0]).exp())
 
 
 def _alias(X: Tensor, p: ParameterValues) -> Tensor:
@@ -171,17 +163,6 @@ PROBLEMS = {
         ((0.0,), (2.0,)),
         12,
         0.1,
-    ),
-    "absorption": Problem(
-        _absorption,
-        {
-            "absorption": Unknown(1.0, factor=2.0),
-            "elimination": Unknown(0.5, factor=2.0),
-            "V": Unknown(2.0, factor=2.0),
-        },
-        ((0.2,), (8.0,)),
-        14,
-        0.01,
     ),
     "radar": Problem(
         _alias,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -217,14 +217,14 @@ def _annealed(posterior: Posterior, generator: torch.Generator) -> Tensor:
     return h
 
 
-def grid(case: Case, number: int = 701, width: float = 4.5) -> tuple[Tensor, Tensor]:
-    """Points ``N x p`` of a grid about the prior of two parameters, and their weights, ``N``.
+def grid(case: Case, numbers: Sequence[int], width: float = 4.5) -> tuple[Tensor, Tensor]:
+    """Points ``N x p`` of a grid about the prior, by numbers in each direction; weights ``N``.
 
     Of the law alone; the noise's variance is integrated out by a sum.
     """
     posterior = Posterior(case, "physics")
-    z = torch.linspace(-width, width, number, dtype=torch.float64)
-    points = torch.cartesian_prod(*[z] * posterior.p)
+    each = [torch.linspace(-width, width, number, dtype=torch.float64) for number in numbers]
+    points = torch.cartesian_prod(*each)
     square = torch.cat(
         [(posterior.y - posterior.f(part)).square().sum(-1) for part in points.split(20_000)]
     )
@@ -236,6 +236,23 @@ def grid(case: Case, number: int = 701, width: float = 4.5) -> tuple[Tensor, Ten
     value = (exponent - 0.5 * u.square()).logsumexp(-1)
     value = torch.from_numpy(np.interp(square.log().numpy(), known.numpy(), value.numpy()))
     return points, (value - 0.5 * points.square().sum(-1)).softmax(0)
+
+
+def distance(draws: Tensor, values: Tensor, weights: Tensor) -> float:
+    """The largest difference of distribution functions of any parameter, between 0 and 1.
+
+    Args:
+        draws: Equally likely draws, ``K x p``.
+        values: Draws or points, ``N x p``, with weights ``N``.
+    """
+    worst = 0.0
+    for own, other in zip(draws.mT, values.mT, strict=True):
+        order, own = other.argsort(), own.sort().values
+        below = torch.cat([weights.new_zeros(1), weights[order].cumsum(0)])
+        shares = below[torch.searchsorted(other[order].contiguous(), own.contiguous())]
+        steps = torch.arange(len(own) + 1, dtype=shares.dtype) / len(own)
+        worst = max(worst, float((shares - 0.5 * (steps[1:] + steps[:-1])).abs().max()))
+    return worst
 
 
 def ends(values: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
