@@ -111,6 +111,11 @@ def fit(
     outputscale; of others ``relevance`` is None. An offset between physics and targets that is
     hundreds of times their spread counts against the physics.
 
+    *Where left-out observations are missed* by more than predicted, variances are larger: near a
+    kink or a jump, as by dry friction or an impact, of which stationary kernels are too sure. All
+    that predicts the sum has it (``predict``, ``interval``, ``posterior``, sampled functions), not
+    the terms apart; means stay. So of ``"bayes"``, where all kernels are RBF or Matern.
+
     *Unknown parameters of the physics*, which all outputs share, are learnt with all else, by
     either method: least squares from several starts, then by turns with the hyper-parameters, from
     which they are integrated out near their most likely values. ``"bayes"`` then draws them given

@@ -22,9 +22,9 @@ class LocalErrors(Module):
 
     .. math:: \max\Big(1, \frac{a + \sum_i k(x, x_i) z_i^2}{a + \sum_i k(x, x_i)}\Big),
 
-    with an RBF kernel k of the shortest lengthscale of all terms, input by input, and a = 1. Locally
-    weighted conformal prediction (Lei et al. 2018) has such a scale, too, by a model of residuals;
-    here there is no guarantee, as the left-out observations had their say in the hyper-parameters.
+    with an RBF kernel k of the shortest lengthscale of all terms, input by input, and a = 1.
+    Locally weighted conformal prediction (Lei et al. 2018) has such a scale, too, by a model of
+    residuals. There is no guarantee here: left-out observations had their say in hyper-parameters.
 
     Args:
         outputs: The batch shape of a model with its outputs last, ``batch_shape x (m)``.

@@ -67,7 +67,7 @@ class SampledFunctions(Module):
         names = ("shift", "scale", "weights", "update", "points", "alpha")
         for name, tensor in zip(names, tensors, strict=True):
             self.register_buffer(name, tensor)
-        self.local_errors = None if alpha is None else deepcopy(model.local_errors)
+        self.errors = None if alpha is None else deepcopy(model.larger_errors)
         self.requires_grad_(False).eval()
         self._data: WeightedSum | None = None
 
@@ -84,8 +84,8 @@ class SampledFunctions(Module):
             weights = torch.cat(drawn, dim=-1).to(train)
             prior = cls(model, features, weights)._values(train, among_reached=True)
             update = conditioning.pathwise_update(prior)
-            errs = not model.local_errors.are_expected
-            alpha = conditioning.mean_cache.unsqueeze(0) if errs else None
+            farther = model.larger_errors is not None
+            alpha = conditioning.mean_cache.unsqueeze(0) if farther else None
             return cls(model, features, weights, train, update, alpha)
 
     @classmethod
@@ -134,11 +134,11 @@ class SampledFunctions(Module):
                 self._data = self.sum.at(self.points, self._reached)
             cross = sought.cross(self._data, is_data=True)
             total = total + _product(cross, self.update, extra)
-            if self.local_errors is not None and self.alpha is not None:
+            if self.errors is not None and self.alpha is not None:
                 means = sought.combine({term.name: term.mean for term, _ in sought.parts})
                 mean = means + _product(cross, self.alpha, extra)
-                x = inputs[..., : self.local_errors.points.shape[-1]]
-                total = mean + self.local_errors(x).sqrt() * (total - mean)
+                x = inputs[..., : self.errors.points.shape[-1]]
+                total = mean + self.errors(x).sqrt() * (total - mean)
         return total
 
 

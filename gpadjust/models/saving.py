@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,8 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
 
     Raises:
         TypeError: If it is no model of this library, or the path none.
-        ValueError: If its class is not in its module, it is a subset of a model's outputs, or the
-            path is a folder, or in none that exists.
+        ValueError: If its class is not in its module or has other names for the data, it is a
+            subset of a model's outputs, or the path is a folder, or in none that exists.
 
     Example:
         >>> import tempfile, torch
@@ -92,6 +93,11 @@ def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
     missing, physics, f_p, names = [*model.objects], None, None, []
     transform: Any = getattr(model, "input_transform", None)
     data: Any = model.data()
+    if lacking := _not_taken(type(model), [n for n, value in data.items() if value is not None]):
+        raise ValueError(
+            f"{name} could not be built again: its constructor takes no {' and no '.join(lacking)}. "
+            "Call its arguments of data as the library does."
+        )
     if isinstance(transform, PhysicsInput):
         given: Any = transform.physics
         several = isinstance(given, JoinedPhysics)
@@ -193,7 +199,8 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
         own["physics"] = _physics(content, objects)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # it was said when the model was built
-        model: TermsModel = model_class(**content["data"], **{**content["options"], **own})
+        data = {name: value for name, value in content["data"].items() if value is not None}
+        model: TermsModel = model_class(**data, **{**content["options"], **own})
     if (found := _kernels(model)) != content["kernels"]:
         raise ValueError(
             f"it was saved with other kernels: expected {', '.join(content['kernels'])}, found "
@@ -220,6 +227,14 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     model.input_names, model.output_names = (tuple(names) for names in content["names"])
     model.was_fitted = content["was_fitted"]
     return model.eval()
+
+
+def _not_taken(model_class: type[TermsModel], names: list[str]) -> list[str]:
+    """Which arguments of data the constructor of a class does not take by name."""
+    own = [*signature(model_class.__init__).parameters.values()][1:]
+    needed = {p.name for p in own if p.kind is p.POSITIONAL_OR_KEYWORD and p.default is p.empty}
+    passes = any(p.kind is p.VAR_KEYWORD for p in own) and needed <= {*names}
+    return [] if passes else [name for name in names if name not in {p.name for p in own}]
 
 
 def _kernels(model: TermsModel) -> list[str]:

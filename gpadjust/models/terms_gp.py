@@ -203,15 +203,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         points = train[..., :d].reshape(-1, *train.shape[-2:-1], d)[0]
         self.local_errors.learn(found, points, shortest)
 
-    def widening(self, inputs: Tensor) -> Tensor | None:
+    @property
+    def larger_errors(self) -> LocalErrors | None:
         """As the base class."""
-        if self.local_errors.are_expected:
-            return None
-        x = inputs[..., : self.terms[0].num_inputs]
-        if self.num_samples is not None:  # that differ in the parameters of the physics alone
-            x = x.narrow(MCMC_DIM - (self._num_outputs > 1), 0, 1)
-        wider: Tensor = self.local_errors(x)
-        return wider
+        return None if self.local_errors.are_expected else self.local_errors
 
     def data(self) -> dict[str, Tensor | None]:
         """As the base class."""

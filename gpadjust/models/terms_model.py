@@ -18,6 +18,7 @@ from torch.nn import Module
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions, check_number
@@ -283,9 +284,21 @@ class TermsModel(PredictiveModel):
         shift, scale = self.units()
         return mean * scale + shift, covariance * scale.square().unsqueeze(-1)
 
+    @property
+    def larger_errors(self) -> LocalErrors | None:
+        """Where errors are larger than kernels say, if they are anywhere."""
+        return None
+
     def widening(self, inputs: Tensor) -> Tensor | None:
         """What variances at transformed inputs are multiplied by, ``... x (m) x q``; None for 1."""
-        return None
+        errors = self.larger_errors
+        if errors is None:
+            return None
+        x = inputs[..., : self.terms[0].num_inputs]
+        if self.num_samples is not None:  # which differ in the parameters of the physics alone
+            x = x.narrow(MCMC_DIM - (self._num_outputs > 1), 0, 1)
+        wider: Tensor = errors(x)
+        return wider
 
     def draw_functions(self, num_functions: int, num_features: int) -> Module:
         """The functions of :meth:`sample_functions`, spread over samples of hyper-parameters."""

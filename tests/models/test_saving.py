@@ -37,6 +37,20 @@ class Gained(CKA):
         super().__init__(train_X, train_Y, train_Yvar, physics=gained)
 
 
+class Renamed(CKA):
+    """A structure of one's own, with names of its own for the data."""
+
+    def __init__(self, X, Y, **options):
+        super().__init__(X, Y, **options)
+
+
+class Passing(CKA):
+    """One whose noise is not known."""
+
+    def __init__(self, train_X, train_Y, *, physics):
+        super().__init__(train_X, train_Y, physics=physics)
+
+
 def saved(model, path):
     """Save a model of a physics that has no name, without the warning of it."""
     with pytest.warns(
@@ -222,7 +236,7 @@ def test_files_that_are_no_models(path):
     with pytest.raises(ValueError, match="is not a model that gpadjust saved"):
         load(path)
     torch.save({"format": 99}, path)
-    with pytest.raises(ValueError, match="expected format 2"):
+    with pytest.raises(ValueError, match="expected format 3"):
         load(path)
     with pytest.raises(TypeError, match="Expected a model of gpadjust, got Linear"):
         save(torch.nn.Linear(1, 1), path)
@@ -382,3 +396,14 @@ def test_a_physics_of_small_units_is_compared(uniform, path):
     with pytest.raises(ValueError, match="saved with another physics"):
         load(path, physics=lambda X: 3e-10 * relu(X))
     load(path, physics=lambda X: 1e-10 * relu(X))
+
+
+def test_data_under_other_names(uniform, path):
+    """No file is written that cannot be read."""
+    X, Y, Z = problem(uniform)
+    with pytest.raises(ValueError, match=r"Renamed could not be built.*no train_X and no train_Y"):
+        save(Renamed(X, Y, physics=relu), path)
+    assert not path.exists()
+    model = Passing(X, Y, physics=relu)
+    save(model, path)
+    same(model, load(path), Z)
