@@ -22,6 +22,7 @@ EXPERIMENTS = {
     "reaching": ("Reaching", "muscle arms that reach after a few trials, by several models"),
     "parameters": ("Parameters", "intervals of a physics' parameters, by several discrepancies"),
     "real": ("Real", "learners of real machines, by free runs beside what was measured"),
+    "elsewhere": ("Elsewhere", "free runs on other torques, loads, days and machines"),
     "tanks": ("Tanks", "cascaded tanks: structures of f_p and GPs, by a free run"),
     "large": ("Large", "100,000 observations: inducing points, or an exact model of some"),
     "optimisation": ("Optimisation", "trials of Bayesian optimisation in Ax, with and without f_p"),

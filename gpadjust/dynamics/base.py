@@ -169,6 +169,7 @@ class Dynamics(ABC):
         noise: Tensor | bool = True,
         start_noise: Tensor | Literal["learnt"] | None = None,
         process_noise: Tensor | Literal["learnt"] | None = None,
+        variation: Tensor | float | None = None,
         state_bounds: Tensor | None = None,
         seed: int = 0,
     ) -> FreeRun:
@@ -195,6 +196,12 @@ class Dynamics(ABC):
                 itself, so that it is carried on. ``"learnt"``: the noise that the dynamics learnt,
                 which is that if they learnt from states without noise, such as those that
                 :func:`smooth` draws. Default: nothing.
+            variation: Standard deviations by which the physics' unknown parameters differ in a run
+                from those that were learnt, one for each or one for all, in those of their priors:
+                ``smoothed.variation`` of :func:`smooth`; more for another machine, of which the
+                records tell nothing. Each particle keeps its own. Under actions (torques, loads)
+                beyond those that were learnt from they are larger: three times, where it is by half
+                of their range, but no more than half of the prior's. Default: none.
             state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
                 would leave them stays where it is. Default: none.
             seed: Seed of functions and noise; PyTorch's generator is left as it is.
@@ -214,9 +221,10 @@ class Dynamics(ABC):
             >>> dynamics.free_run(x, v).mean.flatten()
             tensor([0.1000, 0.2000, 0.3000], dtype=torch.float64)
         """
+        sample_functions = self.sample_functions if variation is None else self._varied(variation)
         return free_run(
             self.spec,
-            self.sample_functions,
+            sample_functions,
             self.noise_variance,
             initial_states,
             actions,
@@ -240,6 +248,15 @@ class Dynamics(ABC):
             actions: ``N x action_dim``.
         """
         return torch.zeros_like(states)
+
+    def _varied(
+        self, variation: Tensor | float
+    ) -> Callable[[int, int | None], TransitionFunctions]:
+        """As `sample_functions`, each function with parameters of its own."""
+        raise ValueError(
+            "Expected dynamics that learnt unknown parameters of a physics, as they are to differ "
+            f"by variation={variation!r}; {type(self).__name__} has none."
+        )
 
     def rehearse(self, states: Tensor, actions: Tensor) -> None:
         """Find what is wrong with the physics before there are transitions, if it can be told.

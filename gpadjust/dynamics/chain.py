@@ -142,9 +142,7 @@ class Chain:
         moves = np.vstack([np.diag(_STEP * self.spread), np.zeros((p, d))])
         turns = np.vstack([np.zeros((d, p)), _STEP * np.eye(p)])
         ends = [
-            self._asked(
-                states + sign * moves[:, None], self.actions, path.parameters + sign * turns
-            )
+            self.asked(states + sign * moves[:, None], self.actions, path.parameters + sign * turns)
             for sign in (1.0, -1.0)
         ]
         sizes = 2 * np.concatenate([_STEP * self.spread, _STEP * np.ones(p)])
@@ -171,7 +169,7 @@ class Chain:
             states = [x + share * (y - x) for x, y in zip(path.states, ahead, strict=True)]
             moved = path.parameters + share * (parameters - path.parameters)
             rows = np.concatenate([x[:-1] for x in states])
-            other = Path(states, moved, self._asked(rows, self.actions, moved))
+            other = Path(states, moved, self.asked(rows, self.actions, moved))
             cost = self.cost(other, noise, process_noise)
             if cost <= before + _BETTER:  # false of NaN
                 return Move(other, share == 1.0, 0.0)
@@ -216,7 +214,7 @@ class Chain:
 
     def _following(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
         """What f_p says, ``n x d``; an error if that is nothing."""
-        found = self._asked(states, actions, parameters)
+        found = self.asked(states, actions, parameters)
         if not np.isfinite(found).all():
             failed = np.flatnonzero(~np.isfinite(found).all(1))
             raise PhysicsError(
@@ -228,7 +226,7 @@ class Chain:
             )
         return found
 
-    def _asked(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
+    def asked(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
         """Next states ``... x n x d``, NaN where f_p fails, of angles near those of ``states``."""
         rows = torch.from_numpy(np.ascontiguousarray(states))
         X = torch.cat([rows, actions.expand(*rows.shape[:-1], -1)], dim=-1)

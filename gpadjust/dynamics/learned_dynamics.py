@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -23,6 +23,7 @@ from gpadjust.dynamics.next_state_physics import check_physics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.transition_physics import Target, TransitionTargets
 from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics.varying_parameters import VaryingParameters
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
 from gpadjust.models.sampled_functions import check_num_features
@@ -358,6 +359,27 @@ class LearnedDynamics(Dynamics):
                 start += size
         self._learnt = Learnt(data, known, chunks, searched_at, fitted, model)
         self.fit_result = None
+
+    def _varied(
+        self, variation: Tensor | float
+    ) -> Callable[[int, int | None], TransitionFunctions]:
+        """As `sample_functions`, each function with parameters of its own."""
+        learnt = self._known_so_far()
+        if self.physics is None or not self.physics.unknowns or len(self._recipe.parts) > 1:
+            return super()._varied(variation)
+        drawn = learnt.model.physics_parameters
+        vary = VaryingParameters.of(self.physics, self.spec, drawn, learnt.data.actions, variation)
+
+        def sample_functions(num_functions: int, seed: int | None = None) -> TransitionFunctions:
+            functions = self.sample_functions(num_functions, seed)
+            change = vary.changes(num_functions, seed)
+
+            def step(states: Tensor, actions: Tensor) -> Tensor:
+                return functions(states, actions) + change(states, actions)
+
+            return step
+
+        return sample_functions
 
     def _learn(self, data: Transitions, known: Tensor | None, previous: Learnt | None) -> None:
         check_observed(self.spec, data)

@@ -83,16 +83,18 @@ def _friction(rate: Tensor, viscous: Tensor, coulomb: Tensor) -> Tensor:
     return viscous * rate + coulomb * (rate / _SLIDES).tanh()
 
 
-def double_pendulum(state: Tensor, action: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+def double_pendulum(
+    state: Tensor, action: Tensor, p: Mapping[str, Tensor], length: float = _LENGTH
+) -> Tensor:
     """Two links with geared drives, by the nine sums of masses that can be told apart.
 
     ``inertia_1`` is :math:`I_1 + m_2 l_1^2`, ``inertia_2`` :math:`I_2`, ``moment_1``
     :math:`m_1 r_1 + m_2 l_1` and ``moment_2`` :math:`m_2 r_2`, with inertias about the joints, and
-    ``rotor`` the inertia of a rotor. Source: the makers' ``docs/text/dynamics.rst``, but for the
-    form of the friction.
+    ``rotor`` the inertia of a rotor. ``length`` is :math:`l_1` in m. Source: the makers'
+    ``docs/text/dynamics.rst``, but for the form of the friction.
     """
     q1, q2, dq1, dq2 = state.unbind(-1)
-    coupling = _LENGTH * p["moment_2"]
+    coupling = length * p["moment_2"]
     across = p["inertia_2"] + coupling * q2.cos()
     whole = p["inertia_1"] + coupling * q2.cos() + across + (_GEAR**2 + 1) * p["rotor"]
     across = across - _GEAR * p["rotor"]
