@@ -30,6 +30,7 @@ EXPERIMENTS = {
     "choice": ("Choice", "a physics of no use, and what compare recommends"),
     "kinks": ("Kinks", "next states of systems with dry friction, impacts, gaps and switches"),
     "ridges": ("Ridges", "intervals of parameters on a ridge, or of which several values do"),
+    "polynomials": ("Polynomials", "CKA, AR1 and MFK on functions that are nearly polynomials"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

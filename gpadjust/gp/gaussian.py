@@ -23,14 +23,16 @@ _SMALL = 256  # points of a covariance up to which a second thread costs more th
 
 
 def nugget(n: int) -> float:
-    r"""The nugget of every factorised covariance of ``n`` points, :math:`\max(100 n, n^2)\epsilon`.
+    r"""The nugget of every factorised covariance of ``n`` points, :math:`\max(100, n)\epsilon`.
 
     It is relative to each point's own variance, in fits and in predictions alike. With less,
-    rounding errors, of the order of :math:`n \epsilon` of the prior variance, would decide what a
-    model without noise knows. These errors are relative to each point's variance, too (Higham 2002,
-    theorem 10.7): those of a large part of a function do not blur a small one.
+    rounding errors, of the order of :math:`n \epsilon` of the prior variance at worst, would decide
+    what a model without noise knows; with more, the nugget, as for a function that is nearly
+    polynomial the prior variance is a million times that of the targets. These errors are relative
+    to each point's variance, too (Higham 2002, theorem 10.7): those of a large part of a function
+    do not blur a small one.
     """
-    return max(100 * n, n**2) * torch.finfo(torch.float64).eps
+    return max(100, n) * torch.finfo(torch.float64).eps
 
 
 def cholesky(
@@ -89,6 +91,18 @@ class LikelihoodValue(NamedTuple):
     coefficients: Tensor | None = None  # of the basis, ... x q; None without one
 
 
+class Trend(NamedTuple):
+    """Functions whose coefficients a restricted likelihood does not charge for.
+
+    Attributes:
+        columns: The functions at the targets, ``... x n x q``, of full rank.
+        shares: Which share of the cost of each is not counted, given those before it, ``q``.
+    """
+
+    columns: Tensor
+    shares: Tensor
+
+
 def log_likelihood(residual: Tensor, covariance: Tensor) -> Tensor:
     r"""The log density of ``... x n`` residuals under :math:`N(0, K)`, by the book.
 
@@ -108,7 +122,7 @@ def negative_log_likelihood(
     basis: Tensor | None = None,
     least_scale: Tensor | None = None,
     derivatives: bool = False,
-    trend: Tensor | None = None,
+    trend: Trend | None = None,
 ) -> LikelihoodValue:
     r"""Negative log likelihood of :math:`r \sim N(H \beta, s K)`, with one Cholesky factor.
 
@@ -122,6 +136,7 @@ def negative_log_likelihood(
     Its derivative by the covariance is :math:`\tfrac12 (K^{-1} - \alpha \alpha^T / s)` with
     :math:`\alpha = P r`. A trend T adds :math:`\tfrac12 \log|T^T K^{-1} T|`, for s = 1, as in the
     restricted likelihood (Harville 1974): coefficients on T then cost the same at all their sizes.
+    Of columns with a share below 1 it is that share of what they add to the logarithm.
 
     Args:
         residual: Targets less their mean, ``... x n``; NaN where there is no observation.
@@ -129,7 +144,7 @@ def negative_log_likelihood(
         basis: The basis H, ``... x n x q``, or none.
         least_scale: The least s, ``...``, or None for s = 1.
         derivatives: Whether to compute the derivatives.
-        trend: The trend T, ``... x n x q`` of full rank, or none.
+        trend: The trend T, or none.
     """
     size = residual.shape[-1]
     observed = ~residual.isnan()
@@ -137,7 +152,8 @@ def negative_log_likelihood(
     everything = bool(observed.all())
     if not everything:
         residual, mask = residual.nan_to_num(nan=0.0), observed.unsqueeze(-1)
-        basis, trend = (None if each is None else each * mask for each in (basis, trend))
+        basis = None if basis is None else basis * mask
+        trend = None if trend is None else trend._replace(columns=trend.columns * mask)
     chol, failed = cholesky(covariance, None if everything else observed)
     alpha, coefficients = torch.cholesky_solve(residual.unsqueeze(-1), chol), None
     if basis is not None:
@@ -152,10 +168,11 @@ def negative_log_likelihood(
         scale = (square / n).maximum(least_scale)
     log_det = 2 * chol.diagonal(dim1=-1, dim2=-2).log().sum(-1)
     if trend is not None:
-        trend = trend.expand(*chol.shape[:-1], trend.shape[-1])
+        columns = trend.columns.expand(*chol.shape[:-1], trend.columns.shape[-1])
         # Through an orthogonal basis, as the product is ill-conditioned where K is.
-        white, triangle = torch.linalg.qr(torch.linalg.solve_triangular(chol, trend, upper=False))
-        log_det = log_det + 2 * triangle.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1)
+        white, triangle = torch.linalg.qr(torch.linalg.solve_triangular(chol, columns, upper=False))
+        log_sizes = triangle.diagonal(dim1=-1, dim2=-2).abs().log()
+        log_det = log_det + 2 * (trend.shares * log_sizes).sum(-1)
     value = 0.5 * (square / scale + n * (scale.log() + math.log(2 * math.pi)) + log_det)
     failed = failed | ~value.isfinite()
     value = value.masked_fill(failed, math.inf)
@@ -168,7 +185,7 @@ def negative_log_likelihood(
     )
     if trend is not None:
         columns = torch.linalg.solve_triangular(chol.mT, white, upper=True)
-        by_covariance = by_covariance - 0.5 * columns @ columns.mT
+        by_covariance = by_covariance - 0.5 * (trend.shares * columns) @ columns.mT
     if not everything:
         by_covariance = by_covariance * observed.unsqueeze(-1) * observed.unsqueeze(-2)
     diagonal = by_covariance.diagonal(dim1=-1, dim2=-2)

@@ -17,6 +17,7 @@ from torch.nn import Parameter
 from gpadjust.gp import SumOfTerms
 from gpadjust.gp.gaussian import (
     LikelihoodValue,
+    Trend,
     cholesky,
     least_squares,
     negative_log_likelihood,
@@ -31,6 +32,8 @@ from gpadjust.physics import PhysicsError
 
 _LEAST = 3  # observations, for a constant to be vague
 _FEW_INPUTS = 3  # up to which a linear trend is, too
+_FEWER_INPUTS = 2  # up to which a quadratic one is in part
+_QUADRATIC = 0.75  # of the cost of its size, which does not count
 _AT_ONCE = 2**20  # numbers in the covariances of a batch; larger ones make memory the bottleneck
 _VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
 
@@ -545,8 +548,8 @@ def _constant_means(residual: Tensor, covariance: Tensor, basis: Tensor) -> tupl
 
 def _trends(
     model: BatchedMultiOutputGPyTorchModel, inputs: Tensor, targets: Tensor
-) -> Tensor | None:
-    """The trends of all groups of observations that have their own: ``... x n x q``, or None."""
+) -> Trend | None:
+    """The trends of all groups of observations that have their own, or None."""
     if not isinstance(model, TermsGP):
         return _trend(inputs, targets)
     inputs, groups = model.trend_inputs(inputs)
@@ -555,24 +558,39 @@ def _trends(
         for rows in groups.expand(*targets.shape, -1).unbind(-1)
     ]
     found = [trend for trend in each if trend is not None]
-    return torch.cat(found, dim=-1) if found else None
+    if not found:
+        return None
+    return Trend(*(torch.cat(parts, dim=-1) for parts in zip(*found, strict=True)))
 
 
-def _trend(inputs: Tensor, targets: Tensor) -> Tensor | None:
-    """A constant and, of few inputs, a linear trend, orthogonal: ``... x n x q``, or None."""
+def _trend(inputs: Tensor, targets: Tensor) -> Trend | None:
+    """A constant and, of few inputs, a linear and a quadratic trend, orthogonal; or None."""
     observed = (~targets.isnan()).unsqueeze(-1)
     n, d = int(observed.sum(-2).min()), inputs.shape[-1]
     if n < _LEAST:
         return None
     one = observed.to(inputs)
     if d > _FEW_INPUTS or n < 2 * (d + 1):
-        return one
+        return Trend(one, torch.ones(1).to(inputs))
     count = one.sum(-2, keepdim=True)
     away = (inputs - (inputs * one).sum(-2, keepdim=True) / count) * one
     spread = (away.square().sum(-2, keepdim=True) / count).sqrt()
     rounding = 8 * n * torch.finfo(inputs.dtype).eps * inputs.abs().amax(-2, keepdim=True)
     away = torch.where(spread > rounding, away / spread, torch.zeros_like(away))
-    slopes, sizes, _ = torch.linalg.svd(away, full_matrices=False)
+    linear = torch.cat([one / count.sqrt(), _span(away)], dim=-1)
+    columns, num_linear = linear, linear.shape[-1]
+    if d <= _FEWER_INPUTS and n >= (d + 1) * (d + 2):  # twice the number of the coefficients
+        i, j = torch.triu_indices(num_linear - 1, num_linear - 1) + 1
+        squares = linear[..., i] * linear[..., j] * count
+        columns = torch.cat([linear, _span(squares - linear @ (linear.mT @ squares))], dim=-1)
+    shares = torch.full_like(columns[(0,) * (columns.dim() - 1)], _QUADRATIC)
+    shares[:num_linear] = 1.0
+    return Trend(columns * math.sqrt(n), shares)
+
+
+def _span(columns: Tensor) -> Tensor:
+    """An orthonormal basis of what columns ``... x n x q`` span; of all of a batch as many."""
+    directions, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
     # Inputs that do not vary, or only together, have no slopes of their own.
-    rank = int((sizes > 1e-6 * math.sqrt(n)).sum(-1).amin())
-    return torch.cat([one, slopes[..., :rank] * math.sqrt(n)], dim=-1)
+    rank = int((sizes > 1e-6 * math.sqrt(columns.shape[-2])).sum(-1).amin())
+    return directions[..., :rank]

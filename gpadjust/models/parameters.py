@@ -49,7 +49,7 @@ KINDS = {
     "outputscale": Kind(0.5, prior=(1.0, 6.0)),
     # That of a rho, whose prior is one of rho itself, which has no units.
     "scaling": Kind(0.5, prior=(0.01, 4.0), has_unit=False),
-    # v. Noise with an sd of less than three millionths of the residual is not told from none.
+    # v, or of a level. Noise with an sd of less than three millionths of it is as good as none.
     "noise": Kind(1e-2, bounds=(1e-11, 1e1), starts=(1e-6, 1.0), prior=(1e-3, 4.0)),
     # As an outputscale: the prior variance of an unknown mean before a fit.
     "mean": Kind(1e2),
@@ -215,7 +215,9 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
             variance = "scaling" if term.unit is Unit.NONE else "outputscale"
             _enter(found, term.kernel, inputs, ranges[..., : term.num_inputs], scale, variance)
     for variances in Noise(model.likelihood).raw_variances:
-        found[id(variances)] = ("noise", unit.unsqueeze(-1).expand(variances.shape))
+        each = _units_of_groups(model, unit)
+        each = each if each.shape == variances.shape else unit.unsqueeze(-1)
+        found[id(variances)] = ("noise", each.expand(variances.shape))
     transform = getattr(model, "input_transform", None)
     for raw in () if transform is None else transform.parameters():
         found[id(raw)] = ("physics", None)
@@ -230,6 +232,21 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
             row = Hyperparameter(name, raw, owner, leaf, kind, size, constraint, shared)
             rows.setdefault(id(raw), row)
     return [*rows.values()]
+
+
+def _units_of_groups(model: BatchedMultiOutputGPyTorchModel, unit: Tensor) -> Tensor:
+    """The variance of the targets of each group that has a trend of its own, ``... x g``.
+
+    Of one group, or one whose targets do not vary, it is the given unit.
+    """
+    groups = torch.ones_like(model.train_inputs[0][..., :1])
+    if hasattr(model, "trend_inputs"):
+        groups = model.trend_inputs(model.train_inputs[0])[1]
+    if groups.shape[-1] == 1:
+        return unit.unsqueeze(-1)
+    targets = model.train_targets.unsqueeze(-1).where(groups > 0, math.nan)
+    units = (targets - targets.nanmean(-2, keepdim=True)).square().nanmean(-2)
+    return units.where(units > 0, unit.unsqueeze(-1))
 
 
 def _enter(
@@ -302,7 +319,8 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     without noise are not ruled out. They were chosen on other data sets than those that are
     reported. A centre that is learnt has N(0, 3^2), in standard deviations of
     f_p from its mean. The constant rho of an :class:`~gpadjust.AR1` has N(1, 1 + r^2) for levels
-    whose targets have standard deviations of the ratio r, high to low. Give a kernel or likelihood
+    whose targets have standard deviations of the ratio r, high to low, and the noise of each level
+    has the variance of its own targets for v. Give a kernel or likelihood
     priors of your own (``lengthscale_prior=...``, or ``register_prior``) to replace them.
 
     Args:

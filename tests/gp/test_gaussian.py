@@ -8,7 +8,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from gpadjust.gp.gaussian import cholesky, least_squares, negative_log_likelihood, nugget
+from gpadjust.gp.gaussian import Trend, cholesky, least_squares, negative_log_likelihood, nugget
 
 n, q = 7, 2
 
@@ -92,14 +92,16 @@ def test_a_trend_adds_the_determinant_of_its_coefficients_precision(problem, wit
     kept = torch.arange(n) != 3 if with_missing else torch.ones(n, dtype=torch.bool)
     leaf = covariance.clone().requires_grad_()
     inside = leaf[:, kept][:, :, kept]
-    precision = trend[:, kept].mT @ torch.linalg.inv(inside) @ trend[:, kept]
-    value = formula(residual[:, kept], inside) + 0.5 * torch.logdet(precision)
+    white = torch.linalg.inv(inside) @ trend[:, kept]
+    precision = trend[:, kept].mT @ white  # of the first column, and of all
+    both = 0.7 * precision[:, 0, 0].log() + 0.3 * torch.logdet(precision)
+    value = formula(residual[:, kept], inside) + 0.5 * both
     (by_covariance,) = torch.autograd.grad(value.sum(), leaf)
     with torch.no_grad():
         found = negative_log_likelihood(
             residual.masked_fill(~kept, torch.nan),
             covariance.clone(),
-            trend=trend,
+            trend=Trend(trend, torch.tensor([1.0, 0.3], dtype=torch.float64)),
             derivatives=True,
         )
     torch.testing.assert_close(found.value, value.detach())

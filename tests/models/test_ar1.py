@@ -90,8 +90,9 @@ def test_rho_is_one_number_for_each_output(levels):
 def test_each_level_has_a_noise_of_its_own(ar1, levels):
     X, Y, low_X, low_Y = levels
     initial = AR1(X, Y, low_X=low_X, low_Y=low_Y)
-    expected = 1e-2 * initial.train_targets.var(correction=0)
-    torch.testing.assert_close(initial.likelihood.noise.detach(), expected.expand(2))
+    low, high = initial.train_targets.split([11, 7])
+    expected = 1e-2 * torch.stack([low.var(correction=0), high.var(correction=0)])
+    torch.testing.assert_close(initial.likelihood.noise.detach(), expected)
     assert ar1.likelihood.noise.shape == (2,)
     low, high = ar1.likelihood.noise.tolist()
     inputs = ar1.train_inputs[0]
@@ -221,6 +222,6 @@ def test_a_discrepancy_that_is_nearly_polynomial(unit):
     model = AR1(X, high(X), low_X=low_X, low_Y=low_Y)
     fit(model)
     Z = torch.linspace(0, 1, 50, dtype=torch.float64).unsqueeze(-1)
-    assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.4 * high(Z).std()
+    assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.1 * high(Z).std()
     lower, upper = model.interval(Z)
     assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9
