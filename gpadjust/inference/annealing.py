@@ -17,7 +17,10 @@ _LEAPS = 5  # of a move, about a quarter of a Gaussian's orbit
 _LENGTH = 0.25  # standard deviations in each of them, at first
 _JITTER = (0.6, 1.4)  # multiples of that, as orbits have periods
 _ACCEPTED = 0.8  # of the moves, by the length that is taken
+_FAR = 1e6  # logarithm of a ratio below which it is zero
 _LAST = 2  # moves when all is done
+_ROUNDS = 50  # of the evidences of all powers, at most
+_SAME = 1e-4  # change of their logarithms that ends these
 
 
 class Density(Protocol):
@@ -30,6 +33,50 @@ class Density(Protocol):
     def value_and_gradient(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Values ``k x B`` and gradients ``k x B x p``."""
         ...
+
+
+class Proposal(Protocol):
+    """Distributions of ``B`` problems that draws begin with."""
+
+    def sample(self, number: int, generator: torch.Generator) -> Tensor:
+        """Draw ``number x B x p``."""
+        ...
+
+    def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
+        ...
+
+    def covariance(self) -> Tensor:
+        """That of all or part of it, ``B x p x p``."""
+        ...
+
+
+class Normal(NamedTuple):
+    """Independent normal distributions.
+
+    Attributes:
+        mean: ``B x p``.
+        sd: ``B x p``.
+    """
+
+    mean: Tensor
+    sd: Tensor
+
+    def sample(self, number: int, generator: torch.Generator) -> Tensor:
+        """Draw ``number x B x p``."""
+        shape = (number, *self.mean.shape)
+        normal = torch.randn(shape, generator=generator, dtype=self.mean.dtype).to(self.mean)
+        return self.mean + self.sd * normal
+
+    def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
+        white = (positions - self.mean) / self.sd
+        constant = (self.sd.log() + 0.5 * math.log(2 * math.pi)).sum(-1)
+        return constant + 0.5 * white.square().sum(-1), white / self.sd
+
+    def covariance(self) -> Tensor:
+        """Of each problem, ``B x p x p``."""
+        return torch.diag_embed(self.sd.square())
 
 
 class Particles(NamedTuple):
@@ -72,7 +119,7 @@ class Mixture(NamedTuple):
     root: Tensor
 
     def sample(self, number: int, generator: torch.Generator) -> Tensor:
-        """Draw ``number x B x p``."""
+        """Draw ``number x B x p``, of which the first is the first centre."""
         problems, p = self.centres.shape[1:]
         which = torch.multinomial(
             self.weights.mT.cpu(), number, replacement=True, generator=generator
@@ -82,7 +129,13 @@ class Mixture(NamedTuple):
         white = normal[..., :p] / normal[..., p:].square().mean(-1, keepdim=True).sqrt()
         every = torch.arange(problems, device=which.device)
         away = self.root[which, every] @ white.unsqueeze(-1)
-        return self.centres[which, every] + away.squeeze(-1)
+        found = self.centres[which, every] + away.squeeze(-1)
+        found[0] = self.centres[0]
+        return found
+
+    def covariance(self) -> Tensor:
+        """That of the shape of the first, ``B x p x p``."""
+        return self.root[0] @ self.root[0].mT
 
     def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
@@ -133,64 +186,119 @@ class _State(NamedTuple):
 
 def sample(
     density: Density,
-    proposal: Mixture,
+    proposal: Proposal,
     num_draws: int,
     num_particles: int,
     num_gradients: int,
     generator: torch.Generator,
+    enough: Tensor | None = None,
 ) -> Particles:
     r"""Draw from :math:`\exp(-U)` of each of ``B`` problems.
 
     Particles are draws from a proposal, weighted by a power of the ratio of both densities, at
     which enough of them count, and resampled. A move of Hamiltonian Monte Carlo then makes them
     draws from that density, and the power goes on, until it is one (sequential Monte Carlo, Del
-    Moral et al. 2006; the sums of weights tell the integral of the density). Two halves of them
-    go their own ways, so that their difference tells how well all is known.
+    Moral et al. 2006). All states that were passed count in the end, by their weights among all
+    powers, ``2 N`` draws of them. Two halves go their own ways, so that their difference tells how
+    well all is known.
 
     Args:
         density: The potential U and its gradient; infinite where the density is zero.
-        proposal: What to draw from first. Its first centre is among the draws.
+        proposal: What to draw from first.
         num_draws: Number of first draws.
         num_particles: Number ``N`` of particles, which is even.
         num_gradients: Number of gradients that may be asked for, by each problem. With fewer than a
             move takes, or before the end, particles are of the density that was reached.
         generator: Source of randomness.
+        enough: Log integrals, ``B``, that are of interest: it ends on the way where all are less,
+            as far as the particles tell.
 
     Raises:
         FloatingPointError: If the potential of some problem is infinite at all draws.
     """
     positions = proposal.sample(num_draws, generator)
-    positions[0] = proposal.centres[0]
     log_ratio = proposal.value_and_gradient(positions)[0] - density(positions)
     log_ratio = log_ratio.where(log_ratio.isfinite(), -math.inf)
     if not log_ratio.isfinite().any(0).all():
         raise FloatingPointError("The density is zero at all draws.")
-    start = torch.zeros_like(log_ratio[0])
-    power, weights, log_evidence = raised(log_ratio, start, min(num_particles, num_draws / 4))
-    root = _root(positions, weights, proposal.root[0])
-    rows = resampled(weights, num_particles, generator)
-    positions, log_ratio = _gathered(positions, rows), _gathered(log_ratio, rows)
     moves = (num_gradients // num_particles - 1) // _LEAPS
-    if moves < 1:
-        return Particles(positions, log_ratio, log_evidence, power)
+    least = min(num_particles, num_draws / 4)
+    start = torch.zeros_like(log_ratio[0])
+    power, weights, log_evidence = raised(log_ratio, start, least)
+    passed = _Passed([positions], [log_ratio], [start], [start])
+    if moves <= 0:
+        return passed.particles(power, num_particles, generator)
+    root = _root(positions, weights, proposal.covariance())
 
     def state_at(positions: Tensor) -> _State:
         value, gradient = density.value_and_gradient(positions)
         return _State(positions, value, gradient, *proposal.value_and_gradient(positions))
 
-    state, length, last = state_at(positions), torch.full_like(power, _LENGTH), 0
+    state = state_at(_gathered(positions, resampled(weights, num_particles, generator)))
+    length, last = torch.full_like(power, _LENGTH), 0
     for _ in range(moves):
-        moved, accepted = _moved(state, power, root, length, state_at, generator)
-        state, length = moved, length * (accepted - _ACCEPTED).exp()
+        state, accepted = _moved(state, power, root, length, state_at, generator)
+        length = length * (accepted - _ACCEPTED).exp()
+        passed.add(state.positions, state.log_ratio, power, log_evidence)
         last += bool((power == 1).all())
         if last == _LAST:
             break
         if not last:
+            at_most = log_evidence + (1 - power) * state.log_ratio.amax(0)
+            if enough is not None and (at_most < enough).all():
+                break
             power, weights, more = raised(state.log_ratio, power, _LEAST * num_particles)
             log_evidence = log_evidence + more
-            root = _root(state.positions, weights, root)
+            root = _root(state.positions, weights, root @ root.mT)
             state = state.rows(resampled(weights, num_particles, generator))
-    return Particles(state.positions, state.log_ratio, log_evidence, power)
+    return passed.particles(power, 2 * num_particles, generator)
+
+
+class _Passed(NamedTuple):
+    """All states of ``B`` problems on the way, at one power after the other.
+
+    Attributes:
+        positions: At each of them, ``N' x B x p``.
+        log_ratios: The logarithms of the densities' ratios there, ``N' x B``.
+        powers: The powers, ``B``.
+        log_evidences: Logarithms of rough integrals of their densities, ``B``.
+    """
+
+    positions: list[Tensor]
+    log_ratios: list[Tensor]
+    powers: list[Tensor]
+    log_evidences: list[Tensor]
+
+    def add(self, *state: Tensor) -> None:
+        """Add states of the density of a power, in the order of the attributes."""
+        for every, one in zip(self, state, strict=True):
+            every.append(one)
+
+    def particles(self, power: Tensor, number: int, generator: torch.Generator) -> Particles:
+        """Draws of the density of a power, ``B``, from all states that were passed.
+
+        Each state counts by its density over that of the mixture of all states, whose integrals are
+        estimated from the same states (Shirts and Chodera 2008).
+        """
+        log_ratio, positions = torch.cat(self.log_ratios), torch.cat(self.positions)
+        counts = log_ratio.new_tensor([float(len(each)) for each in self.log_ratios])
+        log_count, powers = counts.log()[:, None, None], torch.stack(self.powers).unsqueeze(1)
+        evidence = torch.stack(self.log_evidences).unsqueeze(1)
+        is_zero = (log_ratio == -math.inf) & (powers > 0)
+        parts = (powers * log_ratio.clamp_min(-_FAR)).masked_fill(is_zero, -math.inf)
+        for _ in range(_ROUNDS):  # powers x N x B
+            log_mixture = (log_count - evidence + parts).logsumexp(0)
+            found = (parts - log_mixture).logsumexp(1, keepdim=True)
+            before, evidence = evidence, found - found[:1]
+            if (evidence - before).abs().max() < _SAME:
+                break
+        log_mixture = (log_count - evidence + parts).logsumexp(0)
+        log_weights = power * log_ratio - log_mixture
+        rows = resampled(log_weights.softmax(0), number, generator)
+        log_evidence = log_weights.logsumexp(0) - (-log_mixture).logsumexp(0)
+        return Particles(
+            _gathered(positions, rows), _gathered(log_ratio, rows), log_evidence, power
+        )
 
 
 def _moved(
@@ -252,8 +360,8 @@ def raised(log_ratio: Tensor, power: Tensor, least: float) -> tuple[Tensor, Tens
         size = log_weights(more).softmax(0).square().sum(0).reciprocal()
         low, high = more.where(size >= least, low), high.where(size >= least, more)
         more = (low * high).sqrt()
-    found = log_weights(low)
     reached = torch.where(low < 1 - power, power + low, torch.ones_like(power))
+    found = log_weights(low)
     return reached, found.softmax(0), found.logsumexp(0) - math.log(len(found))
 
 
@@ -279,11 +387,11 @@ def _gathered(values: Tensor, rows: Tensor) -> Tensor:
     return values[rows, torch.arange(rows.shape[-1], device=rows.device)]
 
 
-def _root(positions: Tensor, weights: Tensor, root: Tensor) -> Tensor:
-    """A root of the covariance of weighted draws, or of a given one as far as they are few."""
+def _root(positions: Tensor, weights: Tensor, first: Tensor) -> Tensor:
+    """A root of the covariance of weighted draws, or of a first one as far as they are few."""
     p = positions.shape[-1]
     away = positions - (weights.unsqueeze(-1) * positions).sum(0)
     covariance = torch.einsum("kb,kbi,kbj->bij", weights, away, away)
     size = weights.square().sum(0).reciprocal()
     share = (size / (size + p))[:, None, None]
-    return torch.linalg.cholesky(share * covariance + (1 - share) * (root @ root.mT))
+    return torch.linalg.cholesky(share * covariance + (1 - share) * first)

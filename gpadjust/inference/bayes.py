@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gpadjust.gp.gaussian import cholesky
 from gpadjust.inference import annealing
-from gpadjust.inference.annealing import Mixture, Particles
+from gpadjust.inference.annealing import Mixture, Normal, Particles
 from gpadjust.inference.calibrate import calibrate_roughly, draw_parameters, warn_of_parameters
 from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
 from gpadjust.inference.relevance import mixed, probability, without_physics
@@ -28,16 +28,18 @@ _APART = 0.5  # by which these differ in some logarithm
 _EACH = 0.1  # of the draws that all of them share
 _DRAWS = (128, 1024)  # the least and the most by default
 _COST = 5_120_000  # draws times observations squared
-_GRADIENTS = 8  # for each draw, at most
-_COST_OF_GRADIENTS = 2_000_000  # gradients times observations squared
-_LEAST_PARTICLES = 16
-_DRAWS_EACH = 8  # first draws for each particle
+_FROM_PRIOR = 50  # observations up to which draws begin with the prior
+_COST_OF_PARTICLES = 2240  # particles times observations, then
+_MOST_PARTICLES = 128
+_GRADIENTS_FROM_PRIOR = 200  # of each particle, at most
+_COST_OF_GRADIENTS = 4_000_000  # gradients times observations squared, of more observations
 _GRADIENTS_EACH = 40  # of each particle
+_LEAST_PARTICLES = 16
 _STARTS = (8, 128)  # of the search, and how many are screened for them
 _STARTS_OF_RIVAL = (4, 64)  # the same of the model without its physics
 _ITERATIONS = 30  # of it, as the draws go on from where it got
 _LEAST_WEIGHED = 3  # observations of an output, for the physics to be weighed by them
-_DECISIVE = 7.0  # difference of log evidences that needs no closer look
+_DECISIVE = 5.0  # difference of log evidences that needs no closer look
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
 _SAMPLED_ALONE = 2_000_000  # samples times observations squared, of a physics without a GP
 _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
@@ -86,12 +88,12 @@ class _Draws(NamedTuple):
     Attributes:
         target: What they are drawn from.
         particles: The draws.
-        laplace: Log evidences by Laplace's approximation, ``B``.
+        rough: Log evidences where particles are of the density on the way, ``B``.
     """
 
     target: LogPosterior
     particles: Particles
-    laplace: Tensor
+    rough: Tensor
 
     def is_good(self) -> Tensor:
         """Whether they show the posterior, ``B``."""
@@ -106,8 +108,8 @@ class _Draws(NamedTuple):
         mean, *_ = self.target.distribution(parameters.unflatten(parameters.current()))
         spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
         return probability(
-            own.log_evidence.where(both, self.laplace),
-            other.log_evidence.where(both, rival.laplace),
+            own.log_evidence.where(both, self.rough),
+            other.log_evidence.where(both, rival.rough),
             (targets - mean.squeeze(0)).nanmean(-1).abs() / spread,
         )
 
@@ -281,22 +283,32 @@ def _draw(
 ) -> _Draws:
     """Draws of the hyper-parameters; an error if the likelihood is nowhere finite.
 
-    Of a model that is weighed against the log evidence of a ``rival``, the search takes fewer
-    starts, and rough draws do where it is far behind.
+    Few observations leave much of the prior, of many shoulders, and particles begin there; of more
+    observations, around the optima. Of a model that is weighed against the log evidence of a
+    ``rival``, rough draws do where it is far behind.
     """
-    starts = _STARTS if rival is None else _STARTS_OF_RIVAL
-    proposal, laplace = _around_optima(target, search, starts)
-    gradients = min(_GRADIENTS * num_draws, _COST_OF_GRADIENTS // target.num_points**2)
-    if rival is not None and (rival - laplace > _DECISIVE).all():
-        gradients = 0
-    number = min(num_draws // _DRAWS_EACH, gradients // _GRADIENTS_EACH)
-    number = max(_LEAST_PARTICLES, number)
+    n, proposal, rough = target.num_points, None, None
+    enough = None if rival is None else rival - _DECISIVE
+    if n <= _FROM_PRIOR:
+        proposal = Normal(*target.prior_moments())
+        number, gradients = min(_MOST_PARTICLES, _COST_OF_PARTICLES // n), _GRADIENTS_FROM_PRIOR
+    else:
+        starts = _STARTS if rival is None else _STARTS_OF_RIVAL
+        proposal, rough = _around_optima(target, search, starts)
+        gradients = _COST_OF_GRADIENTS // n**2
+        number = max(_LEAST_PARTICLES, gradients // _GRADIENTS_EACH)
+        is_far = enough is not None and bool((rough < enough).all())
+        gradients = 0 if is_far or n > MANY else gradients // number
     number += number % 2
     try:
-        particles = annealing.sample(target, proposal, num_draws, number, gradients, generator)
+        particles = annealing.sample(
+            target, proposal, num_draws, number, gradients * number, generator, enough
+        )
     except FloatingPointError:
         raise RuntimeError(NOWHERE) from None
-    return _Draws(target, particles, laplace)
+    if rough is None:  # on the way, the most that it can be
+        rough = particles.log_evidence + (1 - particles.power) * particles.log_ratio.amax(0)
+    return _Draws(target, particles, rough)
 
 
 def _around_optima(

@@ -34,7 +34,9 @@ _LEAST = 3  # observations, for a constant to be vague
 _FEW_INPUTS = 3  # up to which a linear trend is, too
 _FEWER_INPUTS = 2  # up to which a quadratic one is in part
 _QUADRATIC = 0.75  # of the cost of its size, which does not count
-_AT_ONCE = 2**20  # numbers in the covariances of a batch; larger ones make memory the bottleneck
+_AT_ONCE = 2**18  # numbers in the covariances of a batch; larger ones make memory the bottleneck
+_PRIOR_RANGE = 30.0  # to both sides of a parameter, in logarithms
+_PRIOR_STEPS = 1000  # of it
 _VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
 
 
@@ -300,6 +302,28 @@ class LogPosterior(Target):
     def _evaluate(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
         value, gradient = super()._evaluate(vectors, derivatives)
         return value.where(self.parameters.is_allowed(vectors), math.inf), gradient
+
+    @torch.no_grad()
+    def prior_moments(self) -> tuple[Tensor, Tensor]:
+        """Means and standard deviations of the elements of vectors by their priors, ``B x p``.
+
+        By quadrature, as if they were independent.
+        """
+        parameters = self.parameters
+        middle, limited = parameters.current(), parameters.is_constrained | parameters.noise.bool()
+        low = torch.where(limited, parameters.lower, -math.inf).maximum(middle - _PRIOR_RANGE)
+        limited = parameters.is_constrained
+        high = torch.where(limited, parameters.upper, math.inf).minimum(middle + _PRIOR_RANGE)
+        steps = torch.linspace(0, 1, _PRIOR_STEPS).to(low)[:, None, None]
+        points = low + steps * (high - low)
+        slope = torch.zeros_like(points)
+        if self._log_priors is not None:
+            slope = self._log_priors(points)[1]
+        log_density = torch.zeros_like(points)
+        log_density[1:] = torch.cumulative_trapezoid(slope, points, dim=0)
+        weights = log_density.softmax(0)
+        mean = (weights * points).sum(0)
+        return mean, (weights * (points - mean).square()).sum(0).sqrt()
 
 
 class _Part(NamedTuple):

@@ -84,8 +84,8 @@ class TestMoments:
             root = torch.diag_embed(sd * torch.tensor([[2.0], [0.4]]))
         proposal = Mixture(centre[None], torch.ones(1, 2, dtype=torch.float64), root[None])
         found = draw(gaussian(mean, torch.linalg.inv(covariance)), proposal)
-        assert found.positions.shape == (PARTICLES, 2, 3)
-        assert found.log_ratio.shape == (PARTICLES, 2)
+        assert found.positions.shape == (2 * PARTICLES, 2, 3)
+        assert found.log_ratio.shape == (2 * PARTICLES, 2)
         assert (found.power == 1).all()
         error = (found.positions.mean(0) - mean) / sd
         assert error.abs().max() < 4 / math.sqrt(PARTICLES)
