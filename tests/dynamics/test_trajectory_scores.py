@@ -87,11 +87,12 @@ def test_one_step_is_that_of_the_predictions(cart_pole_system, make):
     dynamics.update(*system.trial(0))
     data = system.trial(1)
     one = dynamics.score(*data)
-    many = dynamics.score_trajectories(*data, horizons=[1], num_functions=79, max_windows=None)
+    dynamics.num_features = 64  # which will do; fewer functions leave 0.2 of the error to chance
+    many = dynamics.score_trajectories(*data, horizons=[1], num_functions=800, max_windows=None)
     assert many.num_windows.tolist() == [25]
     torch.testing.assert_close(many.nlpd[0], one.nlpd, rtol=0.2, atol=0.2)
     torch.testing.assert_close(many.coverage[0], one.coverage, rtol=0, atol=0.13)
-    torch.testing.assert_close(many.rmse[0], one.rmse, rtol=0.25, atol=1e-4)
+    torch.testing.assert_close(many.rmse[0], one.rmse, rtol=0.1, atol=1e-4)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.4])

@@ -191,12 +191,13 @@ class TestManyPoints:
         monkeypatch.setattr(optimise, "MANY", 1000)
         assert (found >= fit(problem(), "map").log_likelihood - 0.1).all()
 
-    def test_it_is_never_worse_than_the_start(self, problem):
+    def test_it_is_never_worse_than_the_start(self, problem, request):
         model = problem()
         good = fit(model, "map", **QUICK).log_likelihood
         again = fit(model, "map", **QUICK, seed=1).log_likelihood
-        # With little noise the likelihood itself has rounding errors of some hundredths.
-        assert (again >= good - 3e-5 * good.abs()).all()
+        # With little noise the likelihood itself, of rows in another order, differs by 0.015.
+        rounding = 3e-5 if "little noise" in request.node.name else 1e-6
+        assert (again >= good - rounding * good.abs()).all()
 
 
 class Pendulum(torch.nn.Module):

@@ -76,7 +76,7 @@ def test_it_learns_the_system_and_brings_the_point_home(make_agent, kind, point_
     assert agent.num_episodes == 3
     assert agent.task.dynamics.num_transitions == 15
     mean, _ = evaluate_policy(agent, point_env(), n_eval_episodes=2, warn=False)
-    assert mean > -1.1  # to stay costs some 5
+    assert mean > -1.0  # to stay costs some 5
 
 
 @pytest.mark.parametrize("kind", KINDS)
