@@ -17,7 +17,6 @@ ALLOWED = {
         "physics/base.py forward",
         "physics/error.py relocate",
         "physics/memo.py recall",
-        "inference/bayes.py _representative",
         "inference/bayes.py _with_parameters",
         "inference/calibrate.py density",
         "inference/calibrate.py draw_parameters",

@@ -153,6 +153,36 @@ class Mixture(NamedTuple):
         return -log_part.logsumexp(1) - at_centre, (pull.unsqueeze(-1) * back).sum(1)
 
 
+class Both(NamedTuple):
+    """Mixtures of two proposals, half of each.
+
+    Attributes:
+        first: One of them, of whose covariance the mixture is taken to be.
+        second: The other.
+    """
+
+    first: Proposal
+    second: Proposal
+
+    def sample(self, number: int, generator: torch.Generator) -> Tensor:
+        """Draw ``number x B x p``."""
+        half = number // 2
+        parts = (self.first.sample(number - half, generator), self.second.sample(half, generator))
+        order = torch.randperm(number, generator=generator).to(parts[0].device)
+        return torch.cat(parts)[order]
+
+    def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
+        parts = [each.value_and_gradient(positions) for each in self]
+        values, gradients = (torch.stack(each) for each in zip(*parts, strict=True))
+        share = (-values).softmax(0).unsqueeze(-1)
+        return math.log(2) - (-values).logsumexp(0), (share * gradients).sum(0)
+
+    def covariance(self) -> Tensor:
+        """That of the first, ``B x p x p``."""
+        return self.first.covariance()
+
+
 class _State(NamedTuple):
     """Where particles are, and the negative log densities and gradients there.
 

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.gp.gaussian import cholesky
 from gpadjust.inference import annealing
-from gpadjust.inference.annealing import Mixture, Normal, Particles
+from gpadjust.inference.annealing import Both, Mixture, Normal, Particles, Proposal
 from gpadjust.inference.calibrate import calibrate_roughly, draw_parameters, warn_of_parameters
 from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
 from gpadjust.inference.relevance import mixed, probability, without_physics
+from gpadjust.inference.representative import LeftOut, disagreement, left_out, representative
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.models import TermsGP, TermsModel
 from gpadjust.models.parameters import Parameters, register_priors, shared_parameters
@@ -28,15 +28,13 @@ _APART = 0.5  # by which these differ in some logarithm
 _EACH = 0.1  # of the draws that all of them share
 _DRAWS = (128, 1024)  # the least and the most by default
 _COST = 5_120_000  # draws times observations squared
-_FROM_PRIOR = 50  # observations up to which draws begin with the prior
-_COST_OF_PARTICLES = 2240  # particles times observations, then
+_COST_OF_PARTICLES = 2500  # particles times observations
+_LEAST_PARTICLES = 16  # of as many draws as by default, in proportion
 _MOST_PARTICLES = 128
-_GRADIENTS_FROM_PRIOR = 200  # of each particle, at most
-_COST_OF_GRADIENTS = 4_000_000  # gradients times observations squared, of more observations
-_GRADIENTS_EACH = 40  # of each particle
-_LEAST_PARTICLES = 16
+_GRADIENTS = 100  # of each particle, at most
 _STARTS = (8, 128)  # of the search, and how many are screened for them
 _STARTS_OF_RIVAL = (4, 64)  # the same of the model without its physics
+_NARROW = 16.0  # log ratio of the prior's size to an optimum's, which few draws of it would meet
 _ITERATIONS = 30  # of it, as the draws go on from where it got
 _LEAST_WEIGHED = 3  # observations of an output, for the physics to be weighed by them
 _DECISIVE = 5.0  # difference of log evidences that needs no closer look
@@ -49,8 +47,7 @@ _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
 _LEAST_SHARE = 0.05  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 256.0
 _UNSEEN = 0.05  # of the posterior of parameters, near optima that no search came to
-_OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what samples represent
-_EXCHANGES = 5  # rounds of better samples for the chosen ones
+_OFF = 0.3  # predicted standard deviations, of the mean of draws
 
 
 class SamplingWarning(UserWarning):
@@ -88,7 +85,7 @@ class _Draws(NamedTuple):
     Attributes:
         target: What they are drawn from.
         particles: The draws.
-        rough: Log evidences where particles are of the density on the way, ``B``.
+        rough: Log evidences by Laplace's approximation, ``B``.
     """
 
     target: LogPosterior
@@ -113,11 +110,11 @@ class _Draws(NamedTuple):
             (targets - mean.squeeze(0)).nanmean(-1).abs() / spread,
         )
 
-    def representative(self, number: int) -> dict[str, Tensor]:
-        """Raw parameters of a few that predict as all do, ``number x`` their shape, by name."""
-        parameters = self.target.parameters
-        chosen = _representative(self.target, self.particles.positions, number)
-        return parameters.to_raw(parameters.unflatten(chosen))
+    def raw(self, rows: Tensor) -> dict[str, Tensor]:
+        """Raw parameters of draws of the numbers ``k x B``, ``k x`` their shape, by name."""
+        positions, parameters = self.particles.positions, self.target.parameters
+        every = torch.arange(rows.shape[-1], device=rows.device)
+        return parameters.to_raw(parameters.unflatten(positions[rows, every]))
 
 
 def sample(
@@ -132,8 +129,7 @@ def sample(
     """
     _check(model)
     n, generator = model.train_targets.shape[-1], torch.Generator().manual_seed(search.seed)
-    if num_draws is None:
-        num_draws = max(_DRAWS[0], min(_DRAWS[1], _COST // n**2))
+    num_draws = num_draws or _default_num_draws(n)
     if model.has_unknowns:
         return _with_parameters(model, search, num_samples, num_draws, generator)
     copy = deepcopy(model)
@@ -142,9 +138,13 @@ def sample(
     register_priors(copy)
     num_samples = num_samples or default_num_samples(n)
     draws = _draw(LogPosterior(copy), search, num_draws, generator)
-    held, relevance = draws.representative(num_samples), None
-    size, is_good = draws.particles.effective_size(), draws.is_good()
-    if without is not None:
+    size, is_good, relevance = draws.particles.effective_size(), draws.is_good(), None
+    positions = draws.particles.positions
+    predicted, (number, problems, p) = left_out(draws.target, positions), positions.shape
+    weights = torch.full_like(positions[..., 0], 1 / number)
+    if without is None:
+        held = draws.raw(representative(predicted, positions, weights, num_samples))
+    else:
         register_priors(without)
         evidence = draws.particles.log_evidence
         plain = _draw(LogPosterior(without), search, num_draws // 2, generator, evidence)
@@ -152,8 +152,24 @@ def sample(
         # What most samples are of is what counts.
         size = size.where(share > 0.5, plain.particles.effective_size())
         is_good = is_good.where(share > 0.5, plain.is_good())
+        others = left_out(plain.target, plain.particles.positions)
+        more = others.mean.shape[0]
+        predicted = LeftOut(*(torch.cat(each) for each in zip(predicted, others, strict=True)))
+        rest = ((1 - share) / more).expand(more, problems)
+        weights = torch.cat([share * weights, rest])
+        middle = positions.mean(0).expand(more, problems, p)
+        rows = representative(predicted, torch.cat([positions, middle]), weights, num_samples)
+        is_on = rows < number
+        held = mixed(
+            draws.raw(rows.clamp_max(number - 1)),
+            plain.raw((rows - number).clamp_min(0)),
+            copy,
+            without,
+            is_on.to(share).mean(0).reshape(model._aug_batch_shape),
+        )
         relevance = share.reshape(model._aug_batch_shape)
-        held = mixed(held, plain.representative(num_samples), copy, without, relevance)
+    off = disagreement(predicted, weights)
+    is_good &= off <= _OFF
     _hold(model, held, settled)
     named = _named(draws.target.parameters, draws.particles.positions)
     return _result(size, is_good, named, draws.target.parameters, relevance)
@@ -245,6 +261,11 @@ def _can_be_weighed(model: TermsGP) -> bool:
     return fewest >= _LEAST_WEIGHED and model.train_targets.shape[-1] <= MANY
 
 
+def _default_num_draws(num_points: int) -> int:
+    """How many draws a fit begins with, if that is not said."""
+    return max(_DRAWS[0], min(_DRAWS[1], _COST // num_points**2))
+
+
 def default_num_samples(num_points: int) -> int:
     """How many samples a model of so many observations holds, if that is not said."""
     return next(number for most, number in _SAMPLES.items() if num_points <= most)
@@ -283,31 +304,31 @@ def _draw(
 ) -> _Draws:
     """Draws of the hyper-parameters; an error if the likelihood is nowhere finite.
 
-    Few observations leave much of the prior, of many shoulders, and particles begin there; of more
-    observations, around the optima. Of a model that is weighed against the log evidence of a
-    ``rival``, rough draws do where it is far behind.
+    Particles begin around the optima, half of them with the prior; all of them with it where
+    optima are wide, so that there are many others. Of a model that is weighed
+    against the log evidence of a ``rival``, the search takes fewer starts, and rough draws do where
+    it is far behind.
     """
-    n, proposal, rough = target.num_points, None, None
+    n, starts = target.num_points, _STARTS if rival is None else _STARTS_OF_RIVAL
+    around, rough = _around_optima(target, search, starts)
+    proposal: Proposal = around
+    if n <= MANY:
+        prior = Normal(*target.prior_moments())
+        log_sizes = around.root.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1)
+        told = (around.weights * (prior.sd.log().sum(-1) - log_sizes)).sum(0)
+        proposal = Both(prior, around) if bool((told > _NARROW).any()) else prior
     enough = None if rival is None else rival - _DECISIVE
-    if n <= _FROM_PRIOR:
-        proposal = Normal(*target.prior_moments())
-        number, gradients = min(_MOST_PARTICLES, _COST_OF_PARTICLES // n), _GRADIENTS_FROM_PRIOR
-    else:
-        starts = _STARTS if rival is None else _STARTS_OF_RIVAL
-        proposal, rough = _around_optima(target, search, starts)
-        gradients = _COST_OF_GRADIENTS // n**2
-        number = max(_LEAST_PARTICLES, gradients // _GRADIENTS_EACH)
-        is_far = enough is not None and bool((rough < enough).all())
-        gradients = 0 if is_far or n > MANY else gradients // number
-    number += number % 2
+    most = min(_MOST_PARTICLES, _COST_OF_PARTICLES / n)
+    number = max(_LEAST_PARTICLES, 2 * round(0.5 * most * num_draws / _default_num_draws(n)))
+    gradients = _GRADIENTS * number
+    if n > MANY or (enough is not None and bool((rough < enough).all())):
+        gradients = 0
     try:
         particles = annealing.sample(
-            target, proposal, num_draws, number, gradients * number, generator, enough
+            target, proposal, num_draws, number, gradients, generator, enough
         )
     except FloatingPointError:
         raise RuntimeError(NOWHERE) from None
-    if rough is None:  # on the way, the most that it can be
-        rough = particles.log_evidence + (1 - particles.power) * particles.log_ratio.amax(0)
     return _Draws(target, particles, rough)
 
 
@@ -355,55 +376,3 @@ def laplace_root(target: LogPosterior, optima: Tensor) -> Tensor:
     values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
     root = vectors * values.clamp_min(_WIDEST**-2).rsqrt().unsqueeze(-2)
     return torch.linalg.qr(root.mT).R.mT
-
-
-@torch.no_grad()
-def _representative(target: LogPosterior, vectors: Tensor, number: int) -> Tensor:
-    """Some of the vectors ``N x B x p`` whose mixture predicts as that of all, ``number x B x p``.
-
-    Their mean predictions of left-out observations, standard deviations and hyper-parameters are
-    to be those of all: greedily chosen, then exchanged one by one.
-    """
-    if number >= len(vectors):
-        return vectors[torch.arange(number) % len(vectors)]
-    mean, covariance, *_ = target.distribution(target.parameters.unflatten(vectors))
-    residual = (target.targets - mean).expand(covariance.shape[:-1])
-    observed = ~residual.isnan()
-    chol, _ = cholesky(covariance, None if observed.all() else observed)
-    variance = torch.cholesky_inverse(chol).diagonal(dim1=-1, dim2=-2).reciprocal()
-    alpha = torch.cholesky_solve(residual.nan_to_num(nan=0.0).unsqueeze(-1), chol).squeeze(-1)
-    unit = variance.mean(0).sqrt()
-    spread = vectors.std(0).clamp_min(torch.finfo(vectors.dtype).tiny)
-    parts = (alpha * variance / unit, variance.sqrt() / unit, _OF_POSITIONS * vectors / spread)
-    shape = vectors.shape[:2]
-    features = torch.cat(
-        [(each - each.mean(0)).reshape(*shape, -1) / math.sqrt(each.shape[-1]) for each in parts],
-        dim=-1,
-    )
-    grams = features.transpose(0, 1) @ features.transpose(0, 1).mT
-    rows = torch.stack([_of_mean_zero(gram, number) for gram in grams.nan_to_num()], dim=-1)
-    return vectors.gather(0, rows.unsqueeze(-1).expand(-1, -1, vectors.shape[-1]))
-
-
-def _of_mean_zero(gram: Tensor, number: int) -> Tensor:
-    """Numbers of elements whose sum is small, by their inner products ``N x N``."""
-    size, total = gram.diagonal(), torch.zeros_like(gram[0])
-    chosen: list[int] = []
-
-    def best() -> int:
-        cost = size + 2 * total
-        cost[chosen] = math.inf
-        return int(cost.argmin())
-
-    for _ in range(number):
-        chosen.append(best())
-        total = total + gram[chosen[-1]]
-    for _ in range(_EXCHANGES):
-        before = [*chosen]
-        for _ in range(number):  # of the first, which goes to the end
-            total = total - gram[chosen.pop(0)]
-            chosen.append(best())
-            total = total + gram[chosen[-1]]
-        if sorted(before) == sorted(chosen):
-            break
-    return torch.tensor(chosen, device=gram.device)
