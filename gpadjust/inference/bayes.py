@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -55,13 +55,15 @@ class SamplingWarning(UserWarning):
     """The draws of the hyper-parameters do not show their distribution."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SampleResult:
-    """What sampling the hyper-parameters has reached.
+    """What sampling the hyper-parameters has reached; it prints as a sentence.
 
     Attributes:
         effective_size: How many independent draws tell as much as those that were made, of each
-            output, ``batch_shape x (m)``: as many as were, if two halves of them agree.
+            output, ``batch_shape x (m)``: as many as were, if two halves of them agree. Beside
+            unknown parameters of the physics also by the weights of theirs, as they are, or by
+            what those remember that moved.
         converged: Whether the draws are of the posterior, of each output, of the same shape;
             there is a :class:`~gpadjust.inference.SamplingWarning` if not. Of more than some 150
             observations they are weighted draws around the optima, of the posterior to a power of
@@ -72,12 +74,38 @@ class SampleResult:
             learnt they are in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
+        num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
+            wall clock; :func:`~gpadjust.fit` says both.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import ZeroMeanGP, fit
+        >>> X = torch.linspace(0, 1, 6, dtype=torch.float64).unsqueeze(-1)
+        >>> fit(ZeroMeanGP(X, X.sin()))  # doctest: +ELLIPSIS
+        converged, 16 samples (effective size ...), ... s
     """
 
     effective_size: Tensor
     converged: Tensor
-    draws: dict[str, Tensor] = field(repr=False)
+    draws: dict[str, Tensor]
     relevance: Tensor | None = None
+    num_samples: int | None = None
+    seconds: float | None = None
+
+    def __repr__(self) -> str:
+        """A sentence; of several outputs with their least effective size."""
+        bad, number = int((~self.converged).sum()), self.converged.numel()
+        some = f" in {bad} of {number} outputs" if number > 1 else ""
+        parts = [f"NOT converged{some}" if bad else "converged"]
+        size = f"effective size {self.effective_size.min():.3g}"
+        known = self.num_samples is not None
+        parts.append(f"{self.num_samples} samples ({size})" if known else size)
+        if self.relevance is not None:
+            shares = ", ".join(f"{share:.2g}" for share in self.relevance.flatten().tolist())
+            parts.append(f"the physics is of use with probability {shares}")
+        if self.seconds is not None:
+            parts.append(f"{self.seconds:.1f} s")
+        return ", ".join(parts)
 
 
 class _Draws(NamedTuple):
@@ -185,7 +213,16 @@ def _with_parameters(
     vectors, coordinates, own = draw_parameters(
         calibrated, parameters, vectors, log_densities, max(_RETURNED, num_samples), generator
     )
-    is_good = is_good & (own >= _LEAST_SIZE_OF_PARAMETERS) & (calibrated.unseen < _UNSEEN)
+    hint = {}
+    if own < _LEAST_SIZE_OF_PARAMETERS or calibrated.unseen >= _UNSEEN:
+        is_good = is_good & False
+        many = calibrated.unseen >= _UNSEEN
+        what = "Many values of them explain the observations" if many else "They are on a ridge"
+        names = ", ".join(calibrated.calibration.unknowns.names)
+        hint = {
+            "hint": f"It is the parameters of the physics, {names}, that are hard to draw. {what}: "
+            "give narrower priors, or observe what tells them apart."
+        }
     size = size.minimum(own)
     rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
     held = parameters.to_raw(parameters.unflatten(vectors[rows]))
@@ -194,7 +231,7 @@ def _with_parameters(
     _hold(model, held, settled)
     calibrated.calibration.direct(model, coordinates[rows])
     warn_of_parameters(calibrated)
-    return _result(size, is_good, named, parameters)
+    return _result(size, is_good, named, parameters, **hint)
 
 
 def _hold(model: TermsGP, samples: dict[str, Tensor], settled: dict[str, Tensor]) -> None:
@@ -219,14 +256,14 @@ def _result(
     draws: dict[str, Tensor],
     parameters: Parameters,
     relevance: Tensor | None = None,
+    hint: str = "Raise num_draws, or give narrower priors, that of the noise above all.",
 ) -> SampleResult:
-    """The result of a fit, with a warning if draws do not show the posterior."""
+    """The result of a fit, with a warning and a hint if draws do not show the posterior."""
     size, converged = (each.reshape(parameters.batch_shape) for each in (size, is_good))
     if not converged.all():
         warnings.warn(
             f"The draws of {int((~converged).sum())} of {converged.numel()} outputs do not show "
-            f"the posterior (effective sample size {size.min():.2g}). Raise num_draws, or give "
-            "narrower priors, that of the noise above all.",
+            f"the posterior (effective sample size {size.min():.2g}). {hint}",
             SamplingWarning,
             stacklevel=4,
         )
