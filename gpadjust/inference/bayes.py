@@ -14,8 +14,9 @@ from torch import Tensor
 from gpadjust.gp.gaussian import cholesky
 from gpadjust.inference import annealing
 from gpadjust.inference.annealing import Mixture, Particles
-from gpadjust.inference.calibrate import calibrate_roughly, draw_parameters, warn_of_parameters
+from gpadjust.inference.calibrate import calibrate_roughly, warn_of_parameters
 from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
+from gpadjust.inference.parameter_draws import draw_parameters
 from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.models import TermsGP, TermsModel
@@ -46,6 +47,7 @@ _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
 _LEAST_SHARE = 0.05  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 256.0
+_HINT = "Raise num_draws, or give narrower priors, that of the noise above all."
 _UNSEEN = 0.05  # of the posterior of parameters, near optima that no search came to
 _OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what samples represent
 _EXCHANGES = 5  # rounds of better samples for the chosen ones
@@ -213,16 +215,14 @@ def _with_parameters(
     vectors, coordinates, own = draw_parameters(
         calibrated, parameters, vectors, log_densities, max(_RETURNED, num_samples), generator
     )
-    hint = {}
-    if own < _LEAST_SIZE_OF_PARAMETERS or calibrated.unseen >= _UNSEEN:
+    few, many = bool(own < _LEAST_SIZE_OF_PARAMETERS), calibrated.unseen >= _UNSEEN
+    hint = _HINT
+    if few or many:
         is_good = is_good & False
-        many = calibrated.unseen >= _UNSEEN
-        what = "Many values of them explain the observations" if many else "They are on a ridge"
         names = ", ".join(calibrated.calibration.unknowns.names)
-        hint = {
-            "hint": f"It is the parameters of the physics, {names}, that are hard to draw. {what}: "
-            "give narrower priors, or observe what tells them apart."
-        }
+        why = "many values of them explain the observations" if many else "few draws of them count"
+        hint = f"It is {names} of the physics: {why}. Give narrower priors, or observe what tells "
+        hint += "them apart."
     size = size.minimum(own)
     rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
     held = parameters.to_raw(parameters.unflatten(vectors[rows]))
@@ -231,7 +231,7 @@ def _with_parameters(
     _hold(model, held, settled)
     calibrated.calibration.direct(model, coordinates[rows])
     warn_of_parameters(calibrated)
-    return _result(size, is_good, named, parameters, **hint)
+    return _result(size, is_good, named, parameters, hint=hint)
 
 
 def _hold(model: TermsGP, samples: dict[str, Tensor], settled: dict[str, Tensor]) -> None:
@@ -256,7 +256,7 @@ def _result(
     draws: dict[str, Tensor],
     parameters: Parameters,
     relevance: Tensor | None = None,
-    hint: str = "Raise num_draws, or give narrower priors, that of the noise above all.",
+    hint: str = _HINT,
 ) -> SampleResult:
     """The result of a fit, with a warning and a hint if draws do not show the posterior."""
     size, converged = (each.reshape(parameters.batch_shape) for each in (size, is_good))

@@ -23,15 +23,15 @@ MODELS = {
 class Settings:
     """What decides the numbers."""
 
-    compared: int = 5
+    compared: int = 3
     """first cases of a ridge that are set beside a reference with each model"""
-    long: int = 4
+    long: int = 3
     """cases of nine parameters"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ridges(Experiment):
-    """Do 95 % intervals of the parameters of a right law hold the true ones, and how wide are they?"""
+    """Intervals of the parameters of a right law: do they hold the true ones, how wide are they?"""
 
     runs: int = 50
     """cases of each problem"""

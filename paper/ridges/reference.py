@@ -19,8 +19,8 @@ _STEP = 1e-4
 _NUGGET = 1e-10
 _NUMBER = 1024  # particles
 _MOVES = 6  # between powers
-_LAST_MOVES = 30
-_EACH = 48  # draws of z
+_LAST_MOVES = 15
+_EACH = 24  # draws of z
 _WIDER = 3.0
 _DEGREES = 4
 _AT_ONCE = 8192
@@ -243,7 +243,8 @@ def distance(draws: Tensor, values: Tensor, weights: Tensor) -> float:
 
     Args:
         draws: Equally likely draws, ``K x p``.
-        values: Draws or points, ``N x p``, with weights ``N``.
+        values: Draws or points, ``N x p``.
+        weights: Theirs, ``N``.
     """
     worst = 0.0
     for own, other in zip(draws.mT, values.mT, strict=True):

@@ -25,8 +25,8 @@ _BUILD: Mapping[str, Callable[..., TermsGP]] = {
     "orthogonal": partial(PhysicsMeanGP, covar_module=orthogonal_rbf),
     "cka": CKA,
 }
-_POINTS = {"alias": (101, 4001), "radar": (101, 6001)}  # of grids, if other than
-_SQUARE = (401, 401)
+_POINTS = {"alias": (61, 2001), "radar": (61, 4001)}  # of grids, if other than
+_SQUARE = (301, 301)
 
 
 def run(experiment: Ridges, problem: str, model: str, seed: int, *, unfinished: Path) -> Record:
