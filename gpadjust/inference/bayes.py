@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -13,8 +13,9 @@ from torch import Tensor
 
 from gpadjust.inference import annealing
 from gpadjust.inference.annealing import Both, Mixture, Normal, Particles, Proposal
-from gpadjust.inference.calibrate import calibrate_roughly, draw_parameters, warn_of_parameters
+from gpadjust.inference.calibrate import calibrate_roughly, warn_of_parameters
 from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
+from gpadjust.inference.parameter_draws import draw_parameters
 from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.representative import LeftOut, disagreement, left_out, representative
 from gpadjust.inference.targets import LogPosterior
@@ -46,6 +47,7 @@ _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
 _LEAST_SHARE = 0.05  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 256.0
+_HINT = "Raise num_draws, or give narrower priors, that of the noise above all."
 _UNSEEN = 0.05  # of the posterior of parameters, near optima that no search came to
 _OFF = 0.3  # predicted standard deviations, of the mean of draws
 
@@ -54,13 +56,15 @@ class SamplingWarning(UserWarning):
     """The draws of the hyper-parameters do not show their distribution."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SampleResult:
-    """What sampling the hyper-parameters has reached.
+    """What sampling the hyper-parameters has reached; it prints as a sentence.
 
     Attributes:
         effective_size: How many independent draws tell as much as those that were made, of each
-            output, ``batch_shape x (m)``: as many as were, if two halves of them agree.
+            output, ``batch_shape x (m)``: as many as were, if two halves of them agree. Beside
+            unknown parameters of the physics also by the weights of theirs, as they are, or by
+            what those remember that moved.
         converged: Whether the draws are of the posterior, of each output, of the same shape;
             there is a :class:`~gpadjust.inference.SamplingWarning` if not. Of more than some 150
             observations they are weighted draws around the optima, of the posterior to a power of
@@ -71,12 +75,38 @@ class SampleResult:
             learnt they are in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
+        num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
+            wall clock; :func:`~gpadjust.fit` says both.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import ZeroMeanGP, fit
+        >>> X = torch.linspace(0, 1, 6, dtype=torch.float64).unsqueeze(-1)
+        >>> fit(ZeroMeanGP(X, X.sin()))  # doctest: +ELLIPSIS
+        converged, 16 samples (effective size ...), ... s
     """
 
     effective_size: Tensor
     converged: Tensor
-    draws: dict[str, Tensor] = field(repr=False)
+    draws: dict[str, Tensor]
     relevance: Tensor | None = None
+    num_samples: int | None = None
+    seconds: float | None = None
+
+    def __repr__(self) -> str:
+        """A sentence; of several outputs with their least effective size."""
+        bad, number = int((~self.converged).sum()), self.converged.numel()
+        some = f" in {bad} of {number} outputs" if number > 1 else ""
+        parts = [f"NOT converged{some}" if bad else "converged"]
+        size = f"effective size {self.effective_size.min():.3g}"
+        known = self.num_samples is not None
+        parts.append(f"{self.num_samples} samples ({size})" if known else size)
+        if self.relevance is not None:
+            shares = ", ".join(f"{share:.2g}" for share in self.relevance.flatten().tolist())
+            parts.append(f"the physics is of use with probability {shares}")
+        if self.seconds is not None:
+            parts.append(f"{self.seconds:.1f} s")
+        return ", ".join(parts)
 
 
 class _Draws(NamedTuple):
@@ -207,7 +237,14 @@ def _with_parameters(
     vectors, coordinates, own = draw_parameters(
         calibrated, parameters, vectors, log_densities, max(_RETURNED, num_samples), generator
     )
-    is_good = is_good & (own >= _LEAST_SIZE_OF_PARAMETERS) & (calibrated.unseen < _UNSEEN)
+    few, many = bool(own < _LEAST_SIZE_OF_PARAMETERS), calibrated.unseen >= _UNSEEN
+    hint = _HINT
+    if few or many:
+        is_good = is_good & False
+        names = ", ".join(calibrated.calibration.unknowns.names)
+        why = "many values of them explain the observations" if many else "few draws of them count"
+        hint = f"It is {names} of the physics: {why}. Give narrower priors, or observe what tells "
+        hint += "them apart."
     size = size.minimum(own)
     rows = torch.linspace(0, len(vectors) - 1, num_samples).round().long()
     held = parameters.to_raw(parameters.unflatten(vectors[rows]))
@@ -216,7 +253,7 @@ def _with_parameters(
     _hold(model, held, settled)
     calibrated.calibration.direct(model, coordinates[rows])
     warn_of_parameters(calibrated)
-    return _result(size, is_good, named, parameters)
+    return _result(size, is_good, named, parameters, hint=hint)
 
 
 def _hold(model: TermsGP, samples: dict[str, Tensor], settled: dict[str, Tensor]) -> None:
@@ -241,14 +278,14 @@ def _result(
     draws: dict[str, Tensor],
     parameters: Parameters,
     relevance: Tensor | None = None,
+    hint: str = _HINT,
 ) -> SampleResult:
-    """The result of a fit, with a warning if draws do not show the posterior."""
+    """The result of a fit, with a warning and a hint if draws do not show the posterior."""
     size, converged = (each.reshape(parameters.batch_shape) for each in (size, is_good))
     if not converged.all():
         warnings.warn(
             f"The draws of {int((~converged).sum())} of {converged.numel()} outputs do not show "
-            f"the posterior (effective sample size {size.min():.2g}). Raise num_draws, or give "
-            "narrower priors, that of the noise above all.",
+            f"the posterior (effective sample size {size.min():.2g}). {hint}",
             SamplingWarning,
             stacklevel=4,
         )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
@@ -14,7 +13,6 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.gp import AppendedPhysics, OrthogonalKernel
 from gpadjust.gp.gaussian import cholesky, negative_log_likelihood
-from gpadjust.inference.annealing import Mixture, Particles, raised, resampled
 from gpadjust.inference.optimise import FitResult, Search, maximise
 from gpadjust.inference.targets import ByModules, MarginalizedParameters
 from gpadjust.models import TermsGP
@@ -33,25 +31,8 @@ _WORSE = 12.0  # negative log density, beside the best, of an optimum that does 
 _KEPT = 12  # of these
 _STUCK = 1e8  # damping of a search that finds nothing better
 _SILENT = 1e-14  # the mean square of residuals, relative to that of the targets, that is none
-_AT_ONCE = 2**22  # numbers in the covariances of a batch
 _ROUNDS = 4  # of hyper-parameters and parameters by turns
 _SETTLED = 0.05  # standard deviations that the parameters moved in the last of them
-_GIVEN = {128: 256, 512: 64, math.inf: 16}  # hyper-parameters of up to so many observations
-_ENOUGH = 512  # effective sample size of the parameters that is enough
-_COUNTED = 64  # draws, at least, by weights that are tempered if need be
-_ROUND = 256  # draws at once
-_MOST_DRAWS = 2048  # about each optimum
-_MOVED = 512  # draws, where these are not enough
-_MOVES = 10  # of each, for each parameter, and as many again
-_JUMPS = 0.1  # of these by a whole difference
-_JITTER = 1e-4
-_ROWS = 1_000_000  # draws times observations
-_STEPS = 4  # from where the mean is linear to a draw
-_POLISHES = 3  # steps after these
-_TINY = 1e-300
-_SOLVED = 1e-2  # standard deviations that a draw may be from its aim
-_FOLDED = 0.05  # of the draws without a solution, above which others are taken
-_WIDER = 1.5  # than the posterior of a linear mean, these
 _UNTOLD = 0.15  # of the prior's precision: what else is known of a direction is next to nothing
 _TAKES_PART = 0.3  # cosine of a parameter and such a direction
 _FAR = 3.0  # standard deviations of the prior
@@ -150,7 +131,7 @@ class Calibration:
             i for i, term in enumerate(model.terms) if isinstance(term.kernel, OrthogonalKernel)
         ]
         scaled = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
-        self._moves_covariance = bool(self._orthogonal) or not all(t.is_known for t in scaled)
+        self.moves_covariance = bool(self._orthogonal) or not all(t.is_known for t in scaled)
 
     @property
     def point(self) -> Tensor:
@@ -186,7 +167,7 @@ class Calibration:
         """The prior mean near points ``... x p``."""
         p = points.shape[-1]
         moves, here = _STEP * torch.eye(p).to(points), points.unsqueeze(-2)
-        residual = self._residuals(torch.cat([here, here + moves, here - moves], dim=-2))
+        residual = self.residuals(torch.cat([here, here + moves, here - moves], dim=-2))
         here, up, down = residual.split([1, p, p], dim=-3)
         slope = ((down - up) / (2 * _STEP)).movedim(-3, -1)
         return LinearizedMean(points, here.squeeze(-3), slope.nan_to_num(0.0, 0.0, 0.0))
@@ -198,7 +179,7 @@ class Calibration:
             return
         moves = _STEP * torch.eye(len(silent)).to(near.point)[silent]
         beside = torch.cat([near.point + moves, near.point - moves])
-        failing = beside[~self._residuals(beside).isfinite().flatten(1).all(-1)]
+        failing = beside[~self.residuals(beside).isfinite().flatten(1).all(-1)]
         if len(failing):
             best, there = (self.unknowns.at(z) for z in (near.point, failing[0]))
             raise ValueError(
@@ -223,7 +204,7 @@ class Calibration:
         """
         guesses, found = self.point.unsqueeze(0), []  # where it works, as the model was built there
         for _ in range(_ROUNDS_OF_SEARCHES):
-            others = _spread_normal((_GUESSES, guesses.shape[-1]), generator).to(guesses)
+            others = spread_normal((_GUESSES, guesses.shape[-1]), generator).to(guesses)
             found.append(self._descend(torch.cat([guesses, others])))
             points, values, variances, hessians = map(torch.cat, zip(*found, strict=True))
             kept, square = _apart(points, values, hessians)
@@ -245,7 +226,7 @@ class Calibration:
             Where they came to, ``k x p``, what they minimise there, ``k``, variances of residuals,
             ``k x B``, and about the second derivatives, ``k x p x p``.
         """
-        values = self._misfit(guesses, self._residuals(guesses))[0]
+        values = self._misfit(guesses, self.residuals(guesses))[0]
         prior = torch.eye(guesses.shape[-1]).to(guesses).expand(len(guesses), -1, -1)
         best = _apart(guesses, values, prior)[0][:_STARTS]
         near = self.linearized(guesses[best[values[best].isfinite()]])
@@ -322,233 +303,16 @@ class Calibration:
         target, _ = self.information(near, chol).posterior()
         shares = torch.tensor([1.0, 0.5, 0.25, 0.1, 0.0]).to(target).unsqueeze(-1)
         points = near.point + shares * (target - near.point)
-        return points[self._at_covariance(points, chol).argmin()]
+        return points[self.at_covariance(points, chol).argmin()]
 
-    @torch.no_grad()
-    def draw(
-        self,
-        places: Tensor,
-        parameters: Parameters,
-        vectors: Tensor,
-        log_densities: Tensor,
-        number: int,
-        generator: torch.Generator,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw parameters and hyper-parameters jointly, by importance sampling.
-
-        Parameters are drawn for each of some vectors (:meth:`_randomized`), and the pairs weighted.
-        Where they have several optima, each draws what is nearer to it than to the others.
-
-        Args:
-            places: Optima of the parameters, ``k x p``.
-            parameters: The learnable hyper-parameters.
-            vectors: Vectors of them, ``H x B x q``.
-            log_densities: Of what these were drawn from, less that of their priors, ``H``.
-            number: Number ``K`` of pairs.
-            generator: Source of randomness.
-
-        Returns:
-            Equally likely pairs, numbers of the vectors, ``K``, and coordinates, ``K x p``; and the
-            effective sample size.
-        """
-        count, each, straight = len(vectors), [], [False] * len(places)
-        for place in places:
-            chol = self.factor(self.moments(parameters, vectors, place.unsqueeze(0))[1])
-            each.append((self.linearized(place), chol))
-        density = self._density_of_pairs(parameters, vectors, each[0][1], log_densities)
-        found, log_weights = places[:0], log_densities[:0]
-        size = log_densities.new_zeros(())
-        most = max(_ROUND, min(_MOST_DRAWS, _ROWS // len(self._raw)))
-        while len(found) < most * len(places):
-            for i, (near, chol) in enumerate(each):
-                if not straight[i]:
-                    z, log_q = self._randomized(near, chol, _ROUND, generator)
-                    straight[i] = bool((log_q == math.inf).double().mean() > _FOLDED)
-                if straight[i]:
-                    z, log_q = self._straight(near, chol, _ROUND, generator)
-                log_w = -density(z, torch.arange(_ROUND, device=z.device) % count) - log_q
-                log_w = log_w.nan_to_num(nan=-math.inf, posinf=-math.inf)
-                log_w[torch.cdist(z, places).argmin(-1) != i] = -math.inf
-                found, log_weights = torch.cat([found, z]), torch.cat([log_weights, log_w])
-            if not log_weights.isfinite().any():
-                continue
-            size = log_weights.softmax(0).square().sum().reciprocal()
-            if size >= _ENOUGH:
-                break
-        if not log_weights.isfinite().any():
-            raise FloatingPointError("The density of the parameters is zero at all draws.")
-        # Weights are tempered as far as few would have them all, and draws then moved.
-        least, start = min(_COUNTED, len(found) / 4), log_weights.new_zeros(1)
-        _, weights, _ = raised(log_weights.unsqueeze(1), start, least)
-        enough = bool(size >= _ENOUGH)
-        rows = resampled(weights, number + number % 2 if enough else _MOVED, generator)[:, 0]
-        which, found = rows % count, found[rows]
-        if not enough:
-            which, before = self._moved(which, found, density, count, generator)
-            which, found = self._moved(which, before.clone(), density, count, generator)
-            size = _size_of_moved(before, found)
-            again = torch.arange(number, device=rows.device) % len(found)
-            which, found = which[again], found[again]
-        return which[:number], found[:number], size
-
-    def _moved(
-        self,
-        which: Tensor,
-        z: Tensor,
-        density: Callable[[Tensor, Tensor], Tensor],
-        count: int,
-        generator: torch.Generator,
-    ) -> tuple[Tensor, Tensor]:
-        """Move pairs by Metropolis' rule, so that they become draws of a density.
-
-        Parameters go by differences of others (ter Braak 2006), each fourth time hyper-parameters
-        by the draws of them. Pairs of even and odd number tell nothing of each other.
-
-        Args:
-            which: Numbers of vectors of hyper-parameters, ``N``.
-            z: Coordinates, ``N x p``.
-            density: Its negative logarithm, ``N``, at coordinates and numbers.
-            count: How many vectors there are.
-            generator: Source of randomness.
-        """
-        n, p = z.shape
-        value, quarter = density(z, which), n // 4
-        every = torch.arange(n).view(quarter, 4)
-        options: Any = {"generator": generator, "dtype": z.dtype}
-        for step in range(_MOVES * p):
-            for own, others in ((every[:, :2], every[:, 2:]), (every[:, 2:], every[:, :2])):
-                one, two = torch.randint(quarter, (2, quarter, 2), generator=generator)
-                pair = [others.gather(0, row).flatten() for row in (one, two)]
-                rows, size = own.flatten(), 2 * quarter
-                new, vectors = z[rows], which[rows]
-                if step % 4 == 3:
-                    vectors = torch.randint(count, (size,), generator=generator).to(which)
-                else:
-                    length = 2.38 / math.sqrt(2 * p) * (0.2 + torch.rand(size, 1, **options))
-                    length[torch.rand(size, **options) < _JUMPS] = 1.0
-                    jitter = _JITTER * torch.randn(size, p, **options)
-                    new = new + length.to(z) * (z[pair[0]] - z[pair[1]]) + jitter.to(z)
-                found = density(new, vectors)
-                chance = (value[rows] - found).exp().nan_to_num(nan=0.0)
-                taken = torch.rand(size, **options).to(z) < chance
-                kept = rows.to(z.device)[taken]
-                z[kept], which[kept], value[kept] = new[taken], vectors[taken], found[taken]
-        return which, z
-
-    def _randomized(
-        self, near: LinearizedMean, chol: Tensor, number: int, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        r"""Draw parameters by least squares of randomised targets, which follow where a mean bends.
-
-        With whitened residuals of prior and targets, :math:`F(z) = (z, L^{-1} (m(z) - y))`, and an
-        orthonormal basis Q of their slopes near a point, a draw is the solution of :math:`Q^T F(z)
-        = \eta`, :math:`\eta \sim N(0, I)`. Its density is :math:`|\det Q^T F'(z)| \, N(Q^T F(z))`
-        (randomize-then-optimize, Bardsley et al. 2014), the posterior itself of a linear mean. The
-        equations are solved by Broyden's method, in one step or, where that does not do, in some.
-
-        Args:
-            near: The mean near a point ``p``.
-            chol: Factors of the targets' covariance, ``H x B x n x n``.
-            number: Number ``N`` of draws, of the ``H`` by turns.
-            generator: Source of randomness.
-
-        Returns:
-            Coordinates, ``N x p``, and logarithms of their densities, ``N``; infinite where there
-            is no solution.
-        """
-        p, slope = len(near.point), near.slope.expand(*chol.shape[:-1], -1)
-        white = torch.linalg.solve_triangular(chol, slope, upper=False)
-        identity = torch.eye(p).to(white).expand(len(white), p, p)
-        basis, _ = torch.linalg.qr(torch.cat([identity, white.flatten(1, 2)], dim=-2))
-        first, rest = basis.split([p, basis.shape[-2] - p], dim=-2)
-        rest = torch.linalg.solve_triangular(
-            chol.mT, rest.unflatten(1, slope.shape[1:3]), upper=True
-        )
-        turns = number // len(white)
-        first, rest = first.repeat(turns, 1, 1), rest.repeat(turns, 1, 1, 1)
-        near = LinearizedMean(*(part.expand(number, *part.shape) for part in near))
-
-        def value_of(z: Tensor, residual: Tensor, which: Tensor) -> Tensor:
-            back = (rest[which] * residual.unsqueeze(-1)).sum((1, 2))
-            return (first[which] * z.unsqueeze(-1)).sum(1) - back
-
-        def slope_of(slope: Tensor) -> Tensor:
-            return first.mT + (rest.unsqueeze(-1) * slope.unsqueeze(-2)).sum((1, 2))
-
-        aim = _spread_normal((number, p), generator).to(white)
-        every = torch.arange(number, device=white.device)
-        start, by_z = value_of(near.point, near.residual, every), slope_of(near.slope)
-        found, unsolved = near.point.clone(), every
-        for steps in (1, _STEPS):  # where one does not do, a way that keeps to the ridge
-            z, value, slopes = near.point[unsolved], start[unsolved], by_z[unsolved]
-            for step in range(steps + _POLISHES):
-                share = min(1.0, (step + 1) / steps)
-                goal = start[unsolved] + share * (aim - start)[unsolved]
-                move = torch.linalg.solve_ex(slopes, (goal - value).unsqueeze(-1))[0]
-                z = z + move.squeeze(-1)
-                missed = value + (slopes @ move).squeeze(-1)
-                value = value_of(z, self._residuals(z), unsolved)
-                length = move.square().sum(-2, keepdim=True).clamp_min(_TINY)
-                slopes = slopes + (value - missed).unsqueeze(-1) * move.mT / length
-                solved = (value - aim[unsolved]).abs().amax(-1) < _SOLVED
-                if step + 1 >= steps and solved.all():
-                    break
-            found[unsolved[solved]] = z[solved]
-            unsolved = unsolved[~solved]
-            if not len(unsolved):
-                break
-        around = self.linearized(found)
-        by_z = slope_of(around.slope)
-        by_z[unsolved] = torch.eye(p).to(by_z)
-        value = value_of(found, around.residual, every)
-        log_q = torch.linalg.slogdet(by_z).logabsdet - 0.5 * value.square().sum(-1)
-        log_q[unsolved] = math.inf
-        return found, log_q - 0.5 * p * math.log(2 * math.pi)
-
-    def _straight(
-        self, near: LinearizedMean, chol: Tensor, number: int, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """As :meth:`_randomized`, of Student's t about the posterior of a linear mean.
-
-        Where a mean folds, randomised equations have no solution beyond the fold.
-        """
-        mean, factor = self.information(near, chol).posterior()
-        root = _WIDER * torch.linalg.cholesky(torch.cholesky_inverse(factor))
-        student = Mixture(mean[None], torch.ones_like(mean[None, :, 0]), root[None])
-        z = student.sample(number // len(mean), generator)
-        return z.flatten(0, 1), -student.value_and_gradient(z)[0].flatten()
-
-    def _density_of_pairs(
-        self, parameters: Parameters, vectors: Tensor, chol: Tensor, log_densities: Tensor
-    ) -> Callable[[Tensor, Tensor], Tensor]:
-        """Negative log densities ``N`` of coordinates ``N x p`` and numbers of vectors ``N``.
-
-        Less those that the ``H`` vectors were drawn from. ``chol`` has the factors of the targets'
-        covariance at these, if parameters do not move it.
-        """
-        at_once = max(1, _AT_ONCE // chol[0].numel())
-        log_det = chol.diagonal(dim1=-1, dim2=-2).log().sum((-1, -2))
-
-        def density(z: Tensor, which: Tensor) -> Tensor:
-            found = []
-            for part, rows in zip(z.split(at_once), which.split(at_once), strict=True):
-                if self._moves_covariance:
-                    value = self._density(part, parameters, vectors[rows])
-                else:
-                    value = self._at_covariance(part.unsqueeze(0), chol[rows])[0] + log_det[rows]
-                found.append(value + log_densities[rows])
-            return torch.cat(found)
-
-        return density
-
-    def _at_covariance(self, z: Tensor, chol: Tensor) -> Tensor:
+    def at_covariance(self, z: Tensor, chol: Tensor) -> Tensor:
         """Negative log densities ``k (x H)`` of ``z``, with factors ``(H) x B x n x n``."""
-        residual = self._residuals(z).movedim(0, -1)  # (H) x B x n x k
+        residual = self.residuals(z).movedim(0, -1)  # (H) x B x n x k
         white = torch.linalg.solve_triangular(chol, residual, upper=False)
         value = white.square().sum((-3, -2)).movedim(-1, 0) + z.square().sum(-1)
         return _or_infinite(0.5 * value)
 
-    def _density(self, z: Tensor, parameters: Parameters, vectors: Tensor) -> Tensor:
+    def density(self, z: Tensor, parameters: Parameters, vectors: Tensor) -> Tensor:
         """Negative log densities ``k`` of parameters ``k x p`` beside vectors ``k x B x q``."""
         mean, covariance = self.moments(parameters, vectors, z)
         failed = (mean.isnan() & self._observed).flatten(1).any(-1)
@@ -564,7 +328,7 @@ class Calibration:
         inputs: Tensor = self._transform.at(self._raw, points)
         return inputs.unsqueeze(-3) if self.model.num_outputs > 1 else inputs
 
-    def _residuals(self, points: Tensor) -> Tensor:
+    def residuals(self, points: Tensor) -> Tensor:
         """As in :class:`LinearizedMean`, at points ``... x p``."""
         mean = self.model.mean_module(self._inputs(points))
         mean = mean.reshape(*points.shape[:-1], *self._targets.shape)
@@ -669,37 +433,6 @@ def calibrate_roughly(model: TermsGP, search: Search) -> Calibrated:
         return calibrate(model, search)
 
 
-def draw_parameters(
-    calibrated: Calibrated,
-    parameters: Parameters,
-    vectors: Tensor,
-    log_densities: Tensor,
-    number: int,
-    generator: torch.Generator,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw parameters of the physics, and of vectors of hyper-parameters those that go with them.
-
-    Args:
-        calibrated: The model near its most likely parameters.
-        parameters: The learnable hyper-parameters.
-        vectors: Draws of them with the parameters integrated out near there, ``H x B x q``.
-        log_densities: Theirs, less that of their priors, ``H``.
-        number: Number ``K`` of draws.
-        generator: Source of randomness.
-
-    Returns:
-        Vectors, ``K x B x q``, coordinates of parameters, ``K x p``, and the effective sample size.
-    """
-    n = calibrated.near.residual.shape[-1]
-    count = next(count for most, count in _GIVEN.items() if n <= most) if parameters.names else 1
-    count = 2 ** int(math.log2(min(count, len(vectors))))  # a round of draws has them equally often
-    rows = torch.linspace(0, len(vectors) - 1, count).round().long()
-    which, coordinates, size = calibrated.calibration.draw(
-        calibrated.places, parameters, vectors[rows], log_densities[rows], number, generator
-    )
-    return vectors[rows][which], coordinates, size
-
-
 def warn_of_parameters(calibrated: Calibrated) -> None:
     """Warn of parameters that the observations tell nothing of, or against what was known.
 
@@ -730,7 +463,7 @@ def warn_of_parameters(calibrated: Calibrated) -> None:
         )
 
 
-def _spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+def spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
     """Standard normal draws ``... x p`` that fill space evenly, in random order (Sobol)."""
     seed = int(torch.randint(2**31, (1,), generator=generator))
     engine = SobolEngine(shape[-1], scramble=True, seed=seed)
@@ -740,23 +473,13 @@ def _spread_normal(shape: tuple[int, ...], generator: torch.Generator) -> Tensor
     return torch.special.ndtri(shares[order]).reshape(shape)
 
 
-def _size_of_moved(before: Tensor, after: Tensor) -> Tensor:
-    """About the effective size of draws ``N x p`` that moved, by how much they remember."""
-    one, two = before - before.mean(0), after - after.mean(0)
-    tiny = torch.finfo(one.dtype).tiny
-    memory = (one * two).mean(0) / (one.var(0) * two.var(0)).sqrt().clamp_min(tiny)
-    memory = memory.amax().clamp(0, 1)
-    none = after.new_zeros(len(after), 1)
-    size = Particles(after.unsqueeze(1), none, none[0], none[0]).effective_size()[0]
-    return size * (1 - memory) / (1 + memory)
-
-
 def _apart(points: Tensor, values: Tensor, hessians: Tensor) -> tuple[Tensor, Tensor]:
     """Points ``k x p`` that are not beside a better one.
 
     Args:
         points: The points.
-        values: Negative log densities there, ``k``; ``hessians`` theirs, ``k x p x p``.
+        values: Negative log densities there, ``k``.
+        hessians: Metrics of distances from each, ``k x p x p``.
 
     Returns:
         Their numbers, ``K``, the best first, and squares of their distances to all, ``K x k``.

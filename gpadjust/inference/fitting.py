@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
+from dataclasses import replace
 from numbers import Integral
 from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, Unpack, overload
 
@@ -120,7 +122,9 @@ def fit(
     either method: least squares from several starts, then by turns with the hyper-parameters, from
     which they are integrated out near their most likely values. ``"bayes"`` then draws them given
     each of some samples of the hyper-parameters, by least squares of randomised targets (Bardsley
-    et al. 2014), and weights the pairs: each sample that the model holds has its own physics.
+    et al. 2014) about each of their optima, and weights the pairs, or moves them where weights
+    say little: each sample that the model holds has its own physics. There is a ``SamplingWarning``
+    if they still remember where they began, or if there are likely optima that no search came to.
     ``model.physics_parameters`` is what is known of them.
 
     ``"map"``: the most likely values. Random starts are screened in one batch beside the model's
@@ -195,11 +199,15 @@ def fit(
     search = Search(**{name: own.pop(name) for name in _SEARCH if name in own})
     with threads_for(model.train_targets.shape[-1]), _without_samples(model):
         try:
+            begin = time.perf_counter()
             result = METHODS[method].run(model, search, **own)
             if isinstance(model, TermsGP):
                 model.was_fitted = True
                 model.eval()
                 model.learn_local_errors()
+            if isinstance(model, TermsGP) and isinstance(result, SampleResult):
+                seconds = time.perf_counter() - begin
+                result = replace(result, num_samples=model.num_samples, seconds=seconds)
             return result
         finally:
             model.eval()

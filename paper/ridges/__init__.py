@@ -23,20 +23,20 @@ MODELS = {
 class Settings:
     """What decides the numbers."""
 
-    compared: int = 5
+    compared: int = 3
     """first cases of a ridge that are set beside a reference with each model"""
-    long: int = 4
+    long: int = 3
     """cases of nine parameters"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ridges(Experiment):
-    """Do 95 % intervals of the parameters of a right law hold the true ones, and how wide are they?"""
+    """Intervals of the parameters of a right law: do they hold the true ones, how wide are they?"""
 
     runs: int = 50
     """cases of each problem"""
-    seed: int = 3000
-    """the first seed; 1000 to 1999 were for trying"""
+    seed: int = 3200
+    """the first seed; 1000 to 1999 were for trying, and runs of 3000 to 3101 were broken off"""
     out: Path = Path("results/ridges")
     problems: tuple[str, ...] = (*RIDGES, NINE, *FOLDS)
     """laws; those that fold are fitted by calibrated physics alone"""

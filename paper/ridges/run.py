@@ -25,8 +25,12 @@ _BUILD: Mapping[str, Callable[..., TermsGP]] = {
     "orthogonal": partial(PhysicsMeanGP, covar_module=orthogonal_rbf),
     "cka": CKA,
 }
-_POINTS = {"alias": (101, 4001), "radar": (101, 6001)}  # of grids, if other than
-_SQUARE = (401, 401)
+_POINTS = {  # of grids
+    "pendulum": (301, 901),
+    "focus": (901, 301),
+    "alias": (61, 2001),
+    "radar": (61, 4001),
+}
 
 
 def run(experiment: Ridges, problem: str, model: str, seed: int, *, unfinished: Path) -> Record:
@@ -59,6 +63,6 @@ def run(experiment: Ridges, problem: str, model: str, seed: int, *, unfinished: 
 
 def reference(problem: str, known: Case, model: str, seed: int) -> tuple[Tensor, Tensor]:
     """Coordinates and weights that stand for the posterior."""
-    if model == "physics" and len(known.true) == 2:
-        return grid(known, _POINTS.get(problem, _SQUARE))
+    if problem in FOLDS:
+        return grid(known, _POINTS[problem])
     return sample(Posterior(known, model), seed)
