@@ -54,8 +54,8 @@ def run(
         found["shown"] = comparison.gain["y"].shown
     else:
         model = ZeroMeanGP(X, Y) if method == "zero" else CKA(X, Y, physics=physics)
-        found["relevance"] = fit(model).relevance
-        found["relevance"] = None if method == "zero" else found["relevance"].item()
+        relevance = fit(model, "bayes").relevance
+        found["relevance"] = None if relevance is None else relevance.item()
     found["seconds"] = time.process_time() - start
     if method == "compare":
         found["single"] = {
