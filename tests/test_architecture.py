@@ -17,7 +17,7 @@ FLOORS = [
 ]
 
 
-FILES, CLASSES, FUNCTIONS = 25, 31, 228  # that the ten lines of the README pass; fewer are better
+FILES, CLASSES, FUNCTIONS = 26, 32, 240  # that the ten lines of the README pass; fewer are better
 
 
 def passed(call):

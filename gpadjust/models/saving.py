@@ -95,8 +95,8 @@ def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
     data: Any = model.data()
     if lacking := _not_taken(type(model), [n for n, value in data.items() if value is not None]):
         raise ValueError(
-            f"{name} could not be built again: its constructor takes no {' and no '.join(lacking)}. "
-            "Call its arguments of data as the library does."
+            f"{name} could not be built again: its constructor takes no "
+            f"{' and no '.join(lacking)}. Call its arguments of data as the library does."
         )
     if isinstance(transform, PhysicsInput):
         given: Any = transform.physics
