@@ -48,6 +48,10 @@ class PhysicsInUnits(Physics):
             raise several_outputs(self.name, self.metric, Y.shape[-1])
         return self.units.metric(Y, self.metric)
 
+    def in_user_units(self, values: Tensor) -> Tensor:
+        """As the metric is."""
+        return self.units.of_metric(values, self.metric)
+
 
 def several_outputs(name: str, metric: str, count: int) -> PhysicsError:
     """The error of a physics with several outputs."""

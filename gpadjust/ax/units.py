@@ -118,6 +118,14 @@ class Units:
                 Y = steps[metric](Y)
         return Y
 
+    def of_metric(self, Y: Tensor, metric: str) -> Tensor:
+        """The reverse; what was clipped stays so."""
+        for steps in reversed(self._forth):
+            if metric in steps:
+                step: Any = steps[metric]
+                Y = _UNDO[step.func](*step.args, Y)
+        return Y
+
 
 def _change(function: Callable[[Tensor], Tensor], name: str, columns: Columns) -> None:
     if name in columns:
@@ -211,6 +219,19 @@ def _scaled(mean: float, sd: float, Y: Tensor) -> Tensor:
     return (Y - mean) / sd
 
 
+def _of_bilog(bound: float, Y: Tensor) -> Tensor:
+    return bound + (Y - bound).sign() * (Y - bound).abs().expm1()
+
+
+def _unscaled(mean: float, sd: float, Y: Tensor) -> Tensor:
+    return mean + sd * Y
+
+
+_UNDO: Mapping[Any, Callable[..., Tensor]] = {
+    torch.clamp: lambda Y: Y,
+    _bilog_of: _of_bilog,
+    _scaled: _unscaled,
+}
 _BACK: Mapping[type[Transform], Callable[[Any], list[Callable[[Columns], None]]]] = {
     Log: _log,
     Logit: _logit,

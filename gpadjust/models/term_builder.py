@@ -281,7 +281,9 @@ class TermBuilder:
             return
         with torch.no_grad():
             f = sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
-            text = complaint(self.data, f + self._offset, self._learns_mean, self._learns_offset)
+            f, Y = (physics.in_user_units(v) for v in (f + self._offset, self.data.Y))
+            data = self.data._replace(Y=Y)
+            text = complaint(data, f, self._learns_mean, self._learns_offset)
         if text:
             warnings.warn(
                 f"Physics {physics.name!r}: {text} Look at `physics(train_X) - train_Y`, and mend "

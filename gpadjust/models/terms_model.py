@@ -23,8 +23,11 @@ from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions, check_number
 from gpadjust.models.summary import summary, title
+from gpadjust.models.term_builder import ModelOptions
 from gpadjust.models.training_data import ArrayLike, check_columns, to_tensor
 from gpadjust.physics import Physics
+
+_SHARED = "Unpack[ModelOptions]"  # how a constructor says that it takes these and no others
 
 
 class TermsModel(PredictiveModel):
@@ -63,7 +66,16 @@ class TermsModel(PredictiveModel):
     def __new__(cls, *args: Any, **options: Any) -> Self:
         """Remember the options that the model is built with, for :func:`gpadjust.save`."""
         model = super().__new__(cls)
-        names = [*signature(cls.__init__).parameters][1:]
+        own = signature(cls.__init__).parameters
+        names = [*own][1:]
+        if any(each.annotation == _SHARED for each in own.values()):
+            known = {n for n in names if own[n].annotation != _SHARED}
+            known |= {*ModelOptions.__annotations__}
+            if unknown := [name for name in options if name not in known]:
+                raise TypeError(
+                    f"{cls.__name__}() got an unexpected keyword argument {unknown[0]!r}; it takes "
+                    f"{', '.join(sorted(known))}."
+                )
         every = {**dict(zip(names, args, strict=False)), **options}
         if callable(variances := every.get("train_Yvar")) and not isinstance(variances, Tensor):
             raise TypeError("Got a function as train_Yvar: did you mean physics=...?")

@@ -180,6 +180,10 @@ class Physics(torch.nn.Module, ABC):
         own = [parameters[0][name].unsqueeze(-1) for name in self.unknowns]
         return torch.cat([self.read(X), *own], dim=-1)
 
+    def in_user_units(self, values: Tensor) -> Tensor:
+        """Values of this physics, or targets beside them, in the units that the user knows."""
+        return values
+
     def of_rows(self, rows: Tensor) -> Tensor:
         """The outputs ``N x m`` of rows ``N x (d + p)``, the columns it reads and its parameters.
 

@@ -15,7 +15,7 @@ from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 from botorch.models.transforms.input import Normalize
 
-from gpadjust import CKA, BlackBoxPhysics
+from gpadjust import CKA, BlackBoxPhysics, PhysicsWarning
 from gpadjust.ax import TRANSFORMS, ParameterPhysics, TellPhysics, generator_kwargs
 
 # Data without noise, on which Ax's acquisition functions are nearly singular.
@@ -45,6 +45,9 @@ ARMS = [
     {"rate": 0.2, "width": 2, "x": 1.5, "glue": "b", "size": 0.5, "grid": 5},
     {"rate": 1e-3, "width": 7, "x": -0.4, "glue": "a", "size": 8.0, "grid": 3},
 ]
+
+
+NAMES = ("rate", "width", "x", "size", "grid")
 
 
 def truth(rate, width, x, size, grid):
@@ -154,6 +157,7 @@ def test_gradients_pass_the_transforms():
         assert slope.abs().min() > 1e-3
 
 
+@pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 @pytest.mark.parametrize(
     "config",
     [
@@ -310,3 +314,20 @@ def test_of_a_single_metric_it_is_of_that():
         transforms=TRANSFORMS,
     )
     assert models(fitted)["cost"].physics.metric == "cost"
+
+
+def test_a_physics_that_is_off_is_told_in_units_of_the_metric():
+    def f_p(rate, x, width, size, grid):
+        return 1000 * truth(rate, width, x, size, grid)
+
+    with pytest.warns(PhysicsWarning) as caught:
+        fitted = adapter(experiment(), f_p, metrics=["cost"])
+    Y = torch.tensor([[truth(**{k: arm[k] for k in NAMES})] for arm in ARMS], dtype=torch.float64)
+    (text,) = (str(each.message) for each in caught if each.category is PhysicsWarning)
+    assert f"the targets have a standard deviation of {float(Y.std()):.3g}:" in text
+    assert "about 1,000 times too large" in text
+    assert "standardised" not in text
+    physics = models(fitted)["cost"].physics
+    seen = physics.units.metric(Y, "cost")
+    assert (seen - Y).abs().min() > 1
+    torch.testing.assert_close(physics.in_user_units(seen), Y)

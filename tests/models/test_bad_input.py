@@ -245,3 +245,10 @@ def test_rra(build, data, XY):
     for shape in ((48,), (3, 47), (3, 1, 48)):
         with pytest.raises(ValueError, match=r"weights of shape k x 48, got"):
             model.functions(torch.zeros(*shape, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "RRA"])
+def test_an_argument_that_there_is_none_of(build, kind, XY):
+    """The constructor of the model is named, and what it takes."""
+    with pytest.raises(TypeError, match=rf"{kind}\(\) got an unexpected .*'center_'; .*likelihood"):
+        build(kind, *XY, center_=1.0)
