@@ -27,6 +27,7 @@ EXPERIMENTS = {
     "large": ("Large", "100,000 observations: inducing points, or an exact model of some"),
     "optimisation": ("Optimisation", "trials of Bayesian optimisation in Ax, with and without f_p"),
     "misled": ("Misled", "Bayesian optimisation with a physics that misleads, or helps"),
+    "seeds": ("Seeds", "fits of the same data by several seeds, beside long sampling"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}
