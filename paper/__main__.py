@@ -31,6 +31,7 @@ EXPERIMENTS = {
     "kinks": ("Kinks", "next states of systems with dry friction, impacts, gaps and switches"),
     "ridges": ("Ridges", "intervals of parameters on a ridge, or of which several values do"),
     "polynomials": ("Polynomials", "CKA, AR1 and MFK on functions that are nearly polynomials"),
+    "seeds": ("Seeds", "fits of the same data by several seeds, beside long sampling"),
     "floor": ("Floor", "what the control tasks cost at best"),
 }
 _OTHER = {"report": "copy the results that are committed into the READMEs"}

@@ -66,13 +66,13 @@ class SampleResult:
             unknown parameters of the physics also by the weights of theirs, as they are, or by
             what those remember that moved.
         converged: Whether the draws are of the posterior, of each output, of the same shape;
-            there is a :class:`~gpadjust.inference.SamplingWarning` if not. Of more than some 150
-            observations they are weighted draws around the optima, of the posterior to a power of
-            0.3 at least.
+            there is a :class:`~gpadjust.inference.SamplingWarning` if not, also where predictions
+            by two halves of the draws tell that their mean is 0.3 standard deviations off. Of more
+            than 150 observations they are weighted draws around the optima, of the posterior to a
+            power of 0.3 at least.
         draws: Equally likely draws of each hyper-parameter of the model with its physics, ``k x``
-            its shape, by its name: 16 to
-            128 by default, 1,024 beside unknown parameters of the physics. Of a centre that is
-            learnt they are in standard deviations of f_p from its mean.
+            its shape, by its name: 16 to 256 by default, 1,024 beside unknown parameters of the
+            physics. Of a centre that is learnt they are in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
         num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
@@ -155,7 +155,8 @@ def sample(
 ) -> SampleResult:
     """Sample a model's hyper-parameters and put the samples into it, see :func:`~gpadjust.fit`.
 
-    The draws begin around the optima that the search finds; its seed is that of both.
+    The draws begin with the prior and around the optima that the search finds; its seed is that of
+    both.
     """
     _check(model)
     n, generator = model.train_targets.shape[-1], torch.Generator().manual_seed(search.seed)

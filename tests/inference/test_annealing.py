@@ -6,7 +6,15 @@ import pyro.distributions as dist
 import pytest
 import torch
 
-from gpadjust.inference.annealing import Mixture, Particles, raised, resampled, sample
+from gpadjust.inference.annealing import (
+    Both,
+    Mixture,
+    Normal,
+    Particles,
+    raised,
+    resampled,
+    sample,
+)
 
 DRAWS, PARTICLES, GRADIENTS = 512, 256, 64 * 256
 
@@ -394,3 +402,54 @@ def test_few_draws_have_any_density():
 def test_a_density_that_is_far_narrower_is_reached():
     found = draw(lambda x: standard(x / 1e-4), around(1.0), 1000 * PARTICLES)
     assert found.power == 1
+
+
+class TestProposals:
+    @pytest.fixture
+    def parts(self):
+        options = {"generator": generator(), "dtype": torch.float64}
+        normal = Normal(torch.randn(2, 3, **options), 0.5 + torch.rand(2, 3, **options))
+        return normal, around(1.0, 0.7, p=3, problems=2)
+
+    def test_density_and_gradient(self, parts):
+        x = torch.randn(7, 2, 3, generator=generator(1), dtype=torch.float64).requires_grad_()
+        normal = dist.Normal(parts[0].mean, parts[0].sd).log_prob(x).sum(-1)
+        torch.testing.assert_close(parts[0].value_and_gradient(x.detach())[0], -normal.detach())
+        wide = -parts[1].value_and_gradient(x)[0]
+        expected = (0.5 * normal.exp() + 0.5 * wide.exp()).log()
+        value, gradient = Both(*parts).value_and_gradient(x.detach())
+        torch.testing.assert_close(value, -expected.detach())
+        torch.testing.assert_close(gradient, -torch.autograd.grad(expected.sum(), x)[0])
+
+    def test_half_of_the_draws_are_of_each(self, parts):
+        far = Normal(parts[0].mean + 100, parts[0].sd)
+        x = Both(far, parts[1]).sample(200, generator())
+        assert x.shape == (200, 2, 3)
+        is_far = (x > 50).all(-1)
+        assert (is_far.sum(0) == 100).all()
+        for half in (is_far[0::2], is_far[1::2]):  # and by turns of both
+            assert (half.sum(0) > 30).all()
+
+    def test_of_what_one_of_them_would_miss(self, parts):
+        density = Potential(lambda x: standard((x - 8) / 0.05))
+        wide = Normal(torch.zeros(20, 2).double(), torch.ones(20, 2).double())
+        found = draw(density, Both(wide, around(8.0, 0.1, problems=20)))
+        assert (found.power == 1).all()
+        expected = math.log(2 * math.pi * 0.05**2)
+        assert is_one_on_average((found.log_evidence - expected).exp())
+
+
+def test_it_ends_where_no_more_can_be_reached():
+    def count(enough):
+        density = Potential(lambda x: standard((x - 4) / 0.1))
+        enough = None if enough is None else torch.tensor([enough], dtype=torch.float64)
+        args = (DRAWS, PARTICLES, GRADIENTS, generator())
+        found = sample(density, around(0.0), *args, enough)
+        return density.num_gradients, found.power
+
+    whole, power = count(None)
+    assert power == 1
+    assert count(-1e3) == (whole, power)  # it may be as much
+    few, power = count(1e3)
+    assert few < whole
+    assert power < 1
