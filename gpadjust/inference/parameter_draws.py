@@ -19,7 +19,7 @@ _ROUND = 256  # draws at once
 _MOST_DRAWS = 2048  # about each optimum
 _MOVED = 512  # draws, where these are not enough
 _MOVES = 10  # of each, for each parameter, and as many again
-_LEAST_MOVES = 40
+_LEAST_MOVES = 80
 _JUMPS = 0.1  # of these by a whole difference
 _JITTER = 1e-4
 _MOVED_UP_TO = 128  # observations
@@ -138,7 +138,7 @@ class ParameterDraws:
                 else:
                     length = 2.38 / math.sqrt(2 * p) * (0.2 + torch.rand(size, 1, **options))
                     length[torch.rand(size, **options) < _JUMPS] = 1.0
-                    jitter = _JITTER * torch.randn(size, p, **options)
+                    jitter = _JITTER * torch.randn(size, p, **options) * z.std(0).cpu()
                     new = new + length.to(z) * (z[pair[0]] - z[pair[1]]) + jitter.to(z)
                 found = self._density(new, vectors)
                 chance = (value[rows] - found).exp().nan_to_num(nan=0.0)
