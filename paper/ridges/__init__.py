@@ -35,8 +35,8 @@ class Ridges(Experiment):
 
     runs: int = 50
     """cases of each problem"""
-    seed: int = 3300
-    """the first seed; 1000 to 1999 were for trying, and runs of 3000 to 3202 were broken off"""
+    seed: int = 3400
+    """the first seed; 1000 to 1999 were for trying, and runs of 3000 to 3313 were broken off"""
     out: Path = Path("results/ridges")
     problems: tuple[str, ...] = (*RIDGES, NINE, *FOLDS)
     """laws; those that fold are fitted by calibrated physics alone"""
