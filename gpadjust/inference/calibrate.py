@@ -26,6 +26,7 @@ _UNSEEN = 0.02  # of the posterior, near optima that searches have not come to
 _ITERATIONS = 60  # of least squares
 _ARRIVED = 1e-4  # decrease of a negative log density at which they stop
 _BESIDE = 0.5  # standard deviations, within which starts or optima are one
+_ALIKE = 1e-3  # standard deviations of the prior, likewise
 _REACHED = 2.0  # standard deviations from an optimum, within which a search came to it
 _WORSE = 12.0  # negative log density, beside the best, of an optimum that does not count
 _KEPT = 12  # of these
@@ -487,7 +488,8 @@ def _apart(points: Tensor, values: Tensor, hessians: Tensor) -> tuple[Tensor, Te
     order = values.argsort()
     away = points[order].unsqueeze(0) - points[order].unsqueeze(1)
     square = torch.einsum("ijp,ipq,ijq->ij", away, hessians[order], away)
-    first = ~(square < _BESIDE**2).tril(-1).any(-1)
+    alike = (square < _BESIDE**2) | (away.square().sum(-1) < _ALIKE**2)
+    first = ~alike.tril(-1).any(-1)
     return order[first], square[first]
 
 

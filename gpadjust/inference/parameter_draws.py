@@ -19,10 +19,10 @@ _ROUND = 256  # draws at once
 _MOST_DRAWS = 2048  # about each optimum
 _MOVED = 512  # draws, where these are not enough
 _MOVES = 10  # of each, for each parameter, and as many again
-_LEAST_MOVES = 40
+_LEAST_MOVES = 80
 _JUMPS = 0.1  # of these by a whole difference
 _JITTER = 1e-4
-_MOVED_UP_TO = 128  # observations
+_MOVED_UP_TO = {False: 128, True: 24}  # observations, by whether each draw has a covariance
 _ROWS = 1_000_000  # draws times observations
 _STEPS = 4  # from where the mean is linear to a draw
 _POLISHES = 3  # steps after these
@@ -58,10 +58,14 @@ class ParameterDraws:
         self._parameters, self._vectors = parameters, vectors
         self._log_densities, self._generator = log_densities, generator
         self._count = len(vectors)
-        self._each = []
+        self._each, precisions = [], []
         for place in places:
             _, covariance = calibration.moments(parameters, vectors, place.unsqueeze(0))
-            self._each.append((calibration.linearized(place), calibration.factor(covariance)))
+            near, chol = calibration.linearized(place), calibration.factor(covariance)
+            self._each.append((near, chol))
+            _, root = calibration.information(near, chol).posterior()
+            precisions.append((root @ root.mT).mean(0))
+        self._precisions = torch.stack(precisions)
         # Of the targets' covariance, if parameters do not move it.
         self._chol = self._each[0][1]
         self._log_det = self._chol.diagonal(dim1=-1, dim2=-2).log().sum((-1, -2))
@@ -93,7 +97,7 @@ class ParameterDraws:
                     z, log_q = self._straight(near, chol, _ROUND)
                 log_w = -self._density(z, turns) - log_q
                 log_w = log_w.nan_to_num(nan=-math.inf, posinf=-math.inf)
-                log_w[torch.cdist(z, places).argmin(-1) != i] = -math.inf
+                log_w[self._nearest(z) != i] = -math.inf
                 found, log_weights = torch.cat([found, z]), torch.cat([log_weights, log_w])
             if log_weights.isfinite().any():
                 size = log_weights.softmax(0).square().sum().reciprocal()
@@ -102,7 +106,7 @@ class ParameterDraws:
         # Weights are tempered as far as few would have them all, and draws then moved.
         least, start = min(_COUNTED, len(found) / 4), log_weights.new_zeros(1)
         _, weights, _ = raised(log_weights.unsqueeze(1), start, least)
-        moves = bool(size < _ENOUGH) and n <= _MOVED_UP_TO
+        moves = bool(size < _ENOUGH) and n <= _MOVED_UP_TO[self._calibration.moves_covariance]
         rows = resampled(weights, _MOVED if moves else number + number % 2, self._generator)[:, 0]
         which, found = rows % self._count, found[rows]
         if moves:
@@ -111,6 +115,11 @@ class ParameterDraws:
             size = _size_of_moved(before, found)
         again = torch.arange(number, device=rows.device) % len(found)
         return which[again], found[again], size
+
+    def _nearest(self, z: Tensor) -> Tensor:
+        """Numbers of the optima that coordinates ``N x p`` are nearest to, by each one's metric."""
+        away = z.unsqueeze(1) - self._places
+        return torch.einsum("nkp,kpq,nkq->nk", away, self._precisions, away).argmin(-1)
 
     def _moved(self, which: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Move pairs by Metropolis' rule, so that they become draws of the posterior.
@@ -138,7 +147,7 @@ class ParameterDraws:
                 else:
                     length = 2.38 / math.sqrt(2 * p) * (0.2 + torch.rand(size, 1, **options))
                     length[torch.rand(size, **options) < _JUMPS] = 1.0
-                    jitter = _JITTER * torch.randn(size, p, **options)
+                    jitter = _JITTER * torch.randn(size, p, **options) * z.std(0).cpu()
                     new = new + length.to(z) * (z[pair[0]] - z[pair[1]]) + jitter.to(z)
                 found = self._density(new, vectors)
                 chance = (value[rows] - found).exp().nan_to_num(nan=0.0)

@@ -1,9 +1,13 @@
-"""Intervals of two parameters that observations tell apart badly, beside those of a grid."""
+"""Intervals of parameters that observations tell apart badly, or that several values do for."""
+
+import re
+from dataclasses import replace
 
 import pytest
 import torch
 
 from gpadjust import CalibratedPhysics, FunctionPhysics, Unknown, fit
+from gpadjust.inference import SamplingWarning
 
 
 def beam(X, p):
@@ -83,3 +87,62 @@ def test_intervals_hold():
             low, high = model.physics_parameters.interval()
             held.append((low <= true) & (true <= high))
     assert 0.9 <= torch.stack(held).double().mean() <= 0.99
+
+
+def fold(law, unknowns, seed, noise=0.1):
+    """Data of a law of one input, and a fit of it; its true parameters are drawn from the prior."""
+    options = {"generator": torch.Generator().manual_seed(seed), "dtype": torch.float64}
+    X = torch.linspace(0.1, 2.0, 12, dtype=torch.float64).unsqueeze(-1)
+    physics = FunctionPhysics(law, unknowns=unknowns)
+    true = physics.unknowns.at(torch.randn(len(unknowns), **options))
+    Y = physics(X, true) + noise * torch.randn(len(X), 1, **options)
+    return CalibratedPhysics(X, Y, noise**2, physics=physics), true
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_optima_are_found(seed):
+    """Of a swing that may have either sign, with the phase of the other."""
+    unknowns = {"swing": Unknown(0.0, sd=1.0), "phase": Unknown(0.0, bounds=(-3.15, 3.15))}
+    model, true = fold(lambda X, p: p.swing * torch.sin(3 * X[:, 0] + p.phase), unknowns, seed)
+    fit(model)
+    swing = model.physics_parameters["swing"]
+    assert 0.4 < (swing > 0).double().mean() < 0.6
+    assert abs(swing.abs().mean() - true[0].abs()) < 0.1
+
+
+@pytest.mark.filterwarnings("ignore::gpadjust.inference.ParameterWarning")
+def test_draws_go_beyond_a_fold():
+    """Of a square of which the data say that it is small: the root has either sign."""
+    X = torch.linspace(0.1, 2.0, 12, dtype=torch.float64).unsqueeze(-1)
+    physics = FunctionPhysics(
+        lambda X, p: p.a.square() * X[:, 0], unknowns={"a": Unknown(0.3, sd=1.0)}
+    )
+    noise = torch.randn(12, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    Y = 0.01 * X + 0.1 * noise
+    model = CalibratedPhysics(X, Y, 0.1**2, physics=physics)
+    fit(model)
+    a = torch.linspace(-2, 2, 4001, dtype=torch.float64)
+    misfit = (Y.mT - a.square().unsqueeze(-1) * X.mT).square().sum(-1)
+    weights = (-0.5 * (misfit / 0.1**2 + (a - 0.3).square())).softmax(0)
+    exact = (weights * a).sum(), (weights * a.square()).sum()
+    draws = model.physics_parameters["a"]
+    assert abs(draws.mean() - exact[0]) < 0.04
+    assert (draws.square().mean() / exact[1]).item() == pytest.approx(1, abs=0.2)
+
+
+def test_warning_of_optima_that_were_not_found():
+    """Of a rate that hundreds of values do for: searches cannot have come to all."""
+    unknowns = {"size": Unknown(1.0, sd=0.3), "rate": Unknown(300.0, sd=100.0)}
+    model, _ = fold(lambda X, p: p.size * torch.cos(p.rate * X[:, 0]), unknowns, 0, noise=1.0)
+    with pytest.warns(SamplingWarning, match="size, rate of the physics: many values"):
+        result = fit(model)
+    assert not result.converged
+
+
+def test_a_fit_prints_as_a_sentence():
+    X, Y, physics, _ = case("enzyme", 0)
+    result = fit(CalibratedPhysics(X, Y, physics=physics))
+    assert re.fullmatch(r"converged, \d+ samples \(effective size \d+\), \d+\.\d s", repr(result))
+    assert result.seconds > 0
+    bad = replace(result, converged=torch.tensor([True, False]), num_samples=None, seconds=None)
+    assert repr(bad).startswith("NOT converged in 1 of 2 outputs, effective size ")
