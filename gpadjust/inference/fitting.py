@@ -101,7 +101,8 @@ def fit(
     below, finds the modes; draws around them move to the posterior by annealed Hamiltonian Monte
     Carlo. Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`, and
     the size of a constant and of a linear trend (of up to three inputs) in the data has no vote on
-    how smooth the functions are. The parameters of a network that is the physics are at their most
+    how smooth the functions are, that of a quadratic one (of one or two) a quarter of a vote. The
+    parameters of a network that is the physics are at their most
     likely values.
 
     *A physics that misleads* is left out: the same model without it, a Gaussian process around the
