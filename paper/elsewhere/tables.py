@@ -90,21 +90,29 @@ def _targets(means: pd.DataFrame) -> list[list[str]]:
         if mine.empty:
             continue
         low, wide = mine["held"] >= _LEAST, mine["width"] <= _WIDEST
-        for j, (text, held, column, base) in enumerate(
+        for j, (text, kept, column, base, alone) in enumerate(
             (
-                (f"{claim}: 95 % hold at least {_LEAST}", low, "held", before["held"]),
+                (
+                    f"{claim}: 95 % hold at least {_LEAST}",
+                    low,
+                    "held",
+                    before["held"],
+                    before["held"] >= _LEAST,
+                ),
                 (
                     f"{claim}: widths at most {_WIDEST} times what holds .95",
                     wide,
                     "width",
                     before["width"],
+                    before["width"] <= _WIDEST,
                 ),
             )
         ):
-            verdict: Verdict = met(bool(held.all()))
+            verdict: Verdict = met(bool(kept.all()))
             number = (
-                f"in {held.sum()} of {len(held)} cells, from {mine[column].min():.2f} to "
-                f"{mine[column].max():.2f} (without variation {base.min():.2f} to {base.max():.2f})"
+                f"in {kept.sum()} of {len(kept)} cells, from {mine[column].min():.2f} to "
+                f"{mine[column].max():.2f} (without variation in {alone.sum()}, {base.min():.2f} "
+                f"to {base.max():.2f})"
             )
             rows.append([f"E{2 * i + j + 1}", text, f"**{verdict}**: {number}"])
     return rows
