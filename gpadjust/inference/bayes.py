@@ -46,7 +46,7 @@ _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
 _LEAST_SHARE = 0.05  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 16.0
-_OFF = 0.3  # predicted standard deviations, of the mean of draws
+_OFF = 0.12  # predicted standard deviations between what halves of the draws predict, of their mean
 
 
 class SamplingWarning(UserWarning):
@@ -61,13 +61,13 @@ class SampleResult:
         effective_size: How many independent draws tell as much as those that were made, of each
             output, ``batch_shape x (m)``: as many as were, if two halves of them agree.
         converged: Whether the draws are of the posterior, of each output, of the same shape;
-            there is a :class:`~gpadjust.inference.SamplingWarning` if not, also where predictions
-            by two halves of the draws tell that their mean is 0.3 standard deviations off. Of more
-            than 150 observations they are weighted draws around the optima, of the posterior to a
-            power of 0.3 at least.
+            there is a :class:`~gpadjust.inference.SamplingWarning` if not, also where left-out
+            observations are predicted differently by two halves of the draws. Of more than 150
+            observations they are weighted draws around the optima, of the posterior to a power of
+            0.3 at least.
         draws: Equally likely draws of each hyper-parameter of the model with its physics, ``k x``
             its shape, by its name: 16 to 256 by default, 1,024 beside unknown parameters of the
-            physics. Of a centre that is learnt they are in standard deviations of f_p from its mean.
+            physics. Of a centre that is learnt in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
     """
