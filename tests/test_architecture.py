@@ -17,7 +17,7 @@ FLOORS = [
 ]
 
 
-FILES, CLASSES, FUNCTIONS = 26, 33, 236  # that the ten lines of the README pass; fewer are better
+FILES, CLASSES, FUNCTIONS = 26, 33, 238  # that the ten lines of the README pass; fewer are better
 
 
 def passed(call):

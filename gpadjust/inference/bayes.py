@@ -44,7 +44,7 @@ _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
 _RETURNED = 1024  # draws of parameters of a physics, at least
 _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
-_LEAST_SHARE = 0.05  # of the draws that count
+_LEAST_SHARE = 0.01  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 16.0
 _OFF = 0.12  # predicted standard deviations between what halves of the draws predict, of their mean
 
