@@ -46,7 +46,7 @@ _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
 _LEAST_SHARE = 0.01  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 16.0
-_OFF = 0.12  # predicted standard deviations between what halves of the draws predict, of their mean
+_OFF = 0.15  # predicted standard deviations between what halves of the draws predict, of their mean
 
 
 class SamplingWarning(UserWarning):
@@ -163,7 +163,7 @@ def sample(
             is_on.to(share).mean(0).reshape(model._aug_batch_shape),
         )
         relevance = share.reshape(model._aug_batch_shape)
-    off = disagreement(predicted, weights)
+    off = disagreement(predicted, weights, draws.target.targets)
     is_good &= off <= _OFF
     _hold(model, held, settled)
     named = _named(draws.target.parameters, draws.particles.positions)
