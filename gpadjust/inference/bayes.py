@@ -45,11 +45,11 @@ _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
 _RETURNED = 1024  # draws of parameters of a physics, at least
 _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
-_LEAST_SHARE = 0.05  # of the draws that count
+_LEAST_SHARE = 0.01  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 64.0
 _HINT = "Raise num_draws, or give narrower priors, that of the noise above all."
 _UNSEEN = 0.05  # of the posterior of parameters, near optima that no search came to
-_OFF = 0.3  # predicted standard deviations, of the mean of draws
+_OFF = 0.15  # predicted standard deviations between what halves of the draws predict, of their mean
 
 
 class SamplingWarning(UserWarning):
@@ -66,13 +66,13 @@ class SampleResult:
             unknown parameters of the physics also by the weights of theirs, as they are, or by
             what those remember that moved.
         converged: Whether the draws are of the posterior, of each output, of the same shape;
-            there is a :class:`~gpadjust.inference.SamplingWarning` if not, also where predictions
-            by two halves of the draws tell that their mean is 0.3 standard deviations off. Of more
-            than 150 observations they are weighted draws around the optima, of the posterior to a
-            power of 0.3 at least.
+            there is a :class:`~gpadjust.inference.SamplingWarning` if not, also where left-out
+            observations are predicted differently by two halves of the draws. Of more than 150
+            observations they are weighted draws around the optima, of the posterior to a power of
+            0.3 at least.
         draws: Equally likely draws of each hyper-parameter of the model with its physics, ``k x``
             its shape, by its name: 16 to 256 by default, 1,024 beside unknown parameters of the
-            physics. Of a centre that is learnt they are in standard deviations of f_p from its mean.
+            physics. Of a centre that is learnt in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
         num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
@@ -199,7 +199,7 @@ def sample(
             is_on.to(share).mean(0).reshape(model._aug_batch_shape),
         )
         relevance = share.reshape(model._aug_batch_shape)
-    off = disagreement(predicted, weights)
+    off = disagreement(predicted, weights, draws.target.targets)
     is_good &= off <= _OFF
     _hold(model, held, settled)
     named = _named(draws.target.parameters, draws.particles.positions)

@@ -13,6 +13,7 @@ from gpadjust.inference.targets import LogPosterior
 
 _OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what draws represent
 _LITTLE = 1e-3  # of the largest weight, of draws that are left out
+_NOTHING = 1e-12  # of the targets' mean square, of a variance
 _EXCHANGES = 5  # rounds of better draws for the chosen ones
 
 
@@ -51,20 +52,24 @@ def left_out(target: LogPosterior, vectors: Tensor) -> LeftOut:
     return LeftOut((-alpha * variance).reshape(shape), variance.reshape(shape))
 
 
-def disagreement(predictions: LeftOut, weights: Tensor) -> Tensor:
+def disagreement(predictions: LeftOut, weights: Tensor, targets: Tensor) -> Tensor:
     """How far predictions by two halves of the draws are apart, ``B``.
 
     Half of the root mean square difference of their means, in predicted standard deviations, which
-    is the error of the mean of both; the halves are the draws by turns.
+    is the error of the mean of both; the halves are the draws by turns. Standard deviations of a
+    millionth of the targets are as good as none.
 
     Args:
         predictions: Those of the draws.
         weights: Of the draws, ``N x B``.
+        targets: The observations, ``... x n``.
     """
     (first, _), (second, _) = (
         predictions.of(slice(i, None, 2)).mixture(weights[i::2]) for i in range(2)
     )
     _, variance = predictions.mixture(weights)
+    size = targets.square().nanmean(-1).reshape(-1, 1)
+    variance = variance + (_NOTHING * size).clamp_min(torch.finfo(size.dtype).tiny)
     return 0.5 * ((first - second).square() / variance).mean(-1).sqrt()
 
 

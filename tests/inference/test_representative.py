@@ -67,9 +67,11 @@ def test_none_without_weight_and_some_twice_if_they_are_few():
 def test_halves_that_disagree():
     predicted, _ = drawn(4000)
     weights = torch.full((4000, 1), 1 / 4000, dtype=torch.float64)
-    assert disagreement(predicted, weights) < 0.05
+    targets = torch.ones(5, dtype=torch.float64)
+    assert disagreement(predicted, weights, targets) < 0.05
     predicted.mean[0::2] += 2.0
     # The mean of both is one away from each.
     _, variance = predicted.mixture(weights)
     expected = (1 / variance).mean().sqrt().item()
-    assert disagreement(predicted, weights).item() == pytest.approx(expected, rel=0.05)
+    assert disagreement(predicted, weights, targets).item() == pytest.approx(expected, rel=0.05)
+    assert disagreement(predicted, weights, 1e9 * targets) < 0.01
