@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -343,9 +344,9 @@ def _draw(
     """Draws of the hyper-parameters; an error if the likelihood is nowhere finite.
 
     Particles begin around the optima, half of them with the prior; all of them with it where
-    optima are wide, so that there are many others. Of a model that is weighed
-    against the log evidence of a ``rival``, the search takes fewer starts, and rough draws do where
-    it is far behind.
+    optima are wide, so that there are many others. Of a model that is weighed against the log
+    evidence of a ``rival``, the search takes fewer starts, and rough draws do where it is far
+    behind.
     """
     n, starts = target.num_points, _STARTS if rival is None else _STARTS_OF_RIVAL
     around, rough = _around_optima(target, search, starts)
@@ -361,13 +362,11 @@ def _draw(
     gradients = _GRADIENTS * number
     if n > MANY or (enough is not None and bool((rough < enough).all())):
         gradients = 0
-    try:
-        particles = annealing.sample(
-            target, proposal, num_draws, number, gradients, generator, enough
-        )
-    except FloatingPointError:
-        raise RuntimeError(NOWHERE) from None
-    return _Draws(target, particles, rough)
+    for begin in (proposal, around):  # of the prior all draws may have no density
+        with suppress(FloatingPointError):
+            given = (target, begin, num_draws, number, gradients, generator, enough)
+            return _Draws(target, annealing.sample(*given), rough)
+    raise RuntimeError(NOWHERE)
 
 
 def _around_optima(

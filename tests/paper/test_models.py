@@ -412,7 +412,7 @@ class TestCalibration:
         after = medians()
         name = "covar_module.terms.0.kernel.base_kernel.lengthscale_prior"
         assert torch.equal(before[name], after[name])
-        torch.testing.assert_close(within[name] / before[name], torch.full((1, 1), 10 / 3).double())
+        torch.testing.assert_close(within[name] / before[name], torch.full((1, 1), 10.0).double())
 
 
 class TestStructures:
