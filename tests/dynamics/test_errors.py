@@ -355,6 +355,7 @@ def test_bad_arguments_are_found_at_once(options, error, message):
         LearnedDynamics(**{"spec": SPEC, "physics": push, **options})
 
 
+@pytest.mark.filterwarnings("ignore:The draws of")
 @pytest.mark.parametrize("model", [RRA, None])
 def test_bad_tensors_are_refused(learnt, model):
     dynamics = PhysicsDynamics(SPEC, push) if model is None else learnt(model=model)

@@ -90,6 +90,7 @@ def test_every_update_is_checked():
         dynamics.update(states, actions, following)
 
 
+@pytest.mark.filterwarnings("ignore:The draws of")
 @pytest.mark.parametrize("learnt", [False, True])
 def test_a_physics_of_differences_is_warned_of(learnt):
     def change(X):
