@@ -112,6 +112,8 @@ def test_measuring(tmp_path, monkeypatch):
     assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8
 
 
+# Few draws of parameters count, as there is no noise at all.
+@pytest.mark.filterwarnings("ignore:The draws of")
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (law,), (log,) = blocks("docs/guide/parameters.md"), blocks("docs/guide/records.md")

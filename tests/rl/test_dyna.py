@@ -263,6 +263,7 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
     assert cost(agent) < 0.2 * before
 
 
+@pytest.mark.filterwarnings("ignore:The draws of")  # there are 16
 def test_cart_pole(cart_pole):
     dynamics = LearnedDynamics(
         CART_POLE_SPEC,
