@@ -189,7 +189,9 @@ def sample(
         rest = ((1 - share) / more).expand(more, problems)
         weights = torch.cat([share * weights, rest])
         middle = positions.mean(0).expand(more, problems, p)
-        rows = representative(predicted, torch.cat([positions, middle]), weights, num_samples)
+        is_own = torch.arange(number + more, device=weights.device) < number
+        every = torch.cat([positions, middle])
+        rows = representative(predicted, every, weights, num_samples, is_own)
         is_on = rows < number
         held = mixed(
             draws.raw(rows.clamp_max(number - 1)),

@@ -12,6 +12,7 @@ from gpadjust.gp.gaussian import cholesky
 from gpadjust.inference.targets import LogPosterior
 
 _OF_POSITIONS = 0.3  # weight of the hyper-parameters themselves among what draws represent
+_OF_MODELS = 3.0  # weight of which model they are of
 _LITTLE = 1e-3  # of the largest weight, of draws that are left out
 _NOTHING = 1e-12  # of the targets' mean square, of a variance
 _EXCHANGES = 5  # rounds of better draws for the chosen ones
@@ -74,7 +75,13 @@ def disagreement(predictions: LeftOut, weights: Tensor, targets: Tensor) -> Tens
 
 
 @torch.no_grad()
-def representative(predictions: LeftOut, positions: Tensor, weights: Tensor, number: int) -> Tensor:
+def representative(
+    predictions: LeftOut,
+    positions: Tensor,
+    weights: Tensor,
+    number: int,
+    is_first: Tensor | None = None,
+) -> Tensor:
     """Numbers of a few draws whose mixture predicts as that of all, ``number x B``, in order.
 
     Their mean predictions of left-out observations, standard deviations and hyper-parameters are
@@ -85,16 +92,20 @@ def representative(predictions: LeftOut, positions: Tensor, weights: Tensor, num
         positions: Of the draws, ``N x B x p``.
         weights: Of the draws, ``N x B``, which sum to one.
         number: How many.
+        is_first: Which draws are of the first of two models, ``N``; as many are chosen as it has
+            weight. Default: all are of one.
     """
     share = weights.unsqueeze(-1)
     unit = (share * predictions.variance).sum(0).sqrt()
     away = positions - (share * positions).sum(0)
     spread = (share * away.square()).sum(0).sqrt().clamp_min(torch.finfo(away.dtype).tiny)
-    parts = (
+    parts = [
         predictions.mean / unit,
         predictions.variance.sqrt() / unit,
         _OF_POSITIONS * away / spread,
-    )
+    ]
+    if is_first is not None:
+        parts.append(_OF_MODELS * is_first.to(away)[:, None, None].expand_as(away[..., :1]))
     features = torch.cat(
         [(each - (share * each).sum(0)) / math.sqrt(each.shape[-1]) for each in parts], dim=-1
     )

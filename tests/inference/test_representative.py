@@ -75,3 +75,14 @@ def test_halves_that_disagree():
     expected = (1 / variance).mean().sqrt().item()
     assert disagreement(predicted, weights, targets).item() == pytest.approx(expected, rel=0.05)
     assert disagreement(predicted, weights, 1e9 * targets) < 0.01
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_of_two_models_as_many_are_chosen_as_they_have_weight(share):
+    """However differently they predict."""
+    predicted, positions = drawn(200)
+    is_first = torch.arange(200) < 100
+    predicted.mean[is_first] += 2.0
+    weights = torch.where(is_first, share, 1 - share).unsqueeze(-1).double() / 100
+    rows = representative(predicted, positions, weights, 10, is_first)
+    assert int(is_first[rows].sum()) == round(10 * share)
