@@ -45,7 +45,6 @@ _SAMPLES_OF_PARAMETERS = 16  # at least, where a physics has unknown ones
 _RETURNED = 1024  # draws of parameters of a physics, at least
 _HELD_ALONE = 256  # samples of a physics without a GP, at most
 _LEAST_POWER = 0.3  # of the way to the posterior, for draws that show it
-_LEAST_SHARE = 0.01  # of the draws that count
 _LEAST_SIZE_OF_PARAMETERS = 64.0
 _HINT = "Raise num_draws, or give narrower priors, that of the noise above all."
 _UNSEEN = 0.05  # of the posterior of parameters, near optima that no search came to
@@ -123,22 +122,23 @@ class _Draws(NamedTuple):
     rough: Tensor
 
     def is_good(self) -> Tensor:
-        """Whether they show the posterior, ``B``."""
-        size, number = self.particles.effective_size(), len(self.particles.positions)
-        return (self.particles.power >= _LEAST_POWER) & (size >= _LEAST_SHARE * number)
+        """Whether they are of the posterior, ``B``."""
+        return self.particles.power >= _LEAST_POWER
 
     def relevance(self, rival: _Draws) -> Tensor:
         """Posterior probability of this model beside one without the physics, ``B``."""
-        own, other = self.particles, rival.particles
-        both = (own.power == 1) & (other.power == 1)  # or evidences are those on the way
         parameters, targets = self.target.parameters, self.target.targets
         mean, *_ = self.target.distribution(parameters.unflatten(parameters.current()))
         spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
         return probability(
-            own.log_evidence.where(both, self.rough),
-            other.log_evidence.where(both, rival.rough),
+            self.log_evidence(),
+            rival.log_evidence(),
             (targets - mean.squeeze(0)).nanmean(-1).abs() / spread,
         )
+
+    def log_evidence(self) -> Tensor:
+        """By all states, ``B``, or rough where particles are of the density on the way."""
+        return self.particles.log_evidence.where(self.particles.power == 1, self.rough)
 
     def raw(self, rows: Tensor) -> dict[str, Tensor]:
         """Raw parameters of draws of the numbers ``k x B``, ``k x`` their shape, by name."""
@@ -177,7 +177,7 @@ def sample(
         held = draws.raw(representative(predicted, positions, weights, num_samples))
     else:
         register_priors(without)
-        evidence = draws.particles.log_evidence
+        evidence = draws.log_evidence()
         plain = _draw(LogPosterior(without), search, num_draws // 2, generator, evidence)
         share = draws.relevance(plain)
         # What most samples are of is what counts.
@@ -353,12 +353,12 @@ def _draw(
     proposal: Proposal = around
     if n <= MANY:
         proposal = Both(Normal(*target.prior_moments()), around)
-    enough = None if rival is None else rival - _DECISIVE
+    is_far = rival is not None and bool((rough < rival - _DECISIVE).all())
+    # On the way, what the search has found may show only late.
+    enough = rival - _DECISIVE if rival is not None and bool((rough < rival).all()) else None
     most = min(_MOST_PARTICLES, _COST_OF_PARTICLES / n)
     number = max(_LEAST_PARTICLES, 2 * round(0.5 * most * num_draws / _default_num_draws(n)))
-    gradients = _GRADIENTS * number
-    if n > MANY or (enough is not None and bool((rough < enough).all())):
-        gradients = 0
+    gradients = 0 if is_far or n > MANY else _GRADIENTS * number
     for begin in (proposal, around):  # of the prior all draws may have no density
         with suppress(FloatingPointError):
             given = (target, begin, num_draws, number, gradients, generator, enough)

@@ -37,6 +37,7 @@ _QUADRATIC = 0.75  # of the cost of its size, which does not count
 _AT_ONCE = 2**18  # numbers in the covariances of a batch; larger ones make memory the bottleneck
 _PRIOR_RANGE = 30.0  # to both sides of a parameter, in logarithms
 _PRIOR_STEPS = 1000  # of it
+_FAR = 300.0  # from zero, of a logarithm
 _VAGUE = 1e4  # the prior variance of an unknown constant mean, in squared standard errors
 
 
@@ -299,9 +300,16 @@ class LogPosterior(Target):
 
     of_logs = True
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._is_log = self.parameters.mask(lambda row: row.is_log).bool()
+
     def _evaluate(self, vectors: Tensor, derivatives: bool) -> tuple[Tensor, Tensor]:
-        value, gradient = super()._evaluate(vectors, derivatives)
-        return value.where(self.parameters.is_allowed(vectors), math.inf), gradient
+        # Moves that fail go far: numbers of these logarithms would be zero, or infinite.
+        near = vectors.clamp(-_FAR, _FAR).where(self._is_log, vectors)
+        value, gradient = super()._evaluate(near, derivatives)
+        allowed = self.parameters.is_allowed(vectors) & (near == vectors).all(-1)
+        return value.where(allowed, math.inf), gradient
 
     @torch.no_grad()
     def prior_moments(self) -> tuple[Tensor, Tensor]:
@@ -309,11 +317,12 @@ class LogPosterior(Target):
 
         By quadrature, as if they were independent.
         """
-        parameters = self.parameters
-        middle, limited = parameters.current(), parameters.is_constrained | parameters.noise.bool()
-        low = torch.where(limited, parameters.lower, -math.inf).maximum(middle - _PRIOR_RANGE)
-        limited = parameters.is_constrained
-        high = torch.where(limited, parameters.upper, math.inf).minimum(middle + _PRIOR_RANGE)
+        parameters, middle = self.parameters, self.parameters.current()
+        limited = parameters.is_constrained | parameters.noise.bool()
+        least = torch.where(limited, parameters.lower, -math.inf)
+        most = torch.where(parameters.is_constrained, parameters.upper, math.inf)
+        middle = middle.maximum(least).minimum(most)
+        low, high = least.maximum(middle - _PRIOR_RANGE), most.minimum(middle + _PRIOR_RANGE)
         steps = torch.linspace(0, 1, _PRIOR_STEPS).to(low)[:, None, None]
         points = low + steps * (high - low)
         slope = torch.zeros_like(points)

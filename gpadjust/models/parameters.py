@@ -56,7 +56,6 @@ KINDS = {
 }
 """The kinds of parameters that have a typical size."""
 _ROUNDING = 1e-12
-_FARTHEST = 500.0  # logarithms, whose exponentials are numbers
 _LITTLE_NOISE = (1e-11, 1e-6)  # the noise of half of the starts, in typical sizes
 _GUESSED = 0.3  # spread of the starts of a physics' parameters around the user's guesses
 
@@ -588,9 +587,6 @@ class LogPriors:
         batch = (len(vectors), *parameters.batch_shape)
         with torch.enable_grad():
             values = parameters.unflatten(leaf)
-            for row in parameters.rows:
-                if row.is_log:  # a prior refuses the zero or infinity that it would round to
-                    values[row.name] = values[row.name].clamp(-_FARTHEST, _FARTHEST)
             densities: list[Tensor] = parameters.call_at(values, self._densities)
             total = leaf.new_zeros(batch)
             for density, own in zip(densities, self._densities(), strict=True):

@@ -105,7 +105,7 @@ def test_a_warning_when_the_draws_are_not_of_the_posterior(XY, monkeypatch):
     size = result.effective_size
     assert result.converged.all()
     assert 1 <= size <= len(result.draws["likelihood.noise_covar.noise"])
-    monkeypatch.setattr(bayes, "_LEAST_SHARE", 1.1)
+    monkeypatch.setattr(bayes, "_OFF", -1.0)
     with pytest.warns(SamplingWarning, match=rf"sample size {size.item():.2g}\). Raise num_draws"):
         again = fit(CKA(*XY, physics=crude), **SHORT)
     assert not again.converged.any()
