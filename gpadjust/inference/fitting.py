@@ -98,8 +98,8 @@ def fit(
     ``"bayes"``, the default where it can be done: full Bayes. The model then is a fully Bayesian
     model as BoTorch has them: it holds samples of its hyper-parameters, its posterior is a
     ``GaussianMixturePosterior``, and acquisition functions average over the samples. A search, as
-    below, finds the modes; draws around them move to the posterior by annealed Hamiltonian Monte
-    Carlo. Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`, and
+    below, finds modes; draws around them, and as many of the prior, move to the posterior by
+    annealed Hamiltonian Monte Carlo. Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`, and
     the size of a constant and of a linear trend (of up to three inputs) in the data has no vote on
     how smooth the functions are, that of a quadratic one (of one or two) a quarter of a vote. The
     parameters of a network that is the physics are at their most

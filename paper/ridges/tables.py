@@ -106,7 +106,7 @@ def _targets(runs: pd.DataFrame) -> list[list[str]]:
         enter(
             "P3",
             f"a warning in 9 of 10 cases that are off (distribution functions by {_OFF:g})",
-            met(warned >= 0.9 * off.sum()),
+            met(warned >= 0.9 * off.sum()) if off.any() else "undetermined",
             [f"{warned} of {off.sum()}"],
         )
         rarely = int(compared["warned"][~off].sum())
