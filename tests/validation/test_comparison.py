@@ -117,7 +117,7 @@ def test_the_best_structure_is_recommended_where_it_is_clear(scaled):
 
 
 def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
-    monkeypatch.setattr(bayes, "_LEAST_SHARE", 1.1)  # as if all sampling had been poor
+    monkeypatch.setattr(bayes, "_OFF", -1.0)  # as if all sampling had been poor
     Y = torch.cat([scaled[1], 100 * (3 * X).cos() + noise], -1)
     Y[3, 1] = torch.nan
 
