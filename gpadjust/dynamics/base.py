@@ -254,8 +254,8 @@ class Dynamics(ABC):
     ) -> Callable[[int, int | None], TransitionFunctions]:
         """As `sample_functions`, each function with parameters of its own."""
         raise ValueError(
-            "Expected dynamics that learnt unknown parameters of a physics, as they are to differ "
-            f"by variation={variation!r}; {type(self).__name__} has none."
+            "Expected dynamics that learnt unknown parameters of one physics, which are to differ "
+            f"by variation={variation!r}; {type(self).__name__} has none, or several physics."
         )
 
     def rehearse(self, states: Tensor, actions: Tensor) -> None:

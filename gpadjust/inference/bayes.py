@@ -359,6 +359,7 @@ def _draw(
     most = min(_MOST_PARTICLES, _COST_OF_PARTICLES / n)
     number = max(_LEAST_PARTICLES, 2 * round(0.5 * most * num_draws / _default_num_draws(n)))
     gradients = 0 if is_far or n > MANY else _GRADIENTS * number
+    num_draws += num_draws % 2  # halves are by turns
     for begin in (proposal, around):  # of the prior all draws may have no density
         with suppress(FloatingPointError):
             given = (target, begin, num_draws, number, gradients, generator, enough)

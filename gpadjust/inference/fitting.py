@@ -99,11 +99,11 @@ def fit(
     model as BoTorch has them: it holds samples of its hyper-parameters, its posterior is a
     ``GaussianMixturePosterior``, and acquisition functions average over the samples. A search, as
     below, finds modes; draws around them, and as many of the prior, move to the posterior by
-    annealed Hamiltonian Monte Carlo. Parameters without a prior get that of :func:`~gpadjust.inference.register_priors`, and
-    the size of a constant and of a linear trend (of up to three inputs) in the data has no vote on
-    how smooth the functions are, that of a quadratic one (of one or two) a quarter of a vote. The
-    parameters of a network that is the physics are at their most
-    likely values.
+    annealed Hamiltonian Monte Carlo. Parameters without a prior get that of
+    :func:`~gpadjust.inference.register_priors`, and the size of a constant and of a linear trend
+    (of up to three inputs) in the data has no vote on how smooth the functions are, that of a
+    quadratic one (of one or two) a quarter of a vote. The parameters of a network that is the
+    physics are at their most likely values.
 
     *A physics that misleads* is left out: the same model without it, a Gaussian process around the
     mean of the targets, has the prior probability 0.2, and its posterior probability, by the
@@ -111,8 +111,8 @@ def fit(
     ``result.relevance`` is what is left for the physics. So are weighed, by 3 to 150 observations,
     a :class:`~gpadjust.CKA` or :class:`~gpadjust.RRA` of a physics without unknown or learnt
     parameters, whose prior means are known and whose kernels have the default priors and an
-    outputscale; of others ``relevance`` is None. An offset between physics and targets that is
-    hundreds of times their spread counts against the physics.
+    outputscale; of others ``relevance`` is None. A constant between physics and targets, however
+    large, does not count against the physics.
 
     *Where left-out observations are missed* by more than predicted, variances are larger: near a
     kink or a jump, as by dry friction or an impact, of which stationary kernels are too sure. All

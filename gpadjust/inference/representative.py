@@ -58,20 +58,22 @@ def disagreement(predictions: LeftOut, weights: Tensor, targets: Tensor) -> Tens
 
     Half of the root mean square difference of their means, in predicted standard deviations, which
     is the error of the mean of both; the halves are the draws by turns. Standard deviations of a
-    millionth of the targets are as good as none.
+    millionth of the targets are as good as none, and rows without a target do not count.
 
     Args:
         predictions: Those of the draws.
         weights: Of the draws, ``N x B``.
-        targets: The observations, ``... x n``.
+        targets: The observations, ``... x n``; NaN where there is none.
     """
     (first, _), (second, _) = (
         predictions.of(slice(i, None, 2)).mixture(weights[i::2]) for i in range(2)
     )
     _, variance = predictions.mixture(weights)
-    size = targets.square().nanmean(-1).reshape(-1, 1)
+    targets = targets.reshape(-1, targets.shape[-1])
+    size = targets.square().nanmean(-1, keepdim=True)
     variance = variance + (_NOTHING * size).clamp_min(torch.finfo(size.dtype).tiny)
-    return 0.5 * ((first - second).square() / variance).mean(-1).sqrt()
+    square = (first - second).square() / variance
+    return 0.5 * square.where(~targets.isnan(), math.nan).nanmean(-1).sqrt()
 
 
 @torch.no_grad()

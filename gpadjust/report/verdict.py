@@ -173,7 +173,18 @@ def _answer(subject: Subject, output: int, how: str) -> tuple[str, str, list[str
             "That is not to say that it does not help: the difference is within two standard "
             "errors, and more observations may show one.",
         ]
-        if sign_of(gain.elpd, gain.se) > 0:
+        sign = sign_of(gain.elpd, gain.se)
+        if gain.by_evidence:
+            rest[1] = (
+                f"{gain.structure} is better by more than two standard errors, but by the evidence "
+                "of a model with and without the physics it is of no use: what they do not agree "
+                "in is not shown."
+                if sign > 0
+                else f"{gain.structure} is worse by more than two standard errors, but among those "
+                "compared is a model that leaves a physics of no use out by itself: so none is "
+                "said to do harm."
+            )
+        elif sign > 0:
             rest[1] = (
                 f"{gain.structure} is better by more than two standard errors, but its fitted "
                 "constants may do that by themselves: the best structure without such constants is "

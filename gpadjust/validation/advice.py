@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -44,7 +45,7 @@ def advice(
         density = _density(left_out, j)
         probable = {name: float(each[j]) for name, each in relevance.items()}
         order = [row.structure for row in rows]
-        found = [_best(rows), *_gains(by_name, order, density, probable.values())]
+        found = [_best(rows), *_gains(by_name, order, density, probable)]
         found += [_of_use(name, probability) for name, probability in probable.items()]
         found += _preferred(models[rows[0].structure], X, j)
         found += _unsampled(rows, converged, j)
@@ -83,7 +84,7 @@ def gains(
     found = {}
     for j, (output, rows) in enumerate(table.items()):
         order = [row.structure for row in rows]
-        probable = [float(each[j]) for each in relevance.values()]
+        probable = {name: float(each[j]) for name, each in relevance.items()}
         found[output] = physics_gain(by_name, order, _density(left_out, j), probable)
     return {output: gain for output, gain in found.items() if gain is not None}
 
@@ -101,7 +102,7 @@ def _gains(
     structures: dict[str, Structure],
     order: list[str],
     density: dict[str, Tensor],
-    relevance: Iterable[float] = (),
+    relevance: Mapping[str, float] = MappingProxyType({}),
 ) -> list[str]:
     """Whether the physics helps, and whether scaling it does."""
     sentences = []
@@ -112,8 +113,10 @@ def _gains(
             says = "makes predictions worse" if physics.shown < 0 else "is not shown to help"
             enough = len(density[physics.structure]) >= ENOUGH
             by_constants = enough and sign_of(physics.elpd, physics.se) > 0
-            alone = "; its unknown constants may do so by themselves" if by_constants else ""
-            return [f"The physics {says}: {text}{alone}."]
+            why = "; its unknown constants may do so by themselves" if by_constants else ""
+            if physics.by_evidence and by_constants:
+                why = "; the evidence does not agree"
+            return [f"The physics {says}: {text}{why}."]
         sentences.append(f"The physics helps: {text}.")
     adjusting = next((name for name in order if structures[name].adjusts), None)
     plain = next((n for n in order if structures[n].uses_physics and not structures[n].adjusts), "")

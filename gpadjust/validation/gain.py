@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from torch import Tensor
@@ -25,6 +26,8 @@ class Gain(NamedTuple):
             models that were weighed without it; -1 if it is shown to make predictions worse, where
             no model leaves it out by itself; 0 if neither is, or there are observations of fewer
             than eight different inputs.
+        by_evidence: Whether a difference of more than two standard errors shows nothing because of
+            models that were weighed without the physics.
     """
 
     elpd: float
@@ -32,13 +35,14 @@ class Gain(NamedTuple):
     structure: str
     without: str
     shown: int
+    by_evidence: bool = False
 
 
 def physics_gain(
     structures: Mapping[str, Structure],
     order: Iterable[str],
     density: Mapping[str, Tensor],
-    relevance: Iterable[float] = (),
+    relevance: Mapping[str, float] = MappingProxyType({}),
 ) -> Gain | None:
     """What the physics is worth; None if there is nothing with it, or nothing without it.
 
@@ -46,7 +50,9 @@ def physics_gain(
         structures: The structures by their names.
         order: The names, best first.
         density: The log predictive densities of left-out observations by each, ``n``.
-        relevance: Probabilities that the physics is of use, of models that were weighed without it.
+        relevance: Probabilities that the physics is of use, of the structures that were weighed
+            without it. Of a structure that was not, the highest one counts: of several physics one
+            may be of use, and others not.
     """
     names = [*order]
     physical = [name for name in names if structures[name].uses_physics]
@@ -54,11 +60,13 @@ def physics_gain(
     if not (physical and others):
         return None
     shows = len(density[physical[0]]) >= ENOUGH  # of fewer the error is itself unknown
-    probable = [probability > 0.5 for probability in relevance]
     fair = next((name for name in physical if not structures[name].unknowns), physical[0])
     elpd, se = difference(density[fair], density[others[0]])
-    if shows and all(probable) and sign_of(elpd, se) > 0:
+    helps = shows and sign_of(elpd, se) > 0
+    if helps and relevance.get(fair, max(relevance.values(), default=1.0)) > 0.5:
         return Gain(elpd, se, fair, others[0], 1)
     elpd, se = difference(density[physical[0]], density[others[0]])
-    shows = shows and not probable
-    return Gain(elpd, se, physical[0], others[0], min(sign_of(elpd, se), 0) if shows else 0)
+    sign = sign_of(elpd, se) if shows else 0
+    by_evidence = helps if sign > 0 else sign < 0 and bool(relevance)
+    shown = 0 if relevance else min(sign, 0)
+    return Gain(elpd, se, physical[0], others[0], shown, by_evidence)

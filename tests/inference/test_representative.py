@@ -77,6 +77,18 @@ def test_halves_that_disagree():
     assert disagreement(predicted, weights, 1e9 * targets) < 0.01
 
 
+def test_what_was_not_observed_does_not_hide_disagreement():
+    predicted, _ = drawn(4000)
+    weights = torch.full((4000, 1), 1 / 4000, dtype=torch.float64)
+    predicted.mean[0::2] += 2.0
+    predicted.mean[..., 1:] = 0.0
+    targets = torch.tensor([1.0, *[torch.nan] * 4], dtype=torch.float64)
+    observed = LeftOut(*(each[..., :1] for each in predicted))
+    expected = disagreement(observed, weights, targets[:1])
+    assert expected > 0.3
+    torch.testing.assert_close(disagreement(predicted, weights, targets), expected)
+
+
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
 def test_of_two_models_as_many_are_chosen_as_they_have_weight(share):
     """However differently they predict."""

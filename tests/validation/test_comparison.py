@@ -117,7 +117,7 @@ def test_the_best_structure_is_recommended_where_it_is_clear(scaled):
 
 
 def test_each_output_is_judged_by_itself(X, scaled, noise, monkeypatch):
-    monkeypatch.setattr(bayes, "_OFF", -1.0)  # as if all sampling had been poor
+    monkeypatch.setattr(bayes, "_LEAST_POWER", 1.1)  # as if all sampling had been poor
     Y = torch.cat([scaled[1], 100 * (3 * X).cos() + noise], -1)
     Y[3, 1] = torch.nan
 
@@ -327,9 +327,26 @@ class TestAdvice:
         names = {structure.name: structure for structure in STRUCTURES}
         for sign in (1.0, -1.0):
             better = {"zero mean": torch.zeros(8), "CKA": sign * torch.ones(8)}
-            for relevance, agrees in (([], True), ([0.9], sign > 0), ([0.1], False)):
+            for relevance, agrees in (
+                ({}, True),
+                ({"CKA": 0.9}, sign > 0),
+                ({"CKA": 0.1}, False),
+                ({"CKA": 0.1, "RRA": 0.9}, False),  # its own is what counts
+                ({"CKA of a": 0.1, "CKA of b": 0.9}, sign > 0),
+            ):
                 gain = physics_gain(names, [*better], better, relevance)
                 assert gain.shown == (sign if agrees else 0)
+                assert gain.by_evidence is not agrees
+        density = {"CKA": torch.ones(8), "zero mean": torch.zeros(8)}
+        (sentence,) = advice_of._gains(names, [*density], density, {"CKA": 0.1})
+        assert sentence.startswith("The physics is not shown to help: elpd +8.0")
+        assert sentence.endswith("(zero mean); the evidence does not agree.")
+
+    def test_one_physics_of_no_use_does_not_hide_another(self, X, noise):
+        parts = {"good": crude, "unrelated": lambda X: (23 * X + 1).cos()}
+        comparison = compare(X, 2 * crude(X) + X + noise, parts, **QUICK)
+        assert says(comparison, "is of use: 0.")
+        assert comparison.gain["y"].shown == 1
 
     def test_a_smooth_bias(self, X, noise):
         Y, names = crude(X) + X.exp() + noise, ["physics mean", "CKA"]
