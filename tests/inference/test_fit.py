@@ -79,7 +79,7 @@ class TestResult:
         assert result.converged.all()
         assert result.converged.shape == result.log_likelihood.shape
         after = log_likelihood(model)
-        torch.testing.assert_close(result.log_likelihood, after, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(result.log_likelihood, after, rtol=1e-5, atol=1e-6)
         assert (after > before).all()
 
     @pytest.mark.parametrize("num_screened", [0, 8])
@@ -189,7 +189,8 @@ class TestManyPoints:
     def test_it_is_as_good_as_a_search_on_all(self, problem, monkeypatch):
         found = fit(problem(), "map").log_likelihood
         monkeypatch.setattr(optimise, "MANY", 1000)
-        assert (found >= fit(problem(), "map").log_likelihood - 0.1).all()
+        expected = fit(problem(), "map").log_likelihood
+        assert (found >= expected - 0.1 - 2e-3 * expected.abs()).all()
 
     def test_it_is_never_worse_than_the_start(self, problem, request):
         model = problem()

@@ -134,7 +134,7 @@ def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
         ratios.append((full.square().mean() / point.square().mean()).log() / 2)
         low, high = models[1].interval(Z)
         covered.append(((low <= truth(Z)) & (truth(Z) <= high)).double().mean())
-    assert sum(ratios) / 6 < -0.05
+    assert sum(ratios) / 6 < (-0.05 if noise else 0.05)  # a point estimate is certain of no noise
     assert sum(covered) / 6 > 0.9
 
 
@@ -250,7 +250,7 @@ def test_nuts_agrees(XY):
     # With the vague defaults NUTS needs very long.
     prior, kernel = LogNormalPrior(-1.0, 1.0), model.terms[1].kernel
     kernel.register_prior("outputscale_prior", prior, "outputscale")
-    expected = nuts(model, num_samples=600, num_warmup=200)
+    expected = nuts(model, num_samples=1800, num_warmup=400)
     result = fit(model, num_draws=8192)
     assert result.effective_size > 200
     draws = torch.cat([each.reshape(len(each), -1).log() for each in result.draws.values()], -1)

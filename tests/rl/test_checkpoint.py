@@ -545,6 +545,7 @@ def test_runs_that_could_not_be_resumed_are_refused(point_agent, point_env, tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The draws of")
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
 def test_cart_pole_of_co_kriging(sampling, cart_pole, assert_same, tmp_path):
     path = tmp_path / "run.ckpt"
