@@ -42,6 +42,8 @@ nitpick_ignore = [  # what signatures name, but users do not call by name
     ("py:class", "gpadjust.dynamics.incremental_fit.DynamicsFitOptions"),
     ("py:class", "gpadjust.dynamics.control_steps.Stretch"),
     ("py:class", "gpadjust.dynamics.smoothing.Estimate"),
+    ("py:class", "gpadjust.dynamics.chain.Known"),
+    ("py:class", "gpadjust.models.local_errors.LocalErrors"),
     ("py:class", "gpadjust.models.stacked.Part"),
     ("py:class", "gpadjust.gp.kernels.AnyKernel"),
     ("py:class", "gpadjust.gp.kernels.Batched"),

@@ -250,7 +250,9 @@ def test_nuts_agrees(XY):
     # With the vague defaults NUTS needs very long.
     prior, kernel = LogNormalPrior(-1.0, 1.0), model.terms[1].kernel
     kernel.register_prior("outputscale_prior", prior, "outputscale")
-    expected = nuts(model, num_samples=1800, num_warmup=400)
+    noise = model.likelihood.noise_covar
+    noise.register_prior("noise_prior", LogNormalPrior(-6.0, 0.7), "noise")
+    expected = nuts(model, num_samples=600, num_warmup=200)
     result = fit(model, num_draws=8192)
     assert result.effective_size > 200
     draws = torch.cat([each.reshape(len(each), -1).log() for each in result.draws.values()], -1)
