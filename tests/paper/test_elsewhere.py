@@ -37,6 +37,7 @@ def test_the_physics_of_another_mass_and_design():
 
 
 @pytest.mark.filterwarnings("ignore:The observations say next to nothing")
+@pytest.mark.slow
 def test_a_run_and_its_tables(tmp_path):
     experiment = Elsewhere(out=tmp_path, trainings=("pendulum",), settings=TINY)
     experiment.check()
