@@ -13,20 +13,14 @@ from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
 
-from gpadjust.active.arguments import (
-    as_bounds,
-    as_options,
-    as_outcomes,
-    as_points,
-    as_points_within,
-)
 from gpadjust.active.best_points import best_points
 from gpadjust.active.design import among, sobol_points
 from gpadjust.active.loop import Loop
 from gpadjust.active.measurement_log import MeasurementLog, Record
-from gpadjust.active.measurements import measurement
+from gpadjust.active.measurements import checked_outcomes, measurement
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
-from gpadjust.models.sampled_functions import check_number, seeded
+from gpadjust.checks import checked_bounds, checked_points, checked_whole
+from gpadjust.models.sampled_functions import seeded
 
 
 class MeasurementWarning(UserWarning):
@@ -116,9 +110,9 @@ class Collection(Loop):
         if fit is not None and not callable(fit):
             raise TypeError(f"Expected fit to be callable, got {fit!r}.")
         self.model_factory, self.acquisition = model_factory, acquisition
-        self.bounds = as_bounds(bounds)
+        self.bounds = checked_bounds("bounds", bounds)
         d = self.bounds.shape[-1]
-        check_number(batch_size, "batch_size")
+        checked_whole("batch_size", batch_size, 1)
         if not isinstance(seed, int) or not 0 <= seed < 2**63:
             raise ValueError(
                 f"Expected seed to be a whole number >= 0 and below 2^63, got {seed!r}."
@@ -127,20 +121,17 @@ class Collection(Loop):
         initial = 2 * (d + 1) if initial is None else initial
         self._first_points = self.bounds[:0]
         if not isinstance(initial, int | float | str):
-            self._first_points, initial = as_points_within(initial, self.bounds, "initial"), 2
+            self._first_points = checked_points("initial", initial, d, self.bounds)
+            initial = 2
             if len(self._first_points.unique(dim=0)) < len(self._first_points):
                 raise ValueError(
                     "Expected the points of initial to differ, got some twice. To measure a point "
                     "again, tell() what came out."
                 )
-        if not isinstance(initial, int) or initial < 2:
-            raise ValueError(
-                f"Expected initial to be a number of points >= 2, or the points, got {initial!r}."
-            )
-        self._initial, self._fit = initial, fit
-        self._options = as_options(optimizer_options)
+        self._fit, self._initial = fit, checked_whole("initial, a number of points,", initial, 2)
+        self._options = _checked_options(optimizer_options)
         if num_outputs is not None:
-            check_number(num_outputs, "num_outputs")
+            checked_whole("num_outputs", num_outputs, 1)
         super().__init__(self.bounds, num_outputs, data)
         self._model: Any = None
         self._last_model: tuple[Any, int] = (None, 0)
@@ -201,7 +192,7 @@ class Collection(Loop):
             LogError: If the points cannot be logged; then they are not pending.
         """
         q = self.batch_size if q is None else q
-        check_number(q, "q")
+        checked_whole("q", q, 1)
         record: Record = {}
         points = self._design(q)
         if points is None:
@@ -232,8 +223,8 @@ class Collection(Loop):
         Warns:
             MeasurementWarning: If one of them has failed.
         """
-        X = as_points(X, self.bounds.shape[-1])
-        Y = as_outcomes(Y, len(X), self.num_outputs)
+        X = checked_points("X", X, self.bounds.shape[-1])
+        Y = checked_outcomes(Y, len(X), self.num_outputs)
         records = [measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)]
         self._enter(records)
         self._warn(records)
@@ -248,7 +239,7 @@ class Collection(Loop):
         Warns:
             MeasurementWarning: In any case.
         """
-        X = as_points(X, self.bounds.shape[-1])
+        X = checked_points("X", X, self.bounds.shape[-1])
         message = reason if isinstance(reason, str) else f"{type(reason).__name__}: {reason}"
         records: list[Record] = [{"x": x, "failed": message} for x in X.tolist()]
         self._enter(records)
@@ -260,7 +251,7 @@ class Collection(Loop):
         Args:
             X: The points, ``n x d``. Default: all that are pending.
         """
-        X = self.pending if X is None else as_points(X, self.bounds.shape[-1])
+        X = self.pending if X is None else checked_points("X", X, self.bounds.shape[-1])
         self._enter([{"withdrawn": X.tolist()}])
 
     def close(self) -> None:
@@ -341,3 +332,19 @@ class Collection(Loop):
                 MeasurementWarning,
                 stacklevel=3,
             )
+
+
+def _checked_options(options: Any) -> dict[str, Any]:
+    """Return options of ``optimize_acqf``; none for None.
+
+    Raises:
+        TypeError: If they are no dictionary.
+        ValueError: If one of them is not for a user to give.
+    """
+    options = {} if options is None else options
+    if not isinstance(options, dict):
+        raise TypeError(f"Expected optimizer_options to be a dictionary, got {options!r}.")
+    own = {"acq_function", "bounds", "q", "return_best_only", "return_full_tree"} & set(options)
+    if own:
+        raise ValueError(f"Expected optimizer_options without {sorted(own)}: these are set here.")
+    return options

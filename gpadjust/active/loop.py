@@ -10,10 +10,9 @@ from typing import Any, Self
 from torch import Tensor
 from tqdm import tqdm
 
-from gpadjust.active.arguments import as_outcomes
 from gpadjust.active.measurement_log import LogError, MeasurementLog
-from gpadjust.active.measurements import Measurements, refusal
-from gpadjust.models.sampled_functions import check_number
+from gpadjust.active.measurements import Measurements, checked_outcomes, refusal
+from gpadjust.checks import checked_whole
 
 
 class CollectionError(RuntimeError):
@@ -92,8 +91,8 @@ class Loop(Measurements, ABC):
         """
         if not callable(oracle):
             raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
-        check_number(budget, "budget")
-        check_number(max_failures, "max_failures")
+        checked_whole("budget", budget, 1)
+        checked_whole("max_failures", max_failures, 1)
         done, failures = min(budget, self.num_measured), 0
         with tqdm(total=budget, initial=done, unit="measurement", disable=not progress) as bar:
             while (left := budget - self.num_measured) > 0:
@@ -123,7 +122,7 @@ class Loop(Measurements, ABC):
             self.fail(X, error)
             return error
         try:
-            Y = as_outcomes(result, len(X), self.num_outputs)
+            Y = checked_outcomes(result, len(X), self.num_outputs)
         except (TypeError, ValueError) as error:
             if self.log is not None:
                 with suppress(LogError):

@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.active.arguments import as_outcomes, as_points
 from gpadjust.active.design import NEAR, among, distances
 from gpadjust.active.measurement_log import Record
-from gpadjust.models.training_data import check_observed
+from gpadjust.checks import check_observed, checked_points, checked_tensor
 
 
 class Measurements:
@@ -58,9 +57,9 @@ class Measurements:
         if data is not None:
             if not isinstance(data, tuple | list) or len(data) != 2:
                 raise TypeError(f"Expected data to be a pair (X, Y), got {data!r}.")
-            X = as_points(data[0], bounds.shape[-1], "the X of data")
-            Y = as_outcomes(data[1], len(X), num_outputs)
-            check_observed(Y, "the Y of data")
+            X = checked_points("the X of data", data[0], bounds.shape[-1])
+            Y = checked_outcomes(data[1], len(X), num_outputs)
+            check_observed("the Y of data", Y)
             self.X, self.Y, self.num_outputs = X, Y, Y.shape[-1]
 
     @property
@@ -93,8 +92,8 @@ class Measurements:
             self.failed_X = torch.cat([self.failed_X, x])
         else:
             values = [math.nan if value is None else value for value in record["y"]]
-            y = as_outcomes([values], 1, self.num_outputs)
-            check_observed(y, "y")
+            y = checked_outcomes([values], 1, self.num_outputs)
+            check_observed("y", y)
             self.num_outputs = y.shape[-1]
             self.X, self.Y = torch.cat([self.X, x]), torch.cat([self.Y, y]) if len(self.Y) else y
         self._no_longer_pending(x[0])
@@ -117,7 +116,7 @@ class Measurements:
     def _points(self, rows: list[list[float]]) -> Tensor:
         """The points of a record, ``n x d``."""
         d = self.X.shape[-1]
-        return as_points(rows, d) if rows else self.X.new_zeros(0, d)
+        return checked_points("X", rows, d) if rows else self.X.new_zeros(0, d)
 
 
 def refusal(X: Tensor, result: Any, error: Exception) -> Record:
@@ -151,3 +150,27 @@ def measurement(x: list[float], y: list[float]) -> Record:
     record: Record = {"x": x, "y": values}
     failed = all(value is None for value in values)
     return record | ({"failed": f"measured {y}"} if failed else {})
+
+
+def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
+    """Return measured values as ``n x m``, float64; they may be NaN or infinite.
+
+    Args:
+        Y: The values, ``n x m`` or ``n``; one number for one point will do.
+        num_points: Number ``n`` of points.
+        num_outputs: Number ``m`` of outputs, if it is known.
+
+    Raises:
+        TypeError: If they are no numbers.
+        ValueError: If they have another shape.
+    """
+    Y = checked_tensor("measured values", Y)
+    columns = Y.reshape(-1, 1) if Y.dim() < 2 else Y
+    right = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
+    if not right or num_outputs not in (None, columns.shape[-1]):
+        m = "m" if num_outputs is None else num_outputs
+        raise ValueError(
+            f"Expected measured values of shape {num_points} x {m}, a row for each point, got "
+            f"{tuple(Y.shape)}."
+        )
+    return columns

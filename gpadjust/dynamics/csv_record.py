@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import torch
 
-from gpadjust.dynamics.control_steps import checked_step
+from gpadjust.checks import checked_number
 from gpadjust.dynamics.record import Record
 from gpadjust.files import CsvColumns
 from gpadjust.states import StateSpec
@@ -43,7 +43,8 @@ def read_record(
     if isinstance(time, str):
         times = table.numbers(time)
     else:
-        times = checked_step(time, "time") * torch.arange(len(table), dtype=torch.float64)
+        step = checked_number("time", time, above=0)
+        times = step * torch.arange(len(table), dtype=torch.float64)
     measured = []
     for name, column in states.items():
         filled_in = name in spec.previous and name == column and name not in table.names

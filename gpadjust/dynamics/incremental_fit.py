@@ -77,7 +77,7 @@ def fit_all(
         options: Of this search; of later ones the method and what it holds.
     """
     n = len(data.states)
-    check_observed(recipe.targets.spec, data)
+    observed_outputs(recipe.targets.spec, data)
     model = recipe.build(data, quiet=previous is not None)
     given: Any = options
     if previous is None:
@@ -92,7 +92,7 @@ def fit_all(
     return Fitted(model, result, n if searches else previous.searched_at)
 
 
-def check_observed(spec: StateSpec, data: Transitions) -> Tensor:
+def observed_outputs(spec: StateSpec, data: Transitions) -> Tensor:
     """Which outputs were observed in each transition, ``n x m``; an error if they are too few."""
     observed = ~data.next_states[:, spec.predicted].isnan()
     least, i = observed.sum(0).min(0)

@@ -8,14 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_switch
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
 from gpadjust.dynamics.incremental_fit import (
     DynamicsFitOptions,
-    check_observed,
     checked_fit_options,
     fit_all,
     kept,
+    observed_outputs,
 )
 from gpadjust.dynamics.learnt import Learnt, LearntState
 from gpadjust.dynamics.model_recipe import ModelRecipe
@@ -98,8 +99,7 @@ class LearnedDynamics(Dynamics):
     ) -> None:
         super().__init__(spec)
         check_num_features(num_features)
-        if not isinstance(encode_angles, bool):
-            raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
+        check_switch("encode_angles", encode_angles)
         self.targets = TransitionTargets(spec, target)
         self.physics = None if physics is None else check_physics(physics, spec)
         self.encode_angles = encode_angles
@@ -382,7 +382,7 @@ class LearnedDynamics(Dynamics):
         return sample_functions
 
     def _learn(self, data: Transitions, known: Tensor | None, previous: Learnt | None) -> None:
-        check_observed(self.spec, data)
+        observed_outputs(self.spec, data)
         with self._recipe.restored_on_error():
             if previous is None and not self._compared:
                 self._recipe.compare_physics(data, known)

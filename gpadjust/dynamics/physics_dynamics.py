@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
 from gpadjust.dynamics.next_state_physics import (
@@ -18,7 +19,6 @@ from gpadjust.dynamics.next_state_physics import (
 )
 from gpadjust.dynamics.physics_probes import PhysicsProbes
 from gpadjust.models import Prediction
-from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 
@@ -103,7 +103,7 @@ class PhysicsDynamics(Dynamics):
         Raises:
             ValueError: If ``num_functions`` is no positive whole number.
         """
-        check_number(num_functions, "num_functions")
+        checked_whole("num_functions", num_functions, 1)
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_blocks(states, actions, num_functions)

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.control_steps import checked_step, in_control_steps
+from gpadjust.checks import checked_number, checked_whole
+from gpadjust.dynamics.control_steps import in_control_steps
 from gpadjust.dynamics.csv_record import checked_columns, read_record
 from gpadjust.dynamics.open_loop import steps_ahead
 from gpadjust.dynamics.record import Record
 from gpadjust.dynamics.resampling import resampled
 from gpadjust.dynamics.transitions import Transitions, spread_rows
-from gpadjust.models.sampled_functions import check_number
 from gpadjust.states import StateSpec
 
 
@@ -66,7 +66,8 @@ class Windows(NamedTuple):
             spec: What the entries of states and actions are.
             step: The control step.
         """
-        times = checked_step(step) * torch.arange(self.states.shape[1], dtype=torch.float64)
+        step = checked_number("step", step, above=0)
+        times = step * torch.arange(self.states.shape[1], dtype=torch.float64)
         actions = torch.cat([self.actions, self.actions[:, -1:]], dim=1)  # the last one is not read
         parts = enumerate(zip(self.states, actions, strict=True))
         return Records([Record(times, *part, name=f"window {i}") for i, part in parts], spec)
@@ -256,9 +257,9 @@ class Records:
         Raises:
             ValueError: If no stretch is as long, or as :meth:`transitions`.
         """
-        check_number(length, "length")
+        checked_whole("length", length, 1)
         stride = length if stride is None else stride
-        check_number(stride, "stride")
+        checked_whole("stride", stride, 1)
         stretches, found = in_control_steps(self.records, self.spec, step), []
         for states, actions, *_ in stretches:
             complete, start = (~states.isnan().any(-1)).tolist(), 0
@@ -295,8 +296,8 @@ class Records:
         Warns:
             UserWarning: If whole records are left out.
         """
-        step = checked_step(step, "step")
-        max_gap = None if max_gap is None else checked_step(max_gap, "max_gap")
+        step = checked_number("step", step, above=0)
+        max_gap = None if max_gap is None else checked_number("max_gap", max_gap, above=0)
         found = [resampled(record, self.spec, step, max_gap) for record in self.records]
         records = [record for record in found if record is not None]
         if not records:

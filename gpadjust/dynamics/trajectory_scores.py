@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.dynamics.open_loop import Move, chosen_starts, follow, of_states, steps_ahead
 from gpadjust.dynamics.particles import (
     about_centre,
@@ -17,7 +18,6 @@ from gpadjust.dynamics.particles import (
 )
 from gpadjust.dynamics.step_or_nan import step_or_nan
 from gpadjust.dynamics.transitions import Transitions
-from gpadjust.models.sampled_functions import check_number
 from gpadjust.states import StateSpec
 from gpadjust.validation import nlpd, rmse
 
@@ -115,7 +115,7 @@ def score_trajectories(
     horizons = checked_horizons(horizons)
     check_enough(num_functions, LEVEL)
     if max_windows is not None:
-        check_number(max_windows, "max_windows")
+        checked_whole("max_windows", max_windows, 1)
     if units is None:
         units = typical_change(spec, data.states, data.next_states)
     units = of_states(units, "units", (spec.state_dim,))
@@ -166,7 +166,7 @@ def checked_horizons(horizons: Sequence[int]) -> tuple[int, ...]:
             f"{horizons!r}."
         )
     for each in given:
-        check_number(each, "each horizon")
+        checked_whole("each horizon", each, 1)
     return tuple(sorted(given))
 
 

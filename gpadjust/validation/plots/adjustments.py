@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     GREY,
@@ -20,7 +21,6 @@ from gpadjust.validation.plots.drawing import (
     quantile,
     tidy,
     two_inputs,
-    whole,
 )
 
 _CONSTANT = 1e-9  # relative variation of what is constant
@@ -72,7 +72,7 @@ def plot_adjustment(
         (2, 1)
     """
     names = _adjustments(model)
-    num_points = whole(num_points, "num_points", 2)
+    num_points = checked_whole("num_points", num_points, 2)
     quantile(level)  # refused before there is a figure
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     d = train_X.shape[-1]
@@ -138,7 +138,7 @@ def plot_adjustment_pair(
         (2, 2)
     """
     names = _adjustments(model)
-    num_points = whole(num_points, "num_points", 2)
+    num_points = checked_whole("num_points", num_points, 2)
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     i, j = two_inputs(inputs, train_X.shape[-1], "`plot_adjustment`")
     shape = (len(names), 2)

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from scipy.stats import binom
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.plots.drawing import (
     BLUE,
@@ -18,7 +19,6 @@ from gpadjust.validation.plots.drawing import (
     new_axes,
     observed,
     tidy,
-    whole,
 )
 from gpadjust.validation.scores import Scores
 
@@ -95,7 +95,7 @@ def plot_pit(
         >>> len(plot_pit(torch.rand(50), bins=5).patches)
         5
     """
-    bins = whole(bins, "bins", 1)
+    bins = checked_whole("bins", bins, 1)
     pit, title = _pit_and_title(prediction, output)
     if ax is None:
         ax = new_axes(1, 1)[0, 0]

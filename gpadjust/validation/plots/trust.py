@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.validation.plots.drawing import (
     BLUE,
     RED,
@@ -17,7 +18,6 @@ from gpadjust.validation.plots.drawing import (
     new_axes,
     tidy,
     two_inputs,
-    whole,
 )
 from gpadjust.validation.trust import SIDES, Trust
 
@@ -53,7 +53,7 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = Non
         (1,)
     """
     side, named = _side_and_names(trust, output)
-    bins = whole(bins, "bins", 1)
+    bins = checked_whole("bins", bins, 1)
     d = trust.X.shape[-1]
     axes = new_axes(1, d)[0] if axes is None else given_axes(axes, (d,))
     for ax, x, name in zip(axes, trust.X.unbind(-1), labels(trust, "input", d), strict=True):
