@@ -8,7 +8,7 @@ import torch
 from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, PhysicsMeanGP, Unknown, fit
 from gpadjust.gp import OrthogonalKernel
 from gpadjust.inference import ParameterWarning
-from gpadjust.inference.calibrate import Calibration
+from gpadjust.inference.calibration import Calibration
 from gpadjust.models import orthogonal_rbf
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
 from gpadjust.validation.plots import plot_prediction

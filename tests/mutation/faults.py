@@ -44,7 +44,7 @@ FAULTS = (
         "The nugget has no units: targets of a tiny scale drown in it.",
     ),
     Fault(
-        "gpadjust/inference/targets.py",
+        "gpadjust/inference/distributions.py",
         "by_length if shape[-1] > 1 else by_length.sum(-1, keepdim=True)",
         "by_length if shape[-1] > 1 else by_length.mean(-1, keepdim=True)",
         "The gradient of a lengthscale that several inputs share is too small.",
