@@ -13,7 +13,7 @@ from gpadjust.physics import as_physics
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
     *("physics", "states", "files", "envs", "gp", "models", "inference"),
-    *("validation", "report", "sklearn", "ax", "active", "dynamics", "control", "rl"),
+    *("validation", "report", "sklearn", "ax", "active", "dynamics", "records", "control", "rl"),
 ]
 
 

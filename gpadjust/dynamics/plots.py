@@ -1,7 +1,13 @@
-"""Figures of free runs beside what was measured."""
+"""Figures of free runs beside what was measured.
+
+Each function draws on the axes that it is given, or on those of a new figure, and returns them;
+show or save the figure with ``axes.flat[0].figure``. They need matplotlib,
+``pip install gpadjust[plot]``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,9 +17,11 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust.dynamics.free_run import FreeRun
-from gpadjust.dynamics.plots.drawing import check_names, going_on, labels
-from gpadjust.dynamics.records import Windows
+from gpadjust.dynamics.trajectories import Windows
+from gpadjust.states import StateSpec
 from gpadjust.validation.plots.drawing import BAND, BLUE, RED, given_axes, legend, new_axes, tidy
+
+__all__ = ["plot_free_run"]
 
 _OTHERS = (RED, "#009E73", "#CC79A7")  # told apart by the colour-blind, too
 _SHOWN = 3  # windows, unless they are chosen
@@ -38,12 +46,12 @@ def plot_free_run(
 
     Args:
         run: Free runs of all the windows.
-        windows: The windows, as of :meth:`Records.windows`.
+        windows: The windows, as of :meth:`Trajectories.windows`.
         rows: The numbers of those to draw. Default: three, evenly spread.
         states: The names of the states to draw, a row of panels each. Default: all that move.
         others: Free runs of other dynamics, by what the legend calls them: their means are drawn.
         step: The time of a step. Default: that of the spec, and without one steps are counted.
-        units: Units for the labels, as of :func:`plot_record`.
+        units: Units for the labels, as of :func:`gpadjust.records.plots.plot_record`.
         axes: ``len(states) x len(rows)`` axes. Default: a new figure.
 
     Returns:
@@ -56,11 +64,11 @@ def plot_free_run(
 
     Example:
         >>> import torch
-        >>> from gpadjust.dynamics import PhysicsDynamics, Record, Records, StateSpec
+        >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec, Trajectories
         >>> spec = StateSpec(["x"], ["v"])
-        >>> times = 0.1 * torch.arange(41, dtype=torch.float64)
-        >>> record = Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1))
-        >>> windows = Records(record, spec).windows(20)
+        >>> times = 0.1 * torch.arange(41, dtype=torch.float64).unsqueeze(-1)
+        >>> x, v = times.sin(), times.cos()
+        >>> windows = Trajectories(x[:-1], v[:-1], x[1:], torch.zeros(40)).windows(20)
         >>> dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + 0.1 * X[:, 1:])
         >>> run = dynamics.free_run(windows.initial_states, windows.actions)
         >>> plot_free_run(run, windows, step=0.1, units={"x": "m"}).shape
@@ -148,3 +156,28 @@ def _check_runs(runs: Mapping[str, FreeRun], windows: Windows) -> None:
                 f"{tuple(windows.measured.shape)}, got runs of shape {tuple(run.mean.shape)}; pass "
                 "windows and runs of all of them, and choose by `rows`."
             )
+
+
+def going_on(values: Tensor, is_angle: bool) -> Tensor:
+    """One state over time, ``n`` with NaN; an angle without jumps, at first within half a turn."""
+    values, known = values.clone(), ~values.isnan()
+    if is_angle and known.any():
+        path = torch.from_numpy(np.unwrap(values[known].numpy()))
+        values[known] = path - 2 * math.pi * (path[0] / (2 * math.pi)).round()
+    return values
+
+
+def labels(spec: StateSpec, units: Mapping[str, str] | None) -> dict[str, str]:
+    """What axes are called, by the names of states and actions and "time"."""
+    names = (*spec.states, *spec.actions, "time")
+    units = {"time": "s", **dict.fromkeys(spec.angles, "rad"), **(units or {})}
+    check_names("units", units, names)
+    return {name: f"{name} in {units[name]}" if units.get(name) else name for name in names}
+
+
+def check_names(argument: str, names: Any, known: Sequence[str]) -> None:
+    """Raise a ValueError unless there are names, all of them known."""
+    unknown = [name for name in names if name not in known]
+    if unknown or not len(names):
+        found = repr(unknown[0]) if unknown else "none"
+        raise ValueError(f"Expected {argument} of {', '.join(known)}, found {found}.")

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.chain import Chain, Path
-from gpadjust.dynamics.kalman import Array, smooth_chain
-from gpadjust.dynamics.smoothing import Estimate
+from gpadjust.records.chain import Chain, Path
+from gpadjust.records.kalman import Array, smooth_chain
+from gpadjust.records.smoothing import Estimate
 
 _MEDIAN = 0.05  # of a variation beforehand, in standard deviations of a parameter's prior
 _SPREAD = 1.0  # of its logarithm

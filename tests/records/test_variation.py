@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from gpadjust import CalibratedPhysics
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, Record, Records, StateSpec, smooth
-from gpadjust.dynamics.variation import log_evidence
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.varying_parameters import VaryingParameters
 from gpadjust.models import PhysicsParameters
 from gpadjust.physics import ODEPhysics, Unknown
+from gpadjust.records import Record, Records, smooth
+from gpadjust.records.variation import log_evidence
 
 STEP, FACTOR = 0.1, 1.5
 SPEC = StateSpec(["x", "v"], ["force"])
@@ -57,7 +58,7 @@ def strokes(number, sd, seed, steps=12, size=1.0, friction=0.0):
 def learnt(records):
     found = smooth(records, spring())
     dynamics = LearnedDynamics(SPEC, spring(), model=CalibratedPhysics, fit_options=FEW)
-    dynamics.update(*found.draw(0).transitions())
+    dynamics.update(*found.draw(0).trajectories())
     return found, dynamics
 
 

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gpadjust.dynamics.chain import Chain, Known
-from gpadjust.dynamics.control_steps import Stretch
-from gpadjust.dynamics.kalman import Array, Smoothed, smooth_chain
 from gpadjust.physics import Physics, PhysicsError
+from gpadjust.records.chain import Chain, Known
+from gpadjust.records.kalman import Array, Smoothed, smooth_chain
+from gpadjust.records.stretches import Stretch
 from gpadjust.states import StateSpec
 
 _LONGER = 1.6  # than a step of expectation maximisation, in logarithms

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from gpadjust.dynamics.record import Record
+from gpadjust.records.record import Record
 from gpadjust.states import StateSpec
 
 _SAME = 0.01  # of a step, by which another one may differ from it
@@ -34,7 +34,7 @@ class Stretch(NamedTuple):
 def in_control_steps(
     records: Sequence[Record], spec: StateSpec, step: float | None
 ) -> list[Stretch]:
-    """All stretches of the records; see :class:`~gpadjust.dynamics.Records`.
+    """All stretches of the records; see :class:`~gpadjust.records.Records`.
 
     Args:
         records: The records.

@@ -1,4 +1,9 @@
-"""Figures of records of a machine."""
+"""Figures of records of a machine.
+
+Each function draws on the axes that it is given, or on those of a new figure, and returns them;
+show or save the figure with ``axes.flat[0].figure``. They need matplotlib,
+``pip install gpadjust[plot]``.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +16,12 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from gpadjust.dynamics.plots.drawing import going_on, labels
-from gpadjust.dynamics.record import Record
+from gpadjust.dynamics.plots import going_on, labels
+from gpadjust.records.record import Record
 from gpadjust.states import StateSpec
 from gpadjust.validation.plots.drawing import BLUE, GREY, given_axes, tidy
+
+__all__ = ["plot_record"]
 
 
 def plot_record(
@@ -50,7 +57,8 @@ def plot_record(
 
     Example:
         >>> import torch
-        >>> from gpadjust.dynamics import Record, StateSpec
+        >>> from gpadjust.records import Record
+        >>> from gpadjust.states import StateSpec
         >>> times = 0.01 * torch.arange(100, dtype=torch.float64)
         >>> record = Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1))
         >>> plot_record(record, StateSpec(["x"], ["v"]), units={"x": "m", "v": "m/s"}).shape

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.record import Record
+from gpadjust.records.record import Record
 from gpadjust.states import StateSpec
 
 _ROUNDING = 1e-6  # of a step

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 import torch
 
-from gpadjust.dynamics import PhysicsDynamics, Record, Records, StateSpec, Transitions
-from gpadjust.dynamics.open_loop import steps_ahead
+from gpadjust.dynamics import PhysicsDynamics, StateSpec, Trajectories
 from gpadjust.physics import ODEPhysics
+from gpadjust.records import Record, Records
 
 SPEC = StateSpec(["x"], ["u"])
 POINT = StateSpec(["x", "v"], ["u"])
@@ -18,6 +18,11 @@ POINT = StateSpec(["x", "v"], ["u"])
 
 def column(*values):
     return torch.tensor(values, dtype=torch.float64).reshape(-1, 1)
+
+
+def steps_of_episodes(data):
+    """How many steps each episode has, one after the other."""
+    return data.episode.unique_consecutive(return_counts=True)[1].tolist()
 
 
 def counted(num_rows, first=0.0, step=0.01, at=None, **options):
@@ -48,25 +53,25 @@ def pendulum_record(num_rows=81, step=0.01):
 
 
 def test_a_control_step_is_every_kth_row_with_the_mean_action():
-    data = Records([counted(8)], SPEC).transitions(0.03)
+    data = Records([counted(8)], SPEC).trajectories(0.03)
     assert data.states.flatten().tolist() == [0, 3]
     assert data.next_states.flatten().tolist() == [3, 6]
     assert data.actions.flatten().tolist() == pytest.approx([5 / 3, (9 + 16 + 25) / 3])
     assert all(tensor.dtype == torch.float64 for tensor in data)
-    assert isinstance(data, Transitions)
-    every = Records([counted(8)], SPEC).transitions()
+    assert isinstance(data, Trajectories)
+    every = Records([counted(8)], SPEC).trajectories()
     assert every.states.flatten().tolist() == [*range(7)]
 
 
 def test_the_steps_of_a_system_are_those_of_its_physics():
     record, physics = pendulum_record()
     spec = StateSpec(["theta", "omega"], ["torque"], angles=["theta"])
-    data = Records([record], spec).transitions(0.05)
+    data = Records([record], spec).trajectories(0.05)
     assert len(data.states) == 16
     assert record.states[:, 0].diff().abs().max() > 6, "it turns over"
-    scores = PhysicsDynamics(spec, physics).score_trajectories(*data, horizons=(1, 16))
-    assert scores.num_windows.tolist() == [16, 1]
-    assert scores.rmse.max() < 1e-6
+    windows = data.windows(16)
+    run = PhysicsDynamics(spec, physics).free_run(windows.initial_states, windows.actions)
+    assert run.score(windows.measured).rmse.max() < 1e-6
 
 
 @pytest.mark.parametrize("step", [0.01, 0.02, 0.05])
@@ -79,24 +84,35 @@ def test_no_step_crosses_segments_gaps_or_records(step):
         Record(0.01 * rows, rows.unsqueeze(-1), rows.unsqueeze(-1)),
         counted(14, first=70.0, name="late"),
     ]
-    data = Records(records, SPEC).transitions(step)
+    data = Records(records, SPEC).trajectories(step)
     lengths = [(n - 1) // k for n in (12, 13, 6, 11, 17, 14)]
     assert (data.next_states - data.states).unique().tolist() == [k]
-    expected = [m for length in lengths for m in range(length, 0, -1)]
-    assert steps_ahead(SPEC, data).tolist() == expected
+    assert steps_of_episodes(data) == lengths
+
+
+def test_windows_do_not_cross_records_that_join():
+    """A machine that starts and ends at rest: one record ends where the other begins."""
+    states = column(0, 1, 2, 2, 1, 0)
+    record = Record(torch.arange(6).double(), states, torch.ones_like(states))
+    data = Records([record, record], SPEC).trajectories()
+    assert torch.equal(data.next_states[4], data.states[5])
+    assert steps_of_episodes(data) == [5, 5]
+    assert len(data.windows(5).actions) == 2
+    with pytest.raises(ValueError, match="the longest stretch has 5"):
+        data.windows(8)
 
 
 def test_the_clock_may_start_anew_in_a_segment():
     times = torch.cat([torch.arange(5), torch.arange(4)]).double()
     record = counted(9, at=times, segments=torch.tensor([1] * 5 + [2] * 4))
-    assert Records([record], SPEC).transitions().states.flatten().tolist() == [0, 1, 2, 3, 5, 6, 7]
+    assert Records([record], SPEC).trajectories().states.flatten().tolist() == [0, 1, 2, 3, 5, 6, 7]
 
 
 def test_rounded_times_are_even():
     """Of 120 Hz in ms; the time from a row to the next is 8 or 9 ms."""
     times = (torch.arange(500, dtype=torch.float64) / 120).mul(1000).round() / 1000
     records = Records([counted(500, at=times)], SPEC)
-    assert len(records.transitions(1 / 24).states) == 99
+    assert len(records.trajectories(1 / 24).states) == 99
     assert records.records[0].sampling_step == pytest.approx(1 / 120, rel=1e-3)
 
 
@@ -108,35 +124,46 @@ def test_states_that_were_not_measured():
     times, states = torch.arange(8).double(), states.double()
     records = Records([Record(times, states, torch.zeros(8, 1).double())], POINT)
     with pytest.warns(UserWarning, match=r"0 of 1 stretches.*4 of 7 steps, 2 of which start at"):
-        data = records.transitions()
+        data = records.trajectories()
     assert data.states[:, 0].tolist() == [0, 1, 5]
     assert data.next_states[1].tolist() == pytest.approx([2, nan], nan_ok=True)
-    assert steps_ahead(POINT, data).tolist() == [2, 1, 1]
+    assert steps_of_episodes(data) == [2, 1]
     states[:, 1] = nan
     never = Records([Record(times, states, torch.zeros(8, 1).double())], POINT)
     with pytest.raises(ValueError, match=r"found none of 7; .* state by state: x 6, v 0"):
-        never.transitions()
+        never.trajectories()
 
 
-def test_what_was_not_measured_joins_no_episodes():
+def test_a_row_that_is_left_out_ends_an_episode():
     """At rest a position alone does not tell the next row from the one after it."""
     states = torch.zeros(6, 2, dtype=torch.float64)
     states[0], states[1, 1], states[2, 1], states[5] = 1.0, 1.0, torch.nan, 2.0
     records = Records([Record(torch.arange(6).double(), states, torch.zeros(6, 1).double())], POINT)
-    with pytest.warns(UserWarning, match="2 of 5 steps, 1 of which"):
-        data = records.transitions()
-    assert not data.next_states.isnan().any()
-    assert steps_ahead(POINT, data).tolist() == [1, 2, 1]
+    with pytest.warns(UserWarning, match="1 of 5 steps, 1 of which"):
+        data = records.trajectories()
+    assert data.next_states[1].isnan().tolist() == [False, True]
+    assert steps_of_episodes(data) == [2, 2]
+
+
+def test_windows_of_a_hidden_state_are_those_of_what_smoothing_finds():
+    states = torch.full((9, 2), torch.nan, dtype=torch.float64)
+    states[:, 0] = torch.arange(9)
+    records = Records([Record(torch.arange(9).double(), states, torch.zeros(9, 1).double())], POINT)
+    for ask in (records.trajectories, lambda: records.windows(3)):
+        with pytest.raises(
+            ValueError, match=r"'v' was never measured.*smooth\(.*draw\(\)\.windows"
+        ):
+            ask()
 
 
 def test_stretches_that_are_too_short_are_left_out():
     records = Records([counted(9, segments=[1, 2, 2, 2, 2, 2, 3, 3, 3])], SPEC)
     with pytest.warns(UserWarning, match="1 of 3 stretches"):
-        assert records.transitions().states.flatten().tolist() == [1, 2, 3, 4, 6, 7]
+        assert records.trajectories().states.flatten().tolist() == [1, 2, 3, 4, 6, 7]
     with pytest.warns(UserWarning, match="2 of 3 stretches"):
-        assert records.transitions(0.04).states.flatten().tolist() == [1]
+        assert records.trajectories(0.04).states.flatten().tolist() == [1]
     with pytest.raises(ValueError, match=r"6 rows or more, which are a control step, .* none of 3"):
-        records.transitions(0.05)
+        records.trajectories(0.05)
 
 
 @pytest.mark.parametrize("step", [0.01, 0.02])
@@ -149,16 +176,16 @@ def test_previous_actions_are_those_of_the_step_before(step):
     states[0, 1] = math.nan
     unknown = Records([Record(record.times, states, record.actions)], spec)
     with pytest.warns(UserWarning, match="1 of which start"):
-        later = unknown.transitions(step)
+        later = unknown.trajectories(step)
     assert len(later.states) == round(0.06 / step) - 1
     torch.testing.assert_close(later.next_states[:, 1:], later.actions)
     torch.testing.assert_close(later.states[1:, 1:], later.actions[:-1])
     if step == 0.01:
-        data = known.transitions(step)
+        data = known.trajectories(step)
         assert data.states[0, 1] == -1
     else:  # what was recorded at the first row is of a row before, not of a step
         with pytest.warns(UserWarning, match="1 of which start"):
-            data = known.transitions(step)
+            data = known.trajectories(step)
     torch.testing.assert_close(later.states, data.states[-len(later.states) :])
 
 
@@ -173,10 +200,11 @@ def test_previous_states_are_those_of_the_steps_before(names, step):
     states = torch.cat([never, record.states], -1)
     records = Records([Record(record.times, states, record.actions, record.segments)], spec)
     with pytest.warns(UserWarning, match="4 of which start at a state not measured in full"):
-        data = records.transitions(step)
+        data = records.trajectories(step)
     starts = [*range(2 * k, 13 - k, k), *range(13 + 2 * k, 24 - k, k)]
     assert data.states[:, 3].tolist() == starts
-    now, after = ({n: t[:, i] for i, n in enumerate(spec.states)} for t in (data[0], data[2]))
+    pair = data.states, data.next_states
+    now, after = ({n: t[:, i] for i, n in enumerate(spec.states)} for t in pair)
     assert (now["x"] - now["x_1"]).unique().tolist() == [k]
     assert (now["x"] - now["x_2"]).unique().tolist() == [2 * k]
     before = [sum((row - j) ** 2 for j in range(1, k + 1)) / k for row in starts]
@@ -189,7 +217,7 @@ def test_previous_states_are_those_of_the_steps_before(names, step):
     records = Records([Record(record.times, states, record.actions, record.segments)], spec)
     left = "2 of which start" if k == 1 else "4 of which start"  # of a row before, not of a step
     with pytest.warns(UserWarning, match=left):
-        data = records.transitions(step)
+        data = records.trajectories(step)
     assert data.states[0, 3] == (0 if k == 1 else 2 * k)
 
 
@@ -197,9 +225,9 @@ def test_the_step_of_the_spec_is_the_default():
     spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.02)
     record = counted(9)
     records = Records([Record(record.times, record.states.repeat(1, 2), record.actions)], spec)
-    assert records.transitions().states[:, 0].tolist() == [0, 2, 4, 6]
+    assert records.trajectories().states[:, 0].tolist() == [0, 2, 4, 6]
     with pytest.raises(ValueError, match=r"step of the spec, 0\.02, got 0\.04; leave `step` out"):
-        records.transitions(0.04)
+        records.trajectories(0.04)
 
 
 def jittery(seed=0, num_rows=200, by=0.3):
@@ -226,7 +254,7 @@ def jittery(seed=0, num_rows=200, by=0.3):
 )
 def test_steps_that_records_do_not_have(records, step, says):
     for take in (
-        Records(records, SPEC).transitions,
+        Records(records, SPEC).trajectories,
         lambda s: Records(records, SPEC).windows(1, s),
     ):
         with pytest.raises(ValueError, match=says):
@@ -235,15 +263,15 @@ def test_steps_that_records_do_not_have(records, step, says):
 
 def test_a_step_is_a_number():
     with pytest.raises(TypeError, match="step as a number, found '50 ms'"):
-        Records([counted(9)], SPEC).transitions("50 ms")
+        Records([counted(9)], SPEC).trajectories("50 ms")
 
 
 def test_even_records_stay_as_they_are_when_resampled():
     records = Records([counted(31, segments=[0] * 14 + [1] * 17), counted(23, first=5.0)], SPEC)
-    expected = records.transitions(0.04)
+    expected = records.trajectories(0.04)
     again = records.resampled(0.04)
     assert [record.name for record in again] == [record.name for record in records]
-    for one, other in zip(again.transitions(), expected, strict=True):
+    for one, other in zip(again.trajectories(), expected, strict=True):
         torch.testing.assert_close(one, other)
 
 
@@ -252,7 +280,7 @@ def test_uneven_records_are_interpolated():
     times = jittery(by=0.45)
     actions = times.diff(append=times[-1:] + 1).reciprocal()  # of one unit from row to row
     record = Record(times, 3 * times.unsqueeze(-1) - 1, actions.unsqueeze(-1))
-    data = Records([record], SPEC).resampled(0.025).transitions()
+    data = Records([record], SPEC).resampled(0.025).trajectories()
     torch.testing.assert_close(data.next_states - data.states, torch.full_like(data.states, 0.075))
     passed = np.interp(times[0] + 0.025 * np.arange(len(data.states) + 1), times, np.arange(200))
     np.testing.assert_allclose(data.actions[:, 0], np.diff(passed) / 0.025)
@@ -262,7 +290,7 @@ def test_resampled_angles_go_the_shortest_way():
     spec = StateSpec(["x"], ["u"], angles=["x"])
     turned = torch.atan2((7 * jittery()).sin(), (7 * jittery()).cos()).unsqueeze(-1)
     record = Record(jittery(), turned, torch.zeros(200, 1).double())
-    data = Records([record], spec).resampled(0.01).transitions()
+    data = Records([record], spec).resampled(0.01).trajectories()
     change = spec.change(data.states, data.next_states)
     torch.testing.assert_close(change, torch.full_like(change, 0.07))
 
@@ -294,7 +322,7 @@ def test_gaps_are_not_interpolated_over_unless_they_are_said_to_be_none():
     assert [int(even.times[rows.start]) for rows in even.stretches()] == [0, 22, 49]
     assert len(records.resampled(2, max_gap=3).records[0].stretches()) == 2
     bridged = records.resampled(2, max_gap=10)
-    data = bridged.transitions()
+    data = bridged.trajectories()
     assert (data.next_states - data.states).unique().tolist() == [2]
     assert len(data.states) == 29
 
@@ -306,7 +334,7 @@ def test_resampling_that_cannot_be():
         even = records.resampled(0.1)
     assert [record.name for record in even] == ["long"]
     with pytest.warns(UserWarning, match="2 of 3 stretches"):
-        assert even.transitions().states.flatten().tolist() == pytest.approx([6, 16])
+        assert even.trajectories().states.flatten().tolist() == pytest.approx([6, 16])
     with pytest.raises(ValueError, match=r"as a step, 0\.5, found none"):
         records.resampled(0.5)
     with pytest.raises(ValueError, match=r"half a sampling step, 0\.005, .* got 0\.004"):
@@ -316,7 +344,7 @@ def test_resampling_that_cannot_be():
     rough = counted(6, at=torch.tensor([0, 1, 3, 4, 7, 8.0]).double())
     with pytest.raises(ValueError, match=r"records\.resampled\(step, max_gap="):
         Records([rough], SPEC).resampled(1)
-    assert len(Records([rough], SPEC).resampled(1, max_gap=3).transitions().states) == 8
+    assert len(Records([rough], SPEC).resampled(1, max_gap=3).trajectories().states) == 8
 
 
 def test_windows_have_the_steps_of_transitions():
@@ -325,7 +353,7 @@ def test_windows_have_the_steps_of_transitions():
     assert windows.initial_states.flatten().tolist() == [0, 6, 14, 20, 50, 56, 62]
     steps = torch.arange(1, 4) * 2
     torch.testing.assert_close(windows.measured[..., 0], windows.initial_states + steps)
-    data = records.transitions(0.02)
+    data = records.trajectories(0.02)
     for i, start in enumerate(windows.initial_states):
         row = int((data.states == start).nonzero()[0, 0])
         assert torch.equal(windows.actions[i], data.actions[row : row + 3])
@@ -348,7 +376,7 @@ def test_windows_start_at_what_was_measured():
 
 
 def test_a_few_transitions_spread_over_all():
-    data = Records([counted(41), counted(62, first=100.0)], SPEC).transitions()
+    data = Records([counted(41), counted(62, first=100.0)], SPEC).trajectories()
     before = torch.get_rng_state()
     few = data.spread(10, seed=3)
     assert torch.equal(before, torch.get_rng_state())
@@ -566,7 +594,7 @@ def test_windows_are_drawn_evenly_and_are_records_again():
     ends = pairwise((0, 3, 6, 9, 13))
     assert all(low <= i < high for i, (low, high) in zip(numbers, ends, strict=True))
     assert torch.equal(windows.spread(4, seed=1).states, drawn.states)
-    again = drawn.as_records(SPEC, 0.01)
+    again = Records.of_windows(drawn, SPEC, 0.01)
     assert [len(each.times) for each in again] == [4] * 4
     back = again.windows(3, 0.01)
     for part, other in zip(back, drawn, strict=True):

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.dynamics import Record, Records, SmoothingWarning, StateSpec, smooth
-from gpadjust.dynamics.kalman import Link, draw_paths, smooth_chain
+from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
+from gpadjust.records import Record, Records, SmoothingWarning, smooth
+from gpadjust.records.kalman import Link, draw_paths, smooth_chain
 
 STEP, LENGTH = 0.1, 150
 SPEC = StateSpec(["x", "v"], ["force"])
@@ -152,7 +153,7 @@ def test_parameters_are_not_biased_by_noise_in_the_inputs():
     states = torch.stack(states)
     noisy = states + 1.5 * torch.randn(states.shape, generator=generator)
     records = Records(Record(torch.arange(400.0).double(), noisy, actions), spec)
-    before, u, after = records.transitions()
+    before, u, after = records.trajectories()
     by_steps = float(before.mT @ (after - u) / before.square().sum())
     found = smooth(records, decay)
     assert by_steps < 0.75
@@ -216,7 +217,7 @@ def test_a_model_learns_from_draws_segment_by_segment():
     with pytest.warns(UserWarning, match="1 of 3 stretches, shorter than a step"):
         found = smooth(Records(parts, SPEC), spring())
     assert [record.name for record in found.records.records] == ["spring"]
-    transitions = [found.draw(seed).transitions() for seed in (0, 0, 1)]
+    transitions = [found.draw(seed).trajectories() for seed in (0, 0, 1)]
     assert len(transitions[0].states) == 69 + 78
     assert torch.equal(transitions[0].states, transitions[1].states)
     assert not torch.equal(transitions[0].states, transitions[2].states)
@@ -226,7 +227,7 @@ def test_a_model_learns_from_draws_segment_by_segment():
         rows = torch.cat([data.states, data.actions], dim=-1)
         return (data.next_states - spring()(rows, known)).std(0)
 
-    drawn, likely = scatter(transitions[0]), scatter(found.records.transitions())
+    drawn, likely = scatter(transitions[0]), scatter(found.records.trajectories())
     torch.testing.assert_close(drawn[1], found.process_noise[1], rtol=0.25, atol=0)
     assert likely[1] < 0.8 * drawn[1]
 

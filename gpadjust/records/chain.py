@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gpadjust.dynamics.control_steps import Stretch
-from gpadjust.dynamics.kalman import Array, Link, Smoothed
-from gpadjust.dynamics.next_state_physics import check_next_values
+from gpadjust.dynamics.targets import check_next_values
 from gpadjust.physics import Physics, PhysicsError
+from gpadjust.records.kalman import Array, Link, Smoothed
+from gpadjust.records.stretches import Stretch
 from gpadjust.states import StateSpec
 
 _STEP = 1e-4  # of differences, in standard deviations of a parameter or a state

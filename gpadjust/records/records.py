@@ -1,75 +1,23 @@
-"""Measured trajectories, as transitions and windows of a control step."""
+"""Measured trajectories: read from files, in control steps, and as windows."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeVar
 
 import torch
-from torch import Tensor
 
-from gpadjust.dynamics.control_steps import checked_step, in_control_steps
-from gpadjust.dynamics.csv_record import checked_columns, read_record
-from gpadjust.dynamics.open_loop import steps_ahead
-from gpadjust.dynamics.record import Record
-from gpadjust.dynamics.resampling import resampled
-from gpadjust.dynamics.transitions import Transitions, spread_rows
-from gpadjust.models.sampled_functions import check_number
+from gpadjust.dynamics import Trajectories, Windows
+from gpadjust.files import CsvColumns
+from gpadjust.records.record import Record
+from gpadjust.records.resampling import resampled
+from gpadjust.records.stretches import Stretch, checked_step, in_control_steps
 from gpadjust.states import StateSpec
 
-
-class Windows(NamedTuple):
-    """Parts of records, of the same length, for free runs: ``w`` windows of ``T`` control steps.
-
-    Args:
-        initial_states: ``w x state_dim``.
-        actions: ``w x T x action_dim``.
-        measured: The states after each action, ``w x T x state_dim``; NaN where an entry was not
-            measured.
-    """
-
-    initial_states: Tensor
-    actions: Tensor
-    measured: Tensor
-
-    @property
-    def states(self) -> Tensor:
-        """The initial states, then what was measured: ``w x (T + 1) x state_dim``."""
-        return torch.cat([self.initial_states.unsqueeze(1), self.measured], dim=1)
-
-    def some(self, rows: Tensor | list[int]) -> Windows:
-        """The windows of these numbers, or those where a tensor of ``w`` booleans is true.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust.dynamics import Record, Records, StateSpec
-            >>> x = torch.arange(9, dtype=torch.float64).unsqueeze(-1)
-            >>> windows = Records(Record(x[:, 0], x, x), StateSpec(["x"], ["u"])).windows(2)
-            >>> fast = (windows.states.abs() > 3).any(1).any(-1)
-            >>> windows.some(fast).states[..., 0]
-            tensor([[2., 3., 4.],
-                    [4., 5., 6.],
-                    [6., 7., 8.]], dtype=torch.float64)
-        """
-        return Windows(*(part[rows] for part in self))
-
-    def spread(self, number: int, seed: int = 0) -> Windows:
-        """So many of the windows, drawn evenly, as by :meth:`Transitions.spread`."""
-        return self.some(spread_rows(len(self.states), number, seed, "windows"))
-
-    def as_records(self, spec: StateSpec, step: float) -> Records:
-        """A record of each window, such as to :func:`smooth` them.
-
-        Args:
-            spec: What the entries of states and actions are.
-            step: The control step.
-        """
-        times = checked_step(step) * torch.arange(self.states.shape[1], dtype=torch.float64)
-        actions = torch.cat([self.actions, self.actions[:, -1:]], dim=1)  # the last one is not read
-        parts = enumerate(zip(self.states, actions, strict=True))
-        return Records([Record(times, *part, name=f"window {i}") for i, part in parts], spec)
+Column = TypeVar("Column", bound=str | None)
 
 
 class Records:
@@ -91,12 +39,13 @@ class Records:
 
     Example:
         >>> import torch
-        >>> from gpadjust.dynamics import Record, Records, StateSpec
+        >>> from gpadjust.records import Record, Records
+        >>> from gpadjust.states import StateSpec
         >>> spec = StateSpec(["x"], ["v"])
         >>> times = 0.01 * torch.arange(101, dtype=torch.float64)
         >>> record = Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1))
         >>> records = Records([record], spec)
-        >>> states, actions, next_states = records.transitions(0.05)
+        >>> states, actions, next_states = records.trajectories(0.05)
         >>> len(states), bool((next_states - states - 0.05 * actions).abs().max() < 0.001)
         (20, True)
         >>> records.windows(10, 0.05).measured.shape
@@ -173,35 +122,46 @@ class Records:
         Example:
             >>> import tempfile
             >>> from pathlib import Path
-            >>> from gpadjust.dynamics import Records, StateSpec
+            >>> from gpadjust.records import Records
+            >>> from gpadjust.states import StateSpec
             >>> spec = StateSpec(["theta", "omega"], ["torque"], angles=["theta"])
             >>> with tempfile.TemporaryDirectory() as folder:
             ...     file = Path(folder, "swing.csv")
             ...     _ = file.write_text("time,q,dq,u\n0,0.1,0,1\n0.5,0.2,0.4,1\n1,0.5,0.8,0\n")
             ...     columns = {"theta": "q", "omega": "dq"}
             ...     records = Records.read_csv(file, spec, states=columns, actions={"torque": "u"})
-            >>> records.transitions().states
+            >>> records.trajectories().states
             tensor([[0.1000, 0.0000],
                     [0.2000, 0.4000]], dtype=torch.float64)
         """
         _check_spec(spec)
         columns = (
-            checked_columns(states, spec.states, "states"),
-            checked_columns(actions, spec.actions, "actions"),
+            _columns(states, spec.states, "states"),
+            _columns(actions, spec.actions, "actions"),
         )
         several = [files] if isinstance(files, str | Path) else files
-        records = [
-            read_record(f, spec, *columns, time, segment, delimiter, decimal) for f in several
-        ]
+        records = [_read(f, spec, *columns, time, segment, delimiter, decimal) for f in several]
         return cls(records, spec)
 
-    def transitions(self, step: float | None = None) -> Transitions:
-        """The transitions of all records, as dynamics learn them and score them.
+    @classmethod
+    def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
+        """A record of each window, such as to :func:`smooth` them.
 
-        Rows are in the order of the records, so that
-        :meth:`~gpadjust.dynamics.Dynamics.score_trajectories` finds the stretches. That takes a row
-        to lead to the next one if what was measured of its next state is the state there. A row of
-        which this would be chance, as its next state was not measured in full, is left out.
+        Args:
+            windows: The windows.
+            spec: What the entries of states and actions are.
+            step: The control step.
+        """
+        times = checked_step(step) * torch.arange(windows.states.shape[1], dtype=torch.float64)
+        actions = torch.cat([windows.actions, windows.actions[:, -1:]], dim=1)  # the last: not read
+        parts = enumerate(zip(windows.states, actions, strict=True))
+        return cls([Record(times, *part, name=f"window {i}") for i, part in parts], spec)
+
+    def trajectories(self, step: float | None = None) -> Trajectories:
+        """The trajectories of all records, as dynamics learn them and score them.
+
+        Rows are in the order of the records. An episode is what follows each other without a gap,
+        and without a row that is left out.
 
         Args:
             step: The control step, in the unit of the times. Default: the step of the spec, and
@@ -213,23 +173,18 @@ class Records:
 
         Warns:
             UserWarning: If steps are left out, because they start at a state that was not measured
-                in full, or end at one of which nothing was measured that a model predicts, or as
-                above; or stretches, because they are shorter than a step.
+                in full, or end at one of which nothing was measured that a model predicts; or
+                stretches, because they are shorter than a step.
         """
-        stretches = in_control_steps(self.records, self.spec, step)
-        parts = [(each.states[:-1], each.actions, each.states[1:]) for each in stretches]
-        data = Transitions(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+        data, stretches = self._in_steps(step)
         complete = ~data.states.isnan().any(-1)
-        says = ~data.next_states[:, self.spec.predicted].isnan().all(-1)
-        kept = data.some(complete & says)
-        while (joined := self._joined_by_chance(kept)).any():
-            kept = kept.some(~joined)
+        kept = data.some(complete & ~data.next_states[:, self.spec.predicted].isnan().all(-1))
         if not len(kept.states):
             columns = zip(self.spec.states, (~data.states.isnan()).sum(0).tolist(), strict=True)
             raise ValueError(
                 f"Expected steps from a state that was measured in full, found none of "
                 f"{len(data.states)}; of these were measured, state by state: "
-                f"{', '.join(f'{name} {number}' for name, number in columns)}."
+                f"{', '.join(f'{name} {number}' for name, number in columns)}.{self._hidden(data)}"
             )
         short = sum(not len(stretch.actions) for stretch in stretches)
         if short or len(kept.states) < len(data.states):
@@ -246,34 +201,21 @@ class Records:
         """Windows of all records, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
 
         A window starts only at a state that was measured in full; else at the next one that was.
+        What follows may lack entries.
 
         Args:
             length: The number ``T`` of control steps.
-            step: The control step, as of :meth:`transitions`.
+            step: The control step, as of :meth:`trajectories`.
             stride: How many steps after a window starts the next one. Default: ``length``, so that
                 they do not overlap.
 
         Raises:
-            ValueError: If no stretch is as long, or as :meth:`transitions`.
+            ValueError: If no stretch is as long, a state is hidden, or as :meth:`trajectories`.
         """
-        check_number(length, "length")
-        stride = length if stride is None else stride
-        check_number(stride, "stride")
-        stretches, found = in_control_steps(self.records, self.spec, step), []
-        for states, actions, *_ in stretches:
-            complete, start = (~states.isnan().any(-1)).tolist(), 0
-            while start + length <= len(actions):
-                end = start + length
-                if complete[start]:
-                    found.append((states[start], actions[start:end], states[start + 1 : end + 1]))
-                start += stride if complete[start] else 1
-        if not found:
-            raise ValueError(
-                f"Expected stretches of {length} steps from a state measured in full, found none; "
-                f"the longest stretch has {max(len(each.actions) for each in stretches)}. Take a "
-                "smaller length."
-            )
-        return Windows(*(torch.stack(parts) for parts in zip(*found, strict=True)))
+        data, _ = self._in_steps(step)
+        if hidden := self._hidden(data):
+            raise ValueError(f"Expected states measured in full, for windows to start at.{hidden}")
+        return data.windows(length, stride)
 
     def resampled(self, step: float, *, max_gap: float | None = None) -> Records:
         """Records with even rows of this step, from the beginning of each stretch.
@@ -314,14 +256,25 @@ class Records:
             )
         return Records(records, self.spec)
 
-    def _joined_by_chance(self, data: Transitions) -> Tensor:
-        """Rows after which an episode would seem to go on, as entries were not measured: ``N``.
+    def _in_steps(self, step: float | None) -> tuple[Trajectories, list[Stretch]]:
+        """All control steps, an episode for each stretch; states are NaN as they were measured."""
+        stretches = in_control_steps(self.records, self.spec, step)
+        parts = [(each.states[:-1], each.actions, each.states[1:]) for each in stretches]
+        lengths = torch.tensor([len(each.actions) for each in stretches])
+        episode = torch.arange(len(stretches)).repeat_interleave(lengths)
+        columns = (torch.cat(column) for column in zip(*parts, strict=True))
+        return Trajectories(*columns, episode), stretches
 
-        Where one does go on, the next state is one that a transition starts at: complete.
-        """
-        if not len(data.states):
-            return torch.zeros(0, dtype=torch.bool)
-        return (steps_ahead(self.spec, data) > 1) & data.next_states.isnan().any(-1)
+    def _hidden(self, data: Trajectories) -> str:
+        """What to do about states that were never measured; empty if there are none."""
+        never = data.states.isnan().all(0).nonzero().flatten().tolist()
+        if not never:
+            return ""
+        names = " and ".join(repr(self.spec.states[i]) for i in never)
+        return (
+            f" {names} was never measured: take states that smoothing finds, as in "
+            "`smooth(records, physics, start=...).draw().windows(20)`."
+        )
 
 
 def _check_spec(spec: StateSpec) -> None:
@@ -330,3 +283,62 @@ def _check_spec(spec: StateSpec) -> None:
             f"Expected spec as a StateSpec, such as StateSpec(['x', 'v'], ['force']); found "
             f"{spec!r}."
         )
+
+
+def _read(
+    file: str | Path,
+    spec: StateSpec,
+    states: Mapping[str, str | None],
+    actions: Mapping[str, str],
+    time: str | float,
+    segment: str | None,
+    delimiter: str,
+    decimal: str,
+) -> Record:
+    """The record in a file; see :meth:`Records.read_csv`.
+
+    Args:
+        file: The file.
+        spec: What the entries of states and actions are.
+        states: The column of each state; None if there is none.
+        actions: The column of each action.
+        time: The column of times, or the time from one row to the next.
+        segment: The column of labels, if there is one.
+        delimiter: What is between two fields.
+        decimal: The decimal mark of numbers.
+    """
+    table = CsvColumns(file, delimiter, decimal=decimal)
+    if isinstance(time, str):
+        times = table.numbers(time)
+    else:
+        times = checked_step(time, "time") * torch.arange(len(table), dtype=torch.float64)
+    measured = []
+    for name, column in states.items():
+        filled_in = name in spec.previous and name == column and name not in table.names
+        if column is None or filled_in:
+            measured.append(torch.full_like(times, math.nan))
+        else:
+            measured.append(table.numbers(column, may_miss=True))
+    taken = [table.numbers(column) for column in actions.values()]
+    labels = None if segment is None else table.texts(segment)
+    return Record(times, torch.stack(measured, -1), torch.stack(taken, -1), labels, str(file))
+
+
+def _columns(
+    given: Mapping[str, Column] | None, names: Iterable[str], argument: str
+) -> dict[str, Column | str]:
+    """The column of each name: the one given, or else that of the same name.
+
+    Raises:
+        TypeError: If it is no mapping.
+        ValueError: If it has another name.
+    """
+    given, names = {} if given is None else given, tuple(names)
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            f"Expected {argument} as a dictionary from names of the spec to columns, such as "
+            f"{{{names[0]!r}: 'q'}}, found {given!r}."
+        )
+    if unknown := [name for name in given if name not in names]:
+        raise ValueError(f"There is no {unknown[0]!r} among the {argument} of the spec, {names}.")
+    return {name: given.get(name, name) for name in names}

@@ -41,7 +41,7 @@ class Record:
 
     Example:
         >>> import torch
-        >>> from gpadjust.dynamics import Record
+        >>> from gpadjust.records import Record
         >>> times = 0.01 * torch.arange(100, dtype=torch.float64)
         >>> Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1), name="swing")
         Record('swing', 100 rows every 0.01, 1 state, 1 action)

@@ -13,18 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.chain import Chain, Known
-from gpadjust.dynamics.control_steps import Stretch, in_control_steps
-from gpadjust.dynamics.kalman import Array, draw_paths
-from gpadjust.dynamics.next_state_physics import check_physics, parts_of
-from gpadjust.dynamics.open_loop import of_states
-from gpadjust.dynamics.record import Record
-from gpadjust.dynamics.records import Records
-from gpadjust.dynamics.smoothing import Estimate, estimate
-from gpadjust.dynamics.variation import variation
+from gpadjust.dynamics.particles import of_states
+from gpadjust.dynamics.targets import check_physics, parts_of
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import ODEPhysics, Physics
+from gpadjust.records.chain import Chain, Known
+from gpadjust.records.kalman import Array, draw_paths
+from gpadjust.records.record import Record
+from gpadjust.records.records import Records
+from gpadjust.records.smoothing import Estimate, estimate
+from gpadjust.records.stretches import Stretch, in_control_steps
+from gpadjust.records.variation import variation
 
 _DRAWS = 256  # of the parameters
 _SAME = 0.01  # of a step, by which another one may differ from it
@@ -147,7 +147,7 @@ def smooth(
         physics: The next values of the states that are neither exogenous nor previous actions,
             from these and the actions, as of :class:`LearnedDynamics`; its unknown parameters are
             learnt from all records together.
-        step: The control step, as of :meth:`Records.transitions`.
+        step: The control step, as of :meth:`Records.trajectories`.
         start: Of states by name, mean and standard deviation at the beginning of each stretch;
             needed of hidden ones. Default: about the first that was measured.
         noise: Standard deviations ``state_dim`` of the errors of what was measured; NaN for those
@@ -165,7 +165,7 @@ def smooth(
     Raises:
         TypeError: If an argument is of the wrong type.
         ValueError: If a hidden state has no start, names or numbers are wrong, or as
-            :meth:`Records.transitions`.
+            :meth:`Records.trajectories`.
         PhysicsError: If the physics fails at measured states.
         RuntimeError: If the states diverge from all starts.
 
@@ -176,8 +176,9 @@ def smooth(
         A mass on a spring of unknown stiffness, of which only the position is measured:
 
         >>> import torch
-        >>> from gpadjust.dynamics import Record, Records, StateSpec, smooth
+        >>> from gpadjust.records import Record, Records, smooth
         >>> from gpadjust.physics import ODEPhysics, Unknown
+        >>> from gpadjust.states import StateSpec
         >>> def spring(x, u, p):
         ...     return torch.stack([x[:, 1], u[:, 0] - p.stiffness * x[:, 0]], dim=-1)
         >>> unknowns = {"stiffness": Unknown(1.0, factor=2.0)}
