@@ -21,8 +21,9 @@ _LEVELS = (0.5, 0.8, 0.95)
 def predictions(subject: Subject) -> Markup:
     """Each observation predicted from all others, and those that are predicted worst."""
     parts: list[str] = [tag("p", _how(subject))]
+    scores = subject.loo.score()
     for j, name in enumerate(subject.outputs):
-        rmse = float(subject.loo.rmse[j])
+        rmse = float(scores.rmse[j])
         n = int((~subject.Y[:, j].isnan()).sum())
         words = (
             f"{name}: {plural(n, 'observation')}, root mean square error "
@@ -40,10 +41,11 @@ def predictions(subject: Subject) -> Markup:
 def calibration(subject: Subject) -> Markup:
     """Whether intervals hold what they promise."""
     rows, parts = [], []
+    held_by = {level: subject.loo.score(level).coverage for level in _LEVELS}
     for j, name in enumerate(subject.outputs):
         n = int((~subject.Y[:, j].isnan()).sum())
         for level in _LEVELS:
-            share = float(subject.loo.coverage(level)[j])
+            share = float(held_by[level][j])
             low, high = (int(binom.ppf(p, n, level)) for p in (0.025, 0.975))
             held = round(share * n)
             says = "too narrow" if held < low else "too wide" if held > high else "in that range"

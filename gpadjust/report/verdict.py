@@ -220,7 +220,7 @@ def _errors(subject: Subject, output: int) -> list[Markup]:
             for physics, values in shown
         }
         own = "adjusted" if subject.physics or subject.is_sampled else "data alone"
-        errors[own] = float(subject.loo.rmse[output])
+        errors[own] = float(subject.loo.score().rmse[output])
     if not errors:
         return []
     fitted = ", with fitted parameters" if subject.as_it_is != "as it is" else ""

@@ -111,16 +111,18 @@ class Comparison:
         """
         if not self.left_out:
             return {output: {} for output in self.table}
-        recommended = self.leave_one_out()
+        recommended = self.leave_one_out().score().rmse
+        left_out = {name: loo.score().rmse for name, loo in self.left_out.items()}
+        alone = {name: loo.score().rmse for name, loo in self.alone.items()}
         calibrated = {n for n, model in self.models.items() if isinstance(model, CalibratedPhysics)}
         using = {name for name, model in self.models.items() if model.rho_names} - calibrated
         found: dict[str, dict[str, float]] = {}
         for j, (output, rows) in enumerate(self.table.items()):
-            rmse = {row.structure: self.left_out[row.structure].rmse[j].item() for row in rows}
-            own = {name: loo.rmse[j].item() for name, loo in self.alone.items()}
+            rmse = {row.structure: left_out[row.structure][j].item() for row in rows}
+            own = {name: each[j].item() for name, each in alone.items()}
             own |= {name: rmse[name] for name in rmse if name in calibrated}
             if self.chosen in using or (self.chosen == STACKED and using):
-                own["adjusted"] = recommended.rmse[j].item()
+                own["adjusted"] = recommended[j].item()
             elif using:
                 own["adjusted"] = next(rmse[name] for name in rmse if name in using)
             without = next((name for name in rmse if name not in using | calibrated), None)

@@ -20,7 +20,7 @@ from gpadjust.gp.noise import Noise
 from gpadjust.models import StackedGP, TermsGP, VariationalCKA
 from gpadjust.models.exact_conditioning import Factors
 from gpadjust.models.stacked import Part
-from gpadjust.validation import scores
+from gpadjust.validation.scores import Scores
 
 _ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
 
@@ -53,29 +53,15 @@ class LeaveOneOut:
         """Standardized residuals, ``(Y - mean) / sd``, ``batch_shape x n x m``."""
         return (self.Y - self.mean) / self.variance.sqrt()
 
-    @property
-    def rmse(self) -> Tensor:
-        """Root mean square error, ``batch_shape x m``."""
-        return scores.rmse(self.mean, self.Y)
+    def score(self, level: float = 0.95) -> Scores:
+        """The scores of the predictions; the density is that of a mixture where they are one.
 
-    @property
-    def nlpd(self) -> Tensor:
-        """Mean negative log predictive density, ``batch_shape x m``."""
-        return -self.log_density.nanmean(-2)
-
-    @property
-    def crps(self) -> Tensor:
-        """Mean continuous ranked probability score, ``batch_shape x m``."""
-        return scores.crps(self.mean, self.variance, self.Y)
-
-    @property
-    def pit(self) -> Tensor:
-        """Probability integral transform, ``batch_shape x n x m``."""
-        return scores.pit(self.mean, self.variance, self.Y)
-
-    def coverage(self, level: float = 0.95) -> Tensor:
-        """Share of the observations in their central intervals, ``batch_shape x m``."""
-        return scores.coverage(self.mean, self.variance, self.Y, level)
+        Args:
+            level: Nominal coverage, between 0 and 1.
+        """
+        names = self.output_names
+        scores = Scores.of(self.mean, self.variance, self.Y, level=level, output_names=names)
+        return replace(scores, nlpd=-self.log_density.nanmean(-2))
 
 
 def leave_one_out(
@@ -117,7 +103,7 @@ def leave_one_out(
         >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
         >>> result = fit(model)
         >>> loo = leave_one_out(model)
-        >>> loo.mean.shape, bool(loo.rmse < 0.1)
+        >>> loo.mean.shape, bool(loo.score().rmse < 0.1)
         (torch.Size([8, 1]), True)
     """
     if isinstance(model, ModelListGP):

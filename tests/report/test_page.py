@@ -68,7 +68,7 @@ def _left_out_is_that_of(loo, page):
     assert float(rows[0][2]) == pytest.approx(float(loo.mean[worst]), rel=1e-3)
     assert float(rows[0][head.index("x")]) == pytest.approx(float(loo.X[worst]), rel=1e-3)
     coverage = {row[0]: row[1] for row in page.tables["Coverage of left-out intervals"]}
-    assert coverage["y, 80 %"] == f"{round(10 * float(loo.coverage(0.8)))} of 10"
+    assert coverage["y, 80 %"] == f"{round(10 * float(loo.score(0.8).coverage))} of 10"
 
 
 def test_the_code_in_the_page_predicts_as_the_model(
@@ -94,7 +94,7 @@ def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undraw
     page = read(report(model, tmp_path / "report.html"))
     assert "Not asked" in page.text
     assert "report(compare(train_X, train_Y, physics))" in page.text
-    rmse = number(float(subject_of(model).loo.rmse[0]))
+    rmse = number(float(subject_of(model).loo.score().rmse[0]))
     alone = number(float((X.sum(-1).sin() - X[:, 0]).square().mean().sqrt()))
     assert f"Your formula: {alone} Pa; adjusted: {rmse} Pa (root mean square" in page.text
     monkeypatch.chdir(tmp_path)

@@ -150,7 +150,7 @@ def test_what_is_left_out_is_what_the_tables_tell_of(scaled, noise):
     for each in rows:
         loo = comparison.left_out[each.structure]
         assert loo.log_density.sum().item() == pytest.approx(each.elpd)
-        assert loo.coverage().item() == pytest.approx(each.coverage)
+        assert loo.score().coverage.item() == pytest.approx(each.coverage)
     gain = comparison.gain["y"]
     elpd = {each.structure: each.elpd for each in rows}
     assert gain.elpd == pytest.approx(elpd[gain.structure] - elpd["zero mean"])
@@ -177,8 +177,8 @@ class TestPhysicsAlone:
         errors = comparison.errors()["y"]
         assert errors["physics alone"] == pytest.approx(rmse)
         assert alone.rmse == pytest.approx(rmse / (Y + noise).std().item())
-        assert errors["adjusted"] == comparison.leave_one_out().rmse.item()
-        assert errors["data alone"] == comparison.left_out["zero mean"].rmse.item()
+        assert errors["adjusted"] == comparison.leave_one_out().score().rmse.item()
+        assert errors["data alone"] == comparison.left_out["zero mean"].score().rmse.item()
         best = comparison.table["y"][0]
         assert alone.elpd_diff == pytest.approx(alone.elpd - best.elpd)
         assert alone.weight == 0
@@ -204,7 +204,7 @@ class TestPhysicsAlone:
         data = training_data(X[:n], crude(X[:n]))
         (loo,) = physics_alone(as_physics(crude), data).values()
         assert loo.log_density.isfinite().all()
-        assert loo.coverage().item() == 1
+        assert loo.score().coverage.item() == 1
         assert not loo.variance.isnan().any()
 
     def test_known_variances_are_its_noise(self, X, noise):

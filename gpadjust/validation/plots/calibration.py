@@ -116,6 +116,7 @@ def plot_pit(
 
 def _pit_and_title(prediction: Tensor | LeaveOneOut | Scores, output: int) -> tuple[Tensor, str]:
     """The PIT values of what was observed, and which output they are of, if that is a question."""
+    prediction = prediction.score() if isinstance(prediction, LeaveOneOut) else prediction
     pit = prediction if isinstance(prediction, Tensor) else getattr(prediction, "pit", None)
     if not isinstance(pit, Tensor):
         raise TypeError(
