@@ -1,7 +1,7 @@
 """Judging predictions, and choosing by them. `gpadjust.validation.plots` needs matplotlib."""
 
+from gpadjust.validation.advice import Gain
 from gpadjust.validation.comparison import Comparison, compare
-from gpadjust.validation.gain import Gain
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out
 from gpadjust.validation.ranking import Candidate, stacking_weights
 from gpadjust.validation.scores import Scores, coverage, crps, energy_score, nlpd, pit, rmse, score

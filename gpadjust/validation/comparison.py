@@ -5,13 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from botorch.models.transforms.input import InputTransform
-from botorch.posteriors.fully_bayesian import MCMC_DIM
 from torch import Tensor
 from tqdm import tqdm
 
@@ -23,14 +22,8 @@ from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
-from gpadjust.validation.advice import advice, gains
-from gpadjust.validation.gain import Gain
-from gpadjust.validation.leave_one_out import (
-    LeaveOneOut,
-    leave_one_out,
-    mixture_of,
-)
-from gpadjust.validation.physics_alone import physics_alone
+from gpadjust.validation.advice import Gain, advice
+from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, mixed
 from gpadjust.validation.ranking import Candidate, beside, ranking
 from gpadjust.validation.structures import (
     ALONE,
@@ -39,6 +32,7 @@ from gpadjust.validation.structures import (
     Structure,
     candidates,
     known_structures,
+    physics_alone,
 )
 
 _DRAWS = (32, 256)  # of the hyper-parameters, the least and the most
@@ -57,9 +51,9 @@ class Comparison:
         models: The fitted models by the names of their structures.
         stacked: All of them, stacked with the weights of the tables.
         table: The candidates of each output, best first, by the names of the outputs.
-        advice: What the comparison says about the physics, in sentences.
-        gain: What the physics is worth to each output, by the names of the outputs; empty without a
-            structure that uses none.
+        advice: What else the comparison says, in sentences.
+        gain: The verdict: what the physics is worth to each output, by the names of the outputs;
+            empty without a structure that uses none.
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
@@ -92,14 +86,8 @@ class Comparison:
         """
         if self.chosen != STACKED:
             return self.left_out[self.chosen]
-        each = [self.left_out[name] for name in self.models]
-        mean, variance, density = (
-            torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
-            for name in ("mean", "variance", "log_density")
-        )
         weight = _weights(self.models, [*self.table.values()]).unsqueeze(-2)  # K x 1 x m
-        mean, variance, density = mixture_of(mean, variance, density, weight)
-        return replace(each[0], mean=mean, variance=variance, log_density=density)
+        return mixed([self.left_out[name] for name in self.models], weight)
 
     def errors(self) -> dict[str, dict[str, float]]:
         """Root mean square errors of left-out observations of each output, in its units.
@@ -157,7 +145,8 @@ class Comparison:
                 for row in rows
             ]
             lines.append("")
-        return "\n".join([*lines, *self.advice])
+        verdict = [text for name, gain in self.gain.items() for text in gain.sentences(name)]
+        return "\n".join([*lines, *verdict, *self.advice])
 
 
 def compare(
@@ -302,8 +291,7 @@ def compare(
     table = dict(zip(data.output_names, by_output, strict=True))
     stacked = StackedGP(models, _weights(models, by_output), _HELD)
     fitted = [structure for structure, _ in found]
-    sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
-    gain = gains(fitted, left_out, relevance, table)
+    gain, sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
     alone = physics_alone(given_physics, data)
     return Comparison(models, stacked, table, sentences, gain, left_out, alone)
 

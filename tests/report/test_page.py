@@ -12,10 +12,9 @@ from gpadjust import CKA, VariationalCKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
 from gpadjust.report.figures import _slice
-from gpadjust.report.markup import table, tag
-from gpadjust.report.numbers import failure, name_and_unit, number
+from gpadjust.report.markup import failure, name_and_unit, number, table, tag
+from gpadjust.report.sections import headline, verdicts
 from gpadjust.report.subject import subject_of
-from gpadjust.report.verdict import headline, verdicts
 from gpadjust.validation import Gain
 
 from .conftest import Page, f_p
@@ -31,7 +30,7 @@ def test_a_comparison(comparison, tmp_path, read):
     assert all(len(image["alt"]) > 10 for image in page.images)
     _the_table_is_that_of(comparison, page)
     (gain,) = comparison.gain.values()
-    assert f"{_three(comparison)} Yes The physics helps to predict y." in page.text
+    assert f"{_three(comparison)} Yes The physics helps to predict y: elpd" in page.text
     assert f"{gain.elpd:+.1f} ± {gain.se:.1f} nats" in page.text
     for sentence in comparison.advice:
         assert sentence.replace("+-", "±") in page.text
@@ -168,7 +167,7 @@ def test_an_error_on_the_way_leaves_what_was_there(comparison, tmp_path, monkeyp
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gpadjust.report.provenance.settings", interrupted)
+    monkeypatch.setattr("gpadjust.report.sections.settings", interrupted)
     with pytest.raises(KeyboardInterrupt):
         report(comparison, old)
     assert old.read_text() == "old"
@@ -182,7 +181,7 @@ def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
         raise ValueError("no way")
 
     (tmp_path / "report.pt").write_text("old")
-    monkeypatch.setattr("gpadjust.report.writing.content_of", refuses)
+    monkeypatch.setattr("gpadjust.report.page.save", refuses)
     page = read(report(comparison, tmp_path / "report.html"))
     assert "The model could not be saved: no way" in page.text
     assert [each.name for each in tmp_path.iterdir()] == ["report.html"]
