@@ -28,6 +28,7 @@ from gpadjust.active.measurements import (
 )
 from gpadjust.active.points import among, best_points, sobol_points
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
+from gpadjust.models.factory import ModelFactory, make_model
 from gpadjust.models.sampled_functions import check_number, seeded
 
 
@@ -71,8 +72,9 @@ class Collection(Measurements):
     harm.
 
     Args:
-        model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64, with
-            NaN where an output was not measured.
+        model_factory: A callable that makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``,
+            float64, with NaN where an output was not measured, such as
+            ``functools.partial(CKA, physics=f_p)``.
         bounds: Bounds of the inputs, ``2 x d``: lower, then upper.
         acquisition: Makes a BoTorch acquisition function of the fitted model.
         batch_size: Number of points that :meth:`ask` returns.
@@ -94,11 +96,12 @@ class Collection(Measurements):
         LogError: If the log is held by another collection, or cannot be opened for writing.
 
     Example:
+        >>> from functools import partial
         >>> import torch
         >>> from gpadjust import CKA
         >>> from gpadjust.active import Collection, qAdjustmentInformationGain
         >>> collection = Collection(
-        ...     lambda X, Y: CKA(X, Y, physics=torch.sin),
+        ...     partial(CKA, physics=torch.sin),
         ...     bounds=[[0.0], [3.0]],
         ...     acquisition=lambda model: qAdjustmentInformationGain(model, about="rho"),
         ... )
@@ -111,7 +114,7 @@ class Collection(Measurements):
 
     def __init__(
         self,
-        model_factory: Callable[[Tensor, Tensor], Model],
+        model_factory: ModelFactory,
         bounds: Tensor | list[list[float]],
         acquisition: Callable[[Any], AcquisitionFunction],
         *,
@@ -385,11 +388,7 @@ class Collection(Measurements):
 
     def _make_model(self, count: int) -> Model:
         """A new model of the first so many measurements."""
-        model = self.model_factory(self.X[:count], self.Y[:count])
-        if not isinstance(model, Model):
-            raise TypeError(
-                f"Expected model_factory(X, Y) to be a BoTorch model, got {type(model).__name__}."
-            )
+        model: Model = make_model(self.model_factory, self.X[:count], self.Y[:count])
         return model
 
     def _previous(self) -> tuple[Any, int]:
@@ -469,7 +468,7 @@ class Collection(Measurements):
 
 
 def collect(
-    model_factory: Callable[[Tensor, Tensor], Model],
+    model_factory: ModelFactory,
     oracle: Callable[[Tensor], Any],
     bounds: Tensor | list[list[float]],
     acquisition: Callable[[Any], AcquisitionFunction],
@@ -510,11 +509,12 @@ def collect(
         MeasurementWarning: If a measurement fails.
 
     Example:
+        >>> from functools import partial
         >>> import torch
         >>> from gpadjust import CKA
         >>> from gpadjust.active import collect, qAdjustmentInformationGain
         >>> result = collect(
-        ...     lambda X, Y: CKA(X, Y, physics=torch.sin),
+        ...     partial(CKA, physics=torch.sin),
         ...     oracle=lambda X: 2 * torch.sin(X) + X,
         ...     bounds=[[0.0], [3.0]],
         ...     acquisition=qAdjustmentInformationGain,

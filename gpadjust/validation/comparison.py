@@ -18,6 +18,7 @@ from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
 from gpadjust.models import CalibratedPhysics, StackedGP, TermsGP
+from gpadjust.models.factory import make_model
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
@@ -156,7 +157,7 @@ def compare(
     train_Yvar: ArrayLike = None,
     *,
     input_transform: InputTransform | None = None,
-    structures: Sequence[str | Structure] = STRUCTURES,
+    structures: Sequence[str | Structure] | None = None,
     num_starts: int | None = None,
     num_screened: int | None = None,
     seed: int = 0,
@@ -208,7 +209,7 @@ def compare(
             its own, where it has parameters.
         train_Yvar: Known observation variances, as in :class:`~gpadjust.CKA`.
         input_transform: As in :class:`~gpadjust.CKA`; each model has a copy of its own.
-        structures: Which to fit: names, or a :class:`Structure` of your own.
+        structures: Which to fit: names, or a :class:`Structure` of your own. Default: those above.
         num_starts: As in :func:`~gpadjust.fit`.
         num_screened: As in :func:`~gpadjust.fit`.
         seed: Seed of the fits.
@@ -239,7 +240,7 @@ def compare(
         'CKA'
         >>> mean, variance = comparison.recommended.predict(X)
     """
-    asked = known_structures(structures)
+    asked = known_structures(STRUCTURES if structures is None else structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
     data = training_data(train_X, train_Y, train_Yvar)
@@ -259,11 +260,13 @@ def compare(
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             try:
-                model = structure.build(
+                model = make_model(
+                    structure.model,
                     train_X,
                     train_Y,
-                    train_Yvar,
-                    physics=deepcopy(part),
+                    kind=TermsGP,
+                    train_Yvar=train_Yvar,
+                    physics=deepcopy(part) if structure.uses_physics else None,
                     input_transform=deepcopy(input_transform),
                 )
                 warnings.simplefilter("ignore", OptimizationWarning)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 from torch.distributions import StudentT
 
-from gpadjust.models import CKA, CalibratedPhysics, PhysicsMeanGP, TermsGP, ZeroMeanGP
-from gpadjust.models.term_builder import PhysicsLike
+from gpadjust.models import CKA, CalibratedPhysics, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.models.factory import ModelFactory
 from gpadjust.models.training_data import TrainingData
 from gpadjust.physics import JoinedPhysics, Physics
 from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, log_densities
@@ -25,8 +25,9 @@ class Structure(NamedTuple):
 
     Attributes:
         name: Its name.
-        build: Makes the model of ``train_X, train_Y, train_Yvar`` with the keyword arguments
-            ``physics`` and ``input_transform``; of any number of outputs, each by itself.
+        model: A callable that makes the model of ``X`` and ``Y``, of any number of outputs, each by
+            itself: a class, or ``functools.partial`` of one. It is given as keywords the
+            ``physics``, if it uses that, and ``train_Yvar`` and ``input_transform``, if there are.
         unknowns: How many constant means are unknown, for one physics.
         uses_physics: Whether it reads the physics at all.
         adjusts: Whether it does more than to take the physics as a mean.
@@ -37,7 +38,7 @@ class Structure(NamedTuple):
     """
 
     name: str
-    build: Callable[..., TermsGP]
+    model: ModelFactory
     unknowns: int = 0
     uses_physics: bool = True
     adjusts: bool = True
@@ -46,13 +47,9 @@ class Structure(NamedTuple):
     prior: float = 0.0
 
 
-def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> TermsGP:
-    return ZeroMeanGP(*data, **options)
-
-
 STRUCTURES = (
     Structure("calibrated physics", CalibratedPhysics, adjusts=False, joins=False, calibrates=True),
-    Structure("zero mean", _zero_mean, uses_physics=False, adjusts=False, joins=False),
+    Structure("zero mean", ZeroMeanGP, uses_physics=False, adjusts=False, joins=False),
     Structure("physics mean", PhysicsMeanGP, adjusts=False),
     Structure(
         "constant rho", partial(PhysicsMeanGP, rho_mean="learn", delta_mean="learn"), unknowns=2
