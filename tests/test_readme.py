@@ -62,7 +62,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
     assert (
         names["comparison"].recommended.predict(names["test_X"]).mean - truth
     ).abs().max() < 1e-2
-    assert names["loo"].rmse < 1e-2
+    assert names["scores"].rmse < 1e-2
 
 
 def abilities(name):
