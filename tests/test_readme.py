@@ -18,7 +18,7 @@ from gpadjust.control import CrossEntropy, Planner
 ROOT = Path(__file__).parents[1]
 WITH_DATA = {"check", "control", "measure", "records", "saving"}  # pages that are tested below
 GUIDE = [p for p in sorted((ROOT / "docs" / "guide").glob("*.md")) if p.stem not in WITH_DATA]
-FIRST = [ROOT / "docs" / "start.md", ROOT / "docs" / "install.md"]
+FIRST = [ROOT / "docs" / f"{name}.md" for name in ("start", "install", "choose")]
 
 
 def blocks(name):

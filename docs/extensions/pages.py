@@ -49,7 +49,7 @@ def gallery(text: str) -> str:
     """The tutorials' README, its table as cards with pictures."""
     rows = re.findall(r"^\| \[(\d+)\. (.+?)\]\((.+?)\.ipynb\) \| (.+?) \|$", text, re.MULTILINE)
     cards = [CARD.format(number=n, title=t, stem=s, text=text) for n, t, s, text in rows]
-    grid = "\n".join(["::::{grid} 1 2 2 3", ":gutter: 3", *cards, "::::"])
+    grid = "\n".join(["::::{grid} 1 2 2 2", ":gutter: 3", *cards, "::::"])
     tree = "\n".join(["```{toctree}", ":hidden:", *(stem for _, _, stem, _ in rows), "```"])
     table = re.search(r"^\|.*^\|.*?$", text, re.MULTILINE | re.DOTALL)
     return text.replace(table[0], f"{grid}\n\n{tree}")
