@@ -1,4 +1,4 @@
-"""What was measured, what failed, and what is being measured."""
+"""What was measured, what failed, and what is being measured; and the checks of what is told."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.active.design import NEAR, among, distances
 from gpadjust.active.measurement_log import Record
+from gpadjust.active.points import NEAR, among, distances
 from gpadjust.checks import check_observed, checked_points, checked_tensor
 
 
@@ -174,3 +174,19 @@ def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor
             f"{tuple(Y.shape)}."
         )
     return columns
+
+
+def as_options(options: Any) -> dict[str, Any]:
+    """Return options of ``optimize_acqf``; none for None.
+
+    Raises:
+        TypeError: If they are no dictionary.
+        ValueError: If one of them is not for a user to give.
+    """
+    options = {} if options is None else options
+    if not isinstance(options, dict):
+        raise TypeError(f"Expected optimizer_options to be a dictionary, got {options!r}.")
+    own = {"acq_function", "bounds", "q", "return_best_only", "return_full_tree"} & set(options)
+    if own:
+        raise ValueError(f"Expected optimizer_options without {sorted(own)}: these are set here.")
+    return options
