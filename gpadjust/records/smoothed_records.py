@@ -20,11 +20,9 @@ from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import Array, draw_paths
-from gpadjust.records.record import Record
+from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.records import Records
-from gpadjust.records.smoothing import Estimate, estimate
-from gpadjust.records.stretches import Stretch, in_control_steps
-from gpadjust.records.variation import variation
+from gpadjust.records.smoothing import Estimate, estimate, variation
 
 _DRAWS = 256  # of the parameters
 _SAME = 0.01  # of a step, by which another one may differ from it

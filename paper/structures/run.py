@@ -73,7 +73,7 @@ def _of_system(data: System, name: Model) -> Record:
     def learnt() -> LearnedDynamics:
         physics = None if name == "gp" else data.physics
         dynamics = LearnedDynamics(data.spec, physics, model=getattr(gpadjust, CLASSES[name]))
-        dynamics.fit(*data.train)
+        dynamics.update(*data.train)
         return dynamics
 
     dynamics, found = _timed(learnt)

@@ -391,7 +391,7 @@ def test_the_model_has_the_names_of_the_spec(uniform):
     following = torch.cat([states[:, :2] + 0.1 * states[:, :2].sin(), actions], -1)
     options = {"method": "map", "num_starts": 1, "num_screened": 8}
     dynamics = LearnedDynamics(spec, lambda X: 0.9 * X[:, :2], fit_options=options)
-    dynamics.fit(states, actions, following)
+    dynamics.update(states, actions, following)
     model = dynamics.model
     assert model.input_names == ("theta", "omega", "torque", "last")
     assert model.output_names == ("change of theta", "change of omega")
