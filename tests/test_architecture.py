@@ -17,7 +17,7 @@ FLOORS = [
 ]
 
 
-FILES, CLASSES, FUNCTIONS = 27, 36, 256  # that the ten lines of the README pass; fewer are better
+FILES, CLASSES, FUNCTIONS = 31, 36, 256  # that the ten lines of the README pass; fewer are better
 
 
 def passed(call):
