@@ -15,7 +15,6 @@ from torch import Tensor
 import gpadjust
 from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.scores import score_transitions
 from gpadjust.inference import SampleResult, SamplingWarning
 from gpadjust.models import TermsGP
 from paper.calibration import PUMP
@@ -77,8 +76,7 @@ def _of_system(data: System, name: Model) -> Record:
         return dynamics
 
     dynamics, found = _timed(learnt)
-    prediction = dynamics.predict(data.test.states, data.test.actions)
-    scores = score_transitions(data.spec, prediction, data.test)
+    scores = dynamics.score(*data.test)
     change = data.spec.change(data.test.states, data.test.next_states)[:, data.spec.moving]
     sd = change.std(0)
     return {
