@@ -6,11 +6,12 @@ import contextlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.records.chain import Chain, Known, Path
@@ -64,6 +65,7 @@ def estimate(
     known: Known,
     max_rounds: int,
     num_starts: int,
+    progress: bool = False,
 ) -> Estimate:
     """States, parameters of the physics and sizes of errors that explain stretches best.
 
@@ -85,14 +87,17 @@ def estimate(
         SmoothingWarning: If there are no rounds left.
     """
     chain, ends = Chain(physics, spec, stretches, known), list[_End]()
-    for coordinates, known_at_once in _starts(chain, num_starts):
-        try:
-            # Far off numbers end; then another start may lead somewhere.
-            with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
-                ends.append(_search(chain, coordinates, known_at_once, max_rounds))
-        except PhysicsError:
-            if not coordinates.any():  # at the guesses
-                raise
+    with tqdm(total=num_starts * max_rounds, unit="round", disable=not progress) as bar:
+        for i, (coordinates, known_at_once) in enumerate(_starts(chain, num_starts)):
+            bar.set_description(f"start {i + 1} of {num_starts}")
+            bar.update(i * max_rounds - bar.n)  # a search that has settled leaves rounds
+            try:
+                # Far off numbers end; then another start may lead somewhere.
+                with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
+                    ends.append(_search(chain, coordinates, known_at_once, max_rounds, bar))
+            except PhysicsError:
+                if not coordinates.any():  # at the guesses
+                    raise
     if not ends:
         raise RuntimeError(
             f"The states diverged from each of {num_starts} starts. Give narrower priors of the "
@@ -126,7 +131,9 @@ def _starts(chain: Chain, number: int) -> Iterator[tuple[Array, bool]]:
             yield coordinates, something_known and i % 2 == 1
 
 
-def _search(chain: Chain, coordinates: Array, known_at_once: bool, max_rounds: int) -> _End:
+def _search(
+    chain: Chain, coordinates: Array, known_at_once: bool, max_rounds: int, bar: tqdm[Any]
+) -> _End:
     """What is found from parameters."""
     path = chain.first_path(coordinates)
     noise, process_noise = chain.first_variances(path)
@@ -134,6 +141,7 @@ def _search(chain: Chain, coordinates: Array, known_at_once: bool, max_rounds: i
         noise, process_noise = chain.checked(noise, process_noise)
     value, steady = -math.inf, False
     for _ in range(max_rounds):
+        bar.update()
         links = chain.linearised(path)
         found, density = smooth_chain(links, chain.starts, noise, process_noise)
         if not math.isfinite(density):
