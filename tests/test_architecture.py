@@ -4,11 +4,15 @@ import ast
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 import gpadjust
 from gpadjust import CKA, fit
+from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import as_physics
+from gpadjust.records import Records, smooth
+from gpadjust.states import StateSpec
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
@@ -17,6 +21,7 @@ FLOORS = [
 ]
 
 
+CSV_TO_FREE_RUN = 45  # files that a log passes on the way to a judged free run
 FILES, CLASSES, FUNCTIONS = 32, 36, 256  # that the ten lines of the README pass; fewer are better
 
 
@@ -63,6 +68,32 @@ def test_the_ten_lines_pass_few_files_classes_and_functions():
     assert len(files) <= FILES, sorted(files)
     assert len(classes) <= CLASSES, sorted(classes)
     assert len(functions) <= FUNCTIONS, sorted(functions)
+
+
+def csv_to_free_run(file):
+    """From the log of an oscillator to scores of free runs, as the guide does it."""
+
+    def oscillator(X):
+        x, v, force = X.unbind(-1)
+        return torch.stack([x + 0.1 * v, v + 0.1 * (force - x)], dim=-1)
+
+    spec = StateSpec(["x", "v"], ["force"], step=0.1)
+    records = Records.read_csv(file, spec)
+    states = smooth(records, oscillator).draw()
+    dynamics = LearnedDynamics(spec, oscillator, fit_options={"method": "map"})
+    dynamics.update(*states.trajectories())
+    windows = states.windows(10)
+    return dynamics.free_run(windows.initial_states, windows.actions).score(windows.measured)
+
+
+@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
+def test_a_log_passes_few_files_on_the_way_to_a_free_run(tmp_path):
+    t = 0.1 * torch.arange(31, dtype=torch.float64)
+    columns = torch.stack([t, t.cos(), -t.sin(), 0.1 * (3 * t).sin()], dim=-1)
+    rows = [",".join(map(str, row)) for row in columns.tolist()]
+    (tmp_path / "log.csv").write_text("\n".join(["time,x,v,force", *rows]))
+    files, _, _ = passed(lambda: csv_to_free_run(tmp_path / "log.csv"))
+    assert len(files) <= CSV_TO_FREE_RUN, sorted(files)
 
 
 def test_a_formula_is_called_through_few_functions():

@@ -13,7 +13,6 @@ from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.learning import (
     DynamicsFitOptions,
     Learnt,
-    ModelFactory,
     Recipe,
     check_enough_observed,
     checked_fit_options,
@@ -26,6 +25,7 @@ from gpadjust.dynamics.targets import Target, Targets, check_physics
 from gpadjust.dynamics.varying_parameters import VaryingParameters
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
+from gpadjust.models.factory import ModelFactory
 from gpadjust.models.sampled_functions import check_num_features
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.states import StateSpec

@@ -125,6 +125,14 @@ def test_draws_have_the_moments_and_one_constant(chain):
     np.testing.assert_allclose(np.cov(paths.T), covariance, atol=0.06)
 
 
+def test_progress_is_shown_when_it_is_asked_for(capsys):
+    t = 0.1 * torch.arange(12, dtype=torch.float64)
+    record = Record(t, torch.stack([t.sin(), t.cos()], -1), torch.zeros(12, 1).double())
+    for progress in (False, True):
+        smooth(Records(record, SPEC), spring(), num_starts=2, max_rounds=40, progress=progress)
+        assert ("start 2 of 2" in capsys.readouterr().err) == progress
+
+
 def test_noise_process_noise_parameters_and_states_are_found():
     runs = [simulated(seed) for seed in range(2)]
     records = Records([measured(*run, seed) for seed, run in enumerate(runs)], SPEC)
