@@ -239,9 +239,10 @@ def named_physics(paths: Sequence[str], data: CsvData) -> NamedPhysics:
         parts[key] = physics
         code[key] = f"BlackBoxPhysics({expression})" if is_numpy else expression
     modules = tuple(dict.fromkeys(path.partition(":")[0] for path in paths))
-    if len(parts) == 1:
-        return NamedPhysics(*parts.values(), {"": next(iter(code.values()))}, modules)
-    return NamedPhysics(as_physics({**parts}), code, modules)
+    if len(parts) > 1:
+        return NamedPhysics(as_physics({**parts}), code, modules)
+    ((key, physics),) = parts.items()
+    return NamedPhysics(physics, {"": code[key]}, modules)
 
 
 def _imported(path: str) -> Any:

@@ -184,11 +184,11 @@ def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
 
 def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
     """The predictions by a mixture of ``K`` models with weights ``K x 1 x m``, 1 in all."""
-    predicted = [
+    mean, variance, density = (
         torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
         for name in ("mean", "variance", "log_density")
-    ]
-    mean, variance, density = mixture_of(*predicted, weight)
+    )
+    mean, variance, density = mixture_of(mean, variance, density, weight)
     return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
@@ -284,10 +284,9 @@ class Scores:
             raise IndexError(
                 "These scores have no batch to take a part of; an output is `scores.rmse[j]`."
             )
-        tensors = {
-            name: value[part] for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **tensors)
+        given: dict[str, Any] = vars(self)
+        parts = {name: v[part] for name, v in given.items() if isinstance(v, Tensor)}
+        return Scores(**{**given, **parts})
 
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
