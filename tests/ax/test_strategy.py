@@ -129,7 +129,7 @@ def test_other_models_and_their_options():
     assert config.botorch_model_class is PhysicsMeanGP
     assert config.model_options["rho_mean"] == 2.0
     for model in (lambda X, Y, physics: CKA(X, Y, physics=physics), 3, partial(CKA, None)):
-        with pytest.raises(TypeError, match="class of models, such as CKA, or functools.partial"):
+        with pytest.raises(TypeError, match=r"class of models, such as CKA, or functools\.partial"):
             generator_kwargs({"output": crude}, model=model)
 
 
