@@ -87,7 +87,7 @@ class ParameterPhysics:
         return tuple(parameters)
 
     def of(self, names: tuple[str, ...]) -> Physics:
-        """It as a physics of rows with the columns ``names``, those of :meth:`names_of`.
+        """The same as a physics of rows with the columns ``names``, those of :meth:`names_of`.
 
         It is made once, so that what is remembered of f_p outlives a model.
         """

@@ -41,7 +41,7 @@ logger: Logger = get_logger(__name__)
 NUM_SOBOL = 1024
 """Points of the whole search space, Ax's Sobol points."""
 STEPS = (1 / 4, 1 / 8, 1 / 16, 1 / 32)
-"""How far each refinement goes, in units of the differences of these points."""
+"""Step of each refinement, in units of the differences of these points."""
 NUM_REFINED = 64
 """Points of each refinement."""
 
@@ -52,11 +52,11 @@ _MOST_DRAWS = 100_000  # of Ax, to keep parameter constraints by rejection
 class PhysicsOptimumNode(CenterGenerationNode):
     """A node of one trial: at the optimum of what the physics says of the objective.
 
-    It is Ax's centre node with another point, and does as that one where a metric of the objective
+    It is Ax's center node with another point, and does as that one where a metric of the objective
     has no physics, where f_p fails (which is logged), and in hierarchical search spaces. A trial at
-    the centre has the generator key ``"CenterOfSearchSpace"``, as Ax's own.
+    the center has the generator key ``"CenterOfSearchSpace"``, as Ax's own.
 
-    The centre and Ax's Sobol points, 1,024 in all, are compared, and then four times 64 points
+    The center and Ax's Sobol points, 1,024 in all, are compared, and then four times 64 points
     around the best so far, at ever smaller steps, on the scales of the parameters and within their
     constraints. f_p is asked all 1,024 at once, and each 64; fewer if points are the same, or a
     step leaves the search space. It finds the same each time: the optimum of one or two parameters
@@ -67,7 +67,7 @@ class PhysicsOptimumNode(CenterGenerationNode):
     kept, if a point is found that does, else broken as little as possible; those relative to a
     status quo are not looked at. Of several objectives (not a weighted sum of metrics, which counts
     as it is) the sum counts, each in units of its standard deviation over the 1,024 points. What no
-    physics reads stays at the centre, unless parameter constraints tie it to others.
+    physics reads stays at the center, unless parameter constraints tie it to others.
 
     Args:
         physics: For each metric that has one, its physics, a :class:`ParameterPhysics`; several of
@@ -108,7 +108,7 @@ class PhysicsOptimumNode(CenterGenerationNode):
         self._at_center = False
 
     def gen(self, *, experiment: Experiment, **arguments: Any) -> GeneratorRun | None:
-        """As Ax's centre node, at the optimum of the physics.
+        """As Ax's center node, at the optimum of the physics.
 
         Raises:
             ValueError: If a physics that is asked reads what is no parameter, or text.
@@ -119,12 +119,12 @@ class PhysicsOptimumNode(CenterGenerationNode):
         return run
 
     def compute_center_params(self) -> TParameterization | None:
-        """The optimum of the physics, or else the centre, or None if there is none."""
+        """The optimum of the physics, or else the center, or None if there is none."""
         center = super().compute_center_params()
         try:
             found = physics_optimum(self.experiment, self.physics, center)
         except PhysicsError as error:
-            logger.warning(f"The first trial is at the centre of the search space: {error}")
+            logger.warning(f"The first trial is at the center of the search space: {error}")
             found = None
         self._at_center = found is None
         return center if found is None else found
@@ -151,7 +151,7 @@ def physics_optimum(
     :class:`PhysicsOptimumNode` says how it is searched.
 
     Args:
-        experiment: What has the search space and the objective.
+        experiment: The experiment with the search space and the objective.
         physics: For each metric that has one, a :class:`ParameterPhysics`, or a list or a
             dictionary of them.
         center: A point to begin with; None if there is none.
@@ -191,7 +191,7 @@ def physics_optimum(
 
 
 class _Wanted:
-    """What the physics says of objective and outcome constraints."""
+    """Objective and outcome constraints by the physics."""
 
     def __init__(self, config: OptimizationConfig, physics: Mapping[str, Any]) -> None:
         objective = config.objective
@@ -239,7 +239,7 @@ class _Wanted:
     def asked(
         self, physics: ParameterPhysics, metric: str, points: Sequence[TParameterization]
     ) -> Tensor:
-        """What a physics says, ``N``, NaN where it fails."""
+        """The values of a physics, ``N``, NaN where it fails."""
         names = physics.names_of(self.parameters)
         lost = [name for name in names if not are_numbers([point[name] for point in points])]
         if lost:
@@ -254,7 +254,7 @@ class _Wanted:
 def _sobol_points(
     experiment: Experiment, reads: set[str], center: TParameterization | None
 ) -> list[TParameterization]:
-    """The centre, if there is one, and Ax's Sobol points, each once."""
+    """The center, if there is one, and Ax's Sobol points, each once."""
     space = experiment.search_space
     tied = {name for each in space.parameter_constraints for name in each.constraint_dict}
     stay = {

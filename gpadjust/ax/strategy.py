@@ -87,14 +87,14 @@ def generation_strategy(
 
     Its first trial is where the physics says that the objective is best, by a search that asks f_p
     1,024 points at once and four times 64 (:class:`PhysicsOptimumNode`). If a metric of the
-    objective has no physics, or f_p fails, it is at the centre of the search space, as Ax's. Sobol
+    objective has no physics, or f_p fails, it is at the center of the search space, as Ax's. Sobol
     points follow, and then what the models choose.
 
     Args:
         physics: As in :func:`generator_kwargs`, like the next two.
         model: As there.
         fit_options: As there.
-        initialize_with_center: True: the first trial is at the centre whatever the physics says.
+        initialize_with_center: True: the first trial is at the center whatever the physics says.
             False: at none of both, the Sobol points come first. Default: at the optimum of the
             physics.
         options: The others of ``Client.configure_generation_strategy`` but ``method``, such as

@@ -1,4 +1,4 @@
-"""How Ax builds, fits, saves and loads what is of this room."""
+"""Registration in Ax: building, fitting, saving and loading of this room's models."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class Units:
         """Parameters in the units of the search space.
 
         Args:
-            X: What the model sees, ``N x d'``.
+            X: Inputs of the model, ``N x d'``.
             names: Some parameters.
 
         Returns:
@@ -136,8 +136,8 @@ class PhysicsInUnits(Physics):
 
     Args:
         origin: The user's physics.
-        metric: What it is of.
-        units: What the transforms did.
+        metric: The metric that it predicts.
+        units: The effect of the transforms.
         parameters: The parameters of the search space, in its order.
     """
 

@@ -169,10 +169,10 @@ def mixture_of(
     mean: Tensor, variance: Tensor, density: Tensor, weight: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, variance and log density of mixtures with weights, 1 in all, along ``MCMC_DIM``."""
-    centre = (weight * mean).sum(MCMC_DIM, keepdim=True)
-    spread = (mean - centre).square()
+    center = (weight * mean).sum(MCMC_DIM, keepdim=True)
+    spread = (mean - center).square()
     total = (weight.log() + density).logsumexp(MCMC_DIM)
-    return centre.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
+    return center.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
 
 
 def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
