@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_switch
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.learning import (
     DynamicsFitOptions,
@@ -97,8 +98,7 @@ class LearnedDynamics(Dynamics):
     ) -> None:
         super().__init__(spec)
         check_num_features(num_features)
-        if not isinstance(encode_angles, bool):
-            raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
+        check_switch("encode_angles", encode_angles)
         self.targets = Targets(spec, target)
         self.physics = None if physics is None else check_physics(physics, spec)
         self.encode_angles = encode_angles

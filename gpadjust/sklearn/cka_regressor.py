@@ -17,6 +17,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Size, Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.inference import FitResult, SampleResult, fit
 from gpadjust.models import (
     CKA,
@@ -227,8 +228,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             NotFittedError: If the regressor was not fitted.
             ValueError: If ``n_samples`` is not positive; and as :meth:`predict`.
         """
-        if not isinstance(n_samples, Integral) or n_samples < 1:
-            raise ValueError(f"Expected n_samples as a whole number >= 1, got {n_samples!r}.")
+        checked_whole("n_samples", n_samples, 1)
         inputs, held = self._inputs(X), self.model_.num_samples or 1
         with torch.no_grad(), manual_seed(_seed(random_state)):
             posterior = self.model_.posterior(inputs, observation_noise=observation_noise)

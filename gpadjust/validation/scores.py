@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any
 
 import torch
@@ -17,6 +16,8 @@ from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM, GaussianMixturePosterior
 from torch import Tensor
 from torch.distributions import Normal
+
+from gpadjust.checks import check_level
 
 
 def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -169,14 +170,6 @@ def central_share(pit: Tensor, level: float) -> Tensor:
     """Share of PIT values (``... x n x m``) in the central interval of a level: ``... x m``."""
     check_level(level)
     return _mean_over_observed(((pit - 0.5).abs() <= level / 2).to(pit.dtype), pit)
-
-
-def check_level(level: float) -> None:
-    """Raise a TypeError or a ValueError unless ``level`` is a number between 0 and 1."""
-    if not isinstance(level, Real):
-        raise TypeError(f"Expected level to be a number such as 0.95, got {level!r}.")
-    if not 0 < level < 1:
-        raise ValueError(f"Expected level between 0 and 1, got {level}; 95 % is 0.95.")
 
 
 @dataclass(frozen=True)

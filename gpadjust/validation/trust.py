@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Integral
 from statistics import NormalDist
 
 import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
+from gpadjust.checks import check_level, checked_whole
 from gpadjust.models import StackedGP, TermsModel
 from gpadjust.models.training_data import ArrayLike, to_tensor
 from gpadjust.validation.leave_one_out import observations
-from gpadjust.validation.scores import check_level
 
 SIDES = ("physics", "data", "neither")
 _NOTHING = 1e-3  # of the targets' standard deviation: what makes no difference
@@ -153,10 +152,9 @@ def trust(
 
 def _points(train_X: Tensor, num_points: int) -> Tensor:
     """Points in the box of the training inputs."""
-    if not isinstance(num_points, Integral) or num_points < 1:
-        raise ValueError(f"Expected num_points to be a whole number >= 1, got {num_points!r}.")
+    num_points = checked_whole("num_points", num_points, 1)
     bounds = torch.stack([train_X.amin(0), train_X.amax(0)])
-    return draw_sobol_samples(bounds, n=int(num_points), q=1, seed=0).squeeze(-2)
+    return draw_sobol_samples(bounds, n=num_points, q=1, seed=0).squeeze(-2)
 
 
 def _rms(values: Tensor) -> Tensor:

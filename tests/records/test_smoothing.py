@@ -340,7 +340,7 @@ def test_states_that_diverge_from_all_starts_are_told():
         ({"noise": [0.1]}, ValueError, "noise of shape 2"),
         ({"process_noise": [0.1, 0.0]}, ValueError, "process_noise as standard deviations above 0"),
         ({"max_rounds": 0}, ValueError, "max_rounds"),
-        ({"num_starts": 1.5}, ValueError, "num_starts"),
+        ({"num_starts": 1.5}, TypeError, "num_starts"),
         ({"step": 0.15}, ValueError, "whole multiple of the sampling step"),
     ],
 )
@@ -359,7 +359,7 @@ def test_a_physics_of_another_step_or_other_outputs_is_refused():
         smooth(records, lambda X: X[:, :1])
     with pytest.raises(ValueError, match="Expected one physics to follow"):
         smooth(records, [lambda X: X[:, :2], lambda X: X[:, :2]])
-    with pytest.raises(ValueError, match="seed as a whole number"):
+    with pytest.raises(TypeError, match="seed must be a whole number"):
         smooth(records, spring(), noise=NOISE, process_noise=SCATTER).draw(1.5)
 
 

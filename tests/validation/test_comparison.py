@@ -469,7 +469,10 @@ def test_bad_input(scaled):
         ((X, Y), {"structures": [Structure("physics alone", CKA)]}, "or 'physics alone', got"),
         ((X.expand(2, -1, -1), Y.expand(2, -1, -1)), {}, "one data set"),
         ((X, Y[:5]), {}, "train_Y"),
-        *(((X, Y), {n: -1}, f"Expected {n}") for n in ("num_starts", "num_screened", "seed")),
+        *(
+            ((X, Y), {n: -1}, f"{n} must be at least")
+            for n in ("num_starts", "num_screened", "seed")
+        ),
     ):
         with pytest.raises(ValueError, match=says):
             compare(*data, crude, **{"structures": ["CKA"], **options})

@@ -273,8 +273,10 @@ def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
 
 RANGES = ("wide", [[0.0], [1.0, 2.0]], object())
 BAD_OPTIONS = [
-    ("num_points", ValueError, "to be a whole number >= 2, got", (1, 2.5, "9", None)),
-    ("output", ValueError, "whole number >= 0, got|no output 2; there are 2", (0.0, None, -1, 2)),
+    ("num_points", ValueError, "must be at least 2; found 1", (1,)),
+    ("num_points", TypeError, "num_points must be a whole number", (2.5, "9", None)),
+    ("output", ValueError, "output must be at least 0|no output 2; there are 2", (-1, 2)),
+    ("output", TypeError, "output must be a whole number", (0.0, None)),
     (
         "bounds",
         ValueError,
@@ -331,12 +333,12 @@ def test_bad_input(line, plane, data, forrester):
         (lambda: plot_prediction(plane, X[:0], Y[:0]), ValueError, "n x d, one point or more"),
         (lambda: plot_prediction(plane, X.numpy(), Y), TypeError, r"got ndarray; .*as_tensor\(X, "),
         (lambda: plot_prediction(plane, X, Y.tolist()), TypeError, "torch tensor, got list"),
-        (lambda: plot_prediction(line, one, level=95), ValueError, "level between 0 and 1"),
+        (lambda: plot_prediction(line, one, level=95), ValueError, "level must be between 0 and 1"),
         (lambda: plot_prediction(line, one, ax=Figure().subplots(2)), ValueError, "1 x 1 axes"),
-        (lambda: plot_leave_one_out(loo, level="95 %"), TypeError, "level to be a number"),
-        (lambda: plot_leave_one_out(loo, output="y1"), ValueError, "number >= 0, got 'y1'"),
+        (lambda: plot_leave_one_out(loo, level="95 %"), TypeError, "level must be a number"),
+        (lambda: plot_leave_one_out(loo, output="y1"), TypeError, "whole number; found 'y1'"),
         (lambda: plot_pit(torch.tensor([0.5, 1.5])), ValueError, "PIT values between 0 and 1"),
-        (lambda: plot_pit(loo, bins=1.5), ValueError, r"bins to be a whole number >= 1, got 1\.5"),
+        (lambda: plot_pit(loo, bins=1.5), TypeError, r"bins must be a whole number; found 1\.5"),
         (
             lambda: plot_pit(loo.score().pit.numpy()),
             TypeError,

@@ -9,6 +9,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     BLUE,
@@ -23,7 +24,6 @@ from gpadjust.validation.plots.drawing import (
     quantile,
     tidy,
     two_inputs,
-    whole,
 )
 from gpadjust.validation.trust import SIDES, Trust
 
@@ -76,7 +76,7 @@ def plot_adjustment(
         (2, 1)
     """
     names = _adjustments(model)
-    num_points = whole(num_points, "num_points", 2)
+    num_points = checked_whole("num_points", num_points, 2)
     quantile(level)  # refused before there is a figure
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     d = train_X.shape[-1]
@@ -142,7 +142,7 @@ def plot_adjustment_pair(
         (2, 2)
     """
     names = _adjustments(model)
-    num_points = whole(num_points, "num_points", 2)
+    num_points = checked_whole("num_points", num_points, 2)
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     i, j = two_inputs(inputs, train_X.shape[-1], "`plot_adjustment`")
     shape = (len(names), 2)
@@ -264,7 +264,7 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = Non
         (1,)
     """
     side, named = _side_and_names(trust, output)
-    bins = whole(bins, "bins", 1)
+    bins = checked_whole("bins", bins, 1)
     d = trust.X.shape[-1]
     axes = new_axes(1, d)[0] if axes is None else given_axes(axes, (d,))
     for ax, x, name in zip(axes, trust.X.unbind(-1), labels(trust, "input", d), strict=True):

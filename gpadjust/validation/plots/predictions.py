@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from scipy.stats import binom
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.physics import JoinedPhysics
 from gpadjust.validation.leave_one_out import LeaveOneOut, observations
 from gpadjust.validation.plots.drawing import (
@@ -30,7 +31,6 @@ from gpadjust.validation.plots.drawing import (
     observed,
     quantile,
     tidy,
-    whole,
 )
 from gpadjust.validation.scores import Scores
 
@@ -266,7 +266,7 @@ def plot_pit(
         >>> len(plot_pit(torch.rand(50), bins=5).patches)
         5
     """
-    bins = whole(bins, "bins", 1)
+    bins = checked_whole("bins", bins, 1)
     pit, title = _pit_and_title(prediction, output)
     if ax is None:
         ax = new_axes(1, 1)[0, 0]
