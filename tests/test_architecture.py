@@ -9,6 +9,7 @@ import torch
 import gpadjust
 from gpadjust import CKA, fit
 from gpadjust.physics import as_physics
+from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
@@ -46,14 +47,10 @@ def passed(call):
     return files, classes, functions
 
 
-def sine(X):
-    return torch.sin(6 * X)
-
-
 def ten_lines():
     """Those of the README, with the default fit."""
-    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-    model = CKA(X, 2 * sine(X) + X, physics=sine)
+    X = line(8)
+    model = CKA(X, 2 * wave(X) + X, physics=wave)
     fit(model)
     return model.predict(X)
 
@@ -66,7 +63,7 @@ def test_the_ten_lines_pass_few_files_classes_and_functions():
 
 
 def test_a_formula_is_called_through_few_functions():
-    physics = as_physics(sine)
+    physics = as_physics(wave)
     X = torch.rand(5, 1, dtype=torch.float64)
     _, _, functions = passed(lambda: physics(X))
     assert len(functions) <= 6, sorted(functions)

@@ -22,6 +22,7 @@ from gpadjust import (
 )
 from gpadjust.gp import OrthogonalKernel
 from gpadjust.models import PhysicsParameters, orthogonal_rbf
+from tests.systems import same
 
 UNKNOWNS = {"a": Unknown(1.0, sd=0.5, unit="m"), "b": Unknown(2.0, factor=1.3)}
 FEW = {"num_samples": 3, "num_draws": 32, "num_starts": 1, "num_screened": 8}
@@ -116,11 +117,6 @@ def mixture(parts):
     """Mean and variance of the mixture of predictions."""
     means, variances = (torch.stack(moments) for moments in zip(*parts, strict=True))
     return means.mean(0), variances.mean(0) + means.var(0, correction=0)
-
-
-def same(ours, theirs, tolerance=1e-8):
-    for one, other in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance)
 
 
 class TestPhysicsParameters:
@@ -240,7 +236,7 @@ def test_each_sample_has_its_own_physics(build, make, waves, num_outputs):
     more = Z[:, :num_outputs]
     new = model.condition_on_observations(Z, more)
     others = [one.condition_on_observations(Z, more) for one in alone]
-    same(new.predict(X), mixture([one.predict(X) for one in others]), 1e-6)
+    same(new.predict(X), mixture([one.predict(X) for one in others]), rtol=1e-6, atol=1e-6)
     assert torch.equal(new.physics_parameters.draws, model.physics_parameters.draws)
 
 

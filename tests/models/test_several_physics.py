@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gpadjust import CKA, RRA, FunctionPhysics, PhysicsError, PhysicsMeanGP, ScaleGP, fit
+from tests.systems import holding
 
 CLASSES = [CKA, RRA, PhysicsMeanGP, ScaleGP]
 
@@ -144,8 +145,7 @@ def test_conditioning_and_copies(uniform, shuffle, same, cls):
     functions = model.sample_functions(1000, seed=0)(Z)
     error = functions.mean(0) - model.posterior(Z).mean
     assert (error.abs() < 0.15 * model.posterior(Z).variance.sqrt()).all()
-    learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
-    model.hold_samples({n: torch.stack([p, p + 0.2]) for n, p in learnt.items()})
+    holding(model, 0.0, 0.2)
     assert model.posterior(Z).mean.shape == (2, 5, 2)
     assert model.rho(Z, physics="drift").mixture_mean.shape == (5, 2)
 

@@ -12,21 +12,16 @@ from gpadjust import CKA, PhysicsMeanGP, StackedGP, ZeroMeanGP
 from gpadjust.models.stacked import allocation
 from gpadjust.validation import leave_one_out
 from gpadjust.validation.leave_one_out import observations
+from tests.systems import around
 
 
 def f_p(X):
     return torch.stack([(6 * X[..., 0]).sin(), 100 * X[..., 1]], -1)
 
 
-def held(model, num_samples, seed):
+def held(model, number, seed):
     """The model with samples around its hyper-parameters."""
-    generator = torch.Generator().manual_seed(seed)
-    samples = {
-        name: p.detach()
-        + 0.3 * torch.randn(num_samples, *p.shape, generator=generator, dtype=torch.float64)
-        for name, p in model.named_parameters()
-    }
-    model.hold_samples(samples)
+    model.hold_samples(around(model, number, seed=seed))
     return model
 
 

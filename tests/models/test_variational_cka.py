@@ -23,20 +23,13 @@ from gpadjust.inference.collapsed_bound import CollapsedBound, Observations
 from gpadjust.models.component_noise import ComponentNoise
 from gpadjust.models.terms_gp import arguments_of
 from gpadjust.validation import Structure
+from tests.systems import line, wave, waves
 
-LINE = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
-
-
-def wave(X):
-    return torch.sin(6 * X[..., :1])
+LINE = line(2)
 
 
-def waves(X):
-    return torch.cat([wave(X), wave(X).square()], dim=-1)
-
-
-def problem(n, num_outputs=1, seed=0):
-    generator = torch.Generator().manual_seed(seed)
+def problem(n, num_outputs=1):
+    generator = torch.Generator().manual_seed(0)
     X = torch.rand(n, 1, generator=generator, dtype=torch.float64)
     noise = torch.randn(n, num_outputs, generator=generator, dtype=torch.float64)
     return X, 2 * waves(X)[:, :num_outputs] + X + 0.1 * noise
