@@ -14,7 +14,7 @@ from tests.systems import line, wave
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
     *("physics", "states", "files", "envs", "gp", "models", "inference"),
-    *("validation", "report", "sklearn", "ax", "active", "dynamics", "control", "rl"),
+    *("validation", "report", "sklearn", "ax", "active", "dynamics", "records", "control", "rl"),
 ]
 
 

@@ -70,6 +70,8 @@ def test_commands_exist(name, monkeypatch, capsys):
             case ["python", "-m", module, *arguments]:
                 assert find_spec(module) is not None or module == "build", command
                 assert all((ROOT / a).exists() for a in arguments if a.startswith("tests")), command
+            case ["cd", folder]:
+                assert (ROOT / folder).is_dir()
             case ["python", script, *_]:
                 assert (ROOT / script).is_file(), command
             case ["pip", "install", "--constraint", file, *_]:
