@@ -17,7 +17,7 @@ from gpadjust.gp.gaussian import nugget
 from gpadjust.inference import optimise
 from gpadjust.models import PaperRRA
 from gpadjust.models.parameters import LogInterval
-from tests.systems import Sine, ripple, wave
+from tests.systems import Sine, line, ripple, wave
 
 pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
 
@@ -225,7 +225,7 @@ class TestLearningPhysics:
     @pytest.mark.slow
     @pytest.mark.parametrize("seed", [1, 3])
     def test_the_users_guess_is_not_lost_among_aliases(self, seed):
-        X = torch.linspace(0, 3, 15, dtype=torch.float64).unsqueeze(-1)
+        X = line(15, 0, 3)
         model = CKA(X, 1.7 * (3 * X).sin() + 0.05 * X, physics=Sine(2.5))
         fit(model, "map", seed=seed)
         assert model.physics.function.rate.item() == pytest.approx(3.0, abs=0.05)

@@ -16,7 +16,7 @@ from gpadjust.gp.gaussian import log_likelihood, negative_log_likelihood, nugget
 from gpadjust.inference.targets import LogLikelihood, LogPosterior, Target
 from gpadjust.models import PaperRRA
 from gpadjust.models.parameters import KINDS
-from tests.systems import ripple
+from tests.systems import line, ripple, uniform
 
 
 class Gain(torch.nn.Module):
@@ -178,8 +178,7 @@ class TestConcentration:
         factor=st.floats(1e-6, 1e6),
     )
     def test_a_common_factor_of_the_variances_makes_no_difference(self, name, seed, factor):
-        generator = torch.Generator().manual_seed(seed)
-        X = torch.rand(9, 2, generator=generator, dtype=torch.float64)
+        X = uniform(9, 2, seed=seed)
         objective = LogLikelihood(BUILD[name](X, 1.5 * ripple(X) + X.flip(-1)))
         assert objective.concentrated
         variances = objective.parameters.variances
@@ -253,7 +252,7 @@ class TestVectors:
 class TestVagueTrend:
     @pytest.mark.parametrize("name", ["CKA", "AR1", "RRA", "missing", "two outputs"])
     def test_gradient(self, name):
-        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        X = line(9)
         Y = ripple(X) + X.square()
         Y = torch.cat([Y, 2 * Y - X], -1) if name == "two outputs" else Y
         if name == "missing":
@@ -275,7 +274,7 @@ class TestVagueTrend:
 
     def test_functions_that_a_wider_prior_allows_beside_cost_nothing(self):
         # delta is nearly linear at this lengthscale, so that its variance is that of a line.
-        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        X = line(9)
         model = CKA(X, ripple(X) + 3 + 2 * X, physics=ripple)
         model.terms[1].kernel.base_kernel.lengthscale = 100.0
         model.likelihood.noise = 1e-2
@@ -296,7 +295,7 @@ class TestVagueTrend:
         assert slope(LogPosterior) == pytest.approx(0.0, abs=0.05)
 
     def test_a_variance_that_cannot_make_the_trend_is_ruled_out(self):
-        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        X = line(9)
         model = ZeroMeanGP(X, 1 + X)
         model.terms[0].kernel.base_kernel.lengthscale = 10.0
         model.likelihood.noise = 1e-6

@@ -15,7 +15,7 @@ from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.validation import trust
-from tests.systems import around, line, same, uniform
+from tests.systems import around, line, normal, same, uniform
 
 # Physics of no use is what this is about.
 pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
@@ -212,8 +212,7 @@ class TestConstant:
     @pytest.mark.parametrize("offset", [0.0, 1e5])
     def test_it_does_not_count_against_the_physics(self, data, offset):
         X, Y, _ = data
-        generator = torch.Generator().manual_seed(1)
-        Y = Y + 0.1 * torch.randn(Y.shape, generator=generator, dtype=torch.float64) + offset
+        Y = Y + 0.1 * normal(*Y.shape, seed=1) + offset
         assert fit(CKA(X, Y, physics=double)).relevance > 0.8
         assert fit(CKA(X, Y, physics=unrelated)).relevance < 0.5
 

@@ -7,7 +7,7 @@ from botorch.models.transforms import Normalize
 
 from gpadjust import AR1, fit
 from gpadjust.inference.targets import LogPosterior
-from tests.systems import crude
+from tests.systems import crude, line
 
 
 @pytest.fixture
@@ -190,8 +190,8 @@ def test_a_low_level_that_does_not_vary_says_nothing_of_rho():
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_the_size_of_a_trend_of_either_level_has_no_vote(which):
-    low_X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
-    X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+    low_X = line(20)
+    X = line(9)
     low, high = 1 - 2 * low_X, 3 + 2 * X
     if which == 1:  # it is delta that has a trend
         low, high = (5 * low_X).sin(), high + 2 * (5 * X).sin()
@@ -217,12 +217,12 @@ def test_a_discrepancy_that_is_nearly_polynomial(unit):
     def high(X):
         return (6 * X - 2).square() * (12 * X - 4).sin()
 
-    X = torch.linspace(0.05, 0.95, 6, dtype=torch.float64).unsqueeze(-1)
-    low_X = torch.cat([X, torch.linspace(0, 1, 15, dtype=torch.float64).unsqueeze(-1)])
+    X = line(6, 0.05, 0.95)
+    low_X = torch.cat([X, line(15)])
     low_Y = unit * (0.25 * high(low_X) + 20 * low_X.square() - 10)
     model = AR1(X, high(X), low_X=low_X, low_Y=low_Y)
     fit(model)
-    Z = torch.linspace(0, 1, 50, dtype=torch.float64).unsqueeze(-1)
+    Z = line(50)
     assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.1 * high(Z).std()
     lower, upper = model.interval(Z)
     assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9

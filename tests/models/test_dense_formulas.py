@@ -5,7 +5,7 @@ import torch
 from botorch.models.transforms import Normalize, Standardize
 
 from gpadjust import CKA
-from tests.systems import crude
+from tests.systems import crude, line
 
 QUANTITIES = ["posterior", "rho", "delta"]
 
@@ -48,7 +48,7 @@ def test_mean_and_covariance(uniform, shuffle, dense, close, d, scale, center):
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
 @pytest.mark.parametrize("options", [{}, {"outcome_transform": Standardize(1)}], ids=["", "std"])
 def test_variances_that_are_small(dense, close, scale, options):
-    X = torch.linspace(0, 1, 30, dtype=torch.float64).unsqueeze(-1)
+    X = line(30)
     Y = scale * (1 + X + 0.1 * (5 * X).sin())
 
     def physics(X):

@@ -22,7 +22,7 @@ from gpadjust import (
 )
 from gpadjust.gp import OrthogonalKernel
 from gpadjust.models import PhysicsParameters, orthogonal_rbf
-from tests.systems import same
+from tests.systems import line, normal, same
 
 UNKNOWNS = {"a": Unknown(1.0, sd=0.5, unit="m"), "b": Unknown(2.0, factor=1.3)}
 FEW = {"num_samples": 3, "num_draws": 32, "num_starts": 1, "num_screened": 8}
@@ -81,10 +81,9 @@ def waves(uniform):
 
 def hold(model, num_samples=3):
     """Make a model hold samples that nobody fitted; return values of the parameters."""
-    generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
-        return torch.randn(shape, generator=generator, dtype=torch.float64)
+        return normal(shape)
 
     def around(parameter):
         return parameter.detach() + 0.3 * draw(num_samples, *parameter.shape)
@@ -122,7 +121,7 @@ def mixture(parts):
 class TestPhysicsParameters:
     @pytest.fixture
     def parameters(self):
-        draws = torch.linspace(0.0, 1.0, 101, dtype=torch.float64).unsqueeze(-1)
+        draws = line(101, 0.0, 1.0)
         return PhysicsParameters(UNKNOWNS, torch.cat([draws, 2 + draws.square()], -1))
 
     def test_are_a_mapping(self, parameters):

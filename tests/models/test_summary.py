@@ -21,7 +21,7 @@ from gpadjust import (
     fit,
 )
 from gpadjust.models.parameters import hyperparameters
-from tests.systems import holding, line
+from tests.systems import holding, line, normal, uniform
 
 
 def crude(X):
@@ -119,8 +119,7 @@ def test_parameters_of_the_physics():
         "rest": Unknown(1.5, bounds=(1.0, 2.0)),
     }
     law = FunctionPhysics(lambda X, p: p.slope * X[:, 0] + p.rest, unknowns=unknowns)
-    generator = torch.Generator().manual_seed(0)
-    noise = 0.05 * torch.randn(12, 1, generator=generator, dtype=torch.float64)
+    noise = 0.05 * normal(12, 1)
     model = CalibratedPhysics(X, 2 * X + 0.9 + noise, 0.05**2, physics=law)
     fit(model)
     text = model.summary()
@@ -146,8 +145,7 @@ def test_a_kernel_that_reads_some_inputs(uniform, normalize):
 
 
 def test_samples_without_the_physics_are_said():
-    generator = torch.Generator().manual_seed(0)
-    X = torch.rand(15, 1, generator=generator, dtype=torch.float64)
+    X = uniform(15, 1)
     Y = torch.cat([(6 * X).sin() + X, 2 * (6 * X).sin() + X], -1)
 
     def physics(X):
