@@ -14,6 +14,7 @@ from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import as_physics
 from gpadjust.records import Records, smooth
 from gpadjust.states import StateSpec
+from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
@@ -53,14 +54,10 @@ def passed(call):
     return files, classes, functions
 
 
-def sine(X):
-    return torch.sin(6 * X)
-
-
 def ten_lines():
     """Those of the README, with the default fit."""
-    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-    model = CKA(X, 2 * sine(X) + X, physics=sine)
+    X = line(8)
+    model = CKA(X, 2 * wave(X) + X, physics=wave)
     fit(model)
     return model.predict(X)
 
@@ -119,7 +116,7 @@ def test_a_report_passes_few_files(tmp_path, monkeypatch):
 
 
 def test_a_formula_is_called_through_few_functions():
-    physics = as_physics(sine)
+    physics = as_physics(wave)
     X = torch.rand(5, 1, dtype=torch.float64)
     _, _, functions = passed(lambda: physics(X))
     assert len(functions) <= 6, sorted(functions)
