@@ -49,9 +49,9 @@ default_role = "py:obj"  # single backticks link where they can, and are code el
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", r"(?!gpadjust\.).*")]  # links to other libraries need the network
 nitpick_ignore = [  # what signatures name, but users do not call by name
-    ("py:class", "gpadjust.envs.arm.view.ArmView"),
-    ("py:class", "gpadjust.envs.cart_pole.view.CartPoleView"),
-    ("py:class", "gpadjust.envs.viewed_env.ViewedEnv"),
+    ("py:class", "gpadjust.systems.arm_view.ArmView"),
+    ("py:class", "gpadjust.systems.cart_pole_view.CartPoleView"),
+    ("py:class", "gpadjust.systems.rendering.ViewedEnv"),
     ("py:class", "gpadjust.inference.fitting.FitOptions"),
     ("py:class", "gpadjust.dynamics.learning.DynamicsFitOptions"),
     ("py:class", "gpadjust.records.record.Stretch"),

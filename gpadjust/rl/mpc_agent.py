@@ -56,11 +56,12 @@ class MPCAgent(ModelLearner, EpisodeLoop):
         >>> import gymnasium
         >>> from gpadjust.control import CrossEntropy, Planner, Task
         >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> from gpadjust.rl import MPCAgent
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
         >>> task = Task(
-        ...     LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward
+        ...     LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics), cart_pole_reward
         ... )
         >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(env, task, quick, first=quick, seed=0)

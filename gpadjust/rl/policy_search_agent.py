@@ -73,11 +73,12 @@ class PolicySearchAgent(ModelLearner, EpisodeLoop):
         >>> import torch
         >>> from gpadjust.control import PolicySearch, Task
         >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-        >>> from gpadjust.envs import cart_pole_start
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+        >>> from gpadjust.systems.cart_pole import cart_pole_start
         >>> from gpadjust.rl import PolicySearchAgent
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics)
         >>> bounds = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
         >>> task = Task(
         ...     dynamics, cart_pole_reward, initial_states=cart_pole_start, state_bounds=bounds

@@ -72,7 +72,7 @@ class Arm(Control):
 
     def check(self) -> None:
         """Whether there are the learners, and OpenSim."""
-        from gpadjust.envs.arm.opensim_model import load_opensim
+        from gpadjust.systems.opensim import load_opensim
 
         super().check()
         load_opensim()

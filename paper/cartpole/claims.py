@@ -12,7 +12,7 @@ settings on the seeds that it reports; all three are said. T4 and T5 are the sam
 
 from __future__ import annotations
 
-from gpadjust.envs.cart_pole.system import TIME_STEP
+from gpadjust.systems.cart_pole import TIME_STEP
 from paper.cartpole import SCENARIOS, Settings
 from paper.common.claims import Claim, Finding, counted, met, reached, reproduced
 from paper.common.curves import Curves

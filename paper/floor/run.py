@@ -10,10 +10,9 @@ import torch
 
 from gpadjust.control import CrossEntropy, Planner, Return, Task
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward
-from gpadjust.envs.cart_pole.swing_up import MAX_FORCE
-from gpadjust.envs.cart_pole.system import START_MEAN
 from gpadjust.models.sampled_functions import seeded
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, START_MEAN, cart_pole_reward
+from gpadjust.systems.swing_up import MAX_FORCE
 from paper.arm import Arm
 from paper.cartpole import Settings
 from paper.common.experiment import Record

@@ -11,7 +11,7 @@ import torch
 
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
-from gpadjust.envs import CartPoleSwingUpEnv
+from gpadjust.systems import CartPoleSwingUpEnv
 from paper.planning import Planning, Settings
 from paper.planning.run import make_agent
 

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 
 from gpadjust.control import CrossEntropy, Planner, PolicySearch, Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.envs import (
-    CART_POLE_SPEC,
-    cart_pole_reward,
-    cart_pole_start,
-    random_cart_pole_physics,
-)
-from gpadjust.envs.cart_pole.system import CartPoleEquation, equation_physics
 from gpadjust.inference import SamplingWarning
 from gpadjust.models import CKA, RRA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.rl import ModelOptions, MPCAgent, PolicySearchAgent
+from gpadjust.systems import cart_pole
+from gpadjust.systems.cart_pole import (
+    CART_POLE_SPEC,
+    CartPoleEquation,
+    cart_pole_reward,
+    cart_pole_start,
+    equation_physics,
+)
 from paper.common.experiment import Record
 from paper.planning import BOUND, Planning, Settings
 from paper.planning.systems import FittedPhysics, environment, equation, mc_pilco_reward
@@ -116,7 +117,7 @@ def dynamics(settings: Settings, system: str, learner: str, seed: int) -> Dynami
     time_step = settings.time_step
     if learner == "oracle":
         return PhysicsDynamics(CART_POLE_SPEC, equation_physics(equation(system), time_step))
-    physics = random_cart_pole_physics(seed, time_step)
+    physics = cart_pole(seed, time_step=time_step).physics
     if learner == "phy":
         return PhysicsDynamics(CART_POLE_SPEC, physics)
     if learner == "fitted":

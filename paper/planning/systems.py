@@ -14,9 +14,15 @@ from scipy import optimize
 from torch import Tensor, nn
 
 from gpadjust.dynamics import PhysicsDynamics, Trajectories
-from gpadjust.envs import CART_POLE_SPEC, REAL_CART_POLE, CartPoleSwingUpEnv
-from gpadjust.envs.cart_pole.system import START_MEAN, CartPoleEquation, equation_physics
 from gpadjust.physics import PhysicsError
+from gpadjust.systems import CartPoleSwingUpEnv
+from gpadjust.systems.cart_pole import (
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    START_MEAN,
+    CartPoleEquation,
+    equation_physics,
+)
 from paper.planning import FRICTIONS, SENSORS, SMALL_NOISE, Settings
 
 _SOFT = 0.05  # m/s: the speed over which dry friction changes its sign

@@ -10,9 +10,14 @@ import torch
 from gpadjust.control import CrossEntropy, PathIntegral, Planner, Task
 from gpadjust.control.search import Search
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.envs import CART_POLE_SPEC, REAL_CART_POLE, cart_pole_reward, cart_pole_start
-from gpadjust.envs.cart_pole.swing_up import MAX_FORCE
-from gpadjust.envs.cart_pole.system import equation_physics
+from gpadjust.systems.cart_pole import (
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    cart_pole_reward,
+    cart_pole_start,
+    equation_physics,
+)
+from gpadjust.systems.swing_up import MAX_FORCE
 from paper.planning import Settings
 from paper.planning.run import planners
 

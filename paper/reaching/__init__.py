@@ -77,7 +77,7 @@ class Reaching(Comparison):
 
     def check(self) -> None:
         """Whether there are the arms and the models, and OpenSim."""
-        from gpadjust.envs.arm.opensim_model import load_opensim
+        from gpadjust.systems.opensim import load_opensim
 
         super().check()
         load_opensim()

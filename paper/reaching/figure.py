@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gpadjust.envs import arm_targets, hand_position
+from gpadjust.systems.reaching import arm_targets, hand_position
 from paper.arm.figure import BOUND, draw_arm
 from paper.common.curves import load_trials
 from paper.common.experiment import Record

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from gpadjust.control import PolicySearch, Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.envs import arm_reward, arm_start
 from gpadjust.inference import SamplingWarning
 from gpadjust.models import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.rl import ModelOptions, PolicySearchAgent
 from gpadjust.states import StateSpec
+from gpadjust.systems.reaching import arm_reward, arm_start
 from paper.arm import Settings as ArmSettings
 from paper.arm.system import memory_start, reach, score
 from paper.common.experiment import Record

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gpadjust.dynamics import PhysicsDynamics, Trajectories
-from gpadjust.envs import ARM_MEMORY_SPEC, ARM_SPEC, MuscleArmEnv, RememberAction
-from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, ArmEquation, torque_arm
 from gpadjust.physics import ODEPhysics
 from gpadjust.states import StateSpec
+from gpadjust.systems import MuscleArmEnv, RememberAction
+from gpadjust.systems.reaching import ARM_MEMORY_SPEC, ARM_SPEC
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, ArmEquation, torque_arm
 from paper.planning.systems import least_squares_fit
 from paper.reaching import SENSORS, Settings
 

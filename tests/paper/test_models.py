@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.envs import random_cart_pole_physics
 from gpadjust.inference import register_priors
+from gpadjust.systems import cart_pole
 from paper.active import Active
 from paper.active import Settings as ActiveSettings
 from paper.active import run as active_run
@@ -230,7 +230,7 @@ class TestWhereToMeasure:
 
     def test_the_cart_pole(self):
         system, X = problem("cartpole", 3), torch.tensor([[0.3, 0.1, 0.2, -0.5, 4.0]]).double()
-        believed = random_cart_pole_physics(3)(X) - X[:, :4]
+        believed = cart_pole(3).physics(X) - X[:, :4]
         torch.testing.assert_close(system.physics(X), believed)
         X = system.sobol(6, 0)
         for kind, expected in (("CKA", CKA), ("physics mean", PhysicsMeanGP), ("GP", ZeroMeanGP)):

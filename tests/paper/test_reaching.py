@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gpadjust.envs.arm.torque_arm import torque_arm
+from gpadjust.systems.torque_arm import torque_arm
 from paper.common.runner import rounded
 from paper.reaching import LEARNERS, SYSTEMS, Reaching, Settings
 from paper.reaching.ensemble import ResidualEnsemble

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-import gpadjust.envs
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, REAL_CART_POLE, equation_physics
 
 POINT_SPEC = StateSpec(["x"], ["v"])
 QUICK = {"num_starts": 1, "num_screened": 0}
@@ -129,9 +129,7 @@ def cart_pole():
 @pytest.fixture
 def cart_pole_dynamics():
     """The real cart-pole."""
-    return PhysicsDynamics(
-        gpadjust.envs.CART_POLE_SPEC, gpadjust.envs.cart_pole_physics(0.5, 0.5, 0.6, 0.1)
-    )
+    return PhysicsDynamics(CART_POLE_SPEC, equation_physics(REAL_CART_POLE))
 
 
 @pytest.fixture

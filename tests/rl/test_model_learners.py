@@ -228,18 +228,14 @@ def test_a_promise_that_data_made_against_the_physics_is_told(make_agent, dynami
 def test_observations_in_another_order_cost_no_episode():
     from gymnasium.wrappers import TransformObservation
 
-    from gpadjust.envs import (
-        CART_POLE_SPEC,
-        CartPoleSwingUpEnv,
-        cart_pole_reward,
-        random_cart_pole_physics,
-    )
+    from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
+    from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
 
     env = CartPoleSwingUpEnv()
     order = [0, 3, 1, 2, 4]
     shuffled = TransformObservation(env, lambda seen: seen[order], env.observation_space)
     task = Task(
-        LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)),
+        LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics),
         cart_pole_reward,
         episode_length=25,
     )
@@ -323,10 +319,11 @@ def test_bad_arguments_are_refused(point_env, point_task):
 
 @pytest.mark.slow
 def test_the_cart_pole_swings_up_in_two_trials():
-    from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+    from gpadjust.systems import cart_pole
+    from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
 
     env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    f_p = random_cart_pole_physics(3)
+    f_p = cart_pole(3).physics
     task = Task(LearnedDynamics(CART_POLE_SPEC, f_p), cart_pole_reward)
     agent = MPCAgent(env, task, seed=3).learn(50)
     assert agent.recorded_episodes(newest=25).rewards.mean() > -0.45
