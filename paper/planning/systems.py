@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -24,38 +24,6 @@ from gpadjust.systems.cart_pole import (
     equation_physics,
 )
 from paper.planning import FRICTIONS, SENSORS, SMALL_NOISE, Settings
-
-_SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
-
-
-@dataclass(frozen=True)
-class FrictionEquation(CartPoleEquation):
-    r"""The equation with dry friction of the cart and drag of the pole.
-
-    The force on the cart is less by :math:`d \tanh(\dot{x} / 0.05)`; on the pole acts a torque
-    :math:`-k \dot\theta |\dot\theta|`.
-
-    Args:
-        dry: The dry friction d, in N.
-        drag: The drag k, in N m s²/rad².
-    """
-
-    dry: float = 0.0
-    drag: float = 0.0
-
-    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
-        """The time derivative of the state ``... x 4``, with the action ``... x 1``."""
-        theta, x_dot, theta_dot = state.unbind(-1)[1:]
-        dry = self.dry * (x_dot / _SOFT).tanh()
-        rates = super().__call__(state, action - dry.unsqueeze(-1))
-        torque = -self.drag * theta_dot * theta_dot.abs()
-        m, length = self.pole_mass, self.pole_length
-        total = self.cart_mass + m
-        inertia = 4 * total - 3 * m * theta.cos().square()
-        x_ddot = 6 * theta.cos() * torque / (length * inertia)
-        theta_ddot = 12 * total * torque / (m * length**2 * inertia)
-        zero = torch.zeros_like(torque)
-        return rates + torch.stack([zero, zero, x_ddot, theta_ddot], dim=-1)
 
 
 class Sensors(gym.ObservationWrapper[Any, Any, Any]):
@@ -117,9 +85,7 @@ def equation(system: str) -> CartPoleEquation:
     if system not in FRICTIONS:
         return REAL_CART_POLE
     dry, drag = FRICTIONS[system]
-    real = REAL_CART_POLE
-    masses = (real.cart_mass, real.pole_mass)
-    return FrictionEquation(*masses, real.pole_length, real.damping, dry=dry, drag=drag)
+    return replace(REAL_CART_POLE, dry=dry, drag=drag)
 
 
 def environment(system: str, settings: Settings) -> Watched:
@@ -176,7 +142,7 @@ class FittedPhysics(PhysicsDynamics):
 
     def __init__(self, start: CartPoleEquation, time_step: float) -> None:
         self.equation = LearntEquation(start)
-        physics = equation_physics(self.equation, time_step, name="fitted_cart_pole")
+        physics = equation_physics(self.equation, time_step)
         super().__init__(CART_POLE_SPEC, physics)
         self._data: Trajectories | None = None
 

@@ -11,8 +11,8 @@ from paper.planning import LEARNERS, SMALL_NOISE, SYSTEMS, Planning, Settings
 from paper.planning.figure import COLORS
 from paper.planning.run import dynamics
 from paper.planning.systems import (
+    CartPoleEquation,
     FittedPhysics,
-    FrictionEquation,
     environment,
     equation,
     mc_pilco_reward,
@@ -68,7 +68,7 @@ def test_friction_takes_energy_and_is_none_at_rest():
     states = torch.randn(20, 4, dtype=torch.float64)
     nothing = torch.zeros(20, 1, dtype=torch.float64)
     rough = equation("friction")
-    assert isinstance(rough, FrictionEquation)
+    assert isinstance(rough, CartPoleEquation)
 
     def power(equation):
         state = states.clone().requires_grad_(True)
