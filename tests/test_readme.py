@@ -85,7 +85,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
     assert (
         names["comparison"].recommended.predict(names["test_X"]).mean - truth
     ).abs().max() < 1e-2
-    assert names["loo"].rmse < 1e-2
+    assert names["scores"].rmse < 1e-2
 
 
 def abilities(name):
@@ -135,6 +135,7 @@ def test_measuring(tmp_path, monkeypatch):
     assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8
 
 
+@pytest.mark.slow
 # Few draws of parameters count, as there is no noise at all.
 @pytest.mark.filterwarnings("ignore:The draws of")
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
@@ -158,6 +159,7 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
     assert error.abs().max() < 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
