@@ -156,7 +156,7 @@ class ODEPhysics(Physics):
         return path[-1] - state if self.difference else path[-1]
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, with the gradient in X by differences if that was asked for."""
+        """Return the outputs of rows, with the gradient in X by differences if that was chosen."""
         by_differences = self.gradient == "finite-difference" and torch.is_grad_enabled()
         by_differences = by_differences and rows.requires_grad
         if not by_differences or any(p.requires_grad for p in self.parameters()):
@@ -188,7 +188,7 @@ class ODEPhysics(Physics):
 
 
 def is_finite(name: str, value: float) -> bool:
-    """Whether a setting is finite; a TypeError if it is no number."""
+    """Return whether a setting is finite; a TypeError if it is no number."""
     try:
         return math.isfinite(value)
     except TypeError:
