@@ -15,7 +15,7 @@ from torch import Tensor
 import gpadjust
 from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.transition_scores import score_transitions
+from gpadjust.dynamics.scores import score_transitions
 from gpadjust.inference import SampleResult, SamplingWarning
 from gpadjust.models import TermsGP
 from paper.calibration.calibration import Data, of_pair, pump, scored
