@@ -50,7 +50,7 @@ EXPERIMENTS = {
         "next states of systems with dry friction, impacts, gaps and switches",
     ),
     "ridges": (
-        "ridges:Ridges",
+        "parameters:Ridges",
         "intervals of parameters on a ridge, or of which several values do",
     ),
     "polynomials": (

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from paper.ridges.problems import Case
+from paper.parameters.laws import Case
 
 _LEVELS = (0.025, 0.975)
 _STEP = 1e-4

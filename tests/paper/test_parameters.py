@@ -1,4 +1,4 @@
-"""The experiment on ridges and folds: its references, tables, and a run of two cases."""
+"""Parameters, ridges and folds: cases, references, tables, and a run of two cases."""
 
 import math
 
@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from paper.common.runner import main
-from paper.ridges import FOLDS, NINE, RIDGES, Ridges, Settings
-from paper.ridges.problems import PROBLEMS, Case, case
-from paper.ridges.reference import Posterior, distance, ends, grid, sample
-from paper.ridges.tables import tables
+from paper.parameters import FOLDS, NINE, RIDGES, Parameters, Ridges, Settings
+from paper.parameters.laws import PROBLEMS, Case, case
+from paper.parameters.reference import Posterior, distance, ends, grid, sample
+from paper.parameters.ridges import tables
 
 
 def line(seed):
@@ -90,7 +90,10 @@ def test_targets(tmp_path):
 
 def test_a_run_of_two_cases(tmp_path):
     settings = Settings(compared=0, long=0)
-    main(Ridges(out=tmp_path, runs=2, jobs=1, problems=("beam", "focus"), settings=settings))
+    main(Ridges(out=tmp_path, runs=2, jobs=1, only=("beam", "focus"), settings=settings))
     assert "calibrated physics" in (tmp_path / "tables.md").read_text()
-    with pytest.raises(ValueError, match="Expected some of"):
-        Ridges(problems=("other",)).check()
+
+
+def test_a_run_of_a_textbook_case(tmp_path):
+    main(Parameters(out=tmp_path, runs=2, jobs=1, only=("smooth", "physics")))
+    assert "| calibrated physics | slope | 2 |" in (tmp_path / "tables.md").read_text()
