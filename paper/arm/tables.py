@@ -30,7 +30,7 @@ from paper.control.tables import (
 MEASURES = {"all_steps": "all steps", "last_five": "last five steps"}
 WINDOWS = ((3, 9), (24, 30))
 _SHOWN = (3, 6, 9, 12, 18, 24, 30)  # episodes
-_SHORT = ("mf-best", "phy", "gp", "cka", "rra", "cka-memory")  # the learners of the main README
+_SHORT = ("mf", "mf-best", "phy", "gp", "cka", "rra", "cka-memory")  # the learners of the main README
 
 
 def load_evaluations(records: Sequence[Record], experiment: Control) -> pd.DataFrame:

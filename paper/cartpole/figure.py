@@ -27,8 +27,8 @@ COLORS = {
     "oracle": "black",
 }
 PANELS = {
-    "As the paper has them, and our CKA": ("mf", "phy", "gp-paper", "cka", "rra-paper"),
-    "As we would do it": ("mf-best", "phy", "gp", "cka", "rra", "oracle"),
+    "In the paper's form; CKA in ours": ("mf", "phy", "gp-paper", "cka", "rra-paper"),
+    "In our form": ("mf-best", "phy", "gp", "cka", "rra", "oracle"),
 }
 
 

@@ -22,7 +22,7 @@ LEARNERS = {
     "cka": "CKA",
     "phymean": "physics mean",
     "phy": "f_p alone",
-    "fitted": "f_p, parameters fitted",
+    "fitted": "f_p and viscous friction, fitted",
     "gp": "GP",
     "rra": "RRA",
     "search": "CKA, policy search",

@@ -85,7 +85,7 @@ def _after(most: float, trial: int, curves: Curves) -> Finding:
 
 def _never_above(curves: Curves) -> Finding:
     own = curves.records[curves.records["scenario"] == "cka"]
-    late = own[own["episode"] > 3]["all_steps"]
+    late = own[own["episode"] >= 3]["all_steps"]
     return met(late.max() <= 8), f"{late.max():.1f} cm"
 
 
@@ -94,5 +94,5 @@ TARGETS = (
     Claim("T2", "mean at most 6.5 cm after trial 2", ("cka",), lambda c: _after(6.5, 2, c)),
     Claim("T3", "mean at most 5.5 cm after trial 4", ("cka",), lambda c: _after(5.5, 4, c)),
     Claim("T4", "mean at most 4.5 cm after trial 10", ("cka",), lambda c: _after(4.5, 10, c)),
-    Claim("T5", "no run above 8 cm after trial 3", ("cka",), _never_above),
+    Claim("T5", "no run above 8 cm after trial 3 or a later one", ("cka",), _never_above),
 )
