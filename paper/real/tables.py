@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from paper.common.claims import counted
 from paper.common.experiment import Record, Table
 from paper.common.statistics import Difference
 from paper.common.tables import claims_table, markdown, number
@@ -19,6 +18,13 @@ from paper.real.targets import verdicts
 SCORES = {"rmse": "RMSE of {angle} in rad", "coverage": "Coverage of 95 %", "nlpd": "NLPD in nats"}
 _FORMS = {"rmse": ".3g", "coverage": ".2f", "nlpd": ".3g"}
 _SECONDS = {"fit_seconds": "a fit", "score_seconds": "the scores"}
+_FEWEST = 3  # draws that a spread is given of
+_BASE, _PAIRED_N = "fitted", 100
+_PAIRED = (
+    ("double-pendulum", "near", "20"),
+    ("double-pendulum", "far", "20"),
+    ("pendulum", "sac", "10"),
+)
 _CELL = ["system", "test", "learner", "n"]
 
 
@@ -55,8 +61,9 @@ def tables(records: Sequence[Record], experiment: Real) -> dict[str, Table]:
     """All tables, by name."""
     runs = load(records)
     means = runs.groupby(_CELL, sort=False).mean(numeric_only=True).drop(columns="seed")
-    judged = {f"means of {counted(runs['seed'].nunique())}": verdicts(means)}
+    judged = {"means of the draws that there are": verdicts(means)}
     found = {"targets": Table("Targets", claims_table("target", judged))}
+    found["paired"] = Table("n = 100, beside least squares by the same draws", _paired(runs))
     for (name, test), own in runs.groupby(["system", "test"], sort=False):
         of = f"{SYSTEMS[name]}, test {test}"
         for column in own.columns:
@@ -86,10 +93,39 @@ def _by_learner(own: pd.DataFrame, column: str, form: str) -> str:
 
 
 def _cell(values: pd.Series[float], form: str) -> str:
+    """The mean, its standard error of three draws and more, and of how many it is."""
     found = Difference.of(values)
-    if np.isnan(found.error):
+    if found.n < 2:
         return number(found.mean, form)
-    return f"{found.mean:{form}} ± {found.error:{'.1g' if form.endswith('g') else form}}"
+    error = "" if found.n < _FEWEST else f" ± {found.error:{'.1g' if form.endswith('g') else form}}"
+    return f"{found.mean:{form}}{error} ({found.n})"
+
+
+def _paired(runs: pd.DataFrame) -> str:
+    """Errors of n = 100 beside those of least squares, by the same draws."""
+    own = runs[runs["n"] == _PAIRED_N]
+    header, rows = [""], []
+    for _, test, steps in _PAIRED:
+        header += [f"{test}, rad after {_ahead(steps)}", "by least squares', 95 %", "95 % hold"]
+    for learner, label in LEARNERS.items():
+        cells = []
+        for name, test, steps in _PAIRED:
+            of_test = own[(own["system"] == name) & (own["test"] == test)]
+            by_seed = of_test[of_test["learner"] == learner].set_index("seed")
+            other = of_test[of_test["learner"] == _BASE].set_index("seed")[f"rmse-{steps}"]
+            errors = by_seed[f"rmse-{steps}"]
+            if learner in UNTAUGHT and len(errors):  # one run, beside all draws
+                errors = other * 0 + errors.iloc[0]
+            ratio = Difference.of(np.log(errors / other) if learner != _BASE else [])
+            said = "" if np.isnan(ratio.mean) else f"{np.exp(ratio.mean):.2f}"
+            if ratio.n >= _FEWEST:
+                said += f" [{np.exp(ratio.low):.2f}, {np.exp(ratio.high):.2f}]"
+            held = by_seed[f"coverage-{steps}"].mean()
+            draws = "" if learner in UNTAUGHT or not len(errors) else f" ({len(errors)})"
+            cells += [number(errors.mean(), ".3f") + draws, said, number(held, ".2f")]
+        if any(cells):
+            rows.append([label, *cells])
+    return markdown(header, rows)
 
 
 def _ahead(steps: str) -> str:
