@@ -25,7 +25,7 @@ THUMBNAILS = {1: 1, 2: 1, 4: 2, 6: 2, 7: 1, 9: 3}  # which picture of a tutorial
 COPIES = {  # files of the repository that are pages of the site
     ROOT / "CHANGELOG.md": "changelog.md",
     ROOT / "CONTRIBUTING.md": "contributing.md",
-    ROOT / "paper" / "real" / "data" / "README.md": "paper/records.md",
+    ROOT / "paper" / "machines" / "data" / "README.md": "paper/records.md",
     TUTORIALS: "tutorials/index.md",
     **{path: f"tutorials/{path.name}" for path in NOTEBOOKS},
 }

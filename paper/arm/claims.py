@@ -12,7 +12,7 @@ our trial 30, leaves the claim undetermined. Low is at most 10 cm at a target, o
 runs; nearly all, nine in ten; only near the start, at less than half, and within 20 cm of where the
 hand starts better than beyond 40 cm; a low variance, a standard deviation of at most 5 cm.
 
-U1 is about the intervals of the models, as in :mod:`paper.multifidelity.tables`; no AR1 here.
+U1 is about the intervals of the models, as for Forrester's function; no AR1 here.
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ from scipy import stats
 from gpadjust.envs import arm_targets, hand_position
 from gpadjust.envs.arm.task import START_MEAN
 from paper.arm import PAPER, SCENARIOS, Settings
-from paper.common.claims import (
+from paper.common.verdicts import (
     Claim,
+    Curves,
+    Difference,
     Finding,
     Verdict,
     all_of,
@@ -39,8 +41,6 @@ from paper.common.claims import (
     reproduced,
     within,
 )
-from paper.common.curves import Curves
-from paper.common.statistics import Difference
 
 LOW = 10.0  # cm: what is called a low error at a target
 STEADY = 5.0  # cm: the standard deviation over runs that is called low
@@ -108,7 +108,7 @@ def _less_spread(curves: Curves, name: str, other: str) -> Verdict:
     """Whether runs of one learner differ less than those of another, by a bootstrap of seeds."""
     values = [
         own[own["episode"] >= 3].pivot(index="seed", columns="episode", values=curves.measure)
-        for own in (curves.records[curves.records["scenario"] == n] for n in (name, other))
+        for own in (curves.of(name), curves.of(other))
     ]
     one, two = (_resampled(each).std(1, ddof=1) for each in values)
     low, high = np.quantile((one - two).mean(-1), [0.025, 0.975])
