@@ -1,4 +1,7 @@
-"""How Sphinx builds the site: from pages, docstrings and committed outputs, without the network."""
+"""How Sphinx builds the site: from pages, docstrings and committed outputs, without the network.
+
+Its source is the repository: ``sphinx-build -W --keep-going -b html -c docs . docs/_build``.
+"""
 
 import sys
 from pathlib import Path
@@ -30,7 +33,18 @@ nb_execution_mode = "off"  # pages show the committed outputs
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # by default from another host
 nb_merge_streams = True
 copybutton_exclude = ".linenos, .gp, .go"
-exclude_patterns = ["_build", "files", "jupyter_execute"]
+root_doc = "docs/index"
+include_patterns = [
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "docs/**",
+    "paper/*.md",
+    "paper/*/README.md",
+    "paper/machines/data/README.md",
+    "paper/results/*/tables.md",
+    "tutorials/*",
+]
+exclude_patterns = ["docs/_build", "docs/jupyter_execute"]
 default_role = "py:obj"  # single backticks link where they can, and are code elsewhere
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", r"(?!gpadjust\.).*")]  # links to other libraries need the network
@@ -78,4 +92,5 @@ html_show_sourcelink = False
 html_logo = html_favicon = "_static/logo.svg"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_extra_path = ["index.html"]  # leads from the site's root to docs/
 html_copy_source = False

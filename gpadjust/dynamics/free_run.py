@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics.free_run_scores import FreeRunScores, score_free_runs
-from gpadjust.dynamics.open_loop import Move, move_on, of_states
 from gpadjust.dynamics.particles import (
+    Move,
     about_centre,
     central_interval,
     check_enough,
     measurement_noise,
+    move_on,
+    of_states,
+    step_or_nan,
 )
-from gpadjust.dynamics.step_or_nan import step_or_nan
+from gpadjust.dynamics.scores import (
+    FreeRunScores,
+    energy_scores,
+    score_free_runs,
+    typical_change,
+)
+from gpadjust.models.sampled_functions import check_number
 from gpadjust.models.training_data import check_finite
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import check_columns
@@ -30,9 +38,10 @@ class FreeRun(NamedTuple):
 
     Step t is the state after t + 1 actions. Each of the ``K`` particles follows one function drawn
     from the dynamics, and nothing that was measured on the way. Noise is added to what is reported
-    of each step, as to a measurement of it, and moves nothing on (see :class:`TrajectoryScores`);
-    process noise moves the particles themselves. A particle that is lost, because it would leave
-    the bounds or the finite numbers or meet a failure of the physics, stays where it was before.
+    of each step, as to a measurement of it, and moves nothing on: as noise of the process it would
+    do more after T steps than is assumed here. Process noise moves the particles themselves. A
+    particle that is lost, because it would leave the bounds or the finite numbers or meet a failure
+    of the physics, stays where it was before.
 
     The mean of an angle is that on the circle. It goes on from the initial state without jumps of
     :math:`2 \pi`, and interval and particles of each step are about it: compare with what was
@@ -50,6 +59,7 @@ class FreeRun(NamedTuple):
         lost: Share of the particles that are lost by then, ``w x T``.
         spec: What the entries of states are.
         level: The probability of the intervals.
+        initial_states: Where the runs start, ``w x state_dim``.
     """
 
     mean: Tensor
@@ -59,20 +69,32 @@ class FreeRun(NamedTuple):
     lost: Tensor
     spec: StateSpec
     level: float
+    initial_states: Tensor
 
-    def score(self, measured: Tensor) -> FreeRunScores:
-        """Judge all steps by what was measured of states that were not learnt from.
+    def score(
+        self,
+        measured: Tensor,
+        *,
+        horizons: Sequence[int] | None = None,
+        units: Tensor | None = None,
+    ) -> FreeRunScores:
+        """Judge the runs by what was measured of states that were not learnt from.
 
         Angles are compared the shortest way round. What was measured has noise: so should the
         runs, as they do by default.
 
         Args:
-            measured: ``w x T x state_dim``, as ``measured`` of :meth:`Records.windows`; NaN where
-                an entry was not measured.
+            measured: ``w x T x state_dim``, as ``measured`` of :meth:`Trajectories.windows`; NaN
+                where an entry was not measured.
+            horizons: After which numbers of steps, such as ``(1, 5, 15)``, from the least to the
+                greatest. Default: all, 1 to ``T``.
+            units: What states are measured in for the energy score, ``state_dim``. Default: the
+                root mean square of their changes in a step, in these windows.
 
         Raises:
             TypeError: If it is no float64 tensor.
-            ValueError: If its shape is not that of the means, or an entry is infinite.
+            ValueError: If its shape is not that of the means, an entry is infinite, a unit is not
+                positive, or a horizon is none of the runs' steps.
 
         Example:
             >>> import torch
@@ -99,9 +121,48 @@ class FreeRun(NamedTuple):
                 "Expected measured to be finite, found infinity; put NaN where an entry was not "
                 "measured."
             )
+        steps, length = slice(None), self.mean.shape[1]
+        if horizons is not None:
+            horizons = checked_horizons(horizons)
+            if horizons[-1] > length:
+                raise ValueError(
+                    f"Expected horizons of at most the {length} steps of the runs, got "
+                    f"{horizons[-1]}; take longer windows."
+                )
+            steps = torch.tensor(horizons) - 1
+        if units is None:
+            before = torch.cat([self.initial_states.unsqueeze(1), measured[:, :-1]], dim=1)
+            units = typical_change(self.spec, before, measured)
+        units = of_states(units, "units", (self.spec.state_dim,))
+        if not (units.isfinite() & (units > 0)).all():
+            raise ValueError(f"Expected units that are finite and positive, got {units.tolist()}.")
         found = self.mean + self.spec.change(self.mean, measured)
         interval = self.lower, self.upper
-        return score_free_runs(self.mean, interval, self.particles.var(0), found)
+        scores = score_free_runs(self.mean, interval, self.particles.var(0), found)
+        moving = self.spec.moving
+        scaled = ((x[..., steps, :] / units)[..., moving] for x in (self.particles, found))
+        kept = {name: values[steps] for name, values in scores.items()}
+        return FreeRunScores(**kept, energy=energy_scores(*scaled).nanmean(0))
+
+
+def checked_horizons(horizons: Sequence[int]) -> tuple[int, ...]:
+    """The numbers of steps, in order.
+
+    Raises:
+        ValueError: If they are not different whole numbers of at least 1.
+    """
+    try:
+        given = tuple(horizons)
+    except TypeError:
+        given = ()
+    if not given or len({*given}) < len(given):
+        raise ValueError(
+            f"Expected horizons as different numbers of steps, such as (1, 5, 15), got "
+            f"{horizons!r}."
+        )
+    for each in given:
+        check_number(each, "each horizon")
+    return tuple(sorted(given))
 
 
 def free_run(
@@ -204,6 +265,7 @@ def free_run(
         lost=torch.stack(lost_by_then, 1),
         spec=spec,
         level=level,
+        initial_states=initial_states,
     )
 
 

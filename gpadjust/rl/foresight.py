@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import warnings
 
+import torch
 from torch import Tensor
 
 from gpadjust.control import Task
-from gpadjust.dynamics import Dynamics, LearnedDynamics
-from gpadjust.dynamics.trajectory_scores import typical_change
+from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
+from gpadjust.dynamics.scores import typical_change
 from gpadjust.models import TermsModel
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.recorded_episodes import RecordedEpisodes
 from gpadjust.validation.trust import trust
 
-_WINDOWS = 4  # of each horizon: some half second for a model of an episode
+_WINDOWS = 4  # some half second for a model of an episode
+_FAR = ("nlpd", "coverage", "energy")
 
 
 def foresight(
     task: Task,
-    transitions: tuple[Tensor, Tensor, Tensor],
+    new: Trajectories,
     recorded: RecordedEpisodes,
     horizons: tuple[int, ...],
 ) -> dict[str, float]:
@@ -30,26 +32,29 @@ def foresight(
 
     Args:
         task: The task, with bounds of the states; its dynamics are scored.
-        transitions: States, actions and next states that they have not learnt from.
+        new: What they have not learnt from.
         recorded: All real episodes.
         horizons: Numbers of steps; none for the scores of next states, and how many of them data
             override the physics in, alone.
     """
     dynamics = task.dynamics
-    score = dynamics.score(*transitions)
+    score = dynamics.score(*new)
     found = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
     names = [dynamics.spec.states[i] for i in dynamics.spec.moving]
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
-    found["overrides"] = _overrides(dynamics, *transitions[:2])
-    if not horizons:
+    found["overrides"] = _overrides(dynamics, new.states, new.actions)
+    found |= {f"{name}_{k}": float("nan") for k in horizons for name in _FAR}
+    possible = [k for k in horizons if k <= new.longest]
+    if not possible:
         return found
+    windows = new.windows(possible[-1], stride=1)
+    last = len(windows.actions) - 1
+    windows = windows.some(torch.linspace(0, last, min(last + 1, _WINDOWS)).round().long())
     try:
-        far = dynamics.score_trajectories(
-            *transitions,
-            horizons=horizons,
-            max_windows=_WINDOWS,
-            units=typical_change(dynamics.spec, recorded.states, recorded.next_states),
-            state_bounds=task.widened(transitions[0]).state_bounds,
+        run = dynamics.free_run(
+            windows.initial_states,
+            windows.actions,
+            state_bounds=task.widened(new.states).state_bounds,
         )
     except (NotImplementedError, PhysicsError) as error:  # scores are not worth an episode
         warnings.warn(
@@ -59,12 +64,13 @@ def foresight(
             stacklevel=4,
         )
         return found
-    for i, horizon in enumerate(horizons):
-        found |= {
-            f"nlpd_{horizon}": float(far.nlpd[i].mean()),
-            f"coverage_{horizon}": float(far.coverage[i].mean()),
-            f"energy_{horizon}": float(far.energy[i]),
-        }
+    units = typical_change(dynamics.spec, recorded.states, recorded.next_states)
+    far = run.score(windows.measured, horizons=possible, units=units)
+    for i, horizon in enumerate(possible):
+        for name in _FAR:
+            values = getattr(far, name)[i]
+            values = values if name == "energy" else values[dynamics.spec.moving]
+            found[f"{name}_{horizon}"] = float(values.mean())
     return found
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import get_args
 
-from gpadjust.dynamics.trajectory_scores import checked_horizons
+from gpadjust.dynamics.free_run import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
 _WHOLE = {  # the least of each

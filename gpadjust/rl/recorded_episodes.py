@@ -10,7 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 
 from gpadjust.control import Task
-from gpadjust.dynamics import Dynamics
+from gpadjust.dynamics import Dynamics, Trajectories
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.states import StateSpec
@@ -65,6 +65,7 @@ class RecordedEpisodes:
         ended = buffer.dones[rows].astype(bool).T
         starts = np.ones_like(ended)
         starts[:, 1:] = ended[:, :-1]
+        self._episode = torch.from_numpy(starts.flatten().cumsum()[happened])
         if buffer.full and starts[:, 1:].any():
             starts[:, 0] = False  # what came before the oldest row is lost
         self._starts = torch.from_numpy(starts.flatten()[happened])
@@ -98,8 +99,8 @@ class RecordedEpisodes:
                 reach[i] = torch.inf
         return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
 
-    def learnable(self, dynamics: Dynamics) -> tuple[Tensor, Tensor, Tensor]:
-        """States, actions and next states, but for those at which the physics fails.
+    def learnable(self, dynamics: Dynamics) -> Trajectories:
+        """What happened, but for the states at which the physics fails.
 
         Raises:
             PhysicsError: If it does not say where, or everywhere.
@@ -107,7 +108,7 @@ class RecordedEpisodes:
         works = torch.ones(self.num_transitions, dtype=torch.bool)
         while True:
             try:
-                dynamics.rehearse(self.states[works], self.actions[works])
+                dynamics.try_physics(self.states[works], self.actions[works])
             except PhysicsError as error:
                 rows = works.nonzero().flatten()[list(error.rows)]
                 if not len(rows) or len(rows) == works.sum():
@@ -120,7 +121,8 @@ class RecordedEpisodes:
                 )
                 works[rows] = False
             else:
-                return self.states[works], self.actions[works], self.next_states[works]
+                parts = self.states, self.actions, self.next_states, self._episode
+                return Trajectories(*parts).some(works)
 
     def check(self, task: Task, tolerance: float = 1e-3) -> None:
         """Compare the functions of a task with what was recorded.

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics import LearnedDynamics, Trajectories
 from gpadjust.inference import SamplingWarning
 from gpadjust.states import StateSpec
 from paper.cartpole.control import make_agent
 from paper.common.experiment import Run, Table
+from paper.common.learners import LEARNERS
 from paper.common.tables import claims_table, markdown
 from paper.common.verdicts import FEWEST, Judged, counted, met
 from paper.machines import METHODS, NOISES, SENSORS, Foresight, ForesightSettings
@@ -40,7 +40,7 @@ def run(experiment: Foresight, system: str, seed: int) -> Run:
     seconds = time.process_time() - start
     made = agent.recorded_episodes()
     parts = (part.split(length) for part in (made.states, made.actions, made.next_states))
-    trials = [Transitions(*rows) for rows in zip(*parts, strict=True)]
+    trials = [Trajectories(*rows, torch.zeros(length)) for rows in zip(*parts, strict=True)]
     rewards = [each.mean().item() for each in made.rewards.split(length)]
     found: dict[str, Any] = {"agent_seconds": seconds, "rewards": rewards}
     for noise in NOISES:
@@ -51,7 +51,7 @@ def run(experiment: Foresight, system: str, seed: int) -> Run:
     return found
 
 
-def measured(spec: StateSpec, trials: list[Transitions], seed: int) -> list[Transitions]:
+def measured(spec: StateSpec, trials: list[Trajectories], seed: int) -> list[Trajectories]:
     """The same trials as noisy sensors see them: each state once, whichever row it is in."""
     sd = torch.tensor([SENSORS.get(name, 0.0) for name in spec.states], dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed + 1_000)
@@ -59,20 +59,19 @@ def measured(spec: StateSpec, trials: list[Transitions], seed: int) -> list[Tran
     for states, actions, next_states in trials:
         every = torch.cat([states, next_states[-1:]])
         seen = every + sd * torch.randn(every.shape, generator=generator, dtype=torch.float64)
-        found.append(Transitions(seen[:-1], actions, seen[1:]))
+        found.append(Trajectories(seen[:-1], actions, seen[1:], torch.zeros(len(actions))))
     return found
 
 
 def _dynamics(spec: StateSpec, physics: Any, method: str) -> LearnedDynamics:
     if method == "default":
         return LearnedDynamics(spec, physics)
-    return LearnedDynamics(
-        spec, physics, model_options={"center": 0.0}, fit_options={"method": "map"}
-    )
+    make = LEARNERS["literal"].make
+    return LearnedDynamics(spec, physics, model=make, fit_options={"method": "map"})
 
 
 def _replay(
-    dynamics: LearnedDynamics, trials: list[Transitions], settings: ForesightSettings
+    dynamics: LearnedDynamics, trials: list[Trajectories], settings: ForesightSettings
 ) -> dict[str, Any]:
     """Learn all trials but the last, one by one, each time judged by the next."""
     rows, third = [], max(1, (len(trials) - 1) // 3)
@@ -91,20 +90,23 @@ def _replay(
 
 
 def _scores(
-    dynamics: LearnedDynamics, unseen: Transitions, settings: ForesightSettings
+    dynamics: LearnedDynamics, unseen: Trajectories, settings: ForesightSettings
 ) -> dict[str, Any]:
     """Of the next states, and of trajectories by their number of steps; an entry for each state."""
     near = dynamics.score(*unseen)
-    far = dynamics.score_trajectories(
-        *unseen,
-        horizons=settings.horizons,
-        num_functions=settings.num_functions,
-        max_windows=settings.max_windows,
-    )
     found: dict[str, Any] = {"coverage": near.coverage.tolist(), "nlpd": near.nlpd.tolist()}
-    for i, horizon in enumerate(far.horizons):
-        found[f"coverage_{horizon}"] = far.coverage[i].tolist()
-        found[f"nlpd_{horizon}"] = far.nlpd[i].tolist()
+    for steps in settings.horizons:
+        windows = unseen.windows(steps, stride=1)
+        last = len(windows.actions) - 1
+        places = torch.linspace(0, last, min(last + 1, settings.max_windows)).round().long()
+        windows = windows.some(places)
+        free = dynamics.free_run(
+            windows.initial_states, windows.actions, num_functions=settings.num_functions
+        )
+        far = free.score(windows.measured, horizons=[steps])
+        moving = dynamics.spec.moving
+        found[f"coverage_{steps}"] = far.coverage[0, moving].tolist()
+        found[f"nlpd_{steps}"] = far.nlpd[0, moving].tolist()
     return found
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, Records, smooth
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.models import PhysicsParameters, orthogonal_rbf
+from gpadjust.records import Records, smooth
 from paper.machines import REAL_LEARNERS, UNTAUGHT
 from paper.machines.networks import NetworkDynamics
 from paper.machines.pendulums import Machine
@@ -36,7 +38,7 @@ def learnt(name: str, machine: Machine, data: Any, seed: int) -> Learnt:
     Args:
         name: Of ``REAL_LEARNERS``.
         machine: The machine.
-        data: ``Transitions``; ``Records`` for all their transitions, or states along them.
+        data: ``Trajectories``; ``Records`` for all their transitions, or states along them.
         seed: Of networks, and of the draw of the states.
     """
     known = REAL_LEARNERS[name]
@@ -44,7 +46,7 @@ def learnt(name: str, machine: Machine, data: Any, seed: int) -> Learnt:
     if known.states == "smoothed":
         found = smooth(data, machine.physics())
         data = found.draw(seed)
-    data = data.transitions() if isinstance(data, Records) else data
+    data = data.trajectories() if isinstance(data, Records) else data
     dynamics = _dynamics(name, machine, data, seed)
     if name not in UNTAUGHT:
         dynamics.update(*data)
@@ -70,4 +72,4 @@ def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:
     if known.model == "network":
         return NetworkDynamics(machine.spec, physics, seed=seed)
     options = {"covar_module": orthogonal_rbf} if "orthogonal" in name else {}
-    return LearnedDynamics(machine.spec, physics, model=known.make, model_options=options)
+    return LearnedDynamics(machine.spec, physics, model=partial(known.make, **options))

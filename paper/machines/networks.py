@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gpadjust.dynamics import Dynamics, PhysicsDynamics, TransitionFunctions, Transitions
+from gpadjust.dynamics import Dynamics, PhysicsDynamics, Trajectories, TransitionFunctions
 from gpadjust.models import Prediction
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
@@ -75,7 +75,7 @@ class NetworkDynamics(Dynamics):
         self.number, self.folds, self.hidden, self.steps = number, folds, hidden, steps
         self.rate, self.decay, self.seed = rate, decay, seed
         self._read = [i for i, name in enumerate(spec.states) if name not in spec.exogenous]
-        self._data: Transitions | None = None
+        self._data: Trajectories | None = None
         self._networks: Networks | None = None
 
     @property

@@ -77,7 +77,7 @@ def _scores(
         states, actions, following = known.steps(test)
         steps = Windows(states, actions.unsqueeze(1), following.unsqueeze(1))
         score = follow(dynamics, steps, settings, **given).score(steps.measured)
-        single = type(score)(*(part[0] for part in score))
+        single = score[0]
         free = follow(dynamics, windows, settings, **given)
     after = free.score(windows.measured)
     scores: dict[str, Any] = {}

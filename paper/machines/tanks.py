@@ -18,17 +18,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 from torch import Tensor
 
-from gpadjust.dynamics import (
-    Dynamics,
-    FreeRun,
-    LearnedDynamics,
-    PhysicsDynamics,
-    SmoothingWarning,
-    StateSpec,
-    smooth,
-)
+from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.inference import SamplingWarning
 from gpadjust.physics import Physics
+from gpadjust.records import SmoothingWarning, smooth
 from paper.common.experiment import Run, Table
 from paper.common.figures import one_legend, panels, save
 from paper.common.learners import LEARNERS
@@ -190,7 +183,7 @@ def _narx(lags: int, actions: Tensor, lower: Tensor, n: int, seed: int) -> Learn
     records = outputs(actions, lower, lags)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Left out", UserWarning)
-        data = records.transitions()
+        data = records.trajectories()
     dynamics = LearnedDynamics(records.spec, model=LEARNERS["gp"].make)
     dynamics.update(*data.spread(min(n, len(data.states)), seed))
     return dynamics
@@ -255,7 +248,7 @@ def _scores_of_gp(
     found = smoothed(by, settings)
     model = LEARNERS["phymean" if learner.endswith("delta") else "cka"].make
     dynamics = LearnedDynamics(SPEC, known.physics, model=model)
-    data = found.draw(seed).transitions()
+    data = found.draw(seed).trajectories()
     dynamics.update(*data.spread(min(n, len(data.states)), seed))
     actions, lower = measured("Val", settings.samples)
     noise = {"noise": found.noise.nan_to_num(), "process_noise": "learnt"}

@@ -7,13 +7,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from paper.calibration import PUMP, ROWS
+from paper.calibration import PUMP as _PUMP
+from paper.calibration import ROWS
 from paper.common.experiment import Experiment, Task
 
 Model = Literal["cka", "phy", "gp", "rra"]
 MODELS: tuple[Model, ...] = get_args(Model)
 LABELS = {"cka": "CKA", "phy": "physics mean", "gp": "GP", "rra": "RRA"}
 CLASSES = {"cka": "CKA", "phy": "PhysicsMeanGP", "gp": "ZeroMeanGP", "rra": "RRA"}
+PUMP = _PUMP[0]
 ARM = "arm"
 SIMULATED = (ARM, "cart-pole")
 MEASURED = ("pendulum", "double-pendulum")

@@ -15,13 +15,12 @@ from torch import Tensor
 import gpadjust
 from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.transition_scores import score_transitions
+from gpadjust.dynamics.scores import score_transitions
 from gpadjust.inference import SampleResult, SamplingWarning
 from gpadjust.models import TermsGP
-from paper.calibration import PUMP
-from paper.calibration.run import Data, of_pair, pump, scored
+from paper.calibration.calibration import Data, of_pair, pump, scored
 from paper.common.experiment import Record
-from paper.structures import CLASSES, GROUPS, Model, Structures
+from paper.structures import CLASSES, GROUPS, PUMP, Model, Structures
 from paper.structures.systems import System, system
 
 _Fitted = TypeVar("_Fitted")

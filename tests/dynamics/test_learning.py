@@ -2,13 +2,14 @@
 
 import io
 import warnings
+from functools import partial
 
 import pytest
 import torch
 from botorch.models.transforms.outcome import Standardize
 from gpytorch.kernels import MaternKernel, ScaleKernel
 
-from gpadjust import fit
+from gpadjust import CKA, fit
 from gpadjust.inference.warm_start import warm_start
 
 pytestmark = pytest.mark.filterwarnings(
@@ -129,7 +130,7 @@ def test_kernels_of_the_users(cart_pole_system, make):
     module = matern(6, torch.Size([4]))
     initial = {name: p.clone() for name, p in module.named_parameters()}
     options = {"rho_covar_module": matern, "delta_covar_module": module}
-    dynamics = make("CKA", system.spec, system.crude, model_options=options)
+    dynamics = make("CKA", system.spec, system.crude, model=partial(CKA, **options))
     for seed in range(2):
         dynamics.update(*system.trial(seed))
     assert dynamics.model.term_names == ("rho", "delta")

@@ -1,5 +1,7 @@
 """Dynamics by a model with inducing points."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -24,7 +26,7 @@ def transitions(n, seed=0):
 
 def make(**options):
     return LearnedDynamics(
-        SPEC, physics=step, model=VariationalCKA, model_options={"num_inducing": 12}, **options
+        SPEC, physics=step, model=partial(VariationalCKA, num_inducing=12), **options
     )
 
 
