@@ -163,7 +163,7 @@ class Elsewhere(Experiment):
             "smoothed": "calibrated CKA, smoothed",
         },
     }
-    calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.dynamics.smooth")
+    calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.records.smooth")
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "scipy")
 
     def check(self) -> None:
@@ -260,7 +260,7 @@ class Tanks(Experiment):
         "n": {1024: "all samples", 100: "100", 400: "400"},
         "learner": {**CANDIDATES, TENTH: "chosen f_p, every tenth sample", **GPS, **NARX},
     }
-    calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.dynamics.smooth")
+    calls: ClassVar[tuple[str, ...]] = (*_DYNAMICS, "gpadjust.records.smooth")
 
     def check(self) -> None:
         """Refuse a number of samples that leaves a block without two."""
