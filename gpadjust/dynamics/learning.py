@@ -181,7 +181,6 @@ class Recipe:
             of the hyper-parameters.
         """
         n, given = len(data.states), dict[str, Any](options)
-        check_enough_observed(self.targets.spec, data)
         model = self.build(data, quiet=previous is not None)
         if previous is None:
             return model, fit(model, **given), n
