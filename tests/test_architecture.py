@@ -9,10 +9,12 @@ import torch
 
 import gpadjust
 from gpadjust import CKA, fit
+from gpadjust.__main__ import main
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import as_physics
 from gpadjust.records import Records, smooth
 from gpadjust.states import StateSpec
+from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
@@ -23,6 +25,7 @@ FLOORS = [
 
 CSV_TO_FREE_RUN = 46  # files that a log passes on the way to a judged free run
 FILES, CLASSES, FUNCTIONS = 32, 36, 256  # that the ten lines of the README pass; fewer are better
+REPORT, WITH_A_REPORT = 13, 35  # of report and validation, and of what is below, by a point fit
 
 
 def passed(call):
@@ -51,14 +54,10 @@ def passed(call):
     return files, classes, functions
 
 
-def sine(X):
-    return torch.sin(6 * X)
-
-
 def ten_lines():
     """Those of the README, with the default fit."""
-    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-    model = CKA(X, 2 * sine(X) + X, physics=sine)
+    X = line(8)
+    model = CKA(X, 2 * wave(X) + X, physics=wave)
     fit(model)
     return model.predict(X)
 
@@ -96,8 +95,28 @@ def test_a_log_passes_few_files_on_the_way_to_a_free_run(tmp_path):
     assert len(files) <= CSV_TO_FREE_RUN, sorted(files)
 
 
+def report_of_a_file():
+    """The command in the working directory, which has the file and the module of the physics."""
+    given = ["--inputs", "flow", "--outputs", "head", "--physics", "walked_pump:head"]
+    assert main(["report", "pump.csv", *given, "--fit", "map"]) == 0
+
+
+def test_a_report_passes_few_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    rows = [f"{q / 8},{28 - 2.2 * (q / 8) ** 3}" for q in range(9)]
+    Path("pump.csv").write_text("\n".join(["flow [l/s],head [m]", *rows, ""]))
+    Path("walked_pump.py").write_text("def head(X):\n    return 30 - 2 * X[:, 0] ** 2\n")
+    import gpadjust.report.command  # not at the top: matplotlib  # noqa: F401
+
+    files, _, _ = passed(report_of_a_file)
+    own = {file for file in files if file.startswith(("report", "validation"))}
+    assert len(own) <= REPORT, sorted(own)
+    assert len(files) <= REPORT + WITH_A_REPORT, sorted(files)
+
+
 def test_a_formula_is_called_through_few_functions():
-    physics = as_physics(sine)
+    physics = as_physics(wave)
     X = torch.rand(5, 1, dtype=torch.float64)
     _, _, functions = passed(lambda: physics(X))
     assert len(functions) <= 6, sorted(functions)

@@ -41,7 +41,7 @@ class CollectionError(RuntimeError):
         message: What happened.
         collection: The collection so far.
         X: The points that were being measured, ``q x d``.
-        result: What the oracle returned for them, if the collection could not take it.
+        result: The values of the oracle, if the collection could not take them.
     """
 
     def __init__(self, message: str, collection: Collection, X: Tensor, result: Any = None) -> None:
@@ -179,7 +179,7 @@ class Collection(Measurements):
         self.close()
 
     def __repr__(self) -> str:
-        """What was measured, in a line."""
+        """The state of the collection in a line."""
         m = "unknown" if self.num_outputs is None else self.num_outputs
         return (
             f"Collection({len(self.X)} measurements, {len(self.failed_X)} failed, "
@@ -458,7 +458,7 @@ class Collection(Measurements):
         return None
 
     def _place(self) -> str:
-        """Where the log is."""
+        """The place of the log."""
         return "no log was kept" if self.log is None else f"the log is at {self.log.path}"
 
 

@@ -1,4 +1,4 @@
-"""What was measured, what failed, and what is being measured; and the checks of what is told."""
+"""Measurements: made, failed and pending; and the checks of their numbers."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Measurements:
 
     Attributes:
         X: The points measured, ``n x d``, those of ``data`` first.
-        Y: What was measured there, ``n x m``; NaN where an output was not.
-        failed_X: Where measuring failed, ``k x d``.
+        Y: The values measured there, ``n x m``; NaN where an output was not.
+        failed_X: Points at which measuring failed, ``k x d``.
         pending: Points asked for and not told yet, ``l x d``.
         num_measured: Number of measurements, failed ones included, those of ``data`` not.
         num_outputs: Number ``m`` of outputs; None before the first measurement.

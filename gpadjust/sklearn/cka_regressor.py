@@ -89,7 +89,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Attributes:
         model_: The fitted model; its own methods take and return float64 tensors.
-        fit_result_: What :func:`gpadjust.fit` returned.
+        fit_result_: The result of :func:`gpadjust.fit`.
         physics_parameters_: The :class:`~gpadjust.models.PhysicsParameters`, draws of the unknown
             parameters of the physics by their names. Only if it has some.
         n_features_in_: The number ``d`` of columns of X.
@@ -284,7 +284,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def _hints(X: Array, Y: Array) -> str:
-    """What to do about scaled data in the terms of scikit-learn."""
+    """Advice on scaled data in the terms of scikit-learn."""
     hints = ""
     if is_standardised(torch.tensor(X)):
         hints += (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -83,18 +83,16 @@ def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
         - \frac{1}{2 S^2} \sum_{i, j} A(\mu_i - \mu_j, \sigma_i^2 + \sigma_j^2)
 
     Args:
-        mean: Predicted means, as in :func:`rmse`.
-        variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``, NaN where not observed.
-        mixture_dim: As in :func:`rmse`.
+        mean: As in :func:`nlpd`, like the others.
+        variance: As there.
+        y: As there.
+        mixture_dim: As there.
 
     Returns:
         ``... x m``, in the units of ``y``.
 
     Raises:
-        TypeError: If one of the three is no tensor of numbers.
-        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
-            negative.
+        TypeError: As :func:`nlpd`, like ``ValueError``.
 
     Example:
         >>> import torch
@@ -114,19 +112,17 @@ def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = 
     """Probability integral transform: the predicted distribution function at the true value.
 
     Args:
-        mean: Predicted means, as in :func:`rmse`.
-        variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``, NaN where not observed.
-        mixture_dim: As in :func:`rmse`.
+        mean: As in :func:`nlpd`, like the others.
+        variance: As there.
+        y: As there.
+        mixture_dim: As there.
 
     Returns:
-        ``... x n x m``, between 0 and 1, or NaN where not observed; uniform for calibrated
-        predictions (Dawid 1984).
+        ``... x n x m``, between 0 and 1, or NaN where not observed; uniform if intervals
+        of all levels hold (Dawid 1984).
 
     Raises:
-        TypeError: If one of the three is no tensor of numbers.
-        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
-            negative.
+        TypeError: As :func:`nlpd`, like ``ValueError``.
 
     Example:
         >>> import torch
@@ -149,14 +145,14 @@ def coverage(
     """Share of the points that lie within the central interval of a given level.
 
     Args:
-        mean: Predicted means, as in :func:`rmse`.
-        variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``, NaN where not observed.
+        mean: As in :func:`nlpd`.
+        variance: As there.
+        y: As there.
         level: Nominal coverage, between 0 and 1.
-        mixture_dim: As in :func:`rmse`.
+        mixture_dim: As there.
 
     Returns:
-        ``... x m``, between 0 and 1; calibrated predictions have it near ``level``.
+        ``... x m``, between 0 and 1; near ``level`` if the intervals hold.
 
     Raises:
         TypeError: As :func:`nlpd`, or if ``level`` is not a number.
@@ -178,7 +174,7 @@ def central_share(pit: Tensor, level: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Scores:
-    """How good predictions were, at the points that were observed.
+    """Quality of predictions at the observed points.
 
     One type for all: of a posterior (:func:`score`), of left-out observations
     (:meth:`~gpadjust.validation.LeaveOneOut.score`), of transitions and of free runs. Leading
@@ -277,10 +273,9 @@ class Scores:
             raise IndexError(
                 "These scores have no batch to take a part of; an output is `scores.rmse[j]`."
             )
-        tensors = {
-            name: value[part] for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **tensors)
+        given: dict[str, Any] = vars(self)
+        parts = {name: v[part] for name, v in given.items() if isinstance(v, Tensor)}
+        return Scores(**{**given, **parts})
 
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
@@ -359,7 +354,7 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
 
     Args:
         y: True values, ``... x n x m``.
-        mixture_dim: Where the components are, if any.
+        mixture_dim: The dimension of the components, if any.
         predicted: ``mean`` and, if need be, ``variance``.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Whether predictions are those of the physics, of the data, or of neither."""
+"""The basis of predictions: the physics, the data, or neither."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _NOTHING = 1e-3  # of the targets' standard deviation: what makes no difference
 
 @dataclass(frozen=True)
 class Trust:
-    r"""What the predictions of a model at some points rest on; see :func:`trust`.
+    r"""The basis of a model's predictions at some points; see :func:`trust`.
 
     Attributes:
         X: The points, raw inputs ``n x d``.
-        override: How far the data move the prediction from the physics, ``n x m``: the distance
+        override: Shift of the prediction from the physics by the data, ``n x m``: the distance
             :math:`|\mu - f_p|` in half widths w of the model's interval. Above 1 the interval
             excludes the physics.
         doubt: The half width in typical discrepancies, :math:`w / D`, ``n x m``.
@@ -40,7 +40,7 @@ class Trust:
 
     @property
     def side(self) -> Tensor:
-        """What each prediction rests on, ``n x m``: 0, 1 or 2 for physics, data or neither."""
+        """The basis of each prediction, ``n x m``: 0, 1 or 2 for physics, data or neither."""
         open_ = torch.where(self.doubt > 1, 2, 0)
         return torch.where(self.override > 1, 1, open_)
 
@@ -93,7 +93,7 @@ def trust(
         X: Raw inputs, ``n x d``, such as states and actions that were visited. Default:
             ``num_points`` in the box of the training inputs, by Sobol's sequence.
         level: Nominal coverage of the interval.
-        num_points: How many points there are if there is no ``X``.
+        num_points: Number of points if there is no ``X``.
 
     Raises:
         TypeError: If the model has no physics to be trusted, or is a :class:`~gpadjust.StackedGP`,

@@ -1,4 +1,4 @@
-"""What the figures share: colours, axes, names, bands, and one output of a posterior."""
+"""Parts of all figures: colors, axes, names, bands, and one output of a posterior."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
 
-BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
+BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the color-blind, too
 BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
 DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
 
@@ -60,7 +60,7 @@ def two_inputs(inputs: Any, d: int, otherwise: str) -> tuple[int, int]:
 
 
 def observed(values: Tensor, output: int) -> Tensor:
-    """Where the ``n`` values of an output are not NaN, which is somewhere."""
+    """The points, of ``n``, at which an output is not NaN; at least one."""
     seen = ~values.isnan()
     if not seen.any():
         raise ValueError(
