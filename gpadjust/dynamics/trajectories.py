@@ -128,7 +128,7 @@ class Trajectories:
                 check_observed("the predicted entries of next_states", tensor[:, spec.predicted])
             else:
                 check_finite(name, tensor)
-        return cls(*(tensor.detach().clone() for tensor in named.values()), episode)
+        return cls(*(tensor.detach().clone() for tensor in named.values()), episode=episode)
 
     def __iter__(self) -> Iterator[Tensor]:
         """States, actions and next states."""
@@ -144,7 +144,8 @@ class Trajectories:
         last = self.episode.max() if len(self.episode) else -1
         first = other.episode.min() if len(other.episode) else 0
         parts = [torch.cat(pair) for pair in zip(self, other, strict=True)]
-        return Trajectories(*parts, torch.cat([self.episode, other.episode - first + last + 1]))
+        episode = torch.cat([self.episode, other.episode - first + last + 1])
+        return Trajectories(*parts, episode=episode)
 
     def some(self, rows: Tensor | slice) -> Trajectories:
         """The rows of these numbers, a slice, or those where ``N`` booleans are true.
@@ -155,7 +156,7 @@ class Trajectories:
         old = self.episode[numbers]
         ends = (numbers.diff() != 1) | (old.diff() != 0)
         new = torch.cat([torch.zeros_like(old[:1]), ends.long().cumsum(0)])
-        return Trajectories(*(tensor[numbers] for tensor in self), new)
+        return Trajectories(*(tensor[numbers] for tensor in self), episode=new)
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
         """So many of the rows, drawn evenly: one of each of as many parts of the same length.
