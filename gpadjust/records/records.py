@@ -264,8 +264,8 @@ class Records:
         parts = [(each.states[:-1], each.actions, each.states[1:]) for each in stretches]
         lengths = torch.tensor([len(each.actions) for each in stretches])
         episode = torch.arange(len(stretches)).repeat_interleave(lengths)
-        columns = (torch.cat(column) for column in zip(*parts, strict=True))
-        return Trajectories(*columns, episode=episode), stretches
+        states, actions, following = (torch.cat(column) for column in zip(*parts, strict=True))
+        return Trajectories(states, actions, following, episode), stretches
 
     def _hidden(self, data: Trajectories) -> str:
         """What to do about states that were never measured; empty if there are none."""
