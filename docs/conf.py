@@ -57,10 +57,8 @@ nitpick_ignore = [  # what signatures name, but users do not call by name
     ("py:class", "gpadjust.models.sampled_functions.TermFeatures"),
     ("py:class", "gpadjust.models.stacked.StackedFunctions"),
     ("py:class", "gpadjust.rl.buffer.CompactReplayBuffer"),
-    ("py:class", "gpadjust.rl.checkpoint.Agent"),
-    ("py:class", "gpadjust.rl.episode_loop.EpisodeLoop"),
     ("py:class", "gpadjust.rl.model_vec_env.ModelStep"),
-    ("py:class", "gpadjust.rl.recorded_episodes.RecordedEpisodes"),
+    ("py:class", "gpadjust.control.checkpoint.Resumable"),
 ]
 
 autodoc_default_options = {"members": True, "show-inheritance": True}

@@ -14,10 +14,11 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 import gpadjust.models
+from gpadjust.control import EpisodeCheckpoint, resume
 from gpadjust.control import Task as ControlTask
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
-from gpadjust.rl import Dyna, DynaOptions, DynaSAC, EpisodeCheckpoint, resume
+from gpadjust.rl import Dyna, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.common.experiment import Record
 from paper.common.runner import Refused, differences, versions

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,11 @@ import torch
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import Tensor
 
-from gpadjust.control import PolicySearch, Task
+from gpadjust.control import PolicySearch, PolicySearchAgent, Task, mlp_policy
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.envs import arm_reward, arm_start
 from gpadjust.inference import SamplingWarning
 from gpadjust.models import CKA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.rl import ModelOptions, PolicySearchAgent
 from gpadjust.states import StateSpec
 from paper.arm import Settings as ArmSettings
 from paper.arm.system import memory_start, reach, score
@@ -52,7 +52,7 @@ def run(experiment: Reaching, system: str, learner: str, seed: int, *, unfinishe
         if trial > settings.noisy_trials:
             agent.action_noise = None
         before, start = dict(agent.wall_time), time.process_time()
-        agent.learn(settings.episode_length, reset_num_timesteps=False)
+        agent.learn(settings.episode_length)
         spent = time.process_time() - start
         errors = evaluate(agent, system, settings, seed)
         promised = agent.promised_reward
@@ -100,15 +100,14 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
     # Of actions scaled to [-1, 1], as SB3 has it.
     sd = 2 * settings.noise * np.ones(4)
     return PolicySearchAgent(
-        "mlp",
         environment(system, settings),
         task,
+        partial(mlp_policy, first_actions=[settings.first_action] * 4),
         search,
-        ModelOptions(reward_tolerance=None, score_horizons=()),
+        reward_tolerance=None,
+        score_horizons=(),
         action_noise=NormalActionNoise(np.zeros(4), sd),
-        policy_kwargs={"first_actions": [settings.first_action] * 4},
         seed=seed,
-        device="cpu",
     )
 
 
