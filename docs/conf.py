@@ -1,4 +1,7 @@
-"""How Sphinx builds the site: from pages, docstrings and committed outputs, without the network."""
+"""How Sphinx builds the site: from pages, docstrings and committed outputs, without the network.
+
+Its source is the repository: ``sphinx-build -W --keep-going -b html -c docs . docs/_build``.
+"""
 
 import sys
 from pathlib import Path
@@ -30,7 +33,18 @@ nb_execution_mode = "off"  # pages show the committed outputs
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # by default from another host
 nb_merge_streams = True
 copybutton_exclude = ".linenos, .gp, .go"
-exclude_patterns = ["_build", "files", "jupyter_execute"]
+root_doc = "docs/index"
+include_patterns = [
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "docs/**",
+    "paper/*.md",
+    "paper/*/README.md",
+    "paper/real/data/README.md",
+    "paper/results/*/tables.md",
+    "tutorials/*",
+]
+exclude_patterns = ["docs/_build", "docs/jupyter_execute"]
 default_role = "py:obj"  # single backticks link where they can, and are code elsewhere
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", r"(?!gpadjust\.).*")]  # links to other libraries need the network
@@ -39,10 +53,10 @@ nitpick_ignore = [  # what signatures name, but users do not call by name
     ("py:class", "gpadjust.envs.cart_pole.view.CartPoleView"),
     ("py:class", "gpadjust.envs.viewed_env.ViewedEnv"),
     ("py:class", "gpadjust.inference.fitting.FitOptions"),
-    ("py:class", "gpadjust.dynamics.incremental_fit.DynamicsFitOptions"),
-    ("py:class", "gpadjust.dynamics.control_steps.Stretch"),
-    ("py:class", "gpadjust.dynamics.smoothing.Estimate"),
-    ("py:class", "gpadjust.dynamics.chain.Known"),
+    ("py:class", "gpadjust.dynamics.learning.DynamicsFitOptions"),
+    ("py:class", "gpadjust.records.record.Stretch"),
+    ("py:class", "gpadjust.records.smoothing.Estimate"),
+    ("py:class", "gpadjust.records.chain.Known"),
     ("py:class", "gpadjust.models.local_errors.LocalErrors"),
     ("py:class", "gpadjust.models.stacked.Part"),
     ("py:class", "gpadjust.gp.kernels.AnyKernel"),
@@ -76,4 +90,5 @@ html_show_sourcelink = False
 html_logo = html_favicon = "_static/logo.svg"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_extra_path = ["index.html"]  # leads from the site's root to docs/
 html_copy_source = False

@@ -19,10 +19,13 @@ def pytest_ignore_collect(collection_path, config):
     return None
 
 
+_LEFT = pytest.StashKey[list]()
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Of tests with three parameters or more, leave to the slow run what has no new pair."""
-    cases = defaultdict(list)
+    cases, left = defaultdict(list), config.stash.setdefault(_LEFT, [])
     for item in items:
         if len(getattr(getattr(item, "callspec", None), "params", ())) > 2:
             cases[item.nodeid.partition("[")[0]].append(item)
@@ -36,6 +39,32 @@ def pytest_collection_modifyitems(items):
             rest = {item: pairs - found for item, pairs in rest.items()}
         for item in rest:
             item.add_marker("slow")
+            left.append(item.nodeid)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session):
+    """Tell the process that reports (of pytest-xdist) which cases were left to the slow run."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["left"] = session.config.stash[_LEFT]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    if hasattr(node, "workeroutput"):
+        node.config.stash[_LEFT] = node.workeroutput["left"]
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """Say how many cases were left to the slow run, and with `-v` which."""
+    if (left := config.stash.get(_LEFT, [])) and config.option.markexpr == "not slow":
+        terminalreporter.section("left to -m slow")
+        terminalreporter.write_line(
+            f"{len(left)} cases of tests with three parameters or more: each pair of their values "
+            "occurs in a case that ran (-v names them)"
+        )
+        for nodeid in left if config.option.verbose > 0 else ():
+            terminalreporter.write_line(nodeid)
 
 
 @pytest.fixture(autouse=True)

@@ -13,11 +13,11 @@ from gpadjust.physics import as_physics
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
     *("physics", "states", "files", "envs", "gp", "models", "inference"),
-    *("validation", "report", "sklearn", "ax", "active", "dynamics", "control", "rl"),
+    *("validation", "report", "sklearn", "ax", "active", "dynamics", "records", "control", "rl"),
 ]
 
 
-FILES, CLASSES, FUNCTIONS = 27, 36, 256  # that the ten lines of the README pass; fewer are better
+FILES, CLASSES, FUNCTIONS = 31, 36, 256  # that the ten lines of the README pass; fewer are better
 
 
 def passed(call):

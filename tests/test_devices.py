@@ -28,7 +28,7 @@ ALLOWED = {
         "models/terms_model.py mean_functions",
     },
     "drawn on the CPU, so that a seed says the same everywhere, and moved": {
-        "inference/calibrate.py spread_normal",
+        "inference/least_squares.py spread_normal",
         "inference/parameter_draws.py _moved",
         "models/rra.py fourier_kernel",
         "models/sampled_functions.py by_matheron",

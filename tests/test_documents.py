@@ -70,6 +70,8 @@ def test_commands_exist(name, monkeypatch, capsys):
             case ["python", "-m", module, *arguments]:
                 assert find_spec(module) is not None or module == "build", command
                 assert all((ROOT / a).exists() for a in arguments if a.startswith("tests")), command
+            case ["cd", folder]:
+                assert (ROOT / folder).is_dir()
             case ["python", script, *_]:
                 assert (ROOT / script).is_file(), command
             case ["pip", "install", "--constraint", file, *_]:
@@ -116,7 +118,14 @@ def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
     assert sorted(listed) == sorted(gpadjust.__all__)
 
 
-@pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.slow if page.stem in ("control", "rl") else ())
+        for page in EXAMPLES
+    ],
+    ids=lambda page: page.stem,
+)
 def test_the_examples_of_the_reference_run(page):
     assert not doctest.testfile(str(page), module_relative=False).failed
 

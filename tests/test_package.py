@@ -17,6 +17,7 @@ def python(code, **options):
     return run.stdout
 
 
+@pytest.mark.slow
 def test_a_script_beside_a_clone_imports_the_library(tmp_path):
     """The clone's folder has the library's name, and no `__init__.py`: a namespace package."""
     (tmp_path / "gpadjust").symlink_to(Path(__file__).parents[1], target_is_directory=True)

@@ -12,7 +12,8 @@ from gpytorch.kernels import RBFKernel, ScaleKernel
 from gpadjust import CKA, fit
 from gpadjust.gp.kernels import PROFILES
 from gpadjust.inference import fitting
-from gpadjust.inference.targets import LogLikelihood, StationaryTerms
+from gpadjust.inference.distributions import StationaryTerms
+from gpadjust.inference.targets import LogLikelihood
 
 PAGE = Path(__file__).parents[1] / "docs" / "architecture.md"
 

@@ -1,38 +1,19 @@
-"""Pages that are kept elsewhere: the tutorials, the paper's results, CONTRIBUTING and CHANGELOG.
+"""Pages as they lie in the repository, with what Markdown elsewhere does not show.
 
-`assemble` copies them beside the other pages, where git ignores them. Links in Markdown and in
-notebooks are those of the repository, so that they work there, too; `localise` turns them into the
-site's as Sphinx reads a page.
+The site's source is the whole repository, so a link of the repository is one of the site. Added as
+a page is read: anchors of the tables of ``paper/results``, and the tutorials' pictures.
 """
 
 import base64
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
-from mdit_py_plugins.anchors.index import slugify
 from sphinx.application import Sphinx
 
-DOCS = Path(__file__).parents[1]
-ROOT = DOCS.parent
-PAPER = ROOT / "paper" / "README.md"
-TUTORIALS = ROOT / "tutorials" / "README.md"
-NOTEBOOKS = sorted((ROOT / "tutorials").glob("*.ipynb"), key=lambda p: int(p.stem.split("_")[0]))
-THUMBNAILS = {1: 1, 2: 1, 4: 2, 6: 2, 7: 1, 9: 3}  # which picture of a tutorial; else its first
-
-COPIES = {  # files of the repository that are pages of the site
-    ROOT / "CHANGELOG.md": "changelog.md",
-    ROOT / "CONTRIBUTING.md": "contributing.md",
-    ROOT / "paper" / "real" / "data" / "README.md": "paper/records.md",
-    TUTORIALS: "tutorials/index.md",
-    **{path: f"tutorials/{path.name}" for path in NOTEBOOKS},
-}
-ORIGINS = {place.rpartition(".")[0]: path for path, place in COPIES.items()}
-WRITTEN: set[Path] = set()
-MARKER = r"^<!-- (\S+:\S+) -->$"  # of a table, to which pages may link
-ANCHORS: dict[str, str] = {}  # of the paper's results, and the page that each is on
+TUTORIALS = Path(__file__).parents[2] / "tutorials"
+THUMBNAILS = {"1": 1, "2": 1, "4": 2, "6": 2, "7": 1, "9": 3}  # which picture; else the first
 
 CARD = """:::{{grid-item-card}} {number}. {title}
 :link: {stem}
@@ -43,100 +24,53 @@ CARD = """:::{{grid-item-card}} {number}. {title}
 :::"""
 
 
-def assemble() -> None:
-    """Write the pages that are kept elsewhere into the folder of the site."""
-    for path in COPIES.keys() - {TUTORIALS, *NOTEBOOKS}:
-        write(COPIES[path], path.read_text())
-    for path in NOTEBOOKS:
-        add_notebook(path)
-    write(COPIES[TUTORIALS], gallery(TUTORIALS.read_text()))
-    split_results(PAPER.read_text())
-    for folder in ("tutorials", "paper"):  # what a former build wrote of pages that are no more
-        for path in (DOCS / folder).rglob("*.*"):
-            if path not in WRITTEN:
-                path.unlink()
+def prepare(app: Sphinx, page: str, source: list[str]) -> None:
+    """Change the text of a page that is about to be read."""
+    if page.startswith("paper/"):
+        source[0] = source[0].replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")  # in cells
+    if page.startswith("paper/results/"):
+        source[0] = anchored(page.split("/")[2], source[0])
+    elif page == "tutorials/README":
+        source[0] = gallery(source[0])
+    elif page.startswith("tutorials/"):
+        notebook = json.loads(source[0])
+        link = f"{{nb-download}}`Download this notebook <{Path(page).name}.ipynb>`\n"
+        notebook["cells"][0]["source"][1:1] = ["\n", link]
+        source[0] = json.dumps(notebook)
 
 
-def write(place: str, content: str | bytes) -> None:
-    """Write a page or picture, unless it is there: Sphinx reads anew what has changed."""
-    path = DOCS / place
-    WRITTEN.add(path)
-    data = content.encode() if isinstance(content, str) else content
-    if not path.exists() or path.read_bytes() != data:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-
-
-def add_notebook(path: Path) -> None:
-    """Add a tutorial with a link to its file, and the picture for its card."""
-    notebook, number = json.loads(path.read_text()), int(path.stem.split("_")[0])
-    outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
-    pictures = [o["data"]["image/png"] for o in outputs if "image/png" in o.get("data", {})]
-    picture = base64.b64decode("".join(pictures[THUMBNAILS.get(number, 0)]))
-    write(f"tutorials/pictures/{number}.png", picture)
-    lines = notebook["cells"][0]["source"]
-    lines[1:1] = ["\n", f"{{nb-download}}`Download this notebook <{path.name}>`\n"]
-    write(COPIES[path], json.dumps(notebook))
+def anchored(name: str, text: str) -> str:
+    """The tables of an experiment, each below an anchor by its marker."""
+    tables = re.sub(r"^<!-- (\S+:\S+) -->$", r"(\1)=\n", text, flags=re.MULTILINE)
+    return f"---\norphan: true\n---\n\n# Tables of `paper {name}`\n\n{tables}"
 
 
 def gallery(text: str) -> str:
     """The tutorials' README, its table as cards with pictures."""
     rows = re.findall(r"^\| \[(\d+)\. (.+?)\]\((.+?)\.ipynb\) \| (.+?) \|$", text, re.MULTILINE)
     cards = [CARD.format(number=n, title=t, stem=s, text=text) for n, t, s, text in rows]
-    grid = "\n".join(["::::{grid} 1 2 2 3", ":gutter: 3", *cards, "::::"])
+    grid = "\n".join(["::::{grid} 1 2 2 2", ":gutter: 3", *cards, "::::"])
     tree = "\n".join(["```{toctree}", ":hidden:", *(stem for _, _, stem, _ in rows), "```"])
     table = re.search(r"^\|.*^\|.*?$", text, re.MULTILINE | re.DOTALL)
     return text.replace(table[0], f"{grid}\n\n{tree}")
 
 
-def split_results(text: str) -> None:
-    """A page for each section of the paper's README, a first one for what is before them."""
-    text = text.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")  # in cells of tables
-    first, *sections = re.split(r"^(?=## )", text, flags=re.MULTILINE)
-    names = []
-    for section in sections:
-        titles = re.findall(r"^#+ (.+)$", section, re.MULTILINE)
-        tables = re.findall(MARKER, section, re.MULTILINE)
-        names.append(slugify(titles[0]))
-        ANCHORS.update(dict.fromkeys([*map(slugify, titles), *tables], names[-1]))
-    ANCHORS[slugify(first.partition("\n")[0].strip("# "))] = "index"
-    tree = "\n".join(["```{toctree}", ":maxdepth: 1", *names, "records", "```", ""])
-    for name, content in zip(["index", *names], [first + tree, *sections], strict=True):
-        page = re.sub(r"^#(#+ )", r"\1", content, flags=re.MULTILINE)
-        write(f"paper/{name}.md", re.sub(MARKER, r"(\1)=\n", page, flags=re.MULTILINE))
-        ORIGINS[f"paper/{name}"] = PAPER
-
-
-def localise(app: Sphinx, page: str, source: list[str]) -> None:
-    """Turn the links of a Markdown page or notebook from the repository's into the site's."""
-    origin = ORIGINS.get(page, DOCS / f"{page}.md")
-    if origin.exists():
-        pattern = r"(?<=\]\()([^)#\s\\]*)(?:#([^)\s]+))?(?=\))"
-        source[0] = re.sub(pattern, lambda link: place(origin, *link.groups("")), source[0])
-
-
-def place(origin: Path, link: str, anchor: str) -> str:
-    """Where a link of the repository leads to on the site."""
-    end = f"#{anchor}" if anchor else ""
-    if not link and not anchor:
-        return ""
-    target = (origin.parent / link).resolve() if link else origin
-    if target == PAPER:
-        return f"/paper/{ANCHORS[anchor] if anchor else 'index'}.md{end.lower()}"
-    if not link or not target.is_file():
-        return link + end
-    if target in COPIES:
-        return f"/{COPIES[target]}{end}"
-    if not target.is_relative_to(DOCS):
-        copy = DOCS / "files" / target.relative_to(ROOT)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(target, copy)
-        target = copy
-    return f"/{target.relative_to(DOCS)}{end}"
+def take_pictures(app: Sphinx) -> None:
+    """Write a picture of each tutorial, for its card and for other pages."""
+    for path in TUTORIALS.glob("*.ipynb"):
+        number = path.stem.partition("_")[0]
+        cells = json.loads(path.read_text())["cells"]
+        data = [output.get("data", {}) for cell in cells for output in cell.get("outputs", [])]
+        pictures = [each["image/png"] for each in data if "image/png" in each]
+        picture = base64.b64decode("".join(pictures[THUMBNAILS.get(number, 0)]))
+        target = TUTORIALS / "pictures" / f"{number}.png"
+        if not target.exists() or target.read_bytes() != picture:
+            target.parent.mkdir(exist_ok=True)
+            target.write_bytes(picture)
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Assemble the pages, and register the hook."""
-    assemble()
-    app.connect("source-read", localise)
+    """Register the hooks."""
+    app.connect("builder-inited", take_pictures)
+    app.connect("source-read", prepare)
     return {"parallel_read_safe": True}

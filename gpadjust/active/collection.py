@@ -1,10 +1,11 @@
-"""Asking for measurements and being told them."""
+"""Asking for measurements and being told them, from the first to the last."""
 
 from __future__ import annotations
 
 import os
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from typing import Any, Self
 
@@ -12,20 +13,22 @@ import torch
 from botorch.acquisition import AcquisitionFunction, AnalyticAcquisitionFunction
 from botorch.models.model import Model
 from torch import Tensor
+from tqdm import tqdm
 
-from gpadjust.active.arguments import (
+from gpadjust.active.measurement_log import LogError, MeasurementLog, Record
+from gpadjust.active.measurements import (
+    Measurements,
     as_bounds,
     as_options,
     as_outcomes,
     as_points,
     as_points_within,
+    measurement,
+    refusal,
 )
-from gpadjust.active.best_points import best_points
-from gpadjust.active.design import among, sobol_points
-from gpadjust.active.loop import Loop
-from gpadjust.active.measurement_log import MeasurementLog, Record
-from gpadjust.active.measurements import measurement
+from gpadjust.active.points import among, best_points, sobol_points
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
+from gpadjust.models.factory import ModelFactory, make_model
 from gpadjust.models.sampled_functions import check_number, seeded
 
 
@@ -33,7 +36,25 @@ class MeasurementWarning(UserWarning):
     """A measurement failed."""
 
 
-class Collection(Loop):
+class CollectionError(RuntimeError):
+    """A run stopped before its budget was spent.
+
+    Args:
+        message: What happened.
+        collection: The collection so far.
+        X: The points that were being measured, ``q x d``.
+        result: What the oracle returned for them, if the collection could not take it.
+    """
+
+    def __init__(self, message: str, collection: Collection, X: Tensor, result: Any = None) -> None:
+        super().__init__(message, collection, X, result)
+        self.collection, self.X, self.result = collection, X, result
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class Collection(Measurements):
     """Chooses where to measure, for a laboratory that measures when it can.
 
     :meth:`ask` says where, :meth:`tell` takes what came out, in any order and for any points; where
@@ -51,8 +72,9 @@ class Collection(Loop):
     harm.
 
     Args:
-        model_factory: Makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``, float64, with
-            NaN where an output was not measured.
+        model_factory: A callable that makes a new model of ``X``, ``n x d``, and ``Y``, ``n x m``,
+            float64, with NaN where an output was not measured, such as
+            ``functools.partial(CKA, physics=f_p)``.
         bounds: Bounds of the inputs, ``2 x d``: lower, then upper.
         acquisition: Makes a BoTorch acquisition function of the fitted model.
         batch_size: Number of points that :meth:`ask` returns.
@@ -74,11 +96,12 @@ class Collection(Loop):
         LogError: If the log is held by another collection, or cannot be opened for writing.
 
     Example:
+        >>> from functools import partial
         >>> import torch
         >>> from gpadjust import CKA
         >>> from gpadjust.active import Collection, qAdjustmentInformationGain
         >>> collection = Collection(
-        ...     lambda X, Y: CKA(X, Y, physics=torch.sin),
+        ...     partial(CKA, physics=torch.sin),
         ...     bounds=[[0.0], [3.0]],
         ...     acquisition=lambda model: qAdjustmentInformationGain(model, about="rho"),
         ... )
@@ -91,7 +114,7 @@ class Collection(Loop):
 
     def __init__(
         self,
-        model_factory: Callable[[Tensor, Tensor], Model],
+        model_factory: ModelFactory,
         bounds: Tensor | list[list[float]],
         acquisition: Callable[[Any], AcquisitionFunction],
         *,
@@ -159,6 +182,15 @@ class Collection(Loop):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def __repr__(self) -> str:
+        """What was measured, in a line."""
+        m = "unknown" if self.num_outputs is None else self.num_outputs
+        return (
+            f"Collection({len(self.X)} measurements, {len(self.failed_X)} failed, "
+            f"{len(self.pending)} pending; inputs: {self.bounds.shape[-1]}, outputs: {m}; "
+            f"{self._place()})"
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """The state of a copy or a pickle, whose log is its own and not held."""
@@ -263,6 +295,69 @@ class Collection(Loop):
         X = self.pending if X is None else as_points(X, self.bounds.shape[-1])
         self._enter([{"withdrawn": X.tolist()}])
 
+    def run(
+        self,
+        oracle: Callable[[Tensor], Any],
+        budget: int,
+        *,
+        progress: bool = False,
+        max_failures: int = 5,
+    ) -> Self:
+        """Ask, measure and tell, until a budget is spent; points that are pending come first.
+
+        A measurement that fails (the oracle raises an exception, or returns nothing but NaN and
+        infinity) is logged with its message and skipped, with a warning. It counts against the
+        budget, and no point within a hundredth of the bounds' widths of it is asked for again. An
+        exception fails the whole batch. Where some outputs are NaN, each output is learnt from its
+        own measurements.
+
+        Args:
+            oracle: Measures: maps points ``q x d`` to values ``q x m`` (or ``q``).
+            budget: Number of measurements in all: failed ones and those of the log included, those
+                of ``data`` not.
+            progress: Whether to show a progress bar.
+            max_failures: Number of calls of the oracle, in a row and without any result, that stop
+                it.
+
+        Returns:
+            This collection.
+
+        Raises:
+            TypeError: If the oracle is not callable.
+            ValueError: If a number is out of range.
+            LogError: If the log cannot be written.
+            CollectionError: If the oracle fails too often, or what it returns can be no measured
+                values or cannot be logged: it is in the error's ``result`` then, and the points
+                are still pending.
+
+        Warns:
+            MeasurementWarning: If a measurement fails.
+        """
+        if not callable(oracle):
+            raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
+        check_number(budget, "budget")
+        check_number(max_failures, "max_failures")
+        done, failures = min(budget, self.num_measured), 0
+        with tqdm(total=budget, initial=done, unit="measurement", disable=not progress) as bar:
+            while (left := budget - self.num_measured) > 0:
+                q = min(self.batch_size, left)
+                # After a resumption the points that it was killed at come first.
+                X = self.pending[:q] if len(self.pending) else self.ask(q)
+                known = len(self.X)
+                error = self._measure(oracle, X)
+                bar.update(len(X))
+                bar.set_postfix(failed=len(self.failed_X))
+                failures = 0 if len(self.X) > known else failures + 1
+                if failures >= max_failures:
+                    raise CollectionError(
+                        f"The oracle failed {failures} times in a row, the last time at "
+                        f"{X.tolist()}: {error or 'NaN or infinity'}. {len(self.X)} measurements "
+                        f"are in the error's `.collection`; {self._place()}.",
+                        self,
+                        X,
+                    ) from error
+        return self
+
     def close(self) -> None:
         """Let another collection have the log; :meth:`tell` takes it again, if none has written."""
         if self.log is not None:
@@ -293,11 +388,7 @@ class Collection(Loop):
 
     def _make_model(self, count: int) -> Model:
         """A new model of the first so many measurements."""
-        model = self.model_factory(self.X[:count], self.Y[:count])
-        if not isinstance(model, Model):
-            raise TypeError(
-                f"Expected model_factory(X, Y) to be a BoTorch model, got {type(model).__name__}."
-            )
+        model: Model = make_model(self.model_factory, self.X[:count], self.Y[:count])
         return model
 
     def _previous(self) -> tuple[Any, int]:
@@ -341,3 +432,98 @@ class Collection(Loop):
                 MeasurementWarning,
                 stacklevel=3,
             )
+
+    def _measure(self, oracle: Callable[[Tensor], Any], X: Tensor) -> Exception | None:
+        """Measure points and tell them; return what went wrong."""
+        try:
+            result = oracle(X.clone())
+        except Exception as error:
+            self.fail(X, error)
+            return error
+        try:
+            Y = as_outcomes(result, len(X), self.num_outputs)
+        except (TypeError, ValueError) as error:
+            if self.log is not None:
+                with suppress(LogError):
+                    self.log.append([refusal(X, result, error)])
+            raise CollectionError(
+                f"The oracle returned no measured values of the points {X.tolist()}: {error} It is "
+                f"in this error's `.result`; {self._place()}. The points are still pending: tell() "
+                "`.collection` their values, mend the oracle, and run it again. To say that a "
+                "measurement failed, it may raise an exception or return NaN.",
+                self,
+                X,
+                result,
+            ) from error
+        try:
+            self.tell(X, Y)
+        except LogError as error:
+            message = f"The values measured are in this error's `.result`. {error}"
+            raise CollectionError(message, self, X, result) from error
+        return None
+
+    def _place(self) -> str:
+        """Where the log is."""
+        return "no log was kept" if self.log is None else f"the log is at {self.log.path}"
+
+
+def collect(
+    model_factory: ModelFactory,
+    oracle: Callable[[Tensor], Any],
+    bounds: Tensor | list[list[float]],
+    acquisition: Callable[[Any], AcquisitionFunction],
+    budget: int,
+    *,
+    progress: bool = False,
+    max_failures: int = 5,
+    **options: Any,
+) -> Collection:
+    """Measure where it teaches most, until the budget is spent.
+
+    It makes a :class:`Collection`, lets it :meth:`~Collection.run`, and closes it. With a log the
+    same call goes on where the last one was killed, or with a larger budget.
+
+    Args:
+        model_factory: As of :class:`Collection`.
+        oracle: As of :meth:`Collection.run`.
+        bounds: As of :class:`Collection`.
+        acquisition: As of :class:`Collection`.
+        budget: As of :meth:`Collection.run`.
+        progress: As of :meth:`Collection.run`.
+        max_failures: As of :meth:`Collection.run`.
+        options: The others of :class:`Collection`: ``batch_size``, ``initial``, ``data``,
+            ``num_outputs``, ``fit``, ``optimizer_options``, ``log`` and ``seed``.
+
+    Returns:
+        The collection, with all data in ``X`` and ``Y``, the ``model`` of them, ``failed_X``, and
+        ``ask``, ``tell`` and ``run`` to go on with.
+
+    Raises:
+        TypeError: As :class:`Collection` and :meth:`Collection.run`.
+        ValueError: As both.
+        LogError: As both.
+        CollectionError: As :meth:`Collection.run`; the points in it can be told to its
+            ``collection``.
+
+    Warns:
+        MeasurementWarning: If a measurement fails.
+
+    Example:
+        >>> from functools import partial
+        >>> import torch
+        >>> from gpadjust import CKA
+        >>> from gpadjust.active import collect, qAdjustmentInformationGain
+        >>> result = collect(
+        ...     partial(CKA, physics=torch.sin),
+        ...     oracle=lambda X: 2 * torch.sin(X) + X,
+        ...     bounds=[[0.0], [3.0]],
+        ...     acquisition=qAdjustmentInformationGain,
+        ...     budget=6,
+        ...     batch_size=2,
+        ...     optimizer_options={"num_restarts": 2, "raw_samples": 16},
+        ... )
+        >>> result.Y.shape
+        torch.Size([6, 1])
+    """
+    with Collection(model_factory, bounds, acquisition, **options) as collection:
+        return collection.run(oracle, budget, progress=progress, max_failures=max_failures)

@@ -32,7 +32,7 @@ from gpadjust.control.option_checks import check_fraction, check_whole
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
-from gpadjust.dynamics.trajectory_scores import checked_horizons
+from gpadjust.dynamics.free_run import checked_horizons
 
 _MAX_HOLD = 5  # steps of a random action
 
@@ -393,7 +393,7 @@ class Agent(Resumable, ABC):
         # Of a single state much would look right that is not.
         twice = spec.decode(seen).repeat(2, 1)
         self.episode_length()
-        self.task.rehearse(twice, self.action_bounds().mean(0).expand(2, -1))
+        self.task.try_functions(twice, self.action_bounds().mean(0).expand(2, -1))
         before.restore()
         if self.model is None:
             self._improve()

@@ -6,17 +6,19 @@ import math
 import time
 import warnings
 
+import torch
 from torch import Tensor
 
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.task import Task
-from gpadjust.dynamics import Dynamics, LearnedDynamics
-from gpadjust.dynamics.trajectory_scores import typical_change
+from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
+from gpadjust.dynamics.free_run import typical_change
 from gpadjust.models import TermsModel
 from gpadjust.physics import PhysicsError
 from gpadjust.validation.trust import trust
 
-_WINDOWS = 4  # of each horizon: some half second for a model of an episode
+_WINDOWS = 4  # some half second for a model of an episode
+_FAR = ("nlpd", "coverage", "energy")
 
 
 def learn_dynamics(
@@ -41,34 +43,35 @@ def learn_dynamics(
         ``energy_15`` of a horizon of 15; ``score_seconds``, ``fit_seconds``.
     """
     start, found = time.perf_counter(), {}
-    new = new.learnable(task.dynamics)
+    learnable = new.learnable(task.dynamics)
     if task.dynamics.is_fitted:
         before = time.perf_counter()
-        found = _scores(task, new, recorded, horizons)
+        found = _scores(task, learnable, recorded, horizons)
         found["score_seconds"] = time.perf_counter() - before
-    task.dynamics.update(new.states, new.actions, new.next_states)
+    task.dynamics.update(*learnable)
     found["fit_seconds"] = time.perf_counter() - start - found.get("score_seconds", 0.0)
     return {name: value for name, value in found.items() if not math.isnan(value)}
 
 
 def _scores(
-    task: Task, new: RecordedEpisodes, recorded: RecordedEpisodes, horizons: tuple[int, ...]
+    task: Task, new: Trajectories, recorded: RecordedEpisodes, horizons: tuple[int, ...]
 ) -> dict[str, float]:
     dynamics, spec = task.dynamics, task.dynamics.spec
-    transitions = (new.states, new.actions, new.next_states)
-    score = dynamics.score(*transitions)
+    score = dynamics.score(*new)
     found = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
     names = [spec.states[i] for i in spec.moving]
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
     found["overrides"] = _overrides(dynamics, new.states, new.actions)
-    if not horizons:
+    possible = [k for k in horizons if k <= new.longest]
+    if not possible:
         return found
+    windows = new.windows(possible[-1], stride=1)
+    last = len(windows.actions) - 1
+    windows = windows.some(torch.linspace(0, last, min(last + 1, _WINDOWS)).round().long())
     try:
-        far = dynamics.score_trajectories(
-            *transitions,
-            horizons=horizons,
-            max_windows=_WINDOWS,
-            units=typical_change(spec, recorded.states, recorded.next_states),
+        run = dynamics.free_run(
+            windows.initial_states,
+            windows.actions,
             state_bounds=task.widened(new.states).state_bounds,
         )
     except (NotImplementedError, PhysicsError) as error:  # scores are not worth an episode
@@ -79,12 +82,13 @@ def _scores(
             stacklevel=4,
         )
         return found
-    for i, horizon in enumerate(horizons):
-        found |= {
-            f"nlpd_{horizon}": float(far.nlpd[i].mean()),
-            f"coverage_{horizon}": float(far.coverage[i].mean()),
-            f"energy_{horizon}": float(far.energy[i]),
-        }
+    units = typical_change(spec, recorded.states, recorded.next_states)
+    far = run.score(windows.measured, horizons=possible, units=units)
+    for i, horizon in enumerate(possible):
+        for name in _FAR:
+            values = getattr(far, name)[i]
+            values = values if name == "energy" else values[spec.moving]
+            found[f"{name}_{horizon}"] = float(values.mean())
     return found
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.control.task import Task
-from gpadjust.dynamics import Dynamics
+from gpadjust.dynamics import Dynamics, Trajectories
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 
@@ -48,6 +48,11 @@ class RecordedEpisodes:
         """Number of steps."""
         return len(self.states)
 
+    @property
+    def trajectories(self) -> Trajectories:
+        """States, actions and next states, of which dynamics learn."""
+        return Trajectories(self.states, self.actions, self.next_states, self.episode)
+
     def some(self, rows: Any) -> Self:
         """The steps that an index of rows selects."""
         names = [field.name for field in fields(self)[1:]]
@@ -81,7 +86,7 @@ class RecordedEpisodes:
             found |= {"initial_states": self.draw_starts, "state_bounds": self.bounds()}
         return replace(task, **{k: v for k, v in found.items() if getattr(task, k) is None})
 
-    def learnable(self, dynamics: Dynamics) -> Self:
+    def learnable(self, dynamics: Dynamics) -> Trajectories:
         """All steps but those at which the physics fails.
 
         Raises:
@@ -90,7 +95,7 @@ class RecordedEpisodes:
         works = torch.ones(self.num_transitions, dtype=torch.bool)
         while True:
             try:
-                dynamics.rehearse(self.states[works], self.actions[works])
+                dynamics.try_physics(self.states[works], self.actions[works])
             except PhysicsError as error:
                 rows = works.nonzero().flatten()[list(error.rows)]
                 if not len(rows) or len(rows) == works.sum():
@@ -103,7 +108,7 @@ class RecordedEpisodes:
                 )
                 works[rows] = False
             else:
-                return self.some(works)
+                return self.trajectories.some(works)
 
     def check(self, task: Task, tolerance: float = 1e-3) -> None:
         """Compare the functions of a task with the recorded rewards and terminations.

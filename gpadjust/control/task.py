@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics import Dynamics
-from gpadjust.dynamics.step_or_nan import step_or_nan
+from gpadjust.dynamics.particles import step_or_nan
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rewards ``N`` of states, actions and next states, ``N`` rows each."""
@@ -103,7 +103,7 @@ class Task:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)
 
-    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+    def try_functions(self, states: Tensor, actions: Tensor) -> None:
         """Call physics and functions once, to find what is wrong with them before it costs data.
 
         Args:
@@ -118,7 +118,7 @@ class Task:
             self.draw_initial_states(len(states))
         self.rewards(states, actions, states)
         self.terminations(states)
-        self.dynamics.rehearse(states, actions)
+        self.dynamics.try_physics(states, actions)
 
     def draw_initial_states(self, n: int) -> Tensor:
         """Draw ``n x state_dim`` states at which episodes start.

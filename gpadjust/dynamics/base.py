@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from gpadjust.dynamics.free_run import FreeRun, free_run
-from gpadjust.dynamics.trajectory_scores import TrajectoryScores, score_trajectories
-from gpadjust.dynamics.transition_scores import TransitionScores, score_transitions
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics.state import fingerprint
+from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.models import Prediction
 from gpadjust.states import StateSpec
 from gpadjust.states.state_spec import check_columns
+from gpadjust.validation import Scores
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
@@ -56,10 +56,6 @@ class Dynamics(ABC):
         """Mean and variance of the next states, ``N x state_dim`` each, entry by entry."""
 
     @abstractmethod
-    def sample(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Draw next states, ``N x state_dim``, row by row, from PyTorch's generator."""
-
-    @abstractmethod
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Draw transition *functions*, so that particles stay consistent along a trajectory.
 
@@ -67,6 +63,14 @@ class Dynamics(ABC):
             A deterministic function of states ``k x N x state_dim`` and actions
             ``k x N x action_dim`` to next states, each of the ``k`` blocks by its own draw.
         """
+
+    def sample(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Draw next states, ``N x state_dim``, row by row, from PyTorch's generator.
+
+        Unless dynamics say something else, each entry from its own normal distribution.
+        """
+        mean, variance = self.predict(states, actions)
+        return mean + variance.sqrt() * torch.randn_like(mean)
 
     def mean_function(self) -> TransitionFunctions:
         """The mean of the predictions, as a function of any ``k`` blocks; see `sample_functions`.
@@ -79,8 +83,14 @@ class Dynamics(ABC):
         """What is known of the system before there are transitions; None if that is nothing."""
         return self if self.is_fitted else None
 
-    def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> TransitionScores:
-        """Judge the predictions by transitions that were not learnt from.
+    def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Scores:
+        r"""Judge the predictions by transitions that were not learnt from.
+
+        The outputs are the states that move, in the spec's order; exogenous ones and previous
+        values are left out. The variance of an integrated state is what the dynamics say,
+        :math:`(h / 2)^2` times that of its velocity: the more certain the velocity, the more the
+        trapezoid's own error counts in its ``nlpd`` and ``coverage``. Of a state that has a
+        variance of zero, which says nothing of errors, there are ``rmse`` and ``median`` only.
 
         Args:
             states: ``N x state_dim``.
@@ -92,72 +102,16 @@ class Dynamics(ABC):
             TypeError: If they are not float64 tensors.
             ValueError: If shapes disagree or values are not finite.
         """
-        data = Transitions.checked(self.spec, states, actions, next_states)
-        return score_transitions(self.spec, self.predict(data.states, data.actions), data)
-
-    def score_trajectories(
-        self,
-        states: Tensor,
-        actions: Tensor,
-        next_states: Tensor,
-        *,
-        horizons: Sequence[int] = (1, 5, 15),
-        num_functions: int = 39,
-        max_windows: int | None = 25,
-        units: Tensor | None = None,
-        state_bounds: Tensor | None = None,
-        seed: int = 0,
-    ) -> TrajectoryScores:
-        """Judge predictions many steps ahead by episodes that were not learnt from.
-
-        Episodes are rows one after the other; a new one begins wherever a state is not the next
-        state of the row before. Functions that are drawn from the dynamics follow the recorded
-        actions, from recorded states; see :class:`TrajectoryScores`.
-
-        Args:
-            states: ``N x state_dim``.
-            actions: ``N x action_dim``.
-            next_states: ``N x state_dim``; NaN where an entry was not measured.
-            horizons: Numbers of steps. No episode need be as long.
-            num_functions: Number of functions, one for each particle: 39 or more, best one less
-                than a multiple of 40, with which the interval of 95 % lies at two of them.
-            max_windows: How many windows of each horizon to take, evenly spread over all that
-                there are; None for all. The time is linear in windows, steps and functions.
-            units: What changes of the states are measured in for the energy score, ``state_dim``.
-                Default: the root mean square of their changes from ``states`` to ``next_states``.
-            state_bounds: Lower and upper bounds, ``2 x state_dim``, as of a task: a particle that
-                would leave them stays where it is. Default: none.
-            seed: Seed of functions and noise; PyTorch's generator is left as it is.
-
-        Raises:
-            RuntimeError: If nothing was learnt yet.
-            TypeError: If states, actions or next states are not float64 tensors.
-            ValueError: If shapes disagree, values are not finite, or an option is out of range.
-            PhysicsError: If the physics fails and does not say where.
-
-        Example:
-            >>> import torch
-            >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
-            >>> spec = StateSpec(["x"], ["v"])
-            >>> dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + 0.1 * X[:, 1:])
-            >>> x = torch.arange(9, dtype=torch.float64).unsqueeze(-1)
-            >>> scores = dynamics.score_trajectories(x[:-1], torch.ones_like(x[1:]), x[1:])
-            >>> scores.rmse[:2, 0], scores.num_windows
-            (tensor([0.9000, 4.5000], dtype=torch.float64), tensor([8, 4, 0]))
-        """
-        data = Transitions.checked(self.spec, states, actions, next_states)
-        return score_trajectories(
-            self.spec,
-            self.sample_functions,
-            self.noise_variance,
-            data,
-            horizons=horizons,
-            num_functions=num_functions,
-            max_windows=max_windows,
-            units=units,
-            state_bounds=state_bounds,
-            seed=seed,
+        data, moving = (
+            Trajectories.checked(self.spec, states, actions, next_states),
+            self.spec.moving,
         )
+        mean, variance = self.predict(data.states, data.actions)
+        # Angles the shortest way round.
+        found = (mean + self.spec.change(mean, data.next_states))[:, moving]
+        mean, variance = mean[:, moving], variance[:, moving]
+        says = variance.masked_fill((variance <= 0).any(0), torch.nan)
+        return Scores.of(mean, says, found, output_names=[self.spec.states[i] for i in moving])
 
     def free_run(
         self,
@@ -176,8 +130,7 @@ class Dynamics(ABC):
         """Follow actions from given states, without looking at what is measured on the way.
 
         Functions that are drawn from the dynamics follow the actions; see :class:`FreeRun`.
-        :meth:`Records.windows` has both of measured records, and what ``score`` of the runs is to
-        know.
+        :meth:`Trajectories.windows` has both, and what ``score`` of the runs is to know.
 
         Args:
             initial_states: ``w x state_dim``.
@@ -258,7 +211,7 @@ class Dynamics(ABC):
             f"by variation={variation!r}; {type(self).__name__} has none, or several physics."
         )
 
-    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+    def try_physics(self, states: Tensor, actions: Tensor) -> None:
         """Find what is wrong with the physics before there are transitions, if it can be told.
 
         Args:
@@ -272,21 +225,36 @@ class Dynamics(ABC):
         if self.is_fitted:
             self.predict(states, actions)
 
-    @abstractmethod
     def describe(self) -> dict[str, str]:
-        """What these dynamics are, each setting as a text; of objects, the class."""
+        """What these dynamics are, each setting as a text: unless they say more, class and spec."""
+        return fingerprint(type(self), self.spec)
 
-    @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """All that was learnt, in tensors and plain values; without physics and spec."""
+        """All that was learnt, in tensors and plain values; without physics and spec.
 
-    @abstractmethod
+        Raises:
+            NotImplementedError: If dynamics of a class of your own do not say it.
+        """
+        raise NotImplementedError(self._not_saved)
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take back what :meth:`state_dict` gave; predictions and later fits are the same."""
+        """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
 
-    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Transitions:
+        Raises:
+            NotImplementedError: As :meth:`state_dict`.
+        """
+        raise NotImplementedError(self._not_saved)
+
+    @property
+    def _not_saved(self) -> str:
+        return (
+            f"{type(self).__name__} cannot be saved or loaded. Give it state_dict() and "
+            "load_state_dict(state), or do without checkpoints."
+        )
+
+    def _checked(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Trajectories:
         """Transitions that are what the spec says."""
-        data = Transitions.checked(self.spec, states, actions, next_states)
+        data = Trajectories.checked(self.spec, states, actions, next_states)
         self.spec.check_transitions(data.states, data.next_states, data.actions)
         return data
 

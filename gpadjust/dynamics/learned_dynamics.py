@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
-from gpadjust.dynamics.incremental_fit import (
+from gpadjust.dynamics.learning import (
     DynamicsFitOptions,
-    check_observed,
+    Learnt,
+    ModelFactory,
+    Recipe,
+    check_enough_observed,
     checked_fit_options,
-    fit_all,
     kept,
+    made_by,
 )
-from gpadjust.dynamics.learnt import Learnt, LearntState
-from gpadjust.dynamics.model_recipe import ModelRecipe
-from gpadjust.dynamics.next_state_physics import check_physics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
-from gpadjust.dynamics.transition_physics import Target, TransitionTargets
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics.state import LearntState, check_fingerprint, fingerprint
+from gpadjust.dynamics.targets import Target, Targets, check_physics
 from gpadjust.dynamics.varying_parameters import VaryingParameters
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
@@ -48,17 +47,17 @@ class LearnedDynamics(Dynamics):
             from these and the actions: columns ``[states, actions]`` in the order of the spec,
             angles in rad. Several: a list, or a dictionary with their names, as of
             :class:`~gpadjust.CKA`. None for a model without physics.
-        model: The class of the model: :class:`~gpadjust.CKA`, another one of
-            :mod:`gpadjust.models` (:class:`~gpadjust.ZeroMeanGP` is the one without physics), or
-            your own.
+        model: Makes the model from ``(X, Y, physics=...)``: :class:`~gpadjust.CKA`, another class
+            of :mod:`gpadjust.models` (:class:`~gpadjust.ZeroMeanGP` is the one without physics),
+            your own, or a function. Further arguments by ``functools.partial``, such as
+            ``partial(RRA, num_features=128)``; a kernel among them may be a function of the number
+            of inputs and the batch shape that makes it, one that is a module is copied for each
+            fit. A function gets ``input_transform``, too, where the state has angles.
         target: What the model learns: the ``"difference"`` of next state and state, of an angle
             the shortest way round, or the next state itself (``"absolute"``). A scaling of an
             absolute position or angle depends on where its origin is; one of a change does not.
         encode_angles: Whether the model reads the sine and cosine of angles; the physics always
             reads the angles.
-        model_options: Further arguments of the model, such as ``rho_mean`` of CKA or
-            ``num_features`` of RRA. A kernel may be a function of the number of inputs and the
-            batch shape that makes it; one that is a module is copied for each fit.
         fit_options: Options of the search that :func:`gpadjust.fit` makes at the first fit, and of
             all fits ``method``, ``num_samples``, ``num_draws`` and ``seed``. By default the
             hyper-parameters are sampled, and what is predicted has their uncertainty, too;
@@ -67,8 +66,8 @@ class LearnedDynamics(Dynamics):
             even one. Fewer are faster: 256 for a policy search, whose functions are many.
 
     Raises:
-        TypeError: If an argument is of another type, or the model needs a physics that is missing
-            or takes none that is given.
+        TypeError: If an argument is of another type, or ``model`` needs a physics (or another
+            argument) that is missing, or takes none that is given.
         ValueError: If ``target`` or an option is unknown, a number is none of those above, or a
             physics returns the change of the state.
 
@@ -89,10 +88,9 @@ class LearnedDynamics(Dynamics):
         spec: StateSpec,
         physics: PhysicsLike | None = None,
         *,
-        model: type[TermsModel] = CKA,
+        model: ModelFactory = CKA,
         target: Target = "difference",
         encode_angles: bool = True,
-        model_options: Mapping[str, Any] | None = None,
         fit_options: DynamicsFitOptions | None = None,
         num_features: int = 1024,
     ) -> None:
@@ -100,11 +98,12 @@ class LearnedDynamics(Dynamics):
         check_num_features(num_features)
         if not isinstance(encode_angles, bool):
             raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
-        self.targets = TransitionTargets(spec, target)
+        self.targets = Targets(spec, target)
         self.physics = None if physics is None else check_physics(physics, spec)
         self.encode_angles = encode_angles
         self.fit_result: FitResult | SampleResult | None = None
-        self._recipe = ModelRecipe(self.targets, self.physics, model, model_options, encode_angles)
+        self.make_model = model
+        self._recipe = Recipe(self.targets, self.physics, model, encode_angles)
         self.fit_options = checked_fit_options(fit_options, model)
         self.num_features = num_features
         self._learnt: Learnt | None = None
@@ -122,27 +121,19 @@ class LearnedDynamics(Dynamics):
         return self._known_so_far().model
 
     @property
-    def model_class(self) -> type[TermsModel]:
-        """The class of the model."""
-        return self._recipe.model_class
-
-    @property
-    def model_options(self) -> dict[str, Any]:
-        """Further arguments of the model."""
-        return self._recipe.options
-
-    @property
     def num_transitions(self) -> int:
         """Number of transitions that it has learnt from."""
         return 0 if self._learnt is None else len(self._learnt.data.states)
 
-    def fit(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Learn from these transitions only, by a full search of the hyper-parameters.
+    def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
+        """Learn from further transitions, beside the earlier ones.
 
-        If this raises an error, what was learnt before stands; so it does in all methods below.
+        The hyper-parameters are searched for anew at first and whenever the number of transitions
+        has doubled since the last search; else they are fitted again from where they were. If this
+        raises an error, what was learnt before stands; so it does in all methods below.
 
         Args:
-            states: ``N x state_dim``, with ``N >= 2``.
+            states: ``N x state_dim``.
             actions: ``N x action_dim``.
             next_states: ``N x state_dim``; NaN where an entry was not measured: each state is
                 learnt from its own rows.
@@ -150,45 +141,29 @@ class LearnedDynamics(Dynamics):
         Raises:
             TypeError: If they are not float64 tensors.
             ValueError: If shapes disagree, values are not finite, a row of next states is NaN in
-                all that the model predicts, there are fewer than 2 rows of a state, or states are
-                not what the spec says (:meth:`StateSpec.check_transitions`).
+                all that the model predicts, there are fewer than 2 rows of a state in all, or
+                states are not what the spec says (:meth:`StateSpec.check_transitions`).
             PhysicsError: If the physics fails.
         """
         data = self._checked(states, actions, next_states)
-        self._learn(data, self._recipe.physics_at(data), None)
+        known, previous = self._recipe.physics_at(data.states, data.actions), self._learnt
+        if previous is not None:
+            data, known = previous.with_rows(data, known)
+        check_enough_observed(self.spec, data)
+        with self._recipe.restored_on_error():
+            if previous is None and not self._compared:
+                self._recipe.compare_physics(data, known)
+            self._recipe.tell_physics(data, known)
+            model, result, searched_at = self._recipe.fit(data, previous, self.fit_options)
+            if self._recipe.physics_learns:
+                known = self._recipe.physics_at(data.states, data.actions)
+        self._compared = self._compared or previous is None
+        self.fit_result = result
+        self._learnt = Learnt(data, known, (len(data.states),), searched_at, model, model)
 
-    def update(
-        self, states: Tensor, actions: Tensor, next_states: Tensor, *, refit: bool = True
-    ) -> None:
-        """Learn from further transitions, beside the earlier ones.
-
-        The hyper-parameters are fitted again from where they were, and searched for anew whenever
-        the number of transitions has doubled since the last search.
-
-        Args:
-            states: ``N x state_dim``.
-            actions: ``N x action_dim``.
-            next_states: ``N x state_dim``; NaN as in :meth:`fit`.
-            refit: Whether to fit the hyper-parameters again; if not, the model is conditioned on
-                the new transitions with those that it has (:meth:`condition`).
-
-        Raises:
-            TypeError: As :meth:`fit`.
-            ValueError: As :meth:`fit`; two rows in all will do.
-            PhysicsError: As :meth:`fit`.
-        """
-        if not refit and self.is_fitted:
-            self.condition(states, actions, next_states)
-            return
-        data = self._checked(states, actions, next_states)
-        known = self._recipe.physics_at(data)
-        if self._learnt is not None:
-            data, known = self._learnt.with_rows(data, known)
-        self._learn(data, known, self._learnt)
-
-    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+    def try_physics(self, states: Tensor, actions: Tensor) -> None:
         """Call the physics once, to find what is wrong with it before there are transitions."""
-        self._recipe.physics_at(Transitions(states, actions, states))
+        self._recipe.physics_at(states, actions)
 
     def condition(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Condition on further transitions with the hyper-parameters as they are.
@@ -201,7 +176,7 @@ class LearnedDynamics(Dynamics):
         """
         before = self._known_so_far()
         new = self._checked(states, actions, next_states)
-        data, known = before.with_rows(new, self._recipe.physics_at(new))
+        data, known = before.with_rows(new, self._recipe.physics_at(new.states, new.actions))
         self._learnt = before._replace(
             data=data,
             known=known,
@@ -309,12 +284,13 @@ class LearnedDynamics(Dynamics):
             several["unknowns"] = {name: repr(u) for name, u in self.physics.unknowns.items()}
         later = {k: v for k, v in kept(self.fit_options).items() if v is not None}
         return fingerprint(
-            self,
-            model=self.model_class,
+            type(self),
+            self.spec,
+            model=made_by(self.make_model),
             **several,
             target=self.targets.target,
             encode_angles=self.encode_angles,
-            model_options=self.model_options,
+            model_options=getattr(self.make_model, "keywords", {}),
             **{"method": None, **later},
         )
 
@@ -350,12 +326,12 @@ class LearnedDynamics(Dynamics):
         )
         with self._recipe.restored_on_error():
             self._recipe.tell_physics(data, known)
-            model = self._recipe.build(data.rows(0, chunks[0]), quiet=True)
+            model = self._recipe.build(data.some(slice(chunks[0])), quiet=True)
             model.load_state_dict(parameters)
             self._recipe.check_same_physics(data, known)
             fitted, start = model.eval(), chunks[0]
             for size in chunks[1:]:
-                model = self._recipe.condition(model, data.rows(start, start + size))
+                model = self._recipe.condition(model, data.some(slice(start, start + size)))
                 start += size
         self._learnt = Learnt(data, known, chunks, searched_at, fitted, model)
         self.fit_result = None
@@ -380,19 +356,6 @@ class LearnedDynamics(Dynamics):
             return step
 
         return sample_functions
-
-    def _learn(self, data: Transitions, known: Tensor | None, previous: Learnt | None) -> None:
-        check_observed(self.spec, data)
-        with self._recipe.restored_on_error():
-            if previous is None and not self._compared:
-                self._recipe.compare_physics(data, known)
-            self._recipe.tell_physics(data, known)
-            model, result, searched_at = fit_all(self._recipe, data, previous, self.fit_options)
-            if self._recipe.physics_learns:
-                known = self._recipe.physics_at(data)
-        self._compared = self._compared or previous is None
-        self.fit_result = result
-        self._learnt = Learnt(data, known, (len(data.states),), searched_at, model, model)
 
     def _known_so_far(self) -> Learnt:
         if self._learnt is None:

@@ -1,16 +1,87 @@
-"""What a cloud of particles says: its centre, what a measurement adds, and intervals."""
+"""Particles: how they move, their center, the noise of a measurement, and intervals."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from gpadjust.models.sampled_functions import check_number
+from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 
+_AT_ONCE = 8  # windows whose particles move together: more leave the cache, at half the speed
 _ROUNDING = 1e-9  # of a number of particles
+
+Move = Callable[[Tensor, Tensor], Tensor]
+
+
+def step_or_nan(
+    move: Callable[[Tensor, Tensor], Tensor],
+    states: Tensor,
+    actions: Tensor,
+    *,
+    some_must_succeed: bool = False,
+) -> Tensor:
+    """The next states ``N x state_dim``; not finite where the physics fails.
+
+    Args:
+        move: A model, from states and actions to next states.
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+        some_must_succeed: Whether it is an error that the physics fails for all of them.
+
+    Raises:
+        PhysicsError: If the physics does not say where it fails; or fails everywhere, though it
+            must not.
+    """
+    states, actions = states.clone(), actions.clone()
+    failed = torch.zeros(len(states), dtype=torch.bool)
+    while True:
+        try:
+            following = move(states, actions)
+        except PhysicsError as error:
+            known = failed.clone()
+            failed[list(error.rows)] = True
+            if (failed == known).all() or (failed.all() and some_must_succeed):
+                raise  # it does not say where, or blames what has another place now
+            if failed.all():
+                return torch.full_like(states, torch.nan)
+            # They are evaluated with the others, at a place where the physics does not fail.
+            working = int((~failed).nonzero()[0])
+            place = states[working].clone(), actions[working].clone()  # not of what is written
+            states[failed], actions[failed] = place
+        else:
+            return following.masked_fill(failed.unsqueeze(-1), torch.nan)
+
+
+def move_on(
+    functions: Move, particles: Tensor, lost: Tensor, actions: Tensor, bounds: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Particles a step later, and which are lost by then; a lost one stays where it was.
+
+    Args:
+        functions: Functions of states ``K x n x ...`` and actions to next states.
+        particles: ``K x w x state_dim``.
+        lost: Which of them are lost already, ``K x w`` booleans.
+        actions: ``w x action_dim``.
+        bounds: Lower and upper ones of the states, ``2 x state_dim``.
+    """
+
+    def move(states: Tensor, actions: Tensor) -> Tensor:
+        blocks = (rows.unflatten(0, (len(particles), -1)) for rows in (states, actions))
+        parts = zip(*(block.split(_AT_ONCE, dim=1) for block in blocks), strict=True)
+        return torch.cat([functions(*part) for part in parts], dim=1).flatten(0, 1)
+
+    actions = actions.expand(len(particles), -1, -1)
+    after = step_or_nan(move, particles.flatten(0, 1), actions.flatten(0, 1)).view_as(particles)
+    fails = ~after.isfinite().all(-1)
+    if bounds is not None:
+        fails |= ((after < bounds[0]) | (after > bounds[1])).any(-1)
+    lost = lost | fails
+    return torch.where(lost.unsqueeze(-1), particles, after), lost
 
 
 def about_centre(spec: StateSpec, particles: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,3 +136,22 @@ def _order_statistic(sample: Tensor, level: float) -> Tensor:
     place = level * (len(sample) + 1) - 1
     below = min(max(int(place), 0), len(sample) - 2)
     return ordered[below].lerp(ordered[below + 1], min(max(place - below, 0.0), 1.0))
+
+
+def of_states(values: Tensor, name: str, shape: tuple[int, ...]) -> Tensor:
+    """The user's numbers, one or more for each state, in float64.
+
+    Raises:
+        TypeError: If they are no numbers.
+        ValueError: If they are not of that shape.
+    """
+    try:
+        values = torch.as_tensor(values, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"Expected {name} as a tensor of numbers, got {values!r}.") from error
+    if values.shape != shape:
+        raise ValueError(
+            f"Expected {name} of shape {' x '.join(map(str, shape))}, an entry for each state, got "
+            f"shape {tuple(values.shape)}."
+        )
+    return values

@@ -9,14 +9,8 @@ import torch
 from torch import Tensor
 
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.fingerprint import check_fingerprint, fingerprint
-from gpadjust.dynamics.next_state_physics import (
-    check_physics,
-    next_values,
-    parts_of,
-    warn_of_differences,
-)
-from gpadjust.dynamics.physics_probes import PhysicsProbes
+from gpadjust.dynamics.state import PhysicsProbes, check_fingerprint, fingerprint
+from gpadjust.dynamics.targets import check_physics, next_values, parts_of, warn_of_differences
 from gpadjust.models import Prediction
 from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import Physics
@@ -113,7 +107,7 @@ class PhysicsDynamics(Dynamics):
 
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text."""
-        return fingerprint(self)
+        return fingerprint(type(self), self.spec)
 
     def state_dict(self) -> dict[str, Any]:
         """What these dynamics are, and what the physics said of the first transitions."""

@@ -4,7 +4,7 @@ from gpadjust.inference.bayes import SampleResult, SamplingWarning
 from gpadjust.inference.calibrate import ParameterWarning
 from gpadjust.inference.fitting import FitOptions, fit
 from gpadjust.inference.optimise import FitResult
-from gpadjust.models.parameters import register_priors
+from gpadjust.inference.priors import register_priors
 
 __all__ = [
     "FitOptions",

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-_DEGREES = 5  # of freedom: tails that are wider than those of what is sampled, as a rule
 _HALVINGS = 30  # of an interval of logarithms, for the power at which enough draws count
 _LEAST_STEP = 1e-12  # of the power
 _LEAST = 0.5  # of the particles, that count after each change of the power
@@ -51,34 +50,6 @@ class Proposal(Protocol):
         ...
 
 
-class Normal(NamedTuple):
-    """Independent normal distributions.
-
-    Attributes:
-        mean: ``B x p``.
-        sd: ``B x p``.
-    """
-
-    mean: Tensor
-    sd: Tensor
-
-    def sample(self, number: int, generator: torch.Generator) -> Tensor:
-        """Draw ``number x B x p``."""
-        shape = (number, *self.mean.shape)
-        normal = torch.randn(shape, generator=generator, dtype=self.mean.dtype).to(self.mean)
-        return self.mean + self.sd * normal
-
-    def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
-        white = (positions - self.mean) / self.sd
-        constant = (self.sd.log() + 0.5 * math.log(2 * math.pi)).sum(-1)
-        return constant + 0.5 * white.square().sum(-1), white / self.sd
-
-    def covariance(self) -> Tensor:
-        """Of each problem, ``B x p x p``."""
-        return torch.diag_embed(self.sd.square())
-
-
 class Particles(NamedTuple):
     """Equally likely draws, in two halves by turns that tell nothing of each other.
 
@@ -103,84 +74,6 @@ class Particles(NamedTuple):
         variance = self.positions.var(0).clamp_min(torch.finfo(away.dtype).tiny)
         n = len(self.positions)
         return n / (n * away.square() / (4 * variance)).mean(-1).clamp_min(1.0)
-
-
-class Mixture(NamedTuple):
-    """Mixtures of Student's t distributions, to draw from.
-
-    Attributes:
-        centres: ``k x B x p``.
-        weights: ``k x B``, which sum to one.
-        root: Roots of their shapes, lower triangular, ``k x B x p x p``.
-    """
-
-    centres: Tensor
-    weights: Tensor
-    root: Tensor
-
-    def sample(self, number: int, generator: torch.Generator) -> Tensor:
-        """Draw ``number x B x p``, of which the first is the first centre."""
-        problems, p = self.centres.shape[1:]
-        which = torch.multinomial(
-            self.weights.mT.cpu(), number, replacement=True, generator=generator
-        ).mT.to(self.centres.device)
-        shape = (number, problems, p + _DEGREES)
-        normal = torch.randn(shape, generator=generator, dtype=self.root.dtype).to(self.root)
-        white = normal[..., :p] / normal[..., p:].square().mean(-1, keepdim=True).sqrt()
-        every = torch.arange(problems, device=which.device)
-        away = self.root[which, every] @ white.unsqueeze(-1)
-        found = self.centres[which, every] + away.squeeze(-1)
-        found[0] = self.centres[0]
-        return found
-
-    def covariance(self) -> Tensor:
-        """That of the shape of the first, ``B x p x p``."""
-        return self.root[0] @ self.root[0].mT
-
-    def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
-        p = positions.shape[-1]
-        away = positions.unsqueeze(1) - self.centres  # N x k x B x p
-        white = torch.linalg.solve_triangular(self.root, away.unsqueeze(-1), upper=False)
-        square = white.square().sum((-1, -2))
-        log_size = self.root.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1)
-        log_part = self.weights.log() - log_size
-        log_part = log_part - 0.5 * (_DEGREES + p) * torch.log1p(square / _DEGREES)
-        pull = log_part.softmax(1) * (_DEGREES + p) / (_DEGREES + square)
-        back = torch.linalg.solve_triangular(self.root.mT, white, upper=True).squeeze(-1)
-        at_centre = math.lgamma((_DEGREES + p) / 2) - math.lgamma(_DEGREES / 2)
-        at_centre -= 0.5 * p * math.log(_DEGREES * math.pi)
-        return -log_part.logsumexp(1) - at_centre, (pull.unsqueeze(-1) * back).sum(1)
-
-
-class Both(NamedTuple):
-    """Mixtures of two proposals, half of each.
-
-    Attributes:
-        first: One of them, of whose covariance the mixture is taken to be.
-        second: The other.
-    """
-
-    first: Proposal
-    second: Proposal
-
-    def sample(self, number: int, generator: torch.Generator) -> Tensor:
-        """Draw ``number x B x p``."""
-        half = number // 2
-        parts = (self.first.sample(number - half, generator), self.second.sample(half, generator))
-        order = torch.randperm(number, generator=generator).to(parts[0].device)
-        return torch.cat(parts)[order]
-
-    def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
-        parts = [each.value_and_gradient(positions) for each in self]
-        values, gradients = (torch.stack(each) for each in zip(*parts, strict=True))
-        share = (-values).softmax(0).unsqueeze(-1)
-        return math.log(2) - (-values).logsumexp(0), (share * gradients).sum(0)
-
-    def covariance(self) -> Tensor:
-        """That of the first, ``B x p x p``."""
-        return self.first.covariance()
 
 
 class _State(NamedTuple):

@@ -13,21 +13,19 @@ import torch
 from torch import Tensor
 
 from gpadjust.inference import annealing
-from gpadjust.inference.annealing import Both, Mixture, Normal, Particles, Proposal
+from gpadjust.inference.annealing import Particles, Proposal
 from gpadjust.inference.calibrate import calibrate_roughly, warn_of_parameters
-from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise, optima
+from gpadjust.inference.optimise import MANY, NOWHERE, Search, maximise
 from gpadjust.inference.parameter_draws import draw_parameters
+from gpadjust.inference.priors import LogPriors, register_priors
+from gpadjust.inference.proposals import Both, Normal, around_optima
 from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.representative import LeftOut, disagreement, left_out, representative
 from gpadjust.inference.targets import LogPosterior
+from gpadjust.inference.vectors import Parameters
 from gpadjust.models import TermsGP, TermsModel
-from gpadjust.models.parameters import Parameters, register_priors, shared_parameters
+from gpadjust.models.parameters import shared_parameters
 
-_STEP = 0.1  # of differences, in logarithms
-_WIDEST = 4.0  # standard deviation of Laplace's approximation, in logarithms
-_MODES = 6  # optima that draws begin around, at most
-_APART = 0.5  # by which these differ in some logarithm
-_EACH = 0.1  # of the draws that all of them share
 _DRAWS = (128, 1024)  # the least and the most by default
 _COST = 5_120_000  # draws times observations squared
 _COST_OF_PARTICLES = 2500  # particles times observations
@@ -36,7 +34,6 @@ _MOST_PARTICLES = 128
 _GRADIENTS = 100  # of each particle, at most
 _STARTS = (8, 128)  # of the search, and how many are screened for them
 _STARTS_OF_RIVAL = (4, 64)  # the same of the model without its physics
-_ITERATIONS = 30  # of it, as the draws go on from where it got
 _LEAST_WEIGHED = 3  # observations of an output, for the physics to be weighed by them
 _DECISIVE = 5.0  # difference of log evidences that needs no closer look
 _SAMPLES = {40: 16, 100: 8, math.inf: 4}  # that a model holds, of up to so many observations
@@ -349,10 +346,11 @@ def _draw(
     takes fewer starts, and rough draws do where it is far behind.
     """
     n, starts = target.num_points, _STARTS if rival is None else _STARTS_OF_RIVAL
-    around, rough = _around_optima(target, search, starts)
-    proposal: Proposal = around
-    if n <= MANY:
-        proposal = Both(Normal(*target.prior_moments()), around)
+    around, rough = around_optima(target, search, starts)
+    proposals: list[Proposal] = [around]
+    if n <= MANY:  # of the prior all draws may have no density
+        prior = LogPriors(target.model, target.parameters, of_logs=True)
+        proposals.insert(0, Both(Normal(*prior.moments()), around))
     is_far = rival is not None and bool((rough < rival - _DECISIVE).all())
     # On the way, what the search has found may show only late.
     enough = rival - _DECISIVE if rival is not None and bool((rough < rival).all()) else None
@@ -360,54 +358,8 @@ def _draw(
     number = max(_LEAST_PARTICLES, 2 * round(0.5 * most * num_draws / _default_num_draws(n)))
     gradients = 0 if is_far or n > MANY else _GRADIENTS * number
     num_draws += num_draws % 2  # halves are by turns
-    for begin in (proposal, around):  # of the prior all draws may have no density
+    for proposal in proposals:
         with suppress(FloatingPointError):
-            given = (target, begin, num_draws, number, gradients, generator, enough)
+            given = (target, proposal, num_draws, number, gradients, generator, enough)
             return _Draws(target, annealing.sample(*given), rough)
     raise RuntimeError(NOWHERE)
-
-
-def _around_optima(
-    target: LogPosterior, search: Search, starts: tuple[int, int]
-) -> tuple[Mixture, Tensor]:
-    """Laplace's approximation around all optima that the search finds, with wider tails.
-
-    And the log evidence by it, ``B``.
-    """
-    number, screened = starts
-    search = search._replace(
-        num_starts=search.num_starts or number,
-        num_screened=screened if search.num_screened is None else search.num_screened,
-        max_iterations=min(search.max_iterations, _ITERATIONS),
-    )
-    centres, values = optima(target, search)
-    values, order = values.to(centres).sort(dim=0)
-    centres = centres.gather(0, order.unsqueeze(-1).expand_as(centres))
-    near = (centres.unsqueeze(1) - centres).abs().amax(-1) < _APART  # k x k x B
-    again = torch.stack([row[:i].any(0) for i, row in enumerate(near)])  # k x B
-    first = again.to(centres).argsort(dim=0, stable=True)[:_MODES]
-    centres = centres.gather(0, first.unsqueeze(-1).expand(-1, -1, centres.shape[-1]))
-    values, again = values.gather(0, first), again.gather(0, first)
-    root = laplace_root(target, centres)
-    log_share = root.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1) - values
-    log_share = log_share.masked_fill(again, -math.inf)
-    even = ~again / (~again).sum(0)
-    log_evidence = log_share.logsumexp(0) + 0.5 * centres.shape[-1] * math.log(2 * math.pi)
-    weights = (1 - _EACH) * log_share.softmax(0) + _EACH * even
-    return Mixture(centres, weights, root), log_evidence
-
-
-def laplace_root(target: LogPosterior, optima: Tensor) -> Tensor:
-    """Roots of the covariances of Laplace's approximation at optima ``k x B x p``.
-
-    Lower triangular, ``k x B x p x p``.
-    """
-    k, _, p = optima.shape
-    step = _STEP * torch.eye(p).to(optima)[:, None, None]
-    points = torch.cat([optima + step, optima - step]).flatten(0, 1)
-    _, gradient = target.value_and_gradient(points)
-    up, down = gradient.unflatten(0, (2 * p, k)).chunk(2)
-    hessian = (up - down).movedim(0, -2) / (2 * _STEP)
-    values, vectors = torch.linalg.eigh(0.5 * (hessian + hessian.mT))
-    root = vectors * values.clamp_min(_WIDEST**-2).rsqrt().unsqueeze(-2)
-    return torch.linalg.qr(root.mT).R.mT

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.inference.priors import LogPriors
+from gpadjust.inference.vectors import Parameters
 from gpadjust.models import TermsGP, VariationalCKA
-from gpadjust.models.parameters import LogPriors, Parameters
 from gpadjust.models.sparse_conditioning import inducing_root
 
 _Pair = tuple[Tensor, Tensor]

@@ -17,8 +17,9 @@ from botorch.optim.batched_lbfgs_b import fmin_l_bfgs_b_batched
 from torch import Tensor
 
 from gpadjust.gp import AppendedPhysics
-from gpadjust.inference.targets import LogLikelihood, MarginalizedParameters, Target
-from gpadjust.models.parameters import Parameters, magnitude
+from gpadjust.inference.distributions import MarginalizedParameters
+from gpadjust.inference.targets import LogLikelihood, Target
+from gpadjust.inference.vectors import Parameters, magnitude
 
 _TOLERANCE = 1e-8  # relative decrease of the target below which L-BFGS stops
 _RESTARTS = 3  # of runs that ended without convergence

@@ -8,9 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.inference.annealing import Mixture, Particles, raised, resampled
-from gpadjust.inference.calibrate import Calibrated, Calibration, LinearizedMean, spread_normal
-from gpadjust.models.parameters import Parameters
+from gpadjust.inference.annealing import Particles, raised, resampled
+from gpadjust.inference.calibrate import Calibrated
+from gpadjust.inference.calibration import Calibration, LinearizedMean
+from gpadjust.inference.least_squares import spread_normal
+from gpadjust.inference.proposals import Mixture
+from gpadjust.inference.vectors import Parameters
 
 _GIVEN = {128: 256, 512: 64, math.inf: 16}  # hyper-parameters of up to so many observations
 _ENOUGH = 512  # effective sample size of the parameters that is enough

@@ -16,8 +16,8 @@ from gpadjust.inference.calibrate import calibrate
 from gpadjust.inference.collapsed_bound import CollapsedBound, Observations
 from gpadjust.inference.optimise import FitResult, Search, centers_at_rest, maximise, optimise
 from gpadjust.inference.unexplained import unexplained
+from gpadjust.inference.vectors import Parameters
 from gpadjust.models import TermsGP, VariationalCKA
-from gpadjust.models.parameters import Parameters
 from gpadjust.models.variational_cka import NOTHING
 
 _REFINED = 20_000  # observations by which hyper-parameters are refined

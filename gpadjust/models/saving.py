@@ -7,7 +7,7 @@ import warnings
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from gpytorch.kernels import Kernel
@@ -21,7 +21,21 @@ from gpadjust.physics.import_path import import_path, physics_from_path
 _FORMAT = 3
 
 
-def save(model: TermsModel | StackedGP, path: str | Path) -> None:
+class Saved(NamedTuple):
+    """What :func:`save` wrote.
+
+    Attributes:
+        path: The file.
+        physics: The import paths by which :func:`load` finds the physics.
+        missing: The arguments that :func:`load` has to be given, as the file could not hold them.
+    """
+
+    path: Path
+    physics: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+def save(model: TermsModel | StackedGP, path: str | Path) -> Saved:
     """Save a model: data, settings, hyper-parameters (or samples of them), and names.
 
     The physics is saved by its import path, if it is a function or object of a module. What cannot
@@ -30,6 +44,9 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
     Args:
         model: The model.
         path: The file, which ``torch.load`` reads with ``weights_only=True``.
+
+    Returns:
+        What the file holds of the physics, and what it could not hold.
 
     Warns:
         UserWarning: If another program cannot import the physics: a lambda, or one of a script.
@@ -46,10 +63,10 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
         >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
         >>> model = CKA(X, 2 * silu(X) + X, physics=silu)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(model, f"{folder}/model.pt")
+        ...     saved = save(model, f"{folder}/model.pt")
         ...     again = load(f"{folder}/model.pt")
-        >>> torch.equal(again.posterior(X).mean, model.posterior(X).mean)
-        True
+        >>> saved.missing, torch.equal(again.posterior(X).mean, model.posterior(X).mean)
+        ((), True)
     """
     if not isinstance(path, str | Path):
         raise TypeError(f"Expected path as the name of a file, got {path!r}.")
@@ -59,9 +76,10 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
         raise ValueError(f"The path {str(path)!r} is {what}.")
     content = content_of(model)
     models = content["models"].values() if "models" in content else [content]
-    names = [name for each in models for name in (each["physics"] or {}).values()]
+    names = {name for each in models for name in (each["physics"] or {}).values()}
+    missing = {name for each in models for name in each["missing"]}
     if any(name is None or name.startswith("__main__:") for name in names):
-        asked = {"physics", *(name for each in models for name in each["missing"])}
+        asked = {"physics", *missing}
         warnings.warn(
             f"The physics of {path.name} is a lambda, or of the running script, so that other "
             "programs cannot import it. They give it again, "
@@ -74,6 +92,7 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> None:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+    return Saved(path, tuple(sorted(names - {None})), tuple(sorted(missing)))
 
 
 def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:

@@ -7,6 +7,6 @@ except ImportError as error:
         'gpadjust.report needs matplotlib; run `pip install "gpadjust[plot]"`.'
     ) from error
 
-from gpadjust.report.writing import report
+from gpadjust.report.page import report
 
 __all__ = ["report"]

@@ -11,13 +11,19 @@ from pathlib import Path
 
 from gpadjust.inference import fit
 from gpadjust.models import CKA, TermsGP
-from gpadjust.report.csv_data import CsvData, names_of, noise_variances, pairs, read_csv
-from gpadjust.report.named_physics import NamedPhysics, named_physics
-from gpadjust.report.numbers import listed, plural
-from gpadjust.report.provenance import Origin
+from gpadjust.report.inputs import (
+    CsvData,
+    NamedPhysics,
+    named_physics,
+    names_of,
+    noise_variances,
+    pairs,
+    read_csv,
+)
+from gpadjust.report.markup import listed, plural
+from gpadjust.report.page import checked_path, write
+from gpadjust.report.sections import Origin, headline
 from gpadjust.report.subject import subject_of
-from gpadjust.report.verdict import headline
-from gpadjust.report.writing import checked_path, write
 from gpadjust.validation import Comparison, compare
 
 

@@ -11,9 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gpadjust.physics import PhysicsError
-from gpadjust.report.images import image
-from gpadjust.report.markup import Markup
-from gpadjust.report.numbers import number, with_unit
+from gpadjust.report.markup import Markup, image, number, with_unit
 from gpadjust.report.subject import Subject
 from gpadjust.validation.plots import (
     plot_adjustment,

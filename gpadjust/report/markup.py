@@ -1,11 +1,46 @@
-"""HTML by function calls: balanced, and with every text escaped."""
+"""HTML by function calls, balanced and with every text escaped: words, numbers and figures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+import re
+import warnings
+from base64 import b64encode
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
+from io import BytesIO
+from typing import Any
+from urllib.parse import quote
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from gpadjust.physics import PhysicsError
 
 _VOID = ("img", "meta", "br")
+_UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]*)\]", flags=re.DOTALL)
+_SHOWN = 3
+_STYLE: dict[str, Any] = {
+    "font.size": 9.5,
+    "axes.labelsize": 9.5,
+    "axes.titlesize": 9.5,
+    "axes.linewidth": 0.7,
+    "legend.fontsize": 8.5,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "gpadjust",
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+_LARGE = 70_000  # characters, above which a figure of many points is smaller as pixels
+_PLAIN = " <>='/:;,.()!*+@$-_{}\n"  # what a URL between double quotes may have as it is
+_NEEDLESS = re.compile(
+    r"^.*?(?=<svg )|<!--.*?-->|<metadata>.*?</metadata>|(?<=>)\s+(?=<)|(?<=<g) id=\"[^\"]*\"",
+    flags=re.DOTALL,
+)
+_OF_FONTS = "Glyph .* missing|Matplotlib currently does not support"  # names in any script
+_PATH = re.compile(r"\b(?:d|x|y)='[^']*'")
+_SPACE = re.compile(r"\s*\n?([MLQCz])\s*")
+_BEHIND = re.compile(r"(\.\d\d)\d+")  # hundredths of a point are more than a screen shows
 
 
 class Markup(str):
@@ -79,3 +114,83 @@ def bullets(items: Iterable[str]) -> Markup:
 def code(text: str) -> Markup:
     """A block of code."""
     return tag("div", tag("pre", tag("code", text)), class_="scroll", tabindex="0")
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with some significant digits, without an exponent where it can be read so."""
+    if not math.isfinite(value):
+        return "none" if math.isnan(value) else f"{value:g}"
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text
+
+
+def percent(share: float) -> str:
+    """A share in percent."""
+    return f"{100 * share:.0f} %"
+
+
+def plural(count: int, noun: str) -> str:
+    """Such as ``1 row`` and ``2 rows``."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def failure(error: PhysicsError) -> str:
+    """What a physics failed at, in a line, with the first inputs at which it did."""
+    message = str(error.args[0]).rstrip(": ")
+    if error.inputs is None or not len(error.inputs):
+        return message
+    rows = [f"({', '.join(map(number, row))})" for row in error.inputs[:_SHOWN].tolist()]
+    more = len(error.inputs) - len(rows)
+    return f"{message.rstrip('.')}: at inputs {listed([*rows, f'{more} more'] if more else rows)}."
+
+
+def name_and_unit(name: str) -> tuple[str, str]:
+    """``"head [m]"`` as ``"head"`` and ``"m"``; no unit where none is in brackets."""
+    found = _UNIT.fullmatch(name.strip())
+    return (found[1], found[2].strip()) if found else (name, "")
+
+
+def with_unit(value: str, name: str) -> str:
+    """A number and the unit that a name carries."""
+    unit = name_and_unit(name)[1]
+    return f"{value} {unit}" if unit else value
+
+
+def listed(items: Iterable[str]) -> str:
+    """``a, b and c``."""
+    *first, last = items
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def drawn(draw: Callable[[], list[Markup]]) -> Markup:
+    """Figures side by side, or why there are none: a physics may fail where there are no data."""
+    try:
+        with rc_context(_STYLE), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=_OF_FONTS)
+            images = draw()
+    except PhysicsError as error:
+        return tag("p", f"No figure: {failure(error)}", class_="caution")
+    if not images:
+        return Markup()
+    return tag("div", *(tag("figure", image) for image in images), class_="figures")
+
+
+def image(figure: Figure, alt: str, *, pixels: bool = False) -> Markup:
+    """A figure as an image in the page: as curves, or many points or areas as pixels."""
+    source = "" if pixels else _curves(figure)
+    if pixels or len(source) > _LARGE:
+        buffer = BytesIO()
+        figure.savefig(buffer, format="png", dpi=180)
+        raster = f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
+        source = min(source or raster, raster, key=len)
+    width, height = (str(round(96 * size)) for size in figure.get_size_inches())
+    return tag("img", src=Markup(source), alt=alt, width=width, height=height)
+
+
+def _curves(figure: Figure) -> str:
+    """A figure as SVG, without what a page does not need."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = _NEEDLESS.sub("", buffer.getvalue().decode()).replace('"', "'")
+    text = _PATH.sub(lambda path: _SPACE.sub(r"\1", _BEHIND.sub(r"\1", path[0])), text)
+    return f"data:image/svg+xml,{quote(text, safe=_PLAIN)}"

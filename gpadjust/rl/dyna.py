@@ -335,7 +335,7 @@ class Dyna(Resumable, OffPolicyAlgorithm):
         # Of a single state much would look right that is not.
         twice = task.dynamics.spec.decode(observations).repeat(2, 1)
         middle = torch.from_numpy((self.action_space.low + self.action_space.high) / 2).double()
-        task.rehearse(twice, middle.expand(len(twice), -1))
+        task.try_functions(twice, middle.expand(len(twice), -1))
         before.restore()
         if self._random_state is not None:  # a run that goes on
             self._random_state.restore()

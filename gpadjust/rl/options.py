@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from gpadjust.control.option_checks import check_fraction, check_whole
-from gpadjust.dynamics.trajectory_scores import checked_horizons
+from gpadjust.dynamics.free_run import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
 

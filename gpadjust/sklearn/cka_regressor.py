@@ -29,8 +29,8 @@ from gpadjust.models import (
     VariationalCKA,
     ZeroMeanGP,
 )
+from gpadjust.models.factory import ModelFactory, make_model
 from gpadjust.models.plausibility import is_standardised
-from gpadjust.models.terms_gp import arguments_of
 from gpadjust.models.training_data import column_names
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.array_physics import array_physics
@@ -46,7 +46,6 @@ MODELS: dict[str, type[TermsModel]] = {
     "zero_mean": ZeroMeanGP,
     "variational": VariationalCKA,
 }
-_NO_OPTIONS = ("train_X", "train_Y", "physics")
 
 
 class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -59,7 +58,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     *What the physics sees* is the X that the regressor is given, columns by their order, as arrays.
     After a ``StandardScaler`` in a pipeline, that is the scaled X: undo it in the physics, or scale
-    inside of the model, with ``model_options={"input_transform": Normalize(d)}`` of BoTorch. It
+    inside of the model, by ``partial(CKA, input_transform=Normalize(d))`` of BoTorch. It
     must return what y is in: ``TransformedTargetRegressor`` transforms y, not the physics.
 
     *NumPy or torch.* Any function of rows will do. One that returns a tensor, or takes nothing
@@ -77,11 +76,12 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             CKA of :math:`f_p = 0` is.
         model: ``"cka"``, ``"variational"`` (of very many rows), ``"rra"``, ``"physics_mean"``,
             ``"scale"``, ``"calibrated_physics"``, ``"zero_mean"`` (which leaves the physics out, to
-            compare with), or a class: a subclass of :class:`~gpadjust.models.TermsModel`.
+            compare with), or a callable that makes a model of X and y, with the keyword
+            ``physics`` if there is one: a class of models, or ``functools.partial`` of one with
+            further arguments, such as ``partial(CKA, delta_mean="learn")``, or
+            ``partial(CKA, train_Yvar=0.01)`` for noise of known variance. Each fit takes a copy.
         fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`. None: the library's
             calibrated default, full Bayes where the model can have it.
-        model_options: Further arguments of the model, such as ``{"delta_mean": "learn"}``, or
-            ``{"train_Yvar": 0.01}`` for noise of known variance. Copies of them are taken.
         fit_options: Further arguments of :func:`gpadjust.fit`, such as ``{"num_samples": 32}``.
             Its ``seed`` is ``random_state``, unless it is among them.
         random_state: The seed of the fit; a ``RandomState``, or None for NumPy's, draws it.
@@ -115,16 +115,14 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         physics: Any = None,
         *,
-        model: str | type[TermsModel] = "cka",
+        model: str | ModelFactory = "cka",
         fit_method: Literal["bayes", "map"] | None = None,
-        model_options: dict[str, Any] | None = None,
         fit_options: dict[str, Any] | None = None,
         random_state: int | np.random.RandomState | None = None,
     ) -> None:
         self.physics = physics
         self.model = model
         self.fit_method = fit_method
-        self.model_options = model_options
         self.fit_options = fit_options
         self.random_state = random_state
 
@@ -144,9 +142,9 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Raises:
             ValueError: If data are not finite real numbers, or shapes disagree (scikit-learn says
-                it); or if the model, or an option, is none. Of outputs that are missing in some
-                rows, take the models of this library.
-            TypeError: If the physics is none, or an option has a wrong type.
+                it); or if the model's name is unknown. Of outputs that are missing in some rows,
+                take the models of this library.
+            TypeError: If the physics is none, an option has a wrong type, or the model none.
             PhysicsError: If the physics fails, or returns NaN or a wrong shape.
         """
         names_of_y = column_names(y)
@@ -241,32 +239,28 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _build(self, X: Array, Y: Array) -> TermsModel:
         """The model that the parameters say."""
-        model_class = MODELS.get(self.model) if isinstance(self.model, str) else self.model
-        if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
-            raise ValueError(
-                f"Expected model as one of {', '.join(map(repr, MODELS))}, or a subclass of "
-                f"gpadjust.models.TermsModel, got {self.model!r}."
-            )
-        if self.physics is None and model_class is CKA:
-            model_class = ZeroMeanGP
-        options = deepcopy(self.model_options or {})
-        known = [name for name in arguments_of(model_class) if name not in _NO_OPTIONS]
-        wrong = [name for name in options if name not in known]
-        if wrong:
-            raise ValueError(
-                f"{model_class.__name__} takes no {', '.join(wrong)} in model_options; expected "
-                f"some of {', '.join(known)}."
-            )
-        if not issubclass(model_class, ZeroMeanGP):
-            if self.physics is None:
+        factory: Any = self.model
+        if isinstance(factory, str):
+            if factory not in MODELS:
+                raise ValueError(
+                    f"Expected model as one of {', '.join(map(repr, MODELS))}, or a callable that "
+                    f"makes a model, such as CKA or functools.partial(CKA, ...), got {factory!r}."
+                )
+            factory = MODELS[factory]
+            if self.physics is None and factory is CKA:
+                factory = ZeroMeanGP
+            if self.physics is None and factory is not ZeroMeanGP:
                 raise ValueError(
                     f"Expected a physics for the model {self.model!r}, got None; without one take "
                     "model='zero_mean'."
                 )
-            options["physics"] = array_physics(self.physics, X)
+        physics = None
+        if self.physics is not None and factory is not ZeroMeanGP:
+            physics = array_physics(self.physics, X)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
-            model = model_class(X, Y, **options)
+            factory = deepcopy(factory)
+            model: TermsModel = make_model(factory, X, Y, kind=TermsModel, physics=physics)
         for each in caught:
             hints = _hints(X, Y) if issubclass(each.category, PhysicsWarning) else ""
             warnings.warn(f"{each.message}{hints}", each.category, stacklevel=3)

@@ -1,21 +1,137 @@
-"""What a comparison of structures says about the physics, in sentences."""
+"""What a comparison of structures says about the physics: the verdict, and advice."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gpadjust.models import TermsGP
 from gpadjust.models.parameters import shared_parameters
-from gpadjust.validation.gain import Gain, physics_gain
 from gpadjust.validation.leave_one_out import LeaveOneOut
 from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, difference, sign_of
 from gpadjust.validation.structures import Structure
 
 _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
+_ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
+
+
+class Gain(NamedTuple):
+    """By how much an output is predicted better with the physics than without it: the verdict.
+
+    Attributes:
+        elpd: The difference of expected log predictive densities, the sum over the observations, in
+            nats.
+        se: Its standard error.
+        structure: The structure with the physics; one without unknown constants, which may help by
+            themselves, if that is shown to be better.
+        without: The structure without the physics.
+        shown: 1 if the physics is shown to help, by two standard errors and by the evidence of
+            models that were weighed without it; -1 if it is shown to make predictions worse, where
+            no model leaves it out by itself; 0 if neither is, or there are observations of fewer
+            than eight different inputs.
+        by_evidence: Whether a difference of more than two standard errors shows nothing because of
+            models that were weighed without the physics.
+        number: The number of observations, those of the same inputs taken together.
+    """
+
+    elpd: float
+    se: float
+    structure: str
+    without: str
+    shown: int
+    by_evidence: bool = False
+    number: int = ENOUGH
+
+    @property
+    def answer(self) -> str:
+        """``"Yes"``, ``"Not shown"`` or ``"No"``: does the physics help?"""
+        return _ANSWERS[self.shown]
+
+    def sentences(self, output: str) -> list[str]:
+        """The verdict in words: what is found, with its number, and why no more is, if so.
+
+        Args:
+            output: The name of the output.
+        """
+        found = {1: f"The physics helps to predict {output}"}
+        found[-1] = f"With the physics, {output} is predicted worse than without it"
+        found[0] = f"These data do not show whether the physics helps to predict {output}"
+        text = _elpd(self.elpd, self.se, self.structure, "without it", self.without)
+        ratio = math.exp(max(-50.0, min(50.0, self.elpd / self.number)))
+        each = f"each of {self.number} left-out observations is {ratio:.3g} times as likely"
+        finding = f"{found[self.shown]}: {text}; {each} in geometric mean."
+        return [finding] if self.shown else [finding, self._reason()]
+
+    def _reason(self) -> str:
+        """Why the physics is neither shown to help nor to do harm."""
+        sign = sign_of(self.elpd, self.se)
+        if self.number < ENOUGH:
+            return (
+                f"Of fewer than {ENOUGH} observations the standard error is itself unknown: "
+                "neither is it shown that the physics helps, nor that it does not."
+            )
+        if self.by_evidence and sign > 0:
+            return (
+                f"{self.structure} is better by more than two standard errors, but by the evidence "
+                "of a model with and without the physics it is of no use: as the two do not agree, "
+                "nothing is shown."
+            )
+        if self.by_evidence:
+            return (
+                f"{self.structure} is worse by more than two standard errors, but among those "
+                "compared is a model that leaves a physics of no use out by itself: so none is "
+                "said to do harm."
+            )
+        if sign > 0:
+            return (
+                f"{self.structure} is better by more than two standard errors, but its unknown "
+                "constants may do that by themselves: the best structure without such constants is "
+                "not shown to be better."
+            )
+        return (
+            "That is not to say that it does not help: the difference is within two standard "
+            "errors, and more observations may show one."
+        )
+
+
+def physics_gain(
+    structures: Mapping[str, Structure],
+    order: Iterable[str],
+    density: Mapping[str, Tensor],
+    relevance: Mapping[str, float] = MappingProxyType({}),
+) -> Gain | None:
+    """What the physics is worth; None if there is nothing with it, or nothing without it.
+
+    Args:
+        structures: The structures by their names.
+        order: The names, best first.
+        density: The log predictive densities of left-out observations by each, ``n``.
+        relevance: Probabilities that the physics is of use, of the structures that were weighed
+            without it. Of a structure that was not, the highest one counts: of several physics one
+            may be of use, and others not.
+    """
+    names = [*order]
+    physical = [name for name in names if structures[name].uses_physics]
+    others = [name for name in names if not structures[name].uses_physics]
+    if not (physical and others):
+        return None
+    number = len(density[physical[0]])
+    shows = number >= ENOUGH  # of fewer the error is itself unknown
+    fair = next((name for name in physical if not structures[name].unknowns), physical[0])
+    elpd, se = difference(density[fair], density[others[0]])
+    helps = shows and sign_of(elpd, se) > 0
+    if helps and relevance.get(fair, max(relevance.values(), default=1.0)) > 0.5:
+        return Gain(elpd, se, fair, others[0], 1, number=number)
+    elpd, se = difference(density[physical[0]], density[others[0]])
+    sign = sign_of(elpd, se) if shows else 0
+    by_evidence = helps if sign > 0 else sign < 0 and bool(relevance)
+    shown = 0 if relevance else min(sign, 0)
+    return Gain(elpd, se, physical[0], others[0], shown, by_evidence, number)
 
 
 def advice(
@@ -26,8 +142,8 @@ def advice(
     relevance: dict[str, Tensor],
     table: dict[str, list[Candidate]],
     X: Tensor,
-) -> list[str]:
-    """Sentences for each output, and what holds for all.
+) -> tuple[dict[str, Gain], list[str]]:
+    """What the physics is worth to each output, and sentences on all else.
 
     Args:
         structures: What was fitted.
@@ -37,16 +153,29 @@ def advice(
         relevance: Probabilities that the physics is of use, ``m``, of the structures that say it.
         table: The rankings, by the names of the outputs.
         X: Training inputs, ``n x d``.
+
+    Returns:
+        The gains by the names of the outputs, where structures with and without the physics were
+        compared; and the sentences.
     """
     by_name = {structure.name: structure for structure in structures}
+    gains: dict[str, Gain] = {}
     sentences = []
     for j, (output, rows) in enumerate(table.items()):
         where = f"{output}: " if len(table) > 1 else ""
-        density = _density(left_out, j)
+        density = dict(zip(left_out, densities(left_out, j).unbind(-1), strict=True))
         probable = {name: float(each[j]) for name, each in relevance.items()}
         order = [row.structure for row in rows]
-        found = [_best(rows), *_gains(by_name, order, density, probable)]
-        found += [_of_use(name, probability) for name, probability in probable.items()]
+        gain = physics_gain(by_name, order, density, probable)
+        if gain is not None:
+            gains[output] = gain
+        found = [_best(rows)]
+        if gain is None or gain.shown > 0:
+            found += _scaling(by_name, order, density)
+        found += [
+            f"By the evidence of {name} with and without it, f_p is of use: {probability:.2f}."
+            for name, probability in probable.items()
+        ]
         found += _preferred(models[rows[0].structure], X, j)
         found += _unsampled(rows, converged, j)
         sentences += [where + sentence for sentence in found]
@@ -57,7 +186,7 @@ def advice(
             "of the physics, so that these elpd are too high. Freeze them with "
             "requires_grad_(False) for a fair comparison."
         )
-    return sentences
+    return gains, sentences
 
 
 def _best(rows: list[Candidate]) -> str:
@@ -73,59 +202,18 @@ def _best(rows: list[Candidate]) -> str:
     )
 
 
-def gains(
-    structures: Sequence[Structure],
-    left_out: dict[str, LeaveOneOut],
-    relevance: dict[str, Tensor],
-    table: dict[str, list[Candidate]],
-) -> dict[str, Gain]:
-    """What the physics is worth to each output, if there are structures with and without it."""
-    by_name = {structure.name: structure for structure in structures}
-    found = {}
-    for j, (output, rows) in enumerate(table.items()):
-        order = [row.structure for row in rows]
-        probable = {name: float(each[j]) for name, each in relevance.items()}
-        found[output] = physics_gain(by_name, order, _density(left_out, j), probable)
-    return {output: gain for output, gain in found.items() if gain is not None}
-
-
-def _density(left_out: dict[str, LeaveOneOut], output: int) -> dict[str, Tensor]:
-    """The log predictive densities of an output's observations by each structure, ``n``."""
-    return dict(zip(left_out, densities(left_out, output).unbind(-1), strict=True))
-
-
-def _of_use(structure: str, probability: float) -> str:
-    return f"By the evidence of {structure} with and without it, f_p is of use: {probability:.2f}."
-
-
-def _gains(
-    structures: dict[str, Structure],
-    order: list[str],
-    density: dict[str, Tensor],
-    relevance: Mapping[str, float] = MappingProxyType({}),
+def _scaling(
+    structures: dict[str, Structure], order: list[str], density: dict[str, Tensor]
 ) -> list[str]:
-    """Whether the physics helps, and whether scaling it does."""
-    sentences = []
-    physics = physics_gain(structures, order, density, relevance)
-    if physics is not None:
-        text = _elpd(physics.elpd, physics.se, physics.structure, "without it", physics.without)
-        if physics.shown <= 0:
-            says = "makes predictions worse" if physics.shown < 0 else "is not shown to help"
-            enough = len(density[physics.structure]) >= ENOUGH
-            by_constants = enough and sign_of(physics.elpd, physics.se) > 0
-            why = "; its unknown constants may do so by themselves" if by_constants else ""
-            if physics.by_evidence and by_constants:
-                why = "; the evidence does not agree"
-            return [f"The physics {says}: {text}{why}."]
-        sentences.append(f"The physics helps: {text}.")
+    """Whether to scale the physics is better than to take it as the mean."""
     adjusting = next((name for name in order if structures[name].adjusts), None)
     plain = next((n for n in order if structures[n].uses_physics and not structures[n].adjusts), "")
-    if adjusting is not None and plain:
-        value, error = difference(density[adjusting], density[plain])
-        says = "helps" if sign_of(value, error) > 0 else "is not shown to help"
-        text = _elpd(value, error, adjusting, "with the physics as a mean", plain)
-        sentences.append(f"Scaling the physics {says}: {text}.")
-    return sentences
+    if adjusting is None or not plain:
+        return []
+    value, error = difference(density[adjusting], density[plain])
+    says = "helps" if sign_of(value, error) > 0 else "is not shown to help"
+    text = _elpd(value, error, adjusting, "with the physics as a mean", plain)
+    return [f"Scaling the physics {says}: {text}."]
 
 
 def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -> str:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from botorch.models.transforms.input import InputTransform
-from botorch.posteriors.fully_bayesian import MCMC_DIM
 from torch import Tensor
 from tqdm import tqdm
 
@@ -19,18 +18,13 @@ from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
 from gpadjust.models import CalibratedPhysics, StackedGP, TermsGP
+from gpadjust.models.factory import make_model
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
-from gpadjust.validation.advice import advice, gains
-from gpadjust.validation.gain import Gain
-from gpadjust.validation.leave_one_out import (
-    LeaveOneOut,
-    leave_one_out,
-    mixture_of,
-)
-from gpadjust.validation.physics_alone import physics_alone
+from gpadjust.validation.advice import Gain, advice
+from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, mixed
 from gpadjust.validation.ranking import Candidate, beside, ranking
 from gpadjust.validation.structures import (
     ALONE,
@@ -39,6 +33,7 @@ from gpadjust.validation.structures import (
     Structure,
     candidates,
     known_structures,
+    physics_alone,
 )
 
 _DRAWS = (32, 256)  # of the hyper-parameters, the least and the most
@@ -57,9 +52,9 @@ class Comparison:
         models: The fitted models by the names of their structures.
         stacked: All of them, stacked with the weights of the tables.
         table: The candidates of each output, best first, by the names of the outputs.
-        advice: What the comparison says about the physics, in sentences.
-        gain: What the physics is worth to each output, by the names of the outputs; empty without a
-            structure that uses none.
+        advice: What else the comparison says, in sentences.
+        gain: The verdict: what the physics is worth to each output, by the names of the outputs;
+            empty without a structure that uses none.
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
@@ -92,14 +87,8 @@ class Comparison:
         """
         if self.chosen != STACKED:
             return self.left_out[self.chosen]
-        each = [self.left_out[name] for name in self.models]
-        mean, variance, density = (
-            torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
-            for name in ("mean", "variance", "log_density")
-        )
         weight = _weights(self.models, [*self.table.values()]).unsqueeze(-2)  # K x 1 x m
-        mean, variance, density = mixture_of(mean, variance, density, weight)
-        return replace(each[0], mean=mean, variance=variance, log_density=density)
+        return mixed([self.left_out[name] for name in self.models], weight)
 
     def errors(self) -> dict[str, dict[str, float]]:
         """Root mean square errors of left-out observations of each output, in its units.
@@ -111,16 +100,18 @@ class Comparison:
         """
         if not self.left_out:
             return {output: {} for output in self.table}
-        recommended = self.leave_one_out()
+        recommended = self.leave_one_out().score().rmse
+        left_out = {name: loo.score().rmse for name, loo in self.left_out.items()}
+        alone = {name: loo.score().rmse for name, loo in self.alone.items()}
         calibrated = {n for n, model in self.models.items() if isinstance(model, CalibratedPhysics)}
         using = {name for name, model in self.models.items() if model.rho_names} - calibrated
         found: dict[str, dict[str, float]] = {}
         for j, (output, rows) in enumerate(self.table.items()):
-            rmse = {row.structure: self.left_out[row.structure].rmse[j].item() for row in rows}
-            own = {name: loo.rmse[j].item() for name, loo in self.alone.items()}
+            rmse = {row.structure: left_out[row.structure][j].item() for row in rows}
+            own = {name: each[j].item() for name, each in alone.items()}
             own |= {name: rmse[name] for name in rmse if name in calibrated}
             if self.chosen in using or (self.chosen == STACKED and using):
-                own["adjusted"] = recommended.rmse[j].item()
+                own["adjusted"] = recommended[j].item()
             elif using:
                 own["adjusted"] = next(rmse[name] for name in rmse if name in using)
             without = next((name for name in rmse if name not in using | calibrated), None)
@@ -155,7 +146,8 @@ class Comparison:
                 for row in rows
             ]
             lines.append("")
-        return "\n".join([*lines, *self.advice])
+        verdict = [text for name, gain in self.gain.items() for text in gain.sentences(name)]
+        return "\n".join([*lines, *verdict, *self.advice])
 
 
 def compare(
@@ -165,7 +157,7 @@ def compare(
     train_Yvar: ArrayLike = None,
     *,
     input_transform: InputTransform | None = None,
-    structures: Sequence[str | Structure] = STRUCTURES,
+    structures: Sequence[str | Structure] | None = None,
     num_starts: int | None = None,
     num_screened: int | None = None,
     seed: int = 0,
@@ -217,7 +209,7 @@ def compare(
             its own, where it has parameters.
         train_Yvar: Known observation variances, as in :class:`~gpadjust.CKA`.
         input_transform: As in :class:`~gpadjust.CKA`; each model has a copy of its own.
-        structures: Which to fit: names, or a :class:`Structure` of your own.
+        structures: Which to fit: names, or a :class:`Structure` of your own. Default: those above.
         num_starts: As in :func:`~gpadjust.fit`.
         num_screened: As in :func:`~gpadjust.fit`.
         seed: Seed of the fits.
@@ -248,7 +240,7 @@ def compare(
         'CKA'
         >>> mean, variance = comparison.recommended.predict(X)
     """
-    asked = known_structures(structures)
+    asked = known_structures(STRUCTURES if structures is None else structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
     data = training_data(train_X, train_Y, train_Yvar)
@@ -268,11 +260,13 @@ def compare(
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             try:
-                model = structure.build(
+                model = make_model(
+                    structure.model,
                     train_X,
                     train_Y,
-                    train_Yvar,
-                    physics=deepcopy(part),
+                    kind=TermsGP,
+                    train_Yvar=train_Yvar,
+                    physics=deepcopy(part) if structure.uses_physics else None,
                     input_transform=deepcopy(input_transform),
                 )
                 warnings.simplefilter("ignore", OptimizationWarning)
@@ -300,8 +294,7 @@ def compare(
     table = dict(zip(data.output_names, by_output, strict=True))
     stacked = StackedGP(models, _weights(models, by_output), _HELD)
     fitted = [structure for structure, _ in found]
-    sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
-    gain = gains(fitted, left_out, relevance, table)
+    gain, sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
     alone = physics_alone(given_physics, data)
     return Comparison(models, stacked, table, sentences, gain, left_out, alone)
 

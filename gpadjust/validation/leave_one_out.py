@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,9 +20,9 @@ from gpadjust.gp.noise import Noise
 from gpadjust.models import StackedGP, TermsGP, VariationalCKA
 from gpadjust.models.exact_conditioning import Factors
 from gpadjust.models.stacked import Part
-from gpadjust.validation import scores
+from gpadjust.validation.scores import Scores
 
-_ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
+ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
 
 
 @dataclass(frozen=True)
@@ -53,29 +53,15 @@ class LeaveOneOut:
         """Standardized residuals, ``(Y - mean) / sd``, ``batch_shape x n x m``."""
         return (self.Y - self.mean) / self.variance.sqrt()
 
-    @property
-    def rmse(self) -> Tensor:
-        """Root mean square error, ``batch_shape x m``."""
-        return scores.rmse(self.mean, self.Y)
+    def score(self, level: float = 0.95) -> Scores:
+        """The scores of the predictions; the density is that of a mixture where they are one.
 
-    @property
-    def nlpd(self) -> Tensor:
-        """Mean negative log predictive density, ``batch_shape x m``."""
-        return -self.log_density.nanmean(-2)
-
-    @property
-    def crps(self) -> Tensor:
-        """Mean continuous ranked probability score, ``batch_shape x m``."""
-        return scores.crps(self.mean, self.variance, self.Y)
-
-    @property
-    def pit(self) -> Tensor:
-        """Probability integral transform, ``batch_shape x n x m``."""
-        return scores.pit(self.mean, self.variance, self.Y)
-
-    def coverage(self, level: float = 0.95) -> Tensor:
-        """Share of the observations in their central intervals, ``batch_shape x m``."""
-        return scores.coverage(self.mean, self.variance, self.Y, level)
+        Args:
+            level: Nominal coverage, between 0 and 1.
+        """
+        names = self.output_names
+        scores = Scores.of(self.mean, self.variance, self.Y, level=level, output_names=names)
+        return replace(scores, nlpd=-self.log_density.nanmean(-2))
 
 
 def leave_one_out(
@@ -117,13 +103,13 @@ def leave_one_out(
         >>> model = CKA(X, 2 * torch.sin(6 * X) + X, physics=lambda X: torch.sin(6 * X))
         >>> result = fit(model)
         >>> loo = leave_one_out(model)
-        >>> loo.mean.shape, bool(loo.rmse < 0.1)
+        >>> loo.mean.shape, bool(loo.score().rmse < 0.1)
         (torch.Size([8, 1]), True)
     """
     if isinstance(model, ModelListGP):
         return _join([leave_one_out(part) for part in model.models])
     if isinstance(model, StackedGP):
-        return _join([_mixture_of(parts) for parts in model.parts])
+        return _join([_of_parts(parts) for parts in model.parts])
     if isinstance(model, VariationalCKA):
         raise TypeError(
             "Expected an exact model, got a VariationalCKA: of so many observations hold some out, "
@@ -167,7 +153,7 @@ def leave_one_out(
 def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:
     """Of observations ``... x n x m`` by Gaussians ``... x S x n x m``; NaN where there is none."""
     spread = (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2, keepdim=True).sqrt()
-    sd = torch.maximum(variance.sqrt(), _ROUNDING * spread.unsqueeze(MCMC_DIM))
+    sd = torch.maximum(variance.sqrt(), ROUNDING * spread.unsqueeze(MCMC_DIM))
     normal = torch.distributions.Normal(mean, sd, validate_args=False)
     return normal.log_prob(Y.unsqueeze(MCMC_DIM))
 
@@ -189,16 +175,20 @@ def mixture_of(
     return centre.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
 
 
-def _mixture_of(parts: Iterable[Part]) -> LeaveOneOut:
+def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
     """Of the mixture of several models of one output."""
-    each = [leave_one_out(part.model) for part in parts]
-    mean, variance, density = (
+    numbers = torch.tensor([part.number for part in parts], dtype=torch.float64)
+    weight = (numbers / numbers.sum()).reshape(-1, 1, 1)
+    return mixed([leave_one_out(part.model) for part in parts], weight)
+
+
+def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
+    """The predictions by a mixture of ``K`` models with weights ``K x 1 x m``, 1 in all."""
+    predicted = [
         torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
         for name in ("mean", "variance", "log_density")
-    )
-    numbers = torch.tensor([part.number for part in parts]).to(mean)
-    weight = (numbers / numbers.sum()).reshape(-1, 1, 1)
-    mean, variance, density = mixture_of(mean, variance, density, weight)
+    ]
+    mean, variance, density = mixture_of(*predicted, weight)
     return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 

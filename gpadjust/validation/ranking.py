@@ -80,14 +80,15 @@ def beside(
 def _row(
     name: str, loo: LeaveOneOut, output: int, density: Tensor, best: Tensor, weight: float
 ) -> Candidate:
+    scores = loo.score()
     spread = float(nanstd(loo.Y[:, output : output + 1], dim=0))
     return Candidate(
         name,
         density.sum().item(),
         *difference(density, best),
         weight,
-        loo.rmse[output].item() / (spread if spread > 0 else 1.0),
-        loo.coverage()[output].item(),
+        scores.rmse[output].item() / (spread if spread > 0 else 1.0),
+        scores.coverage[output].item(),
     )
 
 

@@ -7,8 +7,10 @@ for an output that has none.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from numbers import Real
+from typing import Any
 
 import torch
 from botorch.posteriors import Posterior
@@ -183,21 +185,109 @@ def check_level(level: float) -> None:
 
 @dataclass(frozen=True)
 class Scores:
-    """How good a prediction was, at the points that were observed.
+    """How good predictions were, at the points that were observed.
+
+    One type for all: of a posterior (:func:`score`), of left-out observations
+    (:meth:`~gpadjust.validation.LeaveOneOut.score`), of transitions and of free runs. Leading
+    dimensions, such as the steps of a free run, are a batch: ``scores[i]`` are those of a part.
 
     Attributes:
         rmse: Root mean square error, ``... x m``, in y's units.
+        median: Median absolute error, ``... x m``, in y's units.
         nlpd: Mean negative log predictive density, ``... x m``, in nats.
         crps: Mean continuous ranked probability score, ``... x m``, in y's units.
         coverage: Share of the points in the central interval, ``... x m``.
         pit: Probability integral transform of each point, ``... x n x m``, NaN where not observed.
+        energy: Mean energy score of all outputs together, ``...``, where there are draws of them.
+        output_names: The names of the outputs; empty if they have none.
     """
 
     rmse: Tensor
+    median: Tensor
     nlpd: Tensor
     crps: Tensor
     coverage: Tensor
     pit: Tensor
+    energy: Tensor | None = None
+    output_names: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        mean: Tensor,
+        variance: Tensor,
+        y: Tensor,
+        *,
+        level: float = 0.95,
+        interval: tuple[Tensor, Tensor] | None = None,
+        mixture_dim: int | None = None,
+        energy: Tensor | None = None,
+        output_names: Sequence[str] = (),
+    ) -> Scores:
+        """The scores of Gaussian predictions.
+
+        Args:
+            mean: Predicted means, as in :func:`rmse`.
+            variance: Predicted variances, of the same shape. NaN where the prediction says none:
+                these points count in ``rmse`` and ``median`` only.
+            y: True values, ``... x n x m``, NaN where not observed.
+            level: Nominal coverage, between 0 and 1.
+            interval: Lower and upper ends of the interval of that level, ``... x n x m`` each.
+                Default: those of the prediction's own distribution.
+            mixture_dim: As in :func:`rmse`.
+            energy: The energy score of draws, ``...``; see :func:`energy_score`.
+            output_names: The names of the ``m`` outputs.
+
+        Raises:
+            TypeError: As :func:`nlpd`, or if ``level`` is not a number.
+            ValueError: As :func:`rmse`, if a variance is negative, or if ``level`` is not between
+                0 and 1.
+
+        Example:
+            >>> import torch
+            >>> mean, y = torch.zeros(5, 20, 2), torch.randn(5, 20, 2)
+            >>> scores = Scores.of(mean, torch.ones(5, 20, 2), y)  # 5 steps of 20 windows
+            >>> scores.rmse.shape, scores[4].rmse.shape
+            (torch.Size([5, 2]), torch.Size([2]))
+        """
+        error = (_components(y, mixture_dim, mean=mean)[0].mean(0) - y).abs()
+        silent = variance.isnan()
+        silent = silent if mixture_dim is None else silent.any(mixture_dim)
+        judged = y.masked_fill(silent, math.nan)
+        predicted = mean, variance.nan_to_num(nan=1.0, posinf=math.inf)
+        values = pit(*predicted, judged, mixture_dim=mixture_dim)
+        if interval is None:
+            share = central_share(values, level)
+        else:
+            check_level(level)
+            inside = ((interval[0] <= judged) & (judged <= interval[1])).to(mean.dtype)
+            known = judged + 0 * (interval[0] + interval[1])  # NaN where an end is
+            share = _mean_over_observed(inside, known)
+        return cls(
+            rmse=rmse(mean, y, mixture_dim=mixture_dim),
+            median=error.nanmedian(-2).values if y.shape[-2] else error.sum(-2) / 0,
+            nlpd=nlpd(*predicted, judged, mixture_dim=mixture_dim),
+            crps=crps(*predicted, judged, mixture_dim=mixture_dim),
+            coverage=share,
+            pit=values,
+            energy=energy,
+            output_names=tuple(output_names),
+        )
+
+    def __getitem__(self, part: Any) -> Scores:
+        """The scores of a part of the batch: an index of its leading dimensions.
+
+        Raises:
+            IndexError: If there is no batch, or not this part of it.
+        """
+        if self.rmse.dim() < 2:
+            raise IndexError(
+                "These scores have no batch to take a part of; an output is `scores.rmse[j]`."
+            )
+        tensors = {
+            name: value[part] for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **tensors)
 
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
@@ -236,14 +326,39 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
             f"Expected a posterior, with a mean and a variance, got {type(posterior).__name__}; "
             "that of a model is `model.posterior(X, observation_noise=True)`."
         )
-    values = pit(mean, variance, Y, mixture_dim=dim)
-    return Scores(
-        rmse=rmse(mean, Y, mixture_dim=dim),
-        nlpd=nlpd(mean, variance, Y, mixture_dim=dim),
-        crps=crps(mean, variance, Y, mixture_dim=dim),
-        coverage=central_share(values, level),
-        pit=values,
-    )
+    _components(Y, dim, mean=mean, variance=variance)
+    return Scores.of(mean, variance, Y, level=level, mixture_dim=dim)
+
+
+def energy_score(draws: Tensor, y: Tensor) -> Tensor:
+    r"""Mean energy score of draws of all outputs together; lower is better.
+
+    :math:`\frac1K \sum_i |x_i - y| - \frac{1}{2 K (K - 1)} \sum_{i \neq j} |x_i - x_j|` of ``K``
+    draws (Gneiting and Raftery 2007, sec. 4.3; without bias of ``K``: Ferro 2014). Give all outputs
+    one scale first, as a distance is no more than the largest of them. Of draws that are all equal
+    it is the distance itself.
+
+    Args:
+        draws: ``K x ... x n x m``, at least two.
+        y: True values, ``... x n x m``; points with NaN are left out.
+
+    Returns:
+        ``...``, in the units of ``y``; NaN where there is no point.
+
+    Example:
+        >>> import torch
+        >>> energy_score(torch.tensor([[[0.0]], [[2.0]]]), torch.tensor([[1.0]]))
+        tensor(0.)
+    """
+    known = ~y.isnan().any(-1)
+    error = (draws - _filled(y)).norm(dim=-1).mean(0)
+    # Point by point, as all pairs at once are n K^2; not by products, which cancel.
+    mode = "donot_use_mm_for_euclid_dist"
+    points = draws.movedim(0, -2).flatten(0, -3)
+    pairs = [torch.cdist(each, each, compute_mode=mode).sum() for each in points]
+    spread = torch.stack(pairs).reshape(known.shape) if pairs else torch.zeros_like(error)
+    values = error - spread / (2 * len(draws) * (len(draws) - 1))
+    return values.masked_fill(~known, 0).sum(-1) / known.sum(-1)
 
 
 def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list[Tensor]:

@@ -1,14 +1,20 @@
-"""The structures that :func:`gpadjust.compare` fits."""
+"""What :func:`gpadjust.compare` compares: structures, and the physics alone beside them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
-from gpadjust.models import CKA, CalibratedPhysics, PhysicsMeanGP, TermsGP, ZeroMeanGP
-from gpadjust.models.term_builder import PhysicsLike
+import torch
+from torch import Tensor
+from torch.distributions import StudentT
+
+from gpadjust.models import CKA, CalibratedPhysics, PhysicsMeanGP, ZeroMeanGP
+from gpadjust.models.factory import ModelFactory
+from gpadjust.models.training_data import TrainingData
 from gpadjust.physics import JoinedPhysics, Physics
+from gpadjust.validation.leave_one_out import ROUNDING, LeaveOneOut, log_densities
 
 STACKED = "stacked"  # what a comparison calls the mixture of all structures
 ALONE = "physics alone"  # and f_p as it is
@@ -19,8 +25,9 @@ class Structure(NamedTuple):
 
     Attributes:
         name: Its name.
-        build: Makes the model of ``train_X, train_Y, train_Yvar`` with the keyword arguments
-            ``physics`` and ``input_transform``; of any number of outputs, each by itself.
+        model: A callable that makes the model of ``X`` and ``Y``, of any number of outputs, each by
+            itself: a class, or ``functools.partial`` of one. It is given as keywords the
+            ``physics``, if it uses that, and ``train_Yvar`` and ``input_transform``, if there are.
         unknowns: How many constant means are unknown, for one physics.
         uses_physics: Whether it reads the physics at all.
         adjusts: Whether it does more than to take the physics as a mean.
@@ -31,7 +38,7 @@ class Structure(NamedTuple):
     """
 
     name: str
-    build: Callable[..., TermsGP]
+    model: ModelFactory
     unknowns: int = 0
     uses_physics: bool = True
     adjusts: bool = True
@@ -40,13 +47,9 @@ class Structure(NamedTuple):
     prior: float = 0.0
 
 
-def _zero_mean(*data: Any, physics: PhysicsLike, **options: Any) -> TermsGP:
-    return ZeroMeanGP(*data, **options)
-
-
 STRUCTURES = (
     Structure("calibrated physics", CalibratedPhysics, adjusts=False, joins=False, calibrates=True),
-    Structure("zero mean", _zero_mean, uses_physics=False, adjusts=False, joins=False),
+    Structure("zero mean", ZeroMeanGP, uses_physics=False, adjusts=False, joins=False),
     Structure("physics mean", PhysicsMeanGP, adjusts=False),
     Structure(
         "constant rho", partial(PhysicsMeanGP, rho_mean="learn", delta_mean="learn"), unknowns=2
@@ -98,8 +101,7 @@ def candidates(
         if not isinstance(physics, JoinedPhysics) or not structure.uses_physics:
             found.append((structure, physics))
             continue
-        parts = cast(Iterable[Physics], physics.parts)
-        of: list[tuple[str, Physics]] = [*zip(physics.names, parts, strict=True)]
+        of = _parts(physics)
         for name, part in of:
             alone = 0.0 if structure.joins else structure.prior
             own = structure._replace(name=f"{structure.name} of {name}", prior=alone)
@@ -110,3 +112,49 @@ def candidates(
             found.append((joined, physics))
     few = [pair for pair in found if pair[0].unknowns and num_points < 2 + pair[0].unknowns]
     return [pair for pair in found if pair not in few] or found
+
+
+def _parts(physics: Physics) -> list[tuple[str, Physics]]:
+    """The names and the physics that several are joined of; none of a single one."""
+    if not isinstance(physics, JoinedPhysics):
+        return []
+    return [*zip(physics.names, cast(Iterable[Physics], physics.parts), strict=True)]
+
+
+def physics_alone(physics: Physics, data: TrainingData) -> dict[str, LeaveOneOut]:
+    r"""Each physics as it is, with noise whose variance the other observations tell.
+
+    Nothing is fitted, :math:`y_i = f_p(x_i) + \epsilon_i`. With a prior of the variance that does
+    not depend on units, an observation that is left out has Student's distribution about f_p with
+    the mean square error at the others and ``n - 1`` degrees of freedom (Gelman et al. 2013,
+    section 3.2); with known variances it is Gaussian.
+
+    Args:
+        physics: The physics, or several. Those with unknown parameters are left out: alone, they
+            are :class:`~gpadjust.CalibratedPhysics`.
+        data: Of one data set.
+
+    Returns:
+        The predictions by ``"physics alone"``, of several physics ``"physics alone of coarse"`` and
+        so on.
+    """
+    named = {f"{ALONE} of {name}": part for name, part in _parts(physics)} or {ALONE: physics}
+    return {name: _left_out(part, data) for name, part in named.items() if not part.unknowns}
+
+
+@torch.no_grad()
+def _left_out(physics: Physics, data: TrainingData) -> LeaveOneOut:
+    mean: Tensor = physics(data.X)
+    if data.Yvar is not None:
+        variance = data.Yvar.expand_as(mean)
+        density = log_densities(mean.unsqueeze(-3), variance.unsqueeze(-3), data.Y).squeeze(-3)
+        return LeaveOneOut(data.X, data.Y, mean, variance, density, data.output_names)
+    squares = (data.Y - mean).square()
+    freedom = (~data.Y.isnan()).sum(0) - 1
+    others = squares.nansum(0) - squares.nan_to_num(nan=0.0)
+    spread = (data.Y - data.Y.nanmean(0)).square().nanmean(0)
+    scale = torch.maximum(others.clamp_min(0) / freedom, ROUNDING**2 * spread).sqrt()
+    student = StudentT(freedom.to(mean), mean, scale, validate_args=False)
+    variance = student.variance.nan_to_num(nan=torch.inf)
+    density = student.log_prob(data.Y)
+    return LeaveOneOut(data.X, data.Y, mean, variance, density, data.output_names)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gpadjust import fit
 from gpadjust.active import collect, qAdjustmentInformationGain
-from gpadjust.active.adjustment_information_gain import About
+from gpadjust.active.information_gain import About
 from gpadjust.active.warm_refit import refit
 from gpadjust.validation import coverage, rmse
 from paper.active import Active, LearnerName, Settings

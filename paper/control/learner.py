@@ -6,6 +6,7 @@ import inspect
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,9 +60,8 @@ def dynamics(
     return LearnedDynamics(
         spec,
         adjusted,
-        model=model,
+        model=partial(model, **options),
         target=target,
-        model_options=options,
         fit_options={"method": "map"},
     )
 

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 
 from gpadjust import CKA
-from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, Windows, smooth
+from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, Windows
 from gpadjust.inference import SamplingWarning
 from gpadjust.models import ZeroMeanGP
+from gpadjust.records import smooth
 from paper.common.experiment import Record
 from paper.elsewhere import ANOTHER, HORIZONS, Elsewhere, Settings
 from paper.elsewhere.systems import SYSTEMS
@@ -40,7 +41,7 @@ def run(
         dynamics = LeastSquares(machine, machine.known["crude"])
     else:
         dynamics = LearnedDynamics(machine.spec, model=ZeroMeanGP)
-    dynamics.update(*records.transitions())
+    dynamics.update(*records.trajectories())
     seconds, tests = time.perf_counter() - begin, dict[str, Any]()
     for name, test in known.tests.items():
         windows, own = known.windows(name, HORIZONS[-1], settings.windows), variations

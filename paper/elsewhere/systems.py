@@ -10,7 +10,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import Record, Records, Windows
+from gpadjust.dynamics import Windows
+from gpadjust.records import Record, Records
 from gpadjust.states import StateSpec
 from paper.real.machines import (
     DOUBLE_PENDULUM,
@@ -70,7 +71,7 @@ class System:
     def stretches(self, n: int, seed: int) -> Records:
         """``n`` transitions in stretches of ten, spread over the records that are learnt from."""
         windows = self._records(self.train, _MASS).windows(_LENGTH, STEP)
-        return windows.spread(n // _LENGTH, seed).as_records(self.machine.spec, STEP)
+        return Records.of_windows(windows.spread(n // _LENGTH, seed), self.machine.spec, STEP)
 
     def windows(self, test: str, length: int, number: int) -> Windows:
         """So many windows of a test, evenly spread."""

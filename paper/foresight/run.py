@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust import CKA
+from gpadjust.dynamics import LearnedDynamics, Trajectories
 from gpadjust.inference import SamplingWarning
 from gpadjust.states import StateSpec
 from paper.common.experiment import Record
@@ -35,12 +36,8 @@ def run(experiment: Foresight, system: str, seed: int, *, unfinished: Path) -> R
     agent.learn(experiment.settings.trials * length, log_interval=experiment.settings.trials + 1)
     seconds = time.process_time() - start
     made = agent.recorded_episodes()
-    trials = [
-        Transitions(*rows)
-        for rows in zip(
-            *(t.split(length) for t in (made.states, made.actions, made.next_states)), strict=True
-        )
-    ]
+    columns = (t.split(length) for t in (made.states, made.actions, made.next_states))
+    trials = [Trajectories(*rows, torch.zeros(length)) for rows in zip(*columns, strict=True)]
     rewards = [each.mean().item() for each in made.rewards.split(length)]
     found: dict[str, Any] = {"agent_seconds": seconds, "rewards": rewards}
     for noise in NOISES:
@@ -51,7 +48,7 @@ def run(experiment: Foresight, system: str, seed: int, *, unfinished: Path) -> R
     return found
 
 
-def measured(spec: StateSpec, trials: list[Transitions], seed: int) -> list[Transitions]:
+def measured(spec: StateSpec, trials: list[Trajectories], seed: int) -> list[Trajectories]:
     """The same trials as noisy sensors see them: each state once, whichever row it is in."""
     sd = torch.tensor([SENSORS.get(name, 0.0) for name in spec.states], dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed + 1_000)
@@ -60,7 +57,7 @@ def measured(spec: StateSpec, trials: list[Transitions], seed: int) -> list[Tran
         all_states = torch.cat([states, next_states[-1:]])
         noise = sd * torch.randn(all_states.shape, generator=generator, dtype=torch.float64)
         seen = all_states + noise
-        found.append(Transitions(seen[:-1], actions, seen[1:]))
+        found.append(Trajectories(seen[:-1], actions, seen[1:], torch.zeros(len(actions))))
     return found
 
 
@@ -68,12 +65,12 @@ def _dynamics(spec: StateSpec, physics: Any, method: str) -> LearnedDynamics:
     if method == "default":
         return LearnedDynamics(spec, physics)
     return LearnedDynamics(
-        spec, physics, model_options={"center": 0.0}, fit_options={"method": "map"}
+        spec, physics, model=partial(CKA, center=0.0), fit_options={"method": "map"}
     )
 
 
 def _replay(
-    dynamics: LearnedDynamics, trials: list[Transitions], settings: Settings
+    dynamics: LearnedDynamics, trials: list[Trajectories], settings: Settings
 ) -> dict[str, Any]:
     """Learn all trials but the last, one by one, each time judged by the next."""
     rows, third = [], max(1, (len(trials) - 1) // 3)
@@ -93,19 +90,22 @@ def _replay(
     return {**found, "conditioned": conditioned}
 
 
-def _scores(dynamics: LearnedDynamics, unseen: Transitions, settings: Settings) -> dict[str, Any]:
+def _scores(dynamics: LearnedDynamics, unseen: Trajectories, settings: Settings) -> dict[str, Any]:
     """Of the next states, and of trajectories by their number of steps; an entry for each state."""
     near = dynamics.score(*unseen)
-    far = dynamics.score_trajectories(
-        *unseen,
-        horizons=settings.horizons,
-        num_functions=settings.num_functions,
-        max_windows=settings.max_windows,
-    )
     found: dict[str, Any] = {"coverage": _list(near.coverage), "nlpd": _list(near.nlpd)}
-    for i, horizon in enumerate(far.horizons):
-        found[f"coverage_{horizon}"] = _list(far.coverage[i])
-        found[f"nlpd_{horizon}"] = _list(far.nlpd[i])
+    moving = dynamics.spec.moving
+    for steps in settings.horizons:
+        windows = unseen.windows(steps, stride=1)
+        last = len(windows.actions) - 1
+        number = min(last + 1, settings.max_windows)
+        windows = windows.some(torch.linspace(0, last, number).round().long())
+        run = dynamics.free_run(
+            windows.initial_states, windows.actions, num_functions=settings.num_functions
+        )
+        far = run.score(windows.measured, horizons=[steps])
+        found[f"coverage_{steps}"] = _list(far.coverage[0, moving])
+        found[f"nlpd_{steps}"] = _list(far.nlpd[0, moving])
     return found
 
 

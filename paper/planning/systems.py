@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 from torch import Tensor, nn
 
-from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics import PhysicsDynamics, Trajectories
 from gpadjust.envs import CART_POLE_SPEC, REAL_CART_POLE, CartPoleSwingUpEnv
 from gpadjust.envs.cart_pole.system import START_MEAN, CartPoleEquation, equation_physics
 from gpadjust.physics import PhysicsError
@@ -173,7 +172,7 @@ class FittedPhysics(PhysicsDynamics):
         self.equation = LearntEquation(start)
         physics = equation_physics(self.equation, time_step, name="fitted_cart_pole")
         super().__init__(CART_POLE_SPEC, physics)
-        self._data: Transitions | None = None
+        self._data: Trajectories | None = None
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Fit the parameters to these and earlier transitions."""

@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gpadjust.dynamics import Dynamics, PhysicsDynamics
+from gpadjust.dynamics import Dynamics, PhysicsDynamics, Trajectories
 from gpadjust.dynamics.base import TransitionFunctions
-from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics.targets import TargetPhysics, Targets
 from gpadjust.models import Prediction
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
@@ -67,12 +66,12 @@ class ResidualEnsemble(Dynamics):
         decay: float = 1e-2,
     ) -> None:
         super().__init__(spec)
-        self.targets = TransitionTargets(spec, "difference")
+        self.targets = Targets(spec, "difference")
         self.known = PhysicsDynamics(spec, physics)
-        self.physics = TransitionPhysics(physics, self.targets)
+        self.physics = TargetPhysics(physics, self.targets)
         self.number, self.hidden = number, hidden
         self.steps, self.rate, self.decay = steps, rate, decay
-        self._data: Transitions | None = None
+        self._data: Trajectories | None = None
         self._networks: Networks | None = None
 
     @property

@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics import PhysicsDynamics, Trajectories
 from gpadjust.envs import ARM_MEMORY_SPEC, ARM_SPEC, MuscleArmEnv, RememberAction
 from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, ArmEquation, torque_arm
 from gpadjust.physics import ODEPhysics
@@ -138,7 +137,7 @@ class FittedArm(PhysicsDynamics):
     def __init__(self, spec: StateSpec, start: ArmEquation, settings: Settings) -> None:
         self.equation = LearntArm(start).requires_grad_(False)
         super().__init__(spec, as_physics(self.equation, settings))
-        self._data: Transitions | None = None
+        self._data: Trajectories | None = None
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Fit the parameters to these and earlier transitions."""

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from gpadjust.dynamics import (
-    Dynamics,
-    LearnedDynamics,
-    PhysicsDynamics,
-    Records,
-    Transitions,
-    smooth,
-)
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, Trajectories
 from gpadjust.models import (
     CKA,
     RRA,
@@ -25,13 +19,14 @@ from gpadjust.models import (
     orthogonal_rbf,
 )
 from gpadjust.physics import Physics
+from gpadjust.records import Records, smooth
 from paper.real import SMOOTHED
 from paper.real.least_squares import LeastSquares
 from paper.real.machines import Machine
 from paper.real.networks import NetworkDynamics
 
 Known = Literal["crude", "identified"]
-Maker = Callable[[Machine, Transitions, int], Dynamics]
+Maker = Callable[[Machine, Trajectories, int], Dynamics]
 
 
 class Learnt(NamedTuple):
@@ -49,7 +44,7 @@ class Learnt(NamedTuple):
     parameters: PhysicsParameters | None = None
 
 
-def learnt(learner: str, machine: Machine, data: Transitions, seed: int) -> Learnt:
+def learnt(learner: str, machine: Machine, data: Trajectories, seed: int) -> Learnt:
     """What a learner makes of transitions of a machine; networks are drawn by the seed."""
     dynamics = MAKERS[learner](machine, data, seed)
     if not isinstance(dynamics, LearnedDynamics) or not dynamics.model.has_unknowns:
@@ -60,16 +55,16 @@ def learnt(learner: str, machine: Machine, data: Transitions, seed: int) -> Lear
 def learnt_of_stretches(learner: str, machine: Machine, records: Records, seed: int) -> Learnt:
     """The same of stretches: of all their transitions, or those of a draw of the states."""
     if learner not in SMOOTHED:
-        return learnt(learner, machine, records.transitions(), seed)
+        return learnt(learner, machine, records.trajectories(), seed)
     found = smooth(records, machine.calibrated())
-    dynamics = learnt(learner, machine, found.draw(seed).transitions(), seed).dynamics
+    dynamics = learnt(learner, machine, found.draw(seed).trajectories(), seed).dynamics
     return Learnt(dynamics, found.noise, found.physics_parameters)
 
 
 def _alone(known: Known) -> Maker:
     """f_p, of which nothing is learnt."""
 
-    def make(machine: Machine, data: Transitions, seed: int) -> Dynamics:
+    def make(machine: Machine, data: Trajectories, seed: int) -> Dynamics:
         return PhysicsDynamics(machine.spec, machine.physics(machine.known[known]))
 
     return make
@@ -78,7 +73,7 @@ def _alone(known: Known) -> Maker:
 def _adjusted(model: Any, known: Known | None) -> Maker:
     """The library's dynamics by their defaults."""
 
-    def make(machine: Machine, data: Transitions, seed: int) -> Dynamics:
+    def make(machine: Machine, data: Trajectories, seed: int) -> Dynamics:
         physics = None if known is None else machine.physics(machine.known[known])
         return _taught(LearnedDynamics(machine.spec, physics, model=model), data)
 
@@ -88,19 +83,19 @@ def _adjusted(model: Any, known: Known | None) -> Maker:
 def _calibrated(model: Any, **options: Any) -> Maker:
     """The same with a physics whose parameters are learnt with all else."""
 
-    def make(machine: Machine, data: Transitions, seed: int) -> Dynamics:
+    def make(machine: Machine, data: Trajectories, seed: int) -> Dynamics:
         physics = machine.calibrated()
-        learnt = LearnedDynamics(machine.spec, physics, model=model, model_options=options)
+        learnt = LearnedDynamics(machine.spec, physics, model=partial(model, **options))
         return _taught(learnt, data)
 
     return make
 
 
-def _least_squares(machine: Machine, data: Transitions, seed: int) -> Dynamics:
+def _least_squares(machine: Machine, data: Trajectories, seed: int) -> Dynamics:
     return _taught(LeastSquares(machine, machine.known["crude"]), data)
 
 
-def _adjusted_least_squares(machine: Machine, data: Transitions, seed: int) -> Dynamics:
+def _adjusted_least_squares(machine: Machine, data: Trajectories, seed: int) -> Dynamics:
     """One after the other, from the same transitions."""
     fitted = LeastSquares(machine, machine.known["crude"])
     physics: Physics = _taught(fitted, data).physics
@@ -108,14 +103,14 @@ def _adjusted_least_squares(machine: Machine, data: Transitions, seed: int) -> D
 
 
 def _networks(known: Known | None) -> Maker:
-    def make(machine: Machine, data: Transitions, seed: int) -> Dynamics:
+    def make(machine: Machine, data: Trajectories, seed: int) -> Dynamics:
         physics = None if known is None else machine.physics(machine.known[known])
         return _taught(NetworkDynamics(machine.spec, physics, seed=seed), data)
 
     return make
 
 
-def _taught(dynamics: Any, data: Transitions) -> Any:
+def _taught(dynamics: Any, data: Trajectories) -> Any:
     dynamics.update(*data)
     return dynamics
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 from torch import Tensor
 
-from gpadjust.dynamics import PhysicsDynamics, Transitions
+from gpadjust.dynamics import PhysicsDynamics, Trajectories
 from gpadjust.models import Prediction
 from paper.real.machines import Machine, Parameters
 
@@ -29,7 +29,7 @@ class LeastSquares(PhysicsDynamics):
     def __init__(self, machine: Machine, start: Parameters) -> None:
         self.machine, self.parameters = machine, dict(start)
         super().__init__(machine.spec, machine.physics(start))
-        self._data: Transitions | None = None
+        self._data: Trajectories | None = None
         self._noise = torch.zeros(machine.spec.state_dim, dtype=torch.float64)
 
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:

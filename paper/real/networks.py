@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import Dynamics, TransitionFunctions, Transitions
-from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
+from gpadjust.dynamics import Dynamics, Trajectories, TransitionFunctions
+from gpadjust.dynamics.targets import TargetPhysics, Targets
 from gpadjust.models import Prediction
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
@@ -48,11 +48,11 @@ class NetworkDynamics(Dynamics):
         seed: int = 0,
     ) -> None:
         super().__init__(spec)
-        self.targets = TransitionTargets(spec, "difference")
-        self.physics = None if physics is None else TransitionPhysics(physics, self.targets)
+        self.targets = Targets(spec, "difference")
+        self.physics = None if physics is None else TargetPhysics(physics, self.targets)
         self.folds, self.hidden, self.steps = folds, hidden, steps
         self.rate, self.decay, self.seed = rate, decay, seed
-        self._data: Transitions | None = None
+        self._data: Trajectories | None = None
         self._networks: Networks | None = None
 
     @property

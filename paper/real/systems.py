@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import Records, Transitions, Windows
+from gpadjust.dynamics import Trajectories, Windows
+from gpadjust.records import Records
 from paper.real.machines import DOUBLE_PENDULUM, PENDULUM, STEP, SUBSTEPS, Machine
 
 _LENGTH = 10  # transitions of a stretch
@@ -53,14 +54,14 @@ class System:
             **{name: dict(parameters) for name, parameters in self.machine.known.items()},
         }
 
-    def drawn(self, n: int, seed: int) -> Transitions:
+    def drawn(self, n: int, seed: int) -> Trajectories:
         """Transitions to learn from, spread over the records; ``n`` of them, or none.
 
         Raises:
             ValueError: If the records have fewer.
         """
-        known = self._records(self.train).transitions(STEP)
-        return known.spread(n, seed) if n else known.rows(0, 0)
+        known = self._records(self.train).trajectories(STEP)
+        return known.spread(n, seed) if n else known.some(slice(0))
 
     def stretches(self, n: int, seed: int) -> Records:
         """``n`` transitions in stretches of ten, or as many as divide ``n``, spread alike.
@@ -70,11 +71,11 @@ class System:
         """
         length = max(k for k in range(1, _LENGTH + 1) if n % k == 0)
         found = self._records(self.train).windows(length, STEP).spread(n // length, seed)
-        return found.as_records(self.machine.spec, STEP)
+        return Records.of_windows(found, self.machine.spec, STEP)
 
-    def steps(self, test: str) -> Transitions:
+    def steps(self, test: str) -> Trajectories:
         """The single steps of a test, that start where the machine moves."""
-        data = self._records(self.tests[test]).transitions(STEP)
+        data = self._records(self.tests[test]).trajectories(STEP)
         return data.some(self._fast(data.states).nonzero().flatten())
 
     def windows(self, test: str, length: int, number: int) -> Windows:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.dynamics import Records, Transitions
+from gpadjust.dynamics import Trajectories
 from gpadjust.envs import (
     ARM_SPEC,
     CART_POLE_SPEC,
@@ -21,6 +21,7 @@ from gpadjust.envs import (
     torque_arm_physics,
 )
 from gpadjust.physics import ODEPhysics, Physics
+from gpadjust.records import Records
 from gpadjust.states import StateSpec
 from paper.real.systems import DATA
 from paper.structures import ARM, SIMULATED
@@ -50,8 +51,8 @@ class System(NamedTuple):
 
     spec: StateSpec
     physics: Physics
-    train: Transitions
-    test: Transitions
+    train: Trajectories
+    test: Trajectories
 
 
 def system(name: str, n: int, num_test: int, seed: int) -> System:
@@ -75,13 +76,13 @@ def system(name: str, n: int, num_test: int, seed: int) -> System:
     test = recorded(name, _TEST[name])
     if name == "pendulum":
         moves = test.states[:, 1].abs() > _MOVES
-        test = Transitions(*(part[moves] for part in test))
+        test = Trajectories(*(part[moves] for part in test))
     physics = pendulum_physics() if name == "pendulum" else double_pendulum_physics()
-    return System(_SPECS[name], physics, Transitions(*(part[order[:n]] for part in known)), test)
+    return System(_SPECS[name], physics, Trajectories(*(part[order[:n]] for part in known)), test)
 
 
 @cache
-def episodes(name: str, n: int, seed: int) -> Transitions:
+def episodes(name: str, n: int, seed: int) -> Trajectories:
     """The first ``n`` transitions of episodes with uniform actions, drawn anew for each step."""
     env: Any = MuscleArmEnv() if name == ARM else CartPoleSwingUpEnv()
     space = env.action_space
@@ -96,11 +97,13 @@ def episodes(name: str, n: int, seed: int) -> Transitions:
             if failed:
                 break
             found.append((before, action, env.state))
-    return Transitions(*(torch.from_numpy(np.stack(part[:n])) for part in zip(*found, strict=True)))
+    return Trajectories(
+        *(torch.from_numpy(np.stack(part[:n])) for part in zip(*found, strict=True))
+    )
 
 
 @cache
-def recorded(name: str, numbers: tuple[str, ...]) -> Transitions:
+def recorded(name: str, numbers: tuple[str, ...]) -> Trajectories:
     """The transitions of 40 ms of records, one after the other, without overlap.
 
     The actions are means over the 40 ms.
@@ -109,7 +112,7 @@ def recorded(name: str, numbers: tuple[str, ...]) -> Transitions:
     file = "{}.csv" if pendulum else "A0_20220815_{}.csv"
     files = [DATA / name.replace("-", "_") / file.format(number) for number in numbers]
     records = Records.read_csv(files, _SPECS[name], segment="segment" if pendulum else None)
-    return records.transitions(CONTROL_STEP)
+    return records.trajectories(CONTROL_STEP)
 
 
 def pendulum_physics() -> ODEPhysics:

@@ -13,18 +13,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import (
-    Dynamics,
-    FreeRun,
-    LearnedDynamics,
-    PhysicsDynamics,
-    SmoothingWarning,
-    StateSpec,
-    smooth,
-)
+from gpadjust.dynamics import Dynamics, FreeRun, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.inference import SamplingWarning
 from gpadjust.models import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.physics import Physics
+from gpadjust.records import SmoothingWarning, smooth
 from paper.common.experiment import Record
 from paper.common.runner import run_one, runs_file
 from paper.tanks import CANDIDATES, GPS, NARX, PROCESS_NOISE, TENTH, Settings, Tanks
@@ -153,7 +146,7 @@ def narx(lags: int, actions: Tensor, lower: Tensor, n: int, seed: int) -> Learne
     records = outputs(actions, lower, lags)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Left out", UserWarning)
-        data = records.transitions()
+        data = records.trajectories()
     dynamics = LearnedDynamics(records.spec, model=ZeroMeanGP)
     dynamics.update(*data.spread(min(n, len(data.states)), seed))
     return dynamics
@@ -231,7 +224,7 @@ def _scores_of_gp(learner: str, by: Record, n: int, seed: int, settings: Setting
     known, found = smoothed(by["learner"], tuple(by["values"].items()), settings.samples)
     model = PhysicsMeanGP if learner.endswith("delta") else CKA
     dynamics = LearnedDynamics(SPEC, known, model=model)
-    data = found.draw(seed).transitions()
+    data = found.draw(seed).trajectories()
     dynamics.update(*data.spread(min(n, len(data.states)), seed))
     actions, lower = measured("Val", settings.samples)
     noise = {"noise": found.noise.nan_to_num(), "process_noise": "learnt"}

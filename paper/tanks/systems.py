@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gpadjust.dynamics import Record, Records, StateSpec
+from gpadjust.dynamics import StateSpec
 from gpadjust.physics import ODEPhysics, Unknown
+from gpadjust.records import Record, Records
 from paper.real.systems import DATA
 from paper.tanks import STRUCTURES
 

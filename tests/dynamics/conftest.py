@@ -1,7 +1,7 @@
 """A cart-pole, its crude physics, and dynamics of every model."""
 
 import math
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
@@ -96,9 +96,9 @@ def make():
     def make(kind, spec, physics, **options):
         sampled = FEW_SAMPLES if kind != "RRA-paper" else {"num_starts": 1, "num_screened": 8}
         options.setdefault("fit_options", sampled)
+        model = options.pop("model", _MODELS[kind])
         if kind.startswith("RRA"):
-            options.setdefault("model_options", {"num_features": 32})
-        physics = None if kind == "GP" else physics
-        return LearnedDynamics(spec, physics, model=_MODELS[kind], **options)
+            model = partial(model, num_features=32)
+        return LearnedDynamics(spec, None if kind == "GP" else physics, model=model, **options)
 
     return make

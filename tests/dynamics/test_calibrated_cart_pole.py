@@ -33,7 +33,7 @@ def physics():
 
 
 def trial(seed, noise=0.0):
-    """Transitions under random forces."""
+    """Trajectories under random forces."""
     env, draw = CartPoleSwingUpEnv(), np.random.default_rng(seed)
     env.reset(seed=seed)
     states, actions = [env.unwrapped.state], []

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, Record, Records, StateSpec
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.models import Prediction, ZeroMeanGP
 from gpadjust.physics import PhysicsError
+from gpadjust.records import Record, Records
 
 SPEC = StateSpec(["x"], ["v"])
 TURN = StateSpec(["theta"], ["omega"], angles=["theta"])
@@ -26,9 +27,6 @@ class Drift(Dynamics):
     def predict(self, states, actions):
         return Prediction(states + actions, torch.full_like(states, self.sd**2 + self.noise**2))
 
-    def sample(self, states, actions):
-        raise NotImplementedError
-
     def sample_functions(self, num_functions, seed=None):
         generator = torch.Generator().manual_seed(seed)
         rate = self.sd * torch.randn(num_functions, 1, 1, generator=generator, dtype=torch.float64)
@@ -44,8 +42,6 @@ class Drift(Dynamics):
 
     def update(self, states, actions, next_states):
         raise NotImplementedError
-
-    describe = state_dict = load_state_dict = update
 
 
 def start(num_windows=2, num_steps=6):
@@ -119,29 +115,54 @@ def test_the_ends_of_the_interval_are_draws_at_any_level():
     torch.testing.assert_close(inner.upper, ordered[29])
 
 
-def test_it_says_what_the_scores_of_trajectories_say(cart_pole_system, make, monkeypatch):
+def test_one_step_is_that_of_the_predictions(cart_pole_system, make):
     system = cart_pole_system
     dynamics = make("CKA", system.spec, system.crude)
     dynamics.update(*system.trial(0))
     states, actions, following = system.trial(1)
-    with monkeypatch.context() as patch:
-        patch.setattr(dynamics, "noise_variance", lambda states, actions: 0 * states)
-        options = {"horizons": (1, 9), "max_windows": 5}
-        scores = dynamics.score_trajectories(states, actions, following, **options)
-    rows = torch.arange(0, 17, 4)
-    ahead = actions[rows.unsqueeze(-1) + torch.arange(9)]
-    run = dynamics.free_run(states[rows], ahead, noise=False)
-    measured = following[rows + 8]
-    error = system.spec.change(run.mean[:, -1], measured)
-    torch.testing.assert_close(error.square().mean(0).sqrt(), scores.rmse[1])
-    at = run.mean[:, -1] + error
-    inside = (at >= run.lower[:, -1]) & (at <= run.upper[:, -1])
-    torch.testing.assert_close(inside.double().mean(0), scores.coverage[1])
-    noisy = dynamics.free_run(states[rows], ahead)
-    assert torch.equal(noisy.mean, run.mean)
-    scatter = (noisy.particles - run.particles).std(dim=(0, 1, 2))
+    one = dynamics.score(states, actions, following)
+    dynamics.num_features = 64  # which will do; fewer functions leave 0.2 of the error to chance
+    run = dynamics.free_run(states, actions.unsqueeze(1), num_functions=800)
+    many = run.score(following.unsqueeze(1))
+    torch.testing.assert_close(many.nlpd[0], one.nlpd, rtol=0.2, atol=0.2)
+    torch.testing.assert_close(many.coverage[0], one.coverage, rtol=0, atol=0.13)
+    torch.testing.assert_close(many.rmse[0], one.rmse, rtol=0.1, atol=1e-4)
+    quiet = dynamics.free_run(states, actions.unsqueeze(1), num_functions=800, noise=False)
+    assert torch.equal(quiet.mean, run.mean)
+    scatter = (run.particles - quiet.particles).std(dim=(0, 1, 2))
     learnt = dynamics.noise_variance(states, actions).mean(0).sqrt()
     torch.testing.assert_close(scatter, learnt, rtol=0.05, atol=0)
+
+
+def test_the_coverage_of_a_calibrated_model_is_nominal():
+    """The rate of each of many seeds is one more draw of the rates of its functions."""
+    inside = []
+    for seed, rate in enumerate(torch.randn(200, dtype=torch.float64)):
+        run = Drift(0.1).free_run(*start(1, 3), seed=seed)
+        measured = STATES[:1].unsqueeze(1) + (ACTIONS[:1, :3] + 0.1 * rate).cumsum(1)
+        inside.append(run.score(measured, horizons=[3]).coverage.item())
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.04)
+
+
+def test_states_that_are_integrated_share_the_noise_of_their_velocities(uniform):
+    spec = StateSpec(["q", "v"], ["u"], integrated={"q": "v"}, step=0.5)
+    states, actions = uniform(12, 2), uniform(12, 1, seed=1)
+    v = states[:, 1:] + actions + 0.1 * uniform(12, 1, low=-1, seed=2)
+    following = torch.cat([states[:, :1] + 0.25 * (states[:, 1:] + v), v], -1)
+    dynamics = LearnedDynamics(spec, lambda X: torch.cat([X[:, :1], X[:, 1:2] + X[:, 2:]], -1))
+    dynamics.update(states, actions, following)
+    variance = dynamics.noise_variance(states, actions)
+    noisy = dynamics.predict(states, actions).variance
+    quiet = dynamics.predict(states, actions, observation_noise=False).variance
+    torch.testing.assert_close(variance, noisy - quiet)
+    torch.testing.assert_close(variance[:, 0], variance[:, 1] / 16)
+    # In units of the noise the pair is a line, whose energy score is that of v, sqrt(1 + 1) longer.
+    run = dynamics.free_run(states, actions.unsqueeze(1), num_functions=199)
+    both, alone = (
+        run.score(following.unsqueeze(1), units=torch.tensor([unit, 1.0])).energy
+        for unit in (0.25, 1e9)
+    )
+    assert (both / alone).item() == pytest.approx(2**0.5, rel=0.02)
 
 
 @pytest.mark.parametrize("wraps", [False, True])

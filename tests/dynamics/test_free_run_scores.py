@@ -7,8 +7,9 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from gpadjust.dynamics import FreeRun, PhysicsDynamics, Record, Records, StateSpec
+from gpadjust.dynamics import FreeRun, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.particles import central_interval
+from gpadjust.records import Record, Records
 
 SPEC = StateSpec(["x", "theta"], ["u"], angles=["theta"])
 
@@ -17,7 +18,8 @@ def run_of(particles, level=0.8):
     """Free runs of given particles."""
     ends = central_interval(particles, level)
     lost = torch.zeros(particles.shape[1:3], dtype=torch.float64)
-    return FreeRun(particles.mean(0), *ends, particles, lost, SPEC, level)
+    mean = particles.mean(0)
+    return FreeRun(mean, *ends, particles, lost, SPEC, level, mean[:, 0])
 
 
 @pytest.fixture
@@ -37,13 +39,15 @@ def measured(run, uniform):
 
 def test_each_step_is_scored_by_its_formula(run, measured):
     scores = run.score(measured)
-    assert all(score.shape == (3, 2) for score in scores)
+    assert scores.output_names == SPEC.states
+    of_states = scores.rmse, scores.median, scores.nlpd, scores.coverage
+    assert all(score.shape == (3, 2) for score in of_states)
     assert (run.mean - measured)[..., 1].nan_to_num().max() > math.pi
     for t in range(3):
         for i in range(2):
             rows = [w for w in range(4) if not measured[w, t, i].isnan()]
             if not rows:
-                assert all(score[t, i].isnan() for score in scores)
+                assert all(score[t, i].isnan() for score in of_states)
                 continue
             mean, low, high = (x[rows, t, i].numpy() for x in (run.mean, run.lower, run.upper))
             sd, y = run.particles[:, rows, t, i].numpy().std(0, ddof=1), measured[rows, t, i]
@@ -60,6 +64,58 @@ def test_each_step_is_scored_by_its_formula(run, measured):
             # Of an even number torch takes the lower one of the two in the middle.
             assert scores.median[t, i] == pytest.approx(sorted(abs(error))[(len(rows) - 1) // 2])
     assert 0 < scores.coverage.nan_to_num().mean() < 1
+
+
+def test_the_energy_score_is_a_mean_over_pairs(run, measured):
+    units = torch.tensor([0.5, 2.0])
+    energy = run.score(measured, units=units).energy
+    error = SPEC.change(run.mean, measured)
+    for t in range(3):
+        expected = []
+        for w in range(4):
+            y = (run.mean[w, t] + error[w, t]) / units
+            if y.isnan().any():
+                continue
+            points, y = (run.particles[:, w, t] / units).tolist(), y.tolist()
+            pairs = [math.dist(a, b) for a in points for b in points]
+            expected.append(np.mean([math.dist(x, y) for x in points]) - sum(pairs) / (2 * 9 * 8))
+        mean = np.mean(expected) if expected else math.nan
+        assert energy[t].item() == pytest.approx(mean, nan_ok=True)
+
+
+def test_the_energy_of_one_state_without_doubt_is_the_distance_in_typical_steps():
+    spec, x = StateSpec(["x"], ["u"]), torch.arange(5, dtype=torch.float64)
+    fast = PhysicsDynamics(spec, lambda X: X[:, :1] + 1.5 * X[:, 1:])
+    run = fast.free_run(x[:1].unsqueeze(0), 2 * torch.ones(1, 4, 1).double())
+    scores = run.score(2 * x[1:].reshape(1, 4, 1))  # it moves by 2, the run by 3
+    np.testing.assert_allclose(scores.energy, [0.5, 1.0, 1.5, 2.0])
+
+
+def test_horizons_are_rows_of_all_steps(run, measured):
+    whole, some = run.score(measured), run.score(measured, horizons=[3, 1])
+    for name in ("rmse", "median", "nlpd", "coverage", "energy"):
+        chosen = getattr(some, name)
+        torch.testing.assert_close(getattr(whole, name)[[0, 2]], chosen, equal_nan=True)
+        torch.testing.assert_close(getattr(whole[2], name), chosen[1], equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "says"),
+    [
+        ({"horizons": ()}, ValueError, "different numbers of steps"),
+        ({"horizons": 5}, ValueError, r"such as \(1, 5, 15\), got 5"),
+        ({"horizons": (3, 3)}, ValueError, "different numbers"),
+        ({"horizons": (0, 3)}, ValueError, "each horizon to be a whole number >= 1, got 0"),
+        ({"horizons": (1.5,)}, ValueError, r"whole number >= 1, got 1\.5"),
+        ({"horizons": (1, 4)}, ValueError, "at most the 3 steps of the runs, got 4"),
+        ({"units": torch.zeros(2)}, ValueError, "finite and positive"),
+        ({"units": torch.ones(3)}, ValueError, "Expected units of shape 2, an entry for each"),
+        ({"units": "metres"}, TypeError, "Expected units as a tensor of numbers"),
+    ],
+)
+def test_options_out_of_range(run, measured, options, error, says):
+    with pytest.raises(error, match=says):
+        run.score(measured, **options)
 
 
 def test_particles_without_spread_say_nothing_of_errors(run, measured):

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, Record, Records, StateSpec
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.models import ZeroMeanGP
+from gpadjust.records import Record, Records
 
 QUICK = {"method": "map", "num_starts": 2, "num_screened": 16}
 LAGS = {"y_1": "y", "u_1": "u"}

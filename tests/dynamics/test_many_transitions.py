@@ -1,5 +1,7 @@
 """Dynamics by a model with inducing points."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -24,7 +26,7 @@ def transitions(n, seed=0):
 
 def make(**options):
     return LearnedDynamics(
-        SPEC, physics=step, model=VariationalCKA, model_options={"num_inducing": 12}, **options
+        SPEC, physics=step, model=partial(VariationalCKA, num_inducing=12), **options
     )
 
 
@@ -71,7 +73,7 @@ def test_a_free_run(dynamics):
 
 def test_they_are_not_conditioned_or_sampled(dynamics):
     with pytest.raises(NotImplementedError, match="build it of all data"):
-        dynamics.update(*transitions(5), refit=False)
+        dynamics.condition(*transitions(5))
     assert dynamics.num_transitions == 100
     with pytest.raises(ValueError, match="got 'bayes'"):
         make(fit_options={"method": "bayes"})

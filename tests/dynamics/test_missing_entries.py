@@ -1,4 +1,4 @@
-"""Transitions of which some entries of the next states were not measured."""
+"""Trajectories of which some entries of the next states were not measured."""
 
 import math
 

@@ -40,7 +40,7 @@ class Wider(Dynamics):
     """A user's own: push, and a doubt about the velocity."""
 
     is_fitted = True
-    update = sample = sample_functions = describe = state_dict = load_state_dict = None
+    update = sample_functions = None
 
     def predict(self, states, actions):
         mean = push(torch.cat([states, actions], -1))

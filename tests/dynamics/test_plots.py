@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.dynamics import PhysicsDynamics, Record, StateSpec, Windows
-from gpadjust.dynamics.plots import plot_free_run, plot_record
+from gpadjust.dynamics import PhysicsDynamics, StateSpec, Windows
+from gpadjust.dynamics.plots import plot_free_run
+from gpadjust.records import Record
+from gpadjust.records.plots import plot_record
 
 mpl.use("Agg")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gpadjust.dynamics.step_or_nan import step_or_nan
+from gpadjust.dynamics.particles import step_or_nan
 from gpadjust.physics import PhysicsError
 
 

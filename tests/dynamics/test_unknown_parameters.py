@@ -5,7 +5,7 @@ import torch
 
 from gpadjust import CKA, CalibratedPhysics, ODEPhysics, Unknown
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.transition_physics import TransitionPhysics, TransitionTargets
+from gpadjust.dynamics.targets import TargetPhysics, Targets
 from gpadjust.physics import FunctionPhysics
 
 SPEC = StateSpec(["q", "dq"], ["u"], angles=["q"])
@@ -95,7 +95,7 @@ def test_targets_of_a_physics_at_parameters(uniform):
         return moved.where(p.speed[:, None] < 5.0, torch.nan)
 
     physics = FunctionPhysics(turn, unknowns={"speed": Unknown(1.0, sd=1.0)})
-    targets = TransitionPhysics(physics, TransitionTargets(SPEC, "difference"))
+    targets = TargetPhysics(physics, Targets(SPEC, "difference"))
     X = uniform(4, 3, low=-3.0, high=3.0)
     speed = torch.tensor([[0.5], [4.0], [-4.0]], dtype=torch.float64)
     pi = torch.pi

@@ -6,15 +6,8 @@ import pyro.distributions as dist
 import pytest
 import torch
 
-from gpadjust.inference.annealing import (
-    Both,
-    Mixture,
-    Normal,
-    Particles,
-    raised,
-    resampled,
-    sample,
-)
+from gpadjust.inference.annealing import Particles, raised, resampled, sample
+from gpadjust.inference.proposals import Both, Mixture, Normal
 
 DRAWS, PARTICLES, GRADIENTS = 512, 256, 64 * 256
 

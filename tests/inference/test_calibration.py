@@ -8,7 +8,7 @@ import torch
 from gpadjust import AR1, CKA, CalibratedPhysics, FunctionPhysics, PhysicsMeanGP, Unknown, fit
 from gpadjust.gp import OrthogonalKernel
 from gpadjust.inference import ParameterWarning
-from gpadjust.inference.calibrate import Calibration
+from gpadjust.inference.calibration import Calibration
 from gpadjust.models import orthogonal_rbf
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
 from gpadjust.validation.plots import plot_prediction
@@ -93,7 +93,10 @@ def test_outputs_share_what_they_say():
         assert (both.physics_parameters.sd < one.physics_parameters.sd).all()
 
 
-@pytest.mark.parametrize("model_class", [CalibratedPhysics, PhysicsMeanGP, CKA])
+@pytest.mark.parametrize(
+    "model_class",
+    [CalibratedPhysics, PhysicsMeanGP, pytest.param(CKA, marks=pytest.mark.slow)],
+)
 def test_a_nonlinear_physics_is_found_from_far(model_class):
     X = torch.linspace(0.1, 3, 15, dtype=torch.float64).unsqueeze(-1)
     unknowns = {"a": Unknown(1.0, factor=4.0), "b": Unknown(8.0, factor=4.0)}

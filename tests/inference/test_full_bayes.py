@@ -13,7 +13,7 @@ from gpytorch.priors import LogNormalPrior
 from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size
 
-from gpadjust import CKA, BiasGP, fit
+from gpadjust import CKA, BiasGP, ZeroMeanGP, fit
 from gpadjust.inference import (
     FitResult,
     SampleResult,
@@ -21,8 +21,8 @@ from gpadjust.inference import (
     bayes,
     register_priors,
 )
-from gpadjust.inference.bayes import laplace_root
 from gpadjust.inference.optimise import Search, optima
+from gpadjust.inference.proposals import Both, Mixture, laplace_root
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.validation import leave_one_out
 from gpadjust.validation.plots import plot_adjustment, plot_adjustment_pair
@@ -109,6 +109,22 @@ def test_a_warning_when_the_draws_are_not_of_the_posterior(XY, monkeypatch):
     with pytest.warns(SamplingWarning, match=rf"sample size {size.item():.2g}\). Raise num_draws"):
         again = fit(CKA(*XY, physics=crude), **SHORT)
     assert not again.converged.any()
+
+
+@pytest.mark.parametrize(("many", "tries"), [(150, 2), (5, 1)])
+def test_draws_of_no_density_are_tried_around_the_optima_once(XY, monkeypatch, many, tries):
+    """With the prior among them first, of few observations."""
+    begun = []
+
+    def nothing(density, proposal, *args):
+        begun.append(proposal)
+        raise FloatingPointError
+
+    monkeypatch.setattr(bayes, "MANY", many)
+    monkeypatch.setattr(bayes.annealing, "sample", nothing)
+    with pytest.raises(RuntimeError, match="likelihood"):
+        fit(ZeroMeanGP(*XY), "bayes", **SHORT)
+    assert [type(each) for each in begun] == [Both, Mixture][-tries:]
 
 
 @pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # of one of six

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.gp.noise import Noise
-from gpadjust.inference.targets import ByModules, LogLikelihood, StationaryTerms, Target
+from gpadjust.inference.distributions import ByModules, StationaryTerms
+from gpadjust.inference.targets import LogLikelihood, Target
 
 D = 2
 SEEDS = st.integers(0, 2**31)

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from gpadjust import CKA, VariationalCKA
-from gpadjust.dynamics import Record
 from gpadjust.models.training_data import to_tensor
+from gpadjust.records import Record
 
 N = 6
 ONE_TO_SIX = np.arange(1.0, N + 1)

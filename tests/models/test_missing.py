@@ -49,8 +49,8 @@ def test_each_output_is_the_model_of_its_own_rows(
         own = leave_one_out(single)
         close(loo.mean[rows][:, [j]], own.mean)
         close(loo.variance[rows][:, [j]], own.variance)
-        close(loo.nlpd[[j]], own.nlpd)
-        close(loo.coverage()[[j]], own.coverage())
+        close(loo.score().nlpd[[j]], own.score().nlpd)
+        close(loo.score().coverage[[j]], own.score().coverage)
         new = ~new_Y[:, j].isnan()
         one = {name: values[new][:, [j]] for name, values in known.items()}
         later = single.condition_on_observations(new_X[new], new_Y[new][:, [j]], **one)

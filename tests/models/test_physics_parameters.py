@@ -170,6 +170,14 @@ class TestPhysicsParameters:
         )
         assert parameters.sd.tolist() == [0.0, 0.0]
 
+    @pytest.mark.parametrize(
+        "build",
+        [
+            pytest.param(b, marks=pytest.mark.slow if b in ("orthogonal", "RRA") else ())
+            for b in BUILDS
+        ],
+        indirect=True,
+    )
     def test_after_a_fit(self, make, waves):
         X, Y, Z = waves(1)
         model, truth = make(X, Y), torch.tensor([1.3, 1.7], dtype=torch.float64)

@@ -38,7 +38,7 @@ def test_predictions_while_the_model_is_conditioned(model, data, uniform):
     with torch.no_grad(), ThreadPoolExecutor(1) as pool:
         others = pool.submit(condition)
         try:
-            found = [model.predict(Z) for _ in range(60)]
+            found = [model.predict(Z) for _ in range(30)]
         finally:
             done.set()
         for right, many in ((expected, found), (conditioned, others.result())):
@@ -69,7 +69,7 @@ def test_seeded_functions(model, uniform):
         return model.sample_functions(2, seed=i % 5)(Z)
 
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(draw, range(60)))
+        found = list(pool.map(draw, range(30)))
     for i, values in enumerate(found):
         if i % 5 < 4:
             assert torch.equal(values, expected[i % 5])

@@ -371,7 +371,7 @@ def test_an_exact_model_of_many_points_warns():
 def test_stacking_and_comparison_want_exact_models(one):
     with pytest.raises(TypeError, match="Expected exact models such as CKA, got a VariationalCKA"):
         StackedGP({"many": one}, [[1.0]])
-    with pytest.raises(ValueError, match="got 'bayes'"):
+    with pytest.raises(TypeError, match="to make a gpadjust TermsGP, got VariationalCKA"):
         compare(*problem(8), wave, structures=[Structure("many", VariationalCKA)])
 
 

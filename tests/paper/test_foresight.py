@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gpadjust.dynamics.transitions import Transitions
+from gpadjust.dynamics import Trajectories
 from gpadjust.envs import CART_POLE_SPEC
 from paper.common.runner import rounded
 from paper.foresight import METHODS, NOISES, Foresight, Settings
@@ -45,7 +45,7 @@ def test_a_run_and_its_tables(tmp_path, monkeypatch):
 
 def test_sensors_see_each_state_once():
     states = torch.zeros(4001, 4, dtype=torch.float64)
-    trial = Transitions(states[:-1], torch.ones(4000, 1, dtype=torch.float64), states[1:])
+    trial = Trajectories(states[:-1], torch.ones(4000, 1, dtype=torch.float64), states[1:])
     (seen,) = measured(CART_POLE_SPEC, [trial], 0)
     assert seen.states[1:].equal(seen.next_states[:-1])
     assert seen.actions.equal(trial.actions)

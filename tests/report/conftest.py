@@ -81,8 +81,7 @@ def read():
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leaves the figures out, which take most of the time."""
-    for module in ("adjustment", "left_out"):
-        monkeypatch.setattr(f"gpadjust.report.{module}.drawn", lambda draw: Markup())
+    monkeypatch.setattr("gpadjust.report.sections.drawn", lambda draw: Markup())
 
 
 def f_p(X):

@@ -12,10 +12,9 @@ from gpadjust import CKA, VariationalCKA, ZeroMeanGP, fit, load
 from gpadjust.physics import FunctionPhysics, PhysicsError
 from gpadjust.report import report
 from gpadjust.report.figures import _slice
-from gpadjust.report.markup import table, tag
-from gpadjust.report.numbers import failure, name_and_unit, number
+from gpadjust.report.markup import failure, name_and_unit, number, table, tag
+from gpadjust.report.sections import headline, verdicts
 from gpadjust.report.subject import subject_of
-from gpadjust.report.verdict import headline, verdicts
 from gpadjust.validation import Gain
 
 from .conftest import Page, f_p
@@ -31,7 +30,7 @@ def test_a_comparison(comparison, tmp_path, read):
     assert all(len(image["alt"]) > 10 for image in page.images)
     _the_table_is_that_of(comparison, page)
     (gain,) = comparison.gain.values()
-    assert f"{_three(comparison)} Yes The physics helps to predict y." in page.text
+    assert f"{_three(comparison)} Yes The physics helps to predict y: elpd" in page.text
     assert f"{gain.elpd:+.1f} ± {gain.se:.1f} nats" in page.text
     for sentence in comparison.advice:
         assert sentence.replace("+-", "±") in page.text
@@ -68,7 +67,7 @@ def _left_out_is_that_of(loo, page):
     assert float(rows[0][2]) == pytest.approx(float(loo.mean[worst]), rel=1e-3)
     assert float(rows[0][head.index("x")]) == pytest.approx(float(loo.X[worst]), rel=1e-3)
     coverage = {row[0]: row[1] for row in page.tables["Coverage of left-out intervals"]}
-    assert coverage["y, 80 %"] == f"{round(10 * float(loo.coverage(0.8)))} of 10"
+    assert coverage["y, 80 %"] == f"{round(10 * float(loo.score(0.8).coverage))} of 10"
 
 
 def test_the_code_in_the_page_predicts_as_the_model(
@@ -94,7 +93,7 @@ def test_one_model_whose_physics_has_no_name(tmp_path, read, monkeypatch, undraw
     page = read(report(model, tmp_path / "report.html"))
     assert "Not asked" in page.text
     assert "report(compare(train_X, train_Y, physics))" in page.text
-    rmse = number(float(subject_of(model).loo.rmse[0]))
+    rmse = number(float(subject_of(model).loo.score().rmse[0]))
     alone = number(float((X.sum(-1).sin() - X[:, 0]).square().mean().sqrt()))
     assert f"Your formula: {alone} Pa; adjusted: {rmse} Pa (root mean square" in page.text
     monkeypatch.chdir(tmp_path)
@@ -168,7 +167,7 @@ def test_an_error_on_the_way_leaves_what_was_there(comparison, tmp_path, monkeyp
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gpadjust.report.provenance.settings", interrupted)
+    monkeypatch.setattr("gpadjust.report.sections.settings", interrupted)
     with pytest.raises(KeyboardInterrupt):
         report(comparison, old)
     assert old.read_text() == "old"
@@ -182,7 +181,7 @@ def test_a_model_that_cannot_be_saved_leaves_none_of_an_earlier_page(
         raise ValueError("no way")
 
     (tmp_path / "report.pt").write_text("old")
-    monkeypatch.setattr("gpadjust.report.writing.content_of", refuses)
+    monkeypatch.setattr("gpadjust.report.page.save", refuses)
     page = read(report(comparison, tmp_path / "report.html"))
     assert "The model could not be saved: no way" in page.text
     assert [each.name for each in tmp_path.iterdir()] == ["report.html"]

@@ -1,6 +1,7 @@
 """CKARegressor in scikit-learn's own checks, in its tools, and against the library's models."""
 
 import pickle
+from functools import partial
 
 import cloudpickle
 import numpy as np
@@ -24,6 +25,7 @@ from gpadjust import (
     PhysicsMeanGP,
     PhysicsWarning,
     Unknown,
+    VariationalCKA,
     ZeroMeanGP,
     fit,
 )
@@ -205,7 +207,7 @@ def test_physics_none_is_a_gaussian_process_without_physics(data):
 def test_a_class_of_models_with_options(data):
     X, y = data
     options = {"rho_mean": "learn", "train_Yvar": 0.05**2}
-    regressor = fast(model=PhysicsMeanGP, model_options=options).fit(X, y)
+    regressor = fast(model=partial(PhysicsMeanGP, **options)).fit(X, y)
     model = PhysicsMeanGP(X, y.reshape(-1, 1), physics=BlackBoxPhysics(wave), **options)
     fit(model, "map", **FAST, seed=0)
     np.testing.assert_array_equal(
@@ -215,13 +217,13 @@ def test_a_class_of_models_with_options(data):
 
 
 def test_parameters_are_left_as_they_are(data):
-    linear, kernel_options = torch.nn.Linear(1, 1).double(), {"center": 0.0}
+    linear, model = torch.nn.Linear(1, 1).double(), partial(CKA, center=0.0)
     before = linear.weight.item()
-    regressor = fast(linear, model_options=kernel_options).fit(*data)
+    regressor = fast(linear, model=model).fit(*data)
     assert linear.weight.item() == before != regressor.model_.physics.function.weight.item()
     parameters = regressor.get_params()
     assert parameters["physics"] is linear
-    assert parameters["model_options"] is kernel_options
+    assert parameters["model"] is model
 
 
 @pytest.mark.parametrize("method", [None, "map"])
@@ -392,15 +394,15 @@ def test_bad_data(data, change, error, message):
     [
         ({"model": "krr"}, ValueError, "one of 'cka', 'rra'.*got 'krr'"),
         ({"model": AR1}, ValueError, "AR1 samples f_p in `bounds`"),
-        ({"model": int}, ValueError, "a subclass of gpadjust.models.TermsModel, got"),
+        ({"model": 3}, TypeError, r"callable \(X, Y, \*\*physics\) .*got 3"),
+        ({"model": lambda X, Y, physics: X}, TypeError, "to make a gpadjust TermsModel, got nda"),
         ({"model": "rra", "physics": None}, ValueError, "without one take model='zero_mean'"),
         ({"physics": "wave"}, TypeError, "physics must be a Physics or a callable"),
         ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
         ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes' or 'map'"),
         ({"fit_options": {"num_samples": 4}}, ValueError, "it is one of method 'bayes'"),
-        ({"model_options": {"centre": 0}}, ValueError, "CKA takes no centre.* center"),
-        ({"model_options": {"physics": wave}}, ValueError, "CKA takes no physics"),
-        ({"physics": None, "model_options": {"center": 0}}, ValueError, "ZeroMeanGP takes no cen"),
+        ({"model": partial(CKA, centre=0)}, TypeError, "argument 'centre'; it takes center"),
+        ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
         ({"random_state": "seed"}, ValueError, "cannot be used to seed"),
     ],
 )
@@ -413,7 +415,7 @@ def test_bad_parameters(data, parameters, error, message):
 
 def test_inducing_points(data):
     X, y = data
-    regressor = fast(model="variational", model_options={"num_inducing": 6}).fit(X, y)
+    regressor = fast(model=partial(VariationalCKA, num_inducing=6)).fit(X, y)
     assert type(regressor.model_).__name__ == "VariationalCKA"
     mean, std = regressor.predict(X, return_std=True)
     assert np.abs(mean - y).max() < 0.2

@@ -103,11 +103,12 @@ def test_scores_are_those_of_the_predictions(data, build):
     X, Y = data(num_outputs=2)
     loo = leave_one_out(build("CKA", X, Y))
     three = loo.mean, loo.variance, loo.Y
-    torch.testing.assert_close(loo.rmse, rmse(loo.mean, loo.Y))
-    torch.testing.assert_close(loo.nlpd, nlpd(*three))
-    torch.testing.assert_close(loo.crps, crps(*three))
-    torch.testing.assert_close(loo.pit, pit(*three))
-    torch.testing.assert_close(loo.coverage(0.5), coverage(*three, 0.5))
+    scores = loo.score(0.5)
+    torch.testing.assert_close(scores.rmse, rmse(loo.mean, loo.Y))
+    torch.testing.assert_close(scores.nlpd, nlpd(*three))
+    torch.testing.assert_close(scores.crps, crps(*three))
+    torch.testing.assert_close(scores.pit, pit(*three))
+    torch.testing.assert_close(scores.coverage, coverage(*three, 0.5))
     torch.testing.assert_close(loo.residuals, (loo.Y - loo.mean) / loo.variance.sqrt())
 
 

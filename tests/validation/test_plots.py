@@ -12,7 +12,7 @@ from gpytorch.distributions import MultivariateNormal
 from matplotlib.figure import Figure
 
 from gpadjust import CKA, VariationalCKA, ZeroMeanGP
-from gpadjust.validation import leave_one_out, score
+from gpadjust.validation import LeaveOneOut, leave_one_out, score
 from gpadjust.validation.plots import (
     plot_adjustment,
     plot_adjustment_pair,
@@ -169,10 +169,14 @@ def test_a_row_for_each_physics(uniform):
 def test_calibration_and_pit(plane, data):
     loo = leave_one_out(plane)
     X, Y = data(num_outputs=2)
-    for prediction in (loo, loo.pit, score(plane.posterior(X, observation_noise=True), Y)):
+    for prediction in (loo, loo.score().pit, score(plane.posterior(X, observation_noise=True), Y)):
         ax = plot_calibration(prediction, output=1)
         assert ax.get_title() == "$y_{2}$"
-        values = prediction if isinstance(prediction, torch.Tensor) else prediction.pit
+        values = (
+            loo.score().pit
+            if isinstance(prediction, torch.Tensor | LeaveOneOut)
+            else prediction.pit
+        )
         x, y = curve(ax, "observed").get_data()
         for level in (0.3, 0.8):
             inside = ((values[:, 1] - 0.5).abs() <= level / 2).double().mean().item()
@@ -333,7 +337,11 @@ def test_bad_input(line, plane, data, forrester):
         (lambda: plot_leave_one_out(loo, output="y1"), ValueError, "number >= 0, got 'y1'"),
         (lambda: plot_pit(torch.tensor([0.5, 1.5])), ValueError, "PIT values between 0 and 1"),
         (lambda: plot_pit(loo, bins=1.5), ValueError, r"bins to be a whole number >= 1, got 1\.5"),
-        (lambda: plot_pit(loo.pit.numpy()), TypeError, "the values themselves as a torch tensor"),
+        (
+            lambda: plot_pit(loo.score().pit.numpy()),
+            TypeError,
+            "the values themselves as a torch tensor",
+        ),
         (lambda: plot_calibration(loo, output=2), ValueError, "no output 2; there are 2, from 0"),
     ):
         with pytest.raises(error, match=says):

@@ -8,7 +8,7 @@ from botorch.posteriors import GPyTorchPosterior
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 from gpytorch.distributions import MultitaskMultivariateNormal, MultivariateNormal
 
-from gpadjust.validation import coverage, crps, nlpd, pit, rmse, score
+from gpadjust.validation import Scores, coverage, crps, energy_score, nlpd, pit, rmse, score
 
 
 @pytest.fixture
@@ -202,3 +202,47 @@ def test_gradients_of_scores_skip_what_was_not_observed(prediction):
         (gradient,) = torch.autograd.grad(value.sum(), mean)
         assert gradient.isfinite().all()
         assert gradient[0, 1, 2] == 0
+
+
+def test_scores_of_a_batch_are_those_of_its_parts(prediction):
+    mean, variance, y = prediction
+    lower, upper = mean - 1, mean + variance
+    energy = torch.tensor([1.0, 2.0])
+    whole = Scores.of(*prediction, interval=(lower, upper), energy=energy, output_names="abc")
+    part = whole[1]
+    torch.testing.assert_close(part.rmse, rmse(mean[1], y[1]))
+    torch.testing.assert_close(part.pit, pit(mean[1], variance[1], y[1]))
+    torch.testing.assert_close(part.median, (mean[1] - y[1]).abs().median(0).values)
+    inside = ((lower[1] <= y[1]) & (y[1] <= upper[1])).double().mean(0)
+    torch.testing.assert_close(part.coverage, inside)
+    assert (part.energy, part.output_names) == (2, ("a", "b", "c"))
+    with pytest.raises(IndexError, match="no batch"):
+        part[0]
+
+
+def test_where_no_variance_is_said_only_errors_count(prediction):
+    mean, variance, y = (t.clone() for t in prediction)
+    variance[:, 2], variance[..., 0] = torch.nan, torch.nan
+    rest = [0, 1, 3, 4, 5, 6]
+    scores = Scores.of(mean, variance, y)
+    torch.testing.assert_close(scores.rmse, rmse(mean, y))
+    some = mean[:, rest, 1:], variance[:, rest, 1:], y[:, rest, 1:]
+    for name, one in (("nlpd", nlpd), ("crps", crps), ("coverage", coverage)):
+        torch.testing.assert_close(getattr(scores, name)[:, 1:], one(*some))
+        assert getattr(scores, name)[:, 0].isnan().all()
+    none = Scores.of(mean[:, :0], variance[:, :0], y[:, :0])
+    assert none.median.isnan().all()
+    assert none.rmse.shape == (2, 3)
+
+
+def test_energy_score_is_the_crps_of_one_output(uniform):
+    y, draws = uniform(2, 5, 1, seed=1), uniform(40, 2, 5, 1, seed=2)
+    pairs = (draws - draws.unsqueeze(1)).abs().sum((0, 1)) / (2 * 40 * 39)
+    expected = ((draws - y).abs().mean(0) - pairs).mean((-2, -1))
+    torch.testing.assert_close(energy_score(draws, y), expected)
+    y[0] = torch.nan
+    torch.testing.assert_close(energy_score(draws, y)[1], expected[1])
+    assert energy_score(draws, y)[0].isnan()
+    sure = uniform(5, 3, seed=3)
+    same = energy_score(sure.expand(4, 5, 3), sure + 1)
+    torch.testing.assert_close(same, torch.tensor(3.0).double().sqrt())

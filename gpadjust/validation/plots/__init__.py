@@ -4,10 +4,18 @@ Each function draws on the axes that it is given, or on those of a new figure, a
 show or save the figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``.
 """
 
-from gpadjust.validation.plots.adjustments import plot_adjustment, plot_adjustment_pair
-from gpadjust.validation.plots.calibration import plot_calibration, plot_pit
-from gpadjust.validation.plots.predictions import plot_leave_one_out, plot_prediction
-from gpadjust.validation.plots.trust import plot_trust, plot_trust_pair
+from gpadjust.validation.plots.adjustments import (
+    plot_adjustment,
+    plot_adjustment_pair,
+    plot_trust,
+    plot_trust_pair,
+)
+from gpadjust.validation.plots.predictions import (
+    plot_calibration,
+    plot_leave_one_out,
+    plot_pit,
+    plot_prediction,
+)
 
 __all__ = [
     "plot_adjustment",

@@ -1,0 +1,266 @@
+"""Targets of a model that stand for next states, and the physics in their form."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal, cast
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics.trajectories import Trajectories
+from gpadjust.models.term_builder import PhysicsLike
+from gpadjust.physics import (
+    JoinedPhysics,
+    ODEPhysics,
+    ParameterValues,
+    Physics,
+    PhysicsError,
+    as_physics,
+)
+from gpadjust.physics.memo import RowMemo, row_keys
+from gpadjust.states import StateSpec
+
+Target = Literal["difference", "absolute"]
+
+
+class Targets:
+    r"""Targets of a model that stand for next states.
+
+    They are the change of each predicted state, :math:`y = s' - s`, of an angle the shortest way
+    round; or with ``"absolute"`` its next value :math:`s + (s' - s)`, which is continuous along a
+    trajectory even where angles come wrapped.
+
+    Args:
+        spec: What the entries of states and actions are.
+        target: ``"difference"`` or ``"absolute"``.
+
+    Raises:
+        ValueError: If ``target`` is neither.
+    """
+
+    def __init__(self, spec: StateSpec, target: Target) -> None:
+        if target not in ("difference", "absolute"):
+            raise ValueError(f"Unknown target {target!r}; expected 'difference' or 'absolute'.")
+        self.spec = spec
+        self.target = target
+        moving = spec.moving
+        self.predicted = [moving.index(i) for i in spec.predicted]
+        read = [*moving, *[None] * spec.action_dim, *spec.previous_columns]
+        self.angles = [place for place, i in enumerate(read) if i in spec.angle_columns]
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """The names of the columns of :meth:`inputs`."""
+        spec = self.spec
+        moving, previous = (
+            [spec.states[i] for i in c] for c in (spec.moving, spec.previous_columns)
+        )
+        return (*moving, *spec.actions, *previous)
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """The names of the targets."""
+        names = [self.spec.states[i] for i in self.spec.predicted]
+        return tuple(f"change of {n}" if self.target == "difference" else n for n in names)
+
+    def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The raw inputs of a model, ``... x d``: states that move, actions, previous values.
+
+        The physics reads the first two only.
+        """
+        moving = states[..., self.spec.moving]
+        previous = states[..., self.spec.previous_columns]
+        return torch.cat([moving, actions.expand(*moving.shape[:-1], -1), previous], dim=-1)
+
+    def encode(self, states: Tensor, next_states: Tensor) -> Tensor:
+        """Targets ``... x m`` of transitions."""
+        predicted = self.spec.predicted
+        change = self.spec.change(states, next_states)[..., predicted]
+        return change if self.target == "difference" else states[..., predicted] + change
+
+    def decode(self, states: Tensor, targets: Tensor) -> Tensor:
+        """Next values of the predicted states, ``... x m``."""
+        return targets if self.target == "absolute" else states[..., self.spec.predicted] + targets
+
+
+class TargetPhysics(Physics):
+    r"""Turns f_p, which returns next states, into a physics of the targets.
+
+    Memory, batching and gradients are those of the physics itself. The values at the training
+    inputs can be given, so that a simulator need not run again when a model is loaded.
+
+    Args:
+        physics: Next values of the states that move, from these and the actions.
+        targets: What the models learn.
+    """
+
+    def __init__(self, physics: Physics, targets: Targets) -> None:
+        super().__init__(unknowns=physics.unknowns, name=physics.name)
+        self.physics = physics
+        self.targets = targets
+        self.num_outputs = len(targets.predicted)
+        self._known = RowMemo(2**62)
+
+    def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
+        """The targets that the physics stands for, ``N x m``."""
+        return self._targets_of(self.physics.of_rows, X, *parameters)
+
+    def _targets_of(
+        self, ask: Callable[[Tensor], Tensor], X: Tensor, *parameters: ParameterValues
+    ) -> Tensor:
+        """The targets by what the physics is asked of its rows."""
+        targets = self.targets
+        num_states = len(targets.spec.moving)
+        states = X[:, :num_states]
+        read = X[:, : num_states + targets.spec.action_dim]
+        try:
+            following = ask(self.physics.read_rows(read, *parameters))
+        except PhysicsError as error:
+            error.partial = None  # next states, which are no targets
+            raise
+        check_next_values(self.physics, following, num_states)
+        change = following - states
+        columns = []
+        for i in targets.predicted:
+            column = change[:, i]
+            if i in targets.angles:
+                column = torch.atan2(column.sin(), column.cos())
+            columns.append(column if targets.target == "difference" else states[:, i] + column)
+        return torch.stack(columns, dim=-1)
+
+    def know(self, X: Tensor, values: Tensor) -> None:
+        """Take the values at inputs ``N x d`` as given; they replace those known so far."""
+        keys = dict(zip(row_keys(X), range(len(X)), strict=True))
+        known = RowMemo(self._known.capacity)
+        known.store([*keys], values[list(keys.values())])
+        self._known = known
+
+    def anew(self, X: Tensor) -> Tensor:
+        """The values at ``N x d`` as the physics says them, whatever was given."""
+        known, self._known = self._known, RowMemo(self._known.capacity)
+        try:
+            values: Tensor = self(X)
+            return values
+        finally:
+            self._known = known
+
+    def forget(self) -> None:
+        """Forget what was given, and what the physics remembers."""
+        self._known = RowMemo(self._known.capacity)
+        self.physics.forget()
+
+    def of_rows(self, rows: Tensor) -> Tensor:
+        """As the base class, by the values that were given as far as they are."""
+        asks = torch.is_grad_enabled() and rows.requires_grad
+        if asks or not len(self._known) or self.unknowns or self._state():
+            return super().of_rows(rows)
+        return self._known.recall(rows, super().of_rows, learn=False)
+
+    def fresh_rows(self, rows: Tensor) -> Tensor:
+        """As :meth:`of_rows`, as the physics says it whatever was given or is remembered."""
+        d = rows.shape[-1] - len(self.unknowns)
+        given = [self.unknowns.named(rows[:, d:])] if self.unknowns else []
+        return self._targets_of(self.physics.fresh_rows, rows[:, :d], *given)
+
+    def _state(self) -> list[Tensor]:
+        """What the physics depends on besides X, as far as torch knows."""
+        return [*self.parameters(), *self.buffers()]
+
+    @contextmanager
+    def restored_on_error(self) -> Iterator[None]:
+        """Take back what it was given, and its parameters, if there is an error."""
+        known, state = self._known, [(tensor, tensor.detach().clone()) for tensor in self._state()]
+        try:
+            yield
+        except BaseException:
+            self._known = known
+            with torch.no_grad():
+                for tensor, before in state:
+                    tensor.copy_(before)
+            raise
+
+    def extra_repr(self) -> str:
+        """The settings that ``repr`` shows."""
+        return f"target={self.targets.target!r}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is known, which belongs to the data."""
+        return {**self.__dict__, "_known": RowMemo(self._known.capacity)}
+
+
+def check_physics(physics: PhysicsLike, spec: StateSpec) -> Physics:
+    """A physics of next states, or several of them joined, from what the user gave."""
+    whole = as_physics(physics)
+    for part in parts_of(whole).values():
+        if isinstance(part, ODEPhysics) and part.difference:
+            raise ValueError(
+                f"Physics {part.name!r} returns the change of the state (difference=True), but "
+                "dynamics take the next state from it; build it with difference=False."
+            )
+        step = part.step if isinstance(part, ODEPhysics) else spec.step
+        if spec.step is not None and not math.isclose(step or 0.0, spec.step, rel_tol=1e-6):
+            raise ValueError(
+                f"Physics {part.name!r} makes steps of {step:g}, but the spec says {spec.step:g}; "
+                f"build it with step={spec.step:g}, or correct the spec."
+            )
+    return whole
+
+
+def parts_of(physics: Physics) -> dict[str, Physics]:
+    """The physics that a joined one holds, by their names; of any other, that one itself."""
+    if isinstance(physics, JoinedPhysics):
+        return {n: cast(Physics, p) for n, p in zip(physics.names, physics.parts, strict=True)}
+    return {physics.name: physics}
+
+
+def next_values(physics: Physics, inputs: Tensor, num_states: int) -> Tensor:
+    """What the physics says, ``... x num_states``, from ``... x (num_states + a)``."""
+    Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0))
+    check_next_values(physics, Y, num_states)
+    return Y
+
+
+def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
+    """Raise a ValueError unless the physics has returned as many columns as there are states."""
+    if Y.shape[-1] != num_states:
+        raise ValueError(
+            f"Expected physics {physics.name!r} to return the next values of the {num_states} "
+            f"states that are neither exogenous nor previous values, got {Y.shape[-1]} columns."
+        )
+
+
+def warn_of_differences(
+    name: str, spec: StateSpec, data: Trajectories, columns: list[int], change: Tensor
+) -> None:
+    """Warn if the physics seems to return the change of the state instead of the next state.
+
+    It does if the state plus what it returned errs by less than a third, in units of the root mean
+    square of each state's true change.
+
+    Args:
+        name: The name of the physics.
+        spec: What the entries of the state are.
+        data: Trajectories of the system.
+        columns: The states that were compared.
+        change: Their change in the transitions, if the physics returns next states: ``N x m``.
+    """
+    truth = spec.change(data.states, data.next_states)
+    scale = truth.square().nanmean(0).sqrt()[columns]
+    errors = []
+    for added in (torch.zeros_like(data.states), data.states):
+        predicted = data.states.clone()
+        predicted[:, columns] += change + added[:, columns]
+        error = spec.change(data.next_states, predicted)[:, columns]
+        errors.append(float((error[:, scale > 0] / scale[scale > 0]).square().nansum().sqrt()))
+    if errors[1] < errors[0] / 3:
+        warnings.warn(
+            f"Physics {name!r} seems to return the change of the state, but dynamics take the next "
+            f"state from it. As a change, its error is {errors[1] / errors[0]:.2g} times that of "
+            "the next state. Let it return `next state = state + change`.",
+            UserWarning,
+            stacklevel=4,
+        )

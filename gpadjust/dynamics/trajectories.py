@@ -1,0 +1,236 @@
+"""Trajectories of a system, and windows of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.models.sampled_functions import check_number
+from gpadjust.models.training_data import check_finite, check_observed
+from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import check_columns
+
+
+class Windows(NamedTuple):
+    """Parts of trajectories, of the same length, for free runs: ``w`` windows of ``T`` steps.
+
+    Args:
+        initial_states: ``w x state_dim``.
+        actions: ``w x T x action_dim``.
+        measured: The states after each action, ``w x T x state_dim``; NaN where an entry was not
+            measured.
+    """
+
+    initial_states: Tensor
+    actions: Tensor
+    measured: Tensor
+
+    @property
+    def states(self) -> Tensor:
+        """The initial states, then what was measured: ``w x (T + 1) x state_dim``."""
+        return torch.cat([self.initial_states.unsqueeze(1), self.measured], dim=1)
+
+    def some(self, rows: Tensor | list[int]) -> Windows:
+        """The windows of these numbers, or those where a tensor of ``w`` booleans is true.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import Trajectories
+            >>> x = torch.arange(9, dtype=torch.float64).unsqueeze(-1)
+            >>> windows = Trajectories(x[:-1], x[:-1], x[1:], torch.zeros(8)).windows(2)
+            >>> fast = (windows.states.abs() > 3).any(1).any(-1)
+            >>> windows.some(fast).states[..., 0]
+            tensor([[2., 3., 4.],
+                    [4., 5., 6.],
+                    [6., 7., 8.]], dtype=torch.float64)
+        """
+        return Windows(*(part[rows] for part in self))
+
+    def spread(self, number: int, seed: int = 0) -> Windows:
+        """So many of the windows, drawn evenly, as by :meth:`Trajectories.spread`."""
+        return self.some(spread_rows(len(self.states), number, seed, "windows"))
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """Trajectories of a system: rows of transitions, and to which episode each belongs.
+
+    The next state of a row is the state of the row after it if both are of the same episode. They
+    unpack to states, actions and next states, ``dynamics.update(*trajectories)``.
+
+    Args:
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+        next_states: ``N x state_dim``; NaN where an entry was not measured.
+        episode: ``N`` numbers; the rows of an episode follow each other. Default: each row is
+            an episode, as of transitions that were measured one by one.
+
+    Raises:
+        ValueError: If they differ in their numbers of rows, or an episode has rows of another one
+            between its own.
+    """
+
+    states: Tensor
+    actions: Tensor
+    next_states: Tensor
+    episode: Tensor = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Number the episodes, and check them."""
+        episode = torch.arange(len(self.states)) if self.episode is None else self.episode
+        object.__setattr__(self, "episode", torch.as_tensor(episode).long())
+        rows = {"states": self.states, "actions": self.actions, "next_states": self.next_states}
+        found = {name: len(tensor) for name, tensor in {**rows, "episode": self.episode}.items()}
+        if len({*found.values()}) > 1 or self.episode.dim() != 1:
+            raise ValueError(
+                "Expected states, actions, next_states and episode with as many rows each, found "
+                f"{', '.join(f'{number} of {name}' for name, number in found.items())}."
+            )
+        if len(self.episode.unique_consecutive()) > len(self.episode.unique()):
+            raise ValueError(
+                "Expected the rows of an episode one after the other, found rows of another "
+                "episode between them; sort the rows, or number the parts as episodes."
+            )
+
+    @classmethod
+    def checked(
+        cls,
+        spec: StateSpec,
+        states: Tensor,
+        actions: Tensor,
+        next_states: Tensor,
+        episode: Tensor | None = None,
+    ) -> Trajectories:
+        """Take the user's tensors, copied.
+
+        Raises:
+            TypeError: If they are not float64 tensors.
+            ValueError: If shapes disagree, there are no rows, values are not finite, or of a next
+                state nothing was measured that a model predicts.
+        """
+        named = {"states": states, "actions": actions, "next_states": next_states}
+        for name, tensor in named.items():
+            columns = spec.action_dim if name == "actions" else spec.state_dim
+            check_columns(tensor, columns, name)
+            if tensor.dtype != torch.float64:
+                raise TypeError(
+                    f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`."
+                )
+            if tensor.dim() != 2 or len(tensor) != len(states) or not len(tensor):
+                raise ValueError(
+                    "Expected states, actions and next_states with as many rows each, and at least "
+                    f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
+                )
+            if name == "next_states":
+                check_observed(tensor, name)
+                check_observed(tensor[:, spec.predicted], "the predicted entries of next_states")
+            else:
+                check_finite(tensor, name)
+        return cls(*(tensor.detach().clone() for tensor in named.values()), episode)
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """States, actions and next states."""
+        return iter((self.states, self.actions, self.next_states))
+
+    @property
+    def longest(self) -> int:
+        """Number of steps of the longest episode."""
+        return max(self.episode.unique_consecutive(return_counts=True)[1].tolist(), default=0)
+
+    def append(self, other: Trajectories) -> Trajectories:
+        """These trajectories, then others; no episode goes on in them."""
+        last = self.episode.max() if len(self.episode) else -1
+        first = other.episode.min() if len(other.episode) else 0
+        parts = [torch.cat(pair) for pair in zip(self, other, strict=True)]
+        return Trajectories(*parts, torch.cat([self.episode, other.episode - first + last + 1]))
+
+    def some(self, rows: Tensor | slice) -> Trajectories:
+        """The rows of these numbers, a slice, or those where ``N`` booleans are true.
+
+        Episodes are numbered anew: one ends wherever the row after it is left out.
+        """
+        numbers = torch.arange(len(self.states))[rows]
+        old = self.episode[numbers]
+        ends = (numbers.diff() != 1) | (old.diff() != 0)
+        new = torch.cat([torch.zeros_like(old[:1]), ends.long().cumsum(0)])
+        return Trajectories(*(tensor[numbers] for tensor in self), new)
+
+    def spread(self, number: int, seed: int = 0) -> Trajectories:
+        """So many of the rows, drawn evenly: one of each of as many parts of the same length.
+
+        Args:
+            number: How many rows.
+            seed: Seed of the draw; PyTorch's generator is left as it is.
+
+        Raises:
+            ValueError: If there are fewer, or ``number`` is no positive whole number.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import Trajectories
+            >>> rows = torch.arange(100, dtype=torch.float64).unsqueeze(-1)
+            >>> Trajectories(rows, rows, rows + 1).spread(4).states.flatten() // 25
+            tensor([0., 1., 2., 3.], dtype=torch.float64)
+        """
+        return self.some(spread_rows(len(self.states), number, seed, "transitions"))
+
+    def windows(self, length: int, stride: int | None = None) -> Windows:
+        """Windows within episodes, to compare with :meth:`~gpadjust.dynamics.Dynamics.free_run`.
+
+        A window starts only at a state that was measured in full; else at the next one that was.
+
+        Args:
+            length: The number ``T`` of steps.
+            stride: How many steps after a window starts the next one. Default: ``length``, so that
+                they do not overlap.
+
+        Raises:
+            ValueError: If no episode is as long, or a number is no positive whole one.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import Trajectories
+            >>> x = torch.arange(6, dtype=torch.float64).unsqueeze(-1)
+            >>> two = Trajectories(x, x, x + 1, episode=[0, 0, 0, 0, 1, 1])
+            >>> two.windows(2).states[..., 0]
+            tensor([[0., 1., 2.],
+                    [2., 3., 4.],
+                    [4., 5., 6.]], dtype=torch.float64)
+        """
+        check_number(length, "length")
+        stride = length if stride is None else stride
+        check_number(stride, "stride")
+        complete, starts, end = (~self.states.isnan().any(-1)).tolist(), [], 0
+        lengths = self.episode.unique_consecutive(return_counts=True)[1].tolist()
+        for steps in lengths:
+            row, end = end, end + steps
+            while row + length <= end:
+                if complete[row]:
+                    starts.append(row)
+                row += stride if complete[row] else 1
+        if not starts:
+            raise ValueError(
+                f"Expected stretches of {length} steps from a state measured in full, found none; "
+                f"the longest stretch has {self.longest}. Take a smaller length."
+            )
+        rows = torch.tensor(starts).unsqueeze(-1) + torch.arange(length)
+        return Windows(self.states[rows[:, 0]], self.actions[rows], self.next_states[rows])
+
+
+def spread_rows(total: int, number: int, seed: int, what: str) -> Tensor:
+    """So many of the numbers below ``total``, one of each of as many parts of the same length.
+
+    Raises:
+        ValueError: If there are fewer, or ``number`` is no positive whole number.
+    """
+    check_number(number, "number")
+    if number > total:
+        raise ValueError(f"Expected number <= {total}, the {what} that there are, got {number}.")
+    edges = torch.arange(number + 1) * total // number
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(number, generator=generator, dtype=torch.float64)
+    return edges[:-1] + (share * edges.diff()).long()

@@ -1,0 +1,42 @@
+"""Models made by whatever the user gives to make one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from botorch.models.model import Model
+
+ModelFactory = Callable[..., Model]
+"""A callable ``(X, Y, **physics) -> model``: a class of models, ``functools.partial`` of one with
+further arguments, or a function."""
+
+
+def make_model(
+    factory: ModelFactory, X: Any, Y: Any, *, kind: type[Model] = Model, **given: Any
+) -> Any:
+    """A new model of data.
+
+    Args:
+        factory: Makes it.
+        X: Inputs, ``n x d``.
+        Y: Targets, ``n x m``.
+        kind: The class that the model has to be of.
+        given: What else it is made of, such as ``physics``; None is left out.
+
+    Raises:
+        TypeError: If ``factory`` is not callable, does not take the arguments, or makes something
+            else.
+    """
+    if not callable(factory):
+        raise TypeError(
+            "Expected a callable (X, Y, **physics) that makes a model, such as CKA or "
+            f"functools.partial(CKA, rho_mean=2.0), got {factory!r}."
+        )
+    model = factory(X, Y, **{name: value for name, value in given.items() if value is not None})
+    if not isinstance(model, kind):
+        raise TypeError(
+            f"Expected the model factory to make a {kind.__module__.partition('.')[0]} "
+            f"{kind.__name__}, got {type(model).__name__}."
+        )
+    return model

@@ -1,0 +1,282 @@
+"""Stretches of records as a chain of states, linear near a path through them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from gpadjust.dynamics.targets import check_next_values
+from gpadjust.physics import Physics, PhysicsError
+from gpadjust.records.kalman import Array, Link, Smoothed
+from gpadjust.records.record import Stretch
+from gpadjust.states import StateSpec
+
+_STEP = 1e-4  # of differences, in standard deviations of a parameter or a state
+_WIDE = 10.0  # standard deviations of a state, by which the first one may be elsewhere
+_SIZE = 1e-3  # of a state's size: it varies by no less
+_SHARE = 0.25  # of the variance of f_p's errors in single steps: that of the noise at first
+_HIDDEN = 0.1  # of the change in a step: what it adds to a state that is never measured, at first
+_LEAST = 1e-6  # of the standard deviation of a state: no noise is less, but by rounding
+_HALVINGS = 6
+_BETTER = 0.01  # what a worse path may cost more, by rounding
+
+
+class Known(NamedTuple):
+    """What is known beforehand, of the ``d`` states that move.
+
+    Args:
+        noise: Variances of the errors of what is measured; NaN where they are learnt.
+        process_noise: Variances of what a step adds to the physics; NaN where they are learnt.
+        start: Of states by number, mean and standard deviation at the beginning of a stretch.
+    """
+
+    noise: Array
+    process_noise: Array
+    start: Mapping[int, tuple[float, float]]
+
+
+class Path(NamedTuple):
+    """States of each stretch, ``T + 1 x d``, parameters ``p``, and f_p there: ``sum T x d``."""
+
+    states: list[Array]
+    parameters: Array
+    following: Array
+
+
+class Move(NamedTuple):
+    """Where a search goes from a path.
+
+    Args:
+        path: The next one.
+        whole: Whether it is the one that was found, and not on the way there or the one before.
+        refused: How far a path was that explains less, in standard deviations of the states; 0
+            where one was taken.
+    """
+
+    path: Path
+    whole: bool
+    refused: float
+
+
+class Chain:
+    """Stretches, and the physics that leads through them.
+
+    Args:
+        physics: The physics.
+        spec: What the entries of states and actions are.
+        stretches: The stretches.
+        known: What is known beforehand.
+    """
+
+    def __init__(
+        self, physics: Physics, spec: StateSpec, stretches: Sequence[Stretch], known: Known
+    ) -> None:
+        self.physics, self.known = physics, known
+        self.num_parameters = len(physics.unknowns)
+        moving = spec.moving
+        self.angles = [moving.index(i) for i in spec.angle_columns if i in moving]
+        self.actions = torch.cat([stretch.actions for stretch in stretches])
+        self.measured = [stretch.states[:, moving].numpy() for stretch in stretches]
+        self._unwrap(self.measured)
+        self.middle, self.spread = self._sizes()
+        self.starts = [self._start(measured) for measured in self.measured]
+
+    def first_path(self, parameters: Array) -> Path:
+        """Measured states, and between them and in hidden ones where f_p leads.
+
+        Args:
+            parameters: Its parameters' coordinates, ``p``.
+        """
+        lengths = [len(m) for m in self.measured]
+        states = [np.empty_like(m) for m in self.measured]
+        bounds = np.cumsum([0, *(n - 1 for n in lengths)])
+        now = np.stack([start[: len(self.spread)] for start, _ in self.starts])
+        complete = not np.isnan(np.concatenate(self.measured)).any()
+        for t in range(max(lengths)):
+            going = [i for i, n in enumerate(lengths) if n > t]
+            rows = np.stack([self.measured[i][t] for i in going])
+            if not complete and t:  # after a gap the angle may have gone round
+                rows[:, self.angles] = _near(rows, now[going], self.angles)
+                for i, row in zip(going, rows, strict=True):
+                    self.measured[i][t] = row
+            now[going] = np.where(np.isnan(rows), now[going], rows)
+            for i in going:
+                states[i][t] = now[i]
+            onward = [i for i in going if lengths[i] > t + 1]
+            if onward and not complete:
+                actions = self.actions[[bounds[i] + t for i in onward]]
+                now[onward] = self._following(now[onward], actions, parameters)
+        everything = np.concatenate([x[:-1] for x in states])
+        return Path(states, parameters, self._following(everything, self.actions, parameters))
+
+    def first_variances(self, path: Path) -> tuple[Array, Array]:
+        """Of both noises, by f_p's errors in single steps, whatever is known of them."""
+        ends = np.concatenate([m[1:] for m in self.measured])
+        begins = np.concatenate([x[:-1] for x in path.states])
+        change = ((path.following - begins) ** 2).mean(0)
+        errors = np.array(
+            [
+                np.nanmean((c - path.following[:, i]) ** 2) if ok else _HIDDEN**2 * change[i]
+                for i, (c, ok) in enumerate(self._columns(ends))
+            ]
+        )
+        least = (_LEAST * self.spread) ** 2
+        return (_SHARE * errors).clip(least), (2 * _SHARE * errors).clip(least)
+
+    def checked(self, noise: Array, process_noise: Array) -> tuple[Array, Array]:
+        """Variances with what is known of them, and none too small to reckon with."""
+        least = (_LEAST * self.spread) ** 2
+        pairs = ((self.known.noise, noise), (self.known.process_noise, process_noise))
+        noise, process_noise = (
+            np.where(np.isnan(given), found, given).clip(least) for given, found in pairs
+        )
+        return noise, process_noise
+
+    def linearised(self, path: Path) -> list[Link]:
+        """The chain near a path, by central differences."""
+        d, p = len(self.spread), self.num_parameters
+        states, N = np.concatenate([x[:-1] for x in path.states]), len(path.following)
+        moves = np.vstack([np.diag(_STEP * self.spread), np.zeros((p, d))])
+        turns = np.vstack([np.zeros((d, p)), _STEP * np.eye(p)])
+        ends = [
+            self.asked(states + sign * moves[:, None], self.actions, path.parameters + sign * turns)
+            for sign in (1.0, -1.0)
+        ]
+        sizes = 2 * np.concatenate([_STEP * self.spread, _STEP * np.ones(p)])
+        slope = (ends[0] - ends[1]) / sizes[:, None, None]
+        matrices = np.zeros((N, d + p, d + p))
+        matrices[:, :d] = np.moveaxis(np.nan_to_num(slope), 0, -1)  # 0 where f_p fails nearby
+        matrices[:, d:, d:] = np.eye(p)
+        here = np.concatenate([states, np.broadcast_to(path.parameters, (N, p))], axis=1)
+        onward = np.concatenate([path.following, here[:, d:]], axis=1)
+        offsets = onward - np.einsum("tij,tj->ti", matrices, here)
+        cuts = np.cumsum([len(m) - 1 for m in self.measured])[:-1]
+        parts = zip(np.split(matrices, cuts), np.split(offsets, cuts), self.measured, strict=True)
+        return [Link(*part) for part in parts]
+
+    def towards(
+        self, path: Path, found: Sequence[Smoothed], noise: Array, process_noise: Array
+    ) -> Move:
+        """The path that was found, or as much of the way there as explains more."""
+        d = len(self.spread)
+        ahead = [smoothed.states.means[:, :d] for smoothed in found]
+        parameters = found[0].states.means[0, d:]
+        before, share = self.cost(path, noise, process_noise), 1.0
+        for _ in range(_HALVINGS):
+            states = [x + share * (y - x) for x, y in zip(path.states, ahead, strict=True)]
+            moved = path.parameters + share * (parameters - path.parameters)
+            rows = np.concatenate([x[:-1] for x in states])
+            other = Path(states, moved, self.asked(rows, self.actions, moved))
+            cost = self.cost(other, noise, process_noise)
+            if cost <= before + _BETTER:  # false of NaN
+                return Move(other, share == 1.0, 0.0)
+            share /= 2
+        pairs = zip(ahead, path.states, strict=True)
+        far = max(float((np.abs(y - x) / self.spread).max()) for y, x in pairs)
+        return Move(path, False, far)
+
+    def likely_variances(
+        self, links: Sequence[Link], found: Sequence[Smoothed]
+    ) -> tuple[Array, Array]:
+        """Of noise and process_noise, most likely given what is known of the states."""
+        d = len(self.spread)
+        errors, added = [], []
+        for link, (states, crossed) in zip(links, found, strict=True):
+            means, spread = states.means[:, :d], states.covariances[:, :d, :d]
+            own = (link.measured - means) ** 2 + np.diagonal(spread, axis1=1, axis2=2)
+            errors.append(own)
+            lead = link.matrices[:, :d]
+            step = means[1:] - np.einsum("tij,tj->ti", lead, states.means[:-1])
+            step = step - link.offsets[:, :d]
+            of_both = np.einsum("tij,tij->ti", crossed[:, :d], lead)
+            of_first = np.einsum("tij,tjk,tik->ti", lead, states.covariances[:-1], lead)
+            of_last = np.diagonal(spread[1:], axis1=1, axis2=2)
+            added.append(step**2 + (of_last - 2 * of_both + of_first).clip(0))
+        measured = np.concatenate(errors)
+        columns = zip(self._columns(measured), self.spread, strict=True)
+        noise = [np.nanmean(c) if ok else size**2 for (c, ok), size in columns]  # or any number
+        return np.array(noise), np.concatenate(added).mean(0)
+
+    def cost(self, path: Path, noise: Array, process_noise: Array) -> float:
+        """Twice the negative log density of a path, but for a constant; NaN where f_p fails."""
+        states, d = np.concatenate(path.states), len(self.spread)
+        off = np.nan_to_num(states - np.concatenate(self.measured), nan=0.0) ** 2 / noise
+        ends = np.concatenate([x[1:] for x in path.states])
+        added = (ends - path.following) ** 2 / process_noise
+        begins = sum(
+            (((x[0] - mean[:d]) ** 2) / variance[:d]).sum()
+            for x, (mean, variance) in zip(path.states, self.starts, strict=True)
+        )
+        return float(off.sum() + added.sum() + begins + (path.parameters**2).sum())
+
+    def _following(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
+        """What f_p says, ``n x d``; an error if that is nothing."""
+        found = self.asked(states, actions, parameters)
+        if not np.isfinite(found).all():
+            failed = np.flatnonzero(~np.isfinite(found).all(1))
+            raise PhysicsError(
+                f"Physics {self.physics.name!r} fails at {len(failed)} of {len(found)} states "
+                f"where smoothing begins, the first of which is {states[failed[0]].tolist()} under "
+                f"the action {actions[failed[0]].tolist()}. They are measured ones, which may be "
+                "some noise beyond what is possible, or where the physics leads from `start` with "
+                "its guesses: let it go on smoothly beyond its limits, or say another start."
+            )
+        return found
+
+    def asked(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
+        """Next states ``... x n x d``, NaN where f_p fails, of angles near those of ``states``."""
+        rows = torch.from_numpy(np.ascontiguousarray(states))
+        X = torch.cat([rows, actions.expand(*rows.shape[:-1], -1)], dim=-1)
+        unknowns = self.physics.unknowns
+        values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
+        found: Array = self.physics.or_nan(X, values).numpy()
+        check_next_values(self.physics, torch.from_numpy(found), states.shape[-1])
+        found[..., self.angles] = _near(found, states, self.angles)
+        return found
+
+    def _sizes(self) -> tuple[Array, Array]:
+        """The middle of each state, and by how much it varies, as far as is known."""
+        everything = np.concatenate(self.measured)
+        sizes = np.empty((2, everything.shape[1]))
+        for i, (column, ok) in enumerate(self._columns(everything)):
+            measured = column[~np.isnan(column)] if ok else np.zeros(0)
+            middle, sd = self.known.start.get(i, (measured.mean() if ok else 0.0, 0.0))
+            if len(measured) > 1:
+                middle, sd = measured.mean(), max(sd, measured.std())
+            size = max(abs(middle), np.abs(measured).max(initial=0.0))
+            sizes[:, i] = middle, max(sd, _SIZE * (size or 1.0))
+        return sizes[0], sizes[1]
+
+    def _start(self, measured: Array) -> tuple[Array, Array]:
+        """Means and variances ``d + p`` of the first state of a stretch, and of the parameters."""
+        mean, sd = self.middle.copy(), _WIDE * self.spread
+        for i, (column, ok) in enumerate(self._columns(measured)):
+            if ok:
+                mean[i] = column[np.flatnonzero(~np.isnan(column))[0]]
+        for i, (middle, width) in self.known.start.items():
+            mean[i], sd[i] = middle, width
+        p = self.num_parameters
+        return np.concatenate([mean, np.zeros(p)]), np.concatenate([sd**2, np.ones(p)])
+
+    def _unwrap(self, stretches: Sequence[Array]) -> None:
+        """Let measured angles go on without jumps."""
+        for measured in stretches:
+            for i in self.angles:
+                rows = ~np.isnan(measured[:, i])
+                measured[rows, i] = np.unwrap(measured[rows, i])
+
+    @staticmethod
+    def _columns(rows: Array) -> list[tuple[Array, bool]]:
+        """Each column, and whether anything was measured of it."""
+        return [(column, not np.isnan(column).all()) for column in rows.T]
+
+
+def _near(states: Array, others: Array, angles: Sequence[int]) -> Array:
+    """Angles of states ``... x d``, within half a turn of those of others."""
+    columns = [*angles]
+    turns = np.round((states[..., columns] - others[..., columns]) / (2 * np.pi))
+    found: Array = states[..., columns] - 2 * np.pi * turns
+    return found

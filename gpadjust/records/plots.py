@@ -1,0 +1,110 @@
+"""Figures of records of a machine.
+
+Each function draws on the axes that it is given, or on those of a new figure, and returns them;
+show or save the figure with ``axes.flat[0].figure``. They need matplotlib,
+``pip install gpadjust[plot]``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import matplotlib.pyplot as plt
+import torch
+from matplotlib.axes import Axes
+from torch import Tensor
+
+from gpadjust.dynamics.plots import going_on, labels
+from gpadjust.records.record import Record
+from gpadjust.states import StateSpec
+from gpadjust.validation.plots.drawing import BLUE, GREY, given_axes, tidy
+
+__all__ = ["plot_record"]
+
+
+def plot_record(
+    record: Record,
+    spec: StateSpec,
+    *,
+    max_gap: float | None = None,
+    units: Mapping[str, str] | None = None,
+    axes: Any = None,
+) -> Any:
+    """Draw a record over time, a panel for each state and each action.
+
+    Lines end where a stretch does: gaps are grey, and a dotted line is where a segment begins.
+    Segments whose clock starts anew lie over each other. Angles go on without jumps, from within
+    half a turn at the beginning of a stretch.
+
+    Args:
+        record: The record.
+        spec: What the entries of its states and actions are.
+        max_gap: The longest time between two rows that follow each other, as of
+            :meth:`Record.stretches`.
+        units: Units for the labels, by the names of states and actions and ``"time"``, such as
+            ``{"omega": "rad/s"}``. Default: rad of angles, and s.
+        axes: As many axes as states and actions. Default: a new figure.
+
+    Returns:
+        An array of these axes.
+
+    Raises:
+        TypeError: If ``record`` is no :class:`Record`, or ``spec`` no :class:`StateSpec`.
+        ValueError: If the record has not the columns of the spec, a unit is of an unknown name,
+            the number of ``axes`` is another one, or it takes ``max_gap`` to say what a gap is.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.records import Record
+        >>> from gpadjust.states import StateSpec
+        >>> times = 0.01 * torch.arange(100, dtype=torch.float64)
+        >>> record = Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1))
+        >>> plot_record(record, StateSpec(["x"], ["v"]), units={"x": "m", "v": "m/s"}).shape
+        (2,)
+    """
+    for name, value, kind in (("record", record, Record), ("spec", spec, StateSpec)):
+        if not isinstance(value, kind):
+            raise TypeError(
+                f"Expected {name} as a {kind.__name__}, got {type(value).__name__}"
+                + ("; of `records` draw each." if kind is Record else ".")
+            )
+    found = record.states.shape[1], record.actions.shape[1]
+    if found != (spec.state_dim, spec.action_dim):
+        raise ValueError(
+            f"Expected a record of the spec's states, {', '.join(spec.states)}, and actions, "
+            f"{', '.join(spec.actions)}, found {found[0]} and {found[1]} columns; pass the spec of "
+            "this machine."
+        )
+    names, stretches = [*spec.states, *spec.actions], record.stretches(max_gap)
+    called = labels(spec, units)
+    if axes is None:
+        figure = plt.figure(figsize=(7, 1.4 * len(names)), layout="constrained")
+        axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)
+    axes, values = given_axes(axes, (len(names),)), torch.cat([record.states, record.actions], -1)
+    for i, (name, ax) in enumerate(zip(names, axes, strict=True)):
+        style = "default" if i < spec.state_dim else "steps-post"
+        for rows in stretches:
+            line = going_on(values[rows, i], i in spec.angle_columns)
+            _draw_known(ax, record.times[rows], line, drawstyle=style)
+        for before, after in pairwise(stretches):
+            end, start = (float(record.times[k]) for k in (before.stop - 1, after.start))
+            if end < start:
+                ax.axvspan(end, start, color=GREY, alpha=0.2, lw=0)
+            if record.segments and record.segments[before.start] != record.segments[after.start]:
+                ax.axvline(start, color=GREY, lw=0.8, ls=":")
+        ax.set(ylabel=called[name])
+        tidy(ax)
+    axes[-1].set(xlabel=called["time"])
+    axes[0].figure.align_ylabels(list(axes))
+    return axes
+
+
+def _draw_known(ax: Axes, times: Tensor, values: Tensor, **options: Any) -> None:
+    """Draw a line through ``n`` values with NaN, and dots where one has no neighbours."""
+    known = torch.nn.functional.pad(~values.isnan(), (1, 1))
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    ax.plot(times, values, color=BLUE, lw=1.1, **options)
+    if alone.any():
+        ax.plot(times[alone], values[alone], ".", color=BLUE, ms=3)

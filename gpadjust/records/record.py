@@ -1,0 +1,291 @@
+"""A trajectory of a machine, as it was measured, and in control steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from itertools import pairwise
+from numbers import Real
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.models.training_data import ArrayLike, to_tensor
+from gpadjust.states import StateSpec
+
+_GAP = 1.5  # typical steps: a longer time between two rows is a gap
+_OFTEN = 0.1  # of all times between rows: so many gaps are none
+_SAME = 0.01  # of a step, by which another one may differ from it
+_JITTER = 0.1  # of the sampling step, by which the time between two rows may differ from it
+
+
+class Record:
+    """A measured trajectory: times, and the states and actions of a machine there.
+
+    Row k has the state at its time, and the mean of the action from there to the next row. (That of
+    the last row counts for nothing: if it is not known, repeat the one before.) A record may be in
+    parts, by ``segments`` or because rows are missing, which is a gap: wherever two rows are more
+    than 1.5 times the median time apart. Rows on either side of a gap do not follow each other.
+
+    Args:
+        times: ``N`` times, in s or the unit of time of the velocities, that rise within a segment.
+        states: ``N x state_dim``; NaN where an entry was not measured.
+        actions: ``N x action_dim``.
+        segments: ``N`` labels; a segment ends wherever the label changes. Default: one for all.
+        name: What errors call it.
+
+    Tensors in float64, NumPy arrays, and columns of a pandas frame will do.
+
+    Raises:
+        TypeError: If values are no numbers, or a tensor is not in float64.
+        ValueError: If shapes disagree, times do not rise or are not finite, a state is infinite, an
+            action or a label is missing, or no row follows another.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.records import Record
+        >>> times = 0.01 * torch.arange(100, dtype=torch.float64)
+        >>> Record(times, times.sin().unsqueeze(-1), times.cos().unsqueeze(-1), name="swing")
+        Record('swing', 100 rows every 0.01, 1 state, 1 action)
+    """
+
+    def __init__(
+        self,
+        times: ArrayLike,
+        states: ArrayLike,
+        actions: ArrayLike,
+        segments: ArrayLike | Iterable[object] = None,
+        name: str = "unnamed",
+    ) -> None:
+        self.name = name
+        self.times = self._numbers(times, "times", 1)
+        self.states = self._numbers(states, "states", 2)
+        self.actions = self._numbers(actions, "actions", 2)
+        labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
+        self.segments = None if labels is None else tuple(labels)
+        self._check_rows()
+        self._check_values()
+
+    def __repr__(self) -> str:
+        states, actions = self.states.shape[1], self.actions.shape[1]
+        return (
+            f"Record({self.name!r}, {len(self.times)} rows every {self.sampling_step:.4g}, "
+            f"{states} state{'s' * (states > 1)}, {actions} action{'s' * (actions > 1)})"
+        )
+
+    @property
+    def sampling_step(self) -> float:
+        """The mean time from one row to the next, without gaps."""
+        steps = self.times.diff()[~self._breaks]
+        return float(steps[steps <= _GAP * steps.median()].mean())
+
+    def stretches(self, max_gap: float | None = None) -> list[slice]:
+        """The rows that follow each other, stretch by stretch.
+
+        Args:
+            max_gap: The longest time between two rows that follow each other. Default: 1.5 times
+                the median.
+
+        Raises:
+            ValueError: If times differ so much that it takes ``max_gap`` to say what a gap is.
+        """
+        steps, ends = self.times.diff(), self._breaks
+        if max_gap is None:
+            within = steps[~ends]
+            max_gap = _GAP * float(within.median())
+            longer = int((within > max_gap).sum())
+            if longer > max(1, _OFTEN * len(within)):
+                raise ValueError(
+                    f"{self._called}: expected even sampling with few gaps, found {longer} of "
+                    f"{len(within)} times between rows longer than {_GAP:g} times the median, "
+                    f"{max_gap / _GAP:.4g}. Bring it to even steps with `records.resampled(step, "
+                    "max_gap=...)`, where max_gap is the longest time to interpolate over."
+                )
+        edges = [0, *((ends | (steps > max_gap)).nonzero().flatten() + 1).tolist(), len(self.times)]
+        return [slice(first, end) for first, end in pairwise(edges)]
+
+    def check_even(self) -> None:
+        """Raise a ValueError unless the sampling is even, to a tenth of its step."""
+        step = self.sampling_step
+        for rows in self.stretches():
+            found = self.times[rows].diff()
+            if len(found) and (off := (found - step).abs()).max() > _JITTER * step:
+                row = int(off.argmax())
+                raise ValueError(
+                    f"{self._called}: expected even sampling, to a tenth of its step {step:.4g}, "
+                    f"found {float(found[row]):.4g} from row {rows.start + row} to the next. Bring "
+                    "it to even steps with `records.resampled(step)`."
+                )
+
+    @property
+    def _called(self) -> str:
+        return f"Record {self.name!r}"
+
+    @cached_property
+    def _breaks(self) -> Tensor:
+        """Of each row but the first, whether it begins a segment: ``N - 1`` booleans."""
+        if self.segments is None:
+            return torch.zeros(len(self.times) - 1, dtype=torch.bool)
+        changes = [label != following for label, following in pairwise(self.segments)]
+        return torch.tensor(changes, dtype=torch.bool)
+
+    def _numbers(self, values: ArrayLike, name: str, dims: int) -> Tensor:
+        tensor = to_tensor(values, name).detach().clone()
+        if tensor.dim() != dims or 0 in tensor.shape[1:]:
+            expected = "N" if dims == 1 else f"N x {name.removesuffix('s')}_dim"
+            raise ValueError(
+                f"{self._called}: expected {name} of shape {expected}, got {tuple(tensor.shape)}"
+                + ("; of a single column, use `.reshape(-1, 1)`." if dims > tensor.dim() else ".")
+            )
+        return tensor
+
+    def _check_rows(self) -> None:
+        """Raise an error unless all have as many rows, two or more, one of which follows another.
+
+        A label that is NaN is no label, and would be a segment of its own.
+        """
+        parts = {"times": self.times, "states": self.states, "actions": self.actions}
+        rows = {name: len(tensor) for name, tensor in parts.items()}
+        if self.segments is not None:
+            rows["segments"] = len(self.segments)
+        if len({*rows.values()}) > 1:
+            found = ", ".join(f"{number} of {name}" for name, number in rows.items())
+            raise ValueError(f"{self._called}: expected as many rows of each, found {found}.")
+        for row, label in enumerate(self.segments or ()):
+            if label is None or label != label:
+                raise ValueError(
+                    f"{self._called}, row {row}: expected a label of its segment, found {label}; "
+                    "leave out rows that are of no segment."
+                )
+        if len(self.times) < 2 or self._breaks.all():
+            raise ValueError(
+                f"{self._called}: expected two rows or more of a segment, one after the other, "
+                f"found {len(self.times)} in all; leave the record out, or mend `segments`."
+            )
+
+    def _check_values(self) -> None:
+        """Raise an error unless times rise and are finite, as actions are; states may be NaN."""
+        bad = {
+            "times": ~self.times.isfinite().unsqueeze(-1),
+            "states": self.states.isinf(),
+            "actions": ~self.actions.isfinite(),
+        }
+        for name, where in bad.items():
+            if where.any():
+                row, column = (int(i) for i in where.nonzero()[0])
+                found = float(getattr(self, name).reshape(len(where), -1)[row, column])
+                ways_out = {
+                    "times": "leave the row out",
+                    "states": "put NaN where an entry was not measured",
+                    "actions": "split the record there, by `segments` or in two, without that row",
+                }
+                raise ValueError(
+                    f"{self._called}, row {row}: expected finite numbers, found {found} in column "
+                    f"{column} of {name}; {ways_out[name]}."
+                )
+        stops = (self.times.diff() <= 0) & ~self._breaks
+        if stops.any():
+            row = int(stops.nonzero()[0]) + 1
+            before, time = self.times[row - 1 : row + 1].tolist()
+            raise ValueError(
+                f"{self._called}, row {row}: expected times that rise, found {time:.10g} after "
+                f"{before:.10g}. Leave out rows that were written twice; where the clock was set "
+                "anew, begin a new segment by `segments`."
+            )
+
+
+class Stretch(NamedTuple):
+    """Control steps that follow each other.
+
+    Args:
+        states: Before the first step and after each, ``n + 1 x state_dim``.
+        actions: ``n x action_dim``.
+        times: Of the states, ``n + 1``.
+        record: The number of the record.
+    """
+
+    states: Tensor
+    actions: Tensor
+    times: Tensor
+    record: int
+
+
+def in_control_steps(
+    records: Sequence[Record], spec: StateSpec, step: float | None
+) -> list[Stretch]:
+    """All stretches of the records; see :class:`~gpadjust.records.Records`.
+
+    Args:
+        records: The records.
+        spec: What the entries of states and actions are.
+        step: The control step; None for that of the spec, or else the sampling step.
+
+    Raises:
+        ValueError: If no stretch is as long as a step, sampling steps differ or are uneven, or the
+            step is no multiple of them or not that of the spec.
+    """
+    every, stretches = _rows_a_step(records, spec, step), []
+    for number, record in enumerate(records):
+        for rows in record.stretches():
+            num_steps = (rows.stop - rows.start - 1) // every
+            kept = slice(rows.start, rows.start + num_steps * every + 1, every)
+            states = record.states[kept].clone()
+            actions = record.actions[rows][: num_steps * every]
+            actions = actions.unflatten(0, (num_steps, every)).mean(1)
+            if every > 1:  # recorded ones are of a row before, not of a step
+                states[:1, spec.previous_columns] = math.nan
+            for _ in spec.previous:  # as often as the longest chain of them needs
+                spec.remember(states[1:], states[:-1].clone(), actions)
+            stretches.append(Stretch(states, actions, record.times[kept], number))
+    if not any(len(stretch.actions) for stretch in stretches):
+        raise ValueError(
+            f"Expected a stretch of {every + 1} rows or more, which are a control step, found none "
+            f"of {len(stretches)}; take a shorter step."
+        )
+    return stretches
+
+
+def checked_step(step: float, name: str = "step") -> float:
+    """A time that is positive and finite.
+
+    Raises:
+        TypeError: If it is no number.
+        ValueError: If it is none above zero.
+    """
+    if isinstance(step, bool) or not isinstance(step, Real):
+        raise TypeError(f"Expected {name} as a number, found {step!r}.")
+    if not 0 < step < math.inf:
+        raise ValueError(f"Expected {name} to be positive and finite, found {step}.")
+    return float(step)
+
+
+def _rows_a_step(records: Sequence[Record], spec: StateSpec, step: float | None) -> int:
+    """How many rows of the records make a control step."""
+    for record in records:
+        record.check_even()
+    fast, *_, slow = sorted((records[0], *records), key=lambda record: record.sampling_step)
+    sampling = fast.sampling_step
+    if slow.sampling_step - sampling > _SAME * sampling:
+        raise ValueError(
+            f"Expected records of one sampling step, found {sampling:.4g} of {fast.name!r} and "
+            f"{slow.sampling_step:.4g} of {slow.name!r}; bring them to one by "
+            f"`records.resampled({slow.sampling_step:.4g})`."
+        )
+    wanted = spec.step if step is None else checked_step(step)
+    if wanted is None:
+        return 1
+    if spec.step is not None and abs(wanted - spec.step) > _SAME * spec.step:
+        raise ValueError(
+            f"Expected the step of the spec, {spec.step:.4g}, got {wanted:.4g}; leave `step` out, "
+            "or make a spec with this step."
+        )
+    every = round(wanted / sampling)
+    if abs(wanted - every * sampling) > _SAME * wanted:
+        other = f", or first `records.resampled({wanted:.4g})`" if every else ""
+        raise ValueError(
+            f"Expected a control step that is a whole multiple of the sampling step, "
+            f"{sampling:.4g}, got {wanted:.4g}; take {max(every, 1) * sampling:.4g}{other}."
+        )
+    return every

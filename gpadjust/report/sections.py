@@ -1,0 +1,593 @@
+"""The sections of the page: their words, tables and figures."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import version
+
+from botorch.models.transforms.outcome import nanstd
+from scipy.stats import binom
+from torch import Tensor
+
+import gpadjust
+from gpadjust.models import PhysicsParameters, StackedGP
+from gpadjust.models.saving import Saved
+from gpadjust.physics import PhysicsError
+from gpadjust.report import figures
+from gpadjust.report.markup import (
+    Markup,
+    bullets,
+    code,
+    drawn,
+    failure,
+    join,
+    listed,
+    name_and_unit,
+    number,
+    percent,
+    plural,
+    table,
+    tag,
+    with_unit,
+)
+from gpadjust.report.subject import Adjusted, Subject
+from gpadjust.validation import Trust, trust
+from gpadjust.validation.plots.drawing import quantile
+from gpadjust.validation.structures import ALONE, STACKED
+
+COMPARE = "report(compare(train_X, train_Y, physics))"
+_WHAT = {
+    "zero mean": "no physics: a Gaussian process of the data alone",
+    "physics mean": "f_p + delta(x): the physics, and a bias that depends on the inputs",
+    "constant rho": "rho f_p + mu + delta(x): a fitted scale and offset, and a bias",
+    "CKA": "rho(x) f_p + delta(x): a scale and a bias that depend on the inputs",
+    "calibrated physics": "f_p with fitted parameters, and nothing else",
+    ALONE: "f_p as it is, with noise that the other observations tell; no candidate",
+    STACKED: "the mixture of all structures with the weights of the table",
+}
+_ERRORS = {ALONE: "your formula", "calibrated physics": "your formula, calibrated"}
+_BANDS = "Solid lines are means; bands hold 95 % of the function, without measurement noise."
+_ROUNDING = 1e-9  # of the observations' standard deviation
+_APART = (
+    "Observations are of rho f_p + delta alone: how much of it is rho's and how much delta's the "
+    "data tell far less surely than their sum."
+)
+_WORST = 5
+_LEVELS = (0.5, 0.8, 0.95)
+_LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where what is reported on comes from, as far as the model does not know.
+
+    Attributes:
+        settings: Names and values of settings.
+        remarks: Sentences on the data.
+        notes: Sentences on the fit, such as warnings.
+        physics: Python expressions of the physics by their names, for whoever loads the model; one
+            of the name ``""`` if there is one physics. None: as far as the model's file knows.
+        modules: The modules that these expressions need.
+        how: Code or a command that compares the model with others.
+    """
+
+    settings: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    physics: Mapping[str, str] | None = None
+    modules: tuple[str, ...] = ()
+    how: str = COMPARE
+
+
+def verdicts(subject: Subject, how: str = COMPARE) -> Markup:
+    """Whether the physics helps with each output, below the errors of formula, adjustment and data.
+
+    Args:
+        subject: What it is of.
+        how: Code or a command that compares, for a subject that was not compared.
+    """
+    cards = []
+    for j, name in enumerate(subject.outputs):
+        answer, sentences = verdict(subject, j, how)
+        kind = {"Yes": "yes", "No": "no"}.get(answer, "open")
+        heading = [tag("h3", name)] if len(subject.outputs) > 1 else []
+        body = [tag("p", sentence.replace("+-", "±")) for sentence in sentences]
+        big = tag("p", answer, class_="answer")
+        cards.append(tag("div", *heading, *_errors(subject, j), big, *body, class_=f"card {kind}"))
+    return tag("div", *cards, class_="cards")
+
+
+def headline(subject: Subject, how: str = COMPARE) -> str:
+    """The answer of all outputs in one line, for the terminal."""
+    found = [verdict(subject, j, how) for j in range(len(subject.outputs))]
+    if len(found) == 1:
+        answer, (first, *_) = found[0]
+        return f"{answer}. {first}"
+    pairs = zip(subject.outputs, found, strict=True)
+    return "; ".join(f"{name}: {answer.lower()}" for name, (answer, _) in pairs) + "."
+
+
+def verdict(subject: Subject, output: int, how: str = COMPARE) -> tuple[str, list[str]]:
+    """Whether the physics helps with an output, and sentences: those of the comparison, if any."""
+    name, comparison = subject.outputs[output], subject.comparison
+    if not subject.physics and not subject.is_sampled:
+        return "No physics", [f"The model of {name} has no physics to be judged."]
+    if comparison is None:
+        return "Not asked", [
+            "This is a report of one model; whether the physics helps takes a comparison with a "
+            f"model that has none: {how}"
+        ]
+    if name not in comparison.gain:
+        return "Not asked", [
+            "The comparison has no structure without the physics, or none with it; add 'zero mean' "
+            "to its structures."
+        ]
+    gain = comparison.gain[name]
+    return gain.answer, gain.sentences(name)
+
+
+def recommendation(subject: Subject) -> Markup:
+    """Which model is recommended, and why."""
+    comparison = subject.comparison
+    if comparison is None:
+        what = f"This page is of a given model, {subject.model!r}. It was not compared with others."
+        return tag("p", what)
+    rows = [*comparison.table.values()]
+    if len(comparison.models) == 1:
+        return tag("p", f"Only {rows[0][0].structure} was fitted: {_what(rows[0][0].structure)}.")
+    if comparison.chosen != STACKED:
+        name = comparison.chosen
+        why = "It has nearly all the weight."
+        return tag("p", "Recommended: ", tag("strong", name), f", {_what(name)}. {why}")
+    why = "It keeps the doubt between them in its intervals."
+    weights = []
+    for name, ranked in comparison.table.items():
+        shares = listed(
+            f"{row.structure} {row.weight:.2f}" for row in ranked if row.weight >= 0.005
+        )
+        weights.append(f"{name}: {shares}" if len(comparison.table) > 1 else shares)
+    mixture = tag("strong", "the mixture of all structures")
+    return join(
+        [
+            tag("p", "Recommended: ", mixture, f". {why}"),
+            tag("p", f"Its weights are {'; '.join(weights)}."),
+        ]
+    )
+
+
+def structures(subject: Subject) -> Markup:
+    """The table of each output, and what the structures are."""
+    comparison = subject.comparison
+    if comparison is None:
+        return _weights(subject)
+    parts = []
+    for j, output in enumerate(comparison.table):
+        unit = name_and_unit(output)[1]
+        head = ["structure", "elpd", "less the best", "its error", "weight"]
+        head += [f"RMSE [{unit}]" if unit else "RMSE", "RMSE / sd", "in 95 %"]
+        spread = spread_of(subject, j)
+        rows = [
+            [
+                row.structure,
+                f"{row.elpd:.4g}",
+                f"{row.elpd_diff:.3g}",
+                f"{row.se_diff:.2g}",
+                "-" if row.structure.startswith(ALONE) else f"{row.weight:.2f}",
+                number(row.rmse * spread),
+                f"{row.rmse:.3g}",
+                percent(row.coverage),
+            ]
+            for row in comparison.rows(output)
+        ]
+        parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
+    names = {row.structure: None for output in comparison.table for row in comparison.rows(output)}
+    terms = [join([tag("dt", name), tag("dd", _what(name))]) for name in names]
+    parts.append(
+        tag(
+            "p",
+            "elpd is the log density of left-out observations, summed, in nats: higher is better. "
+            "A difference of less than two of its errors shows nothing. RMSE is of the left-out "
+            "predictions, sd is that of the observations, and the last column is the share of "
+            "left-out observations within their 95 % intervals.",
+        )
+    )
+    return join([*parts, tag("dl", *terms)])
+
+
+def advice(subject: Subject, notes: list[str]) -> Markup:
+    """What the comparison says in sentences, and warnings of the fit."""
+    told = [] if subject.comparison is None else subject.comparison.advice
+    sentences = [text.replace("+-", "±") for text in (*told, *notes)]
+    return bullets(sentences) if sentences else Markup()
+
+
+def spread_of(subject: Subject, output: int) -> float:
+    """The standard deviation of the observations of an output, as tables of `compare` have it."""
+    spread = float(nanstd(subject.Y[:, output : output + 1], dim=0))
+    return spread if spread > 0 else 1.0
+
+
+def _errors(subject: Subject, output: int) -> list[Markup]:
+    """How far off the formula, its adjustment and the data alone are, in a line."""
+    name = subject.outputs[output]
+    if subject.comparison is not None:
+        errors = subject.comparison.errors()[name]
+    else:
+        Y, shown = subject.Y[:, output], subject.physics_at(subject.X, output)
+        errors = {
+            ALONE if len(shown) == 1 else f"{ALONE} of {physics}": float(
+                (Y - values).square().nanmean().sqrt()
+            )
+            for physics, values in shown
+        }
+        own = "adjusted" if subject.physics or subject.is_sampled else "data alone"
+        errors[own] = float(subject.loo.score().rmse[output])
+    if not errors:
+        return []
+    fitted = ", with fitted parameters" if subject.as_it_is != "as it is" else ""
+    told = []
+    for what, rmse in errors.items():
+        short, of, physics = what.partition(" of ")
+        label = _ERRORS.get(short, short) + (fitted if short == ALONE else "")
+        told.append(f"{label}{f' {physics}' * bool(of)}: {with_unit(number(rmse), name)}")
+    text = "; ".join(told)
+    note = tag("span", " (root mean square errors of left-out observations)", class_="note")
+    return [tag("p", text[0].upper() + text[1:], note, class_="errors")]
+
+
+def _weights(subject: Subject) -> Markup:
+    """The weights of a mixture that came without a comparison."""
+    if not isinstance(subject.model, StackedGP):
+        return Markup()
+    rows = [[name, *map("{:.2f}".format, w)] for name, w in subject.model.weights.items()]
+    return table("Weights of the mixture", ["structure", *subject.outputs], rows)
+
+
+def _what(name: str) -> str:
+    """What a structure is; of one of several physics, of which."""
+    short, of, physics = name.partition(" of ")
+    what = _WHAT.get(short, "a structure of your own")
+    return f"{what} ({physics})" if of else what
+
+
+def where_wrong(subject: Subject) -> Markup:
+    """The prediction beside the physics, rho and delta, for each output."""
+    inputs = figures.inputs_drawn(subject)
+    parts: list[str] = []
+    for j, name in enumerate(subject.outputs):
+        if len(subject.outputs) > 1:
+            parts.append(tag("h3", name))
+        shown = subject.adjusted[j]
+        parts.append(tag("p", " ".join(_words(subject, shown, j))))
+        parts.append(drawn(partial(figures.slices, subject, j, inputs)))
+        parts.append(drawn(partial(figures.pairs, subject, j)))
+    held = figures.held(subject, inputs)
+    notes = [tag("p", held, class_="note")] if held else []
+    return join([*notes, *parts])
+
+
+def trusted(subject: Subject) -> Markup:
+    """Which share of the predictions rests on the physics, on data, or on neither."""
+    shares: list[tuple[str, Adjusted, Trust]] = []
+    parts: list[str] = []
+    for name, shown in zip(subject.outputs, subject.adjusted, strict=True):
+        if shown is None:
+            continue
+        try:
+            shares.append((name, shown, trust(shown.model)))
+        except PhysicsError as error:
+            parts.append(tag("p", f"{name}: {failure(error)}", class_="caution"))
+    if not shares:
+        return join([*parts, *([] if parts else [tag("p", _none(subject))])])
+    rows = []
+    for name, shown, found in shares:
+        three = (found.physics, found.data, found.neither)
+        told = [percent(float(share[shown.output])) for share in three]
+        rows.append([name, shown.structure, *told])
+    head = ["output", "by the model", "physics", "data", "neither"]
+    points = f"{len(shares[0][2].X):,}"
+    words = (
+        f"Of {points} points spread over the box of the data: the share at which the prediction "
+        "rests on the physics (its interval holds f_p, and is narrower than the discrepancies that "
+        "were seen), on the data (its interval excludes f_p: the model is sure that the physics is "
+        "wrong there), or on neither (too few data to tell)."
+    )
+    parts += [tag("p", words), table("What predictions rest on", head, rows)]
+    inputs = figures.inputs_drawn(subject)
+    for name, shown, found in shares:
+        parts.append(drawn(partial(figures.trusts, found, shown.output, inputs, name)))
+    over = {1: "Along the input", 2: "Over both inputs"}.get(len(subject.inputs))
+    over = over or "Along each input, for all values of the others"
+    colours = "blue where it rests on the physics, orange on the data, grey on neither"
+    parts.append(tag("p", f"{over}: {colours}.", class_="note"))
+    return join(parts)
+
+
+def _none(subject: Subject) -> str:
+    """Why neither rho and delta nor trust can be shown."""
+    if subject.is_sampled:
+        return "AR1 knows its physics through samples alone, so that nothing is held against it."
+    return "There is no physics that could be adjusted, trusted or overridden."
+
+
+def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
+    """What the figures of an output show."""
+    if shown is None:
+        return [f"{_none(subject)} The figures show the prediction. {_BANDS}"]
+    name = subject.outputs[output]
+    found = []
+    for physics, values in subject.physics_at(subject.X, output):
+        off = subject.Y[:, output] - values
+        off = off[~off.isnan()]
+        rms, mean = float(off.square().mean().sqrt()), float(off.mean())
+        found.append(
+            f"At the data, the {physics} ({subject.as_it_is}) is off by "
+            f"{with_unit(number(rms), name)} (root mean square; observed less physics is "
+            f"{with_unit(number(mean), name)} in the mean)."
+        )
+    terms = [term for term in shown.model.term_names if term != "f"]
+    top = "the prediction of what is recommended, and dashed the physics"
+    if subject.comparison is None:
+        top = "the prediction, and dashed the physics"
+    if len(subject.inputs) == 1:
+        top += ", with the data"
+    found.append(f"Topmost: {top}.")
+    if terms:
+        weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
+        means = [shown.model.term_mean(term, shown.output) for term in terms]
+        means = [
+            0.0 if abs(mean) < _ROUNDING * spread_of(subject, output) else mean for mean in means
+        ]
+        back = [f"{term} = {number(mean)}" for term, mean in zip(terms, means, strict=True)]
+        found.append(
+            f"Below: {listed(terms)} of {shown.structure}{weight}, with ticks at the data; dashed, "
+            f"what they fall back to without data, {listed(back)}."
+        )
+        if len(terms) > 1:
+            found.append(_APART)
+    return [*found, _BANDS]
+
+
+def predictions(subject: Subject) -> Markup:
+    """Each observation predicted from all others, and those that are predicted worst."""
+    parts: list[str] = [tag("p", _how(subject))]
+    scores = subject.loo.score()
+    for j, name in enumerate(subject.outputs):
+        rmse = float(scores.rmse[j])
+        n = int((~subject.Y[:, j].isnan()).sum())
+        words = (
+            f"{name}: {plural(n, 'observation')}, root mean square error "
+            f"{with_unit(number(rmse), name)}, {percent(rmse / spread_of(subject, j))} of the "
+            "standard deviation of the observations."
+        )
+        parts += [
+            tag("p", words),
+            drawn(partial(figures.left_out, subject, j)),
+            _worst(subject, j),
+        ]
+    return join(parts)
+
+
+def calibration(subject: Subject) -> Markup:
+    """Whether intervals hold what they promise."""
+    rows, parts = [], []
+    held_by = {level: subject.loo.score(level).coverage for level in _LEVELS}
+    for j, name in enumerate(subject.outputs):
+        n = int((~subject.Y[:, j].isnan()).sum())
+        for level in _LEVELS:
+            share = float(held_by[level][j])
+            low, high = (int(binom.ppf(p, n, level)) for p in (0.025, 0.975))
+            held = round(share * n)
+            says = "too narrow" if held < low else "too wide" if held > high else "in that range"
+            cells = [f"{held} of {n}", percent(share), f"{low} to {high} of {n}", says]
+            rows.append([f"{name}, {percent(level)}", *cells])
+        parts.append(drawn(partial(figures.calibration, subject, j)))
+    head = ["interval", "holds", "share", "if calibrated", "the intervals are"]
+    words = (
+        "If intervals are honest, those of 95 % hold 95 % of left-out observations, but for "
+        "chance: the fourth column has the range that 95 of 100 honest models would be in. The "
+        "values of the histogram (PIT: where each observation fell within its prediction) are "
+        "then evenly spread; a U is too sure, a hill too careful."
+    )
+    return join([tag("p", words), table("Coverage of left-out intervals", head, rows), *parts])
+
+
+def _how(subject: Subject) -> str:
+    """How observations were left out."""
+    first = "Each observation is predicted by a model that has not seen it"
+    if subject.comparison is not None and subject.comparison.left_out:
+        return (
+            f"{first}, as in the table above. Of a mixture its weights, which have seen all, stay."
+        )
+    if subject.model.num_samples is None:
+        return (
+            "Each observation is predicted from all others; hyper-parameters (and fitted "
+            "parameters of the physics) stay as they are, and have seen it: with few data the "
+            "errors are too small."
+        )
+    return f"{first}, nor have its hyper-parameters: their samples are weighted anew for each."
+
+
+def _worst(subject: Subject, j: int) -> Markup:
+    """The observations that are farthest from their predictions, in standard deviations."""
+    loo, name = subject.loo, subject.outputs[j]
+    sure = loo.residuals[:, j].abs().nan_to_num(nan=-1.0)
+    order = [i for i in sure.argsort(descending=True).tolist() if sure[i] >= 0][:_WORST]
+    unit = name_and_unit(name)[1]
+    of = f" [{unit}]" if unit else ""
+    few = len(subject.inputs) <= 4
+    head = ["", f"observed{of}", f"predicted{of}", "95 %", "residual / sd"]
+    rows = []
+    for i in order:
+        half = quantile(0.95) * float(loo.variance[i, j].sqrt())
+        mean = float(loo.mean[i, j])
+        cells = [number(float(loo.Y[i, j]), 4), number(mean, 4)]
+        cells += [f"{number(mean - half, 4)} to {number(mean + half, 4)}"]
+        cells += [f"{float(loo.residuals[i, j]):+.1f}"]
+        cells += [number(x, 4) for x in subject.X[i].tolist()] if few else []
+        rows.append([subject.rows[i], *cells])
+    head += list(subject.inputs) if few else []
+    caption = f"The {len(rows)} observations of {name} that are farthest from their predictions"
+    return table(caption, head, rows)
+
+
+def parameters(subject: Subject) -> Markup:
+    """The unknown parameters of the physics: prior and posterior; nothing if there are none."""
+    parts = []
+    seen: set[str] = set()
+    for shown in subject.adjusted:
+        if shown is None or not shown.model.has_unknowns:
+            continue
+        if shown.structure in seen:
+            continue  # outputs share them
+        seen.add(shown.structure)
+        known: PhysicsParameters = shown.model.physics_parameters
+        low, high = known.interval()
+        rows = []
+        for i, (name, unknown) in enumerate(known.unknowns.items()):
+            interval = f"{number(float(low[i]), 4)} to {number(float(high[i]), 4)}"
+            mean, sd = number(float(known.mean[i]), 4), number(float(known.sd[i]))
+            rows.append([name, mean, sd, interval, unknown.prior_text, unknown.unit or "-"])
+        head = ["parameter", "mean", "sd", "95 % interval", "known before", "unit"]
+        parts.append(table(f"Parameters of the physics, by {shown.structure}", head, rows))
+    if not parts:
+        return Markup()
+    words = (
+        "A bias that is free to vary leaves open which values are the true ones: these describe "
+        "the system best together with it. Compare 'known before' with the interval: where they "
+        "are alike, the data have told next to nothing."
+    )
+    return join([*parts, tag("p", words)])
+
+
+def summary(subject: Subject) -> Markup:
+    """The summary of what predicts, in the user's units."""
+    words = (
+        "In the units of the data; of samples the median, and the range of 95 % of them. A "
+        "lengthscale is the distance over which a function changes, sd how much. Means are those "
+        "of the prior; what was learnt of rho and delta is in the figures."
+    )
+    text = code(subject.model.summary())
+    return join(
+        [tag("p", words), tag("details", tag("summary", "All hyper-parameters"), text, open="")]
+    )
+
+
+def data(subject: Subject, origin: Origin) -> Markup:
+    """An overview of the columns, and what is missing or repeated."""
+    rows = []
+    kinds = (("input", subject.inputs, subject.X), ("output", subject.outputs, subject.Y))
+    for kind, names, values in kinds:
+        for name, column in zip(names, values.unbind(-1), strict=True):
+            seen = column[~column.isnan()]
+            short, unit = name_and_unit(name)
+            ends = [seen.min(), seen.median(), seen.max()]
+            numbers = [number(float(end), 4) for end in ends]
+            rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])
+    head = ["column", "is", "unit", "least", "median", "most", "missing"]
+    remarks = [f"{plural(len(subject.X), 'row')} of data.", *_repeats(subject), *origin.remarks]
+    return join([table("Columns", head, rows), bullets(remarks)])
+
+
+def _repeats(subject: Subject) -> list[str]:
+    """How many rows have the inputs of another, and how far their outputs differ."""
+    _, index = subject.X.unique(dim=0, return_inverse=True)
+    counts = index.bincount()
+    repeated = int(counts[counts > 1].sum())
+    if not repeated:
+        return ["No two rows have the same inputs."]
+    told = []
+    for name, y in zip(subject.outputs, subject.Y.unbind(-1), strict=True):
+        sd = _pooled_sd(y, index)
+        told += [] if sd is None else [f"{with_unit(number(sd), name)} ({name_and_unit(name)[0]})"]
+    differ = (
+        f", and their outputs differ by a standard deviation of {', '.join(told)}" if told else ""
+    )
+    return [f"{plural(repeated, 'row')} share their inputs with another{differ}."]
+
+
+def _pooled_sd(y: Tensor, index: Tensor) -> float | None:
+    """The standard deviation within groups of the same inputs."""
+    squares, freedom = 0.0, 0
+    for group in index.unique():
+        own = y[(index == group) & ~y.isnan()]
+        if len(own) > 1:
+            squares += float((own - own.mean()).square().sum())
+            freedom += len(own) - 1
+    return (squares / freedom) ** 0.5 if freedom else None
+
+
+def settings(subject: Subject, origin: Origin) -> Markup:
+    """The settings, versions, and the date."""
+    physics = ", ".join(
+        f"{name} ({type(each).__name__}{', learns' * bool([*each.parameters()])})"
+        for name, each in subject.physics.items()
+    )
+    rows = [[name, value] for name, value in origin.settings.items()]
+    physics = physics or ("known through samples" if subject.is_sampled else "none")
+    rows += [["model", repr(subject.model)], ["physics", physics]]
+    versions = [f"{name} {version(name)}" for name in _LIBRARIES]
+    own = f"gpadjust {gpadjust.__version__}"
+    rows.append(["versions", ", ".join([own, f"Python {platform.python_version()}", *versions])])
+    rows.append(["date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")])
+    return table("How this page came about", ["setting", "value"], rows, kind="words")
+
+
+def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
+    """Code that loads the model beside the page, and predicts.
+
+    Args:
+        subject: What the page is of.
+        saved: The model's file; or why there is none.
+        origin: Where the physics comes from.
+    """
+    if isinstance(saved, str):
+        return tag("p", f"The model could not be saved: {saved}", class_="caution")
+    file, missing = saved.path.name, saved.missing
+    words = [f"The model is in {file}, beside this page; run this in its folder."]
+    imports, arguments = ["import torch"], []
+    if origin.physics is not None:
+        imports += [f"import {module}" for module in origin.modules]
+        boxes = any("BlackBoxPhysics(" in each for each in origin.physics.values())
+        imports.append(f"from gpadjust import {'BlackBoxPhysics, ' * boxes}load")
+        where = f"module{'s' * (len(origin.modules) > 1)} {listed(origin.modules)}"
+        words.append(f"Python has to find the {where}: there, or in a folder on PYTHONPATH.")
+        arguments.append(f"physics={_expression(origin.physics)}")
+        missing = tuple(name for name in missing if name != "physics")
+    else:
+        imports.append("from gpadjust import load")
+        if "physics" in missing:
+            words.append(
+                "The file could not hold the physics, which has no name in a module: give what the "
+                "model was built with as f_p."
+            )
+        elif saved.physics:
+            words.append(
+                f"The physics is found by its name: Python has to find {', '.join(saved.physics)}."
+            )
+    arguments += [f"{name}={'f_p' if name == 'physics' else name}" for name in missing]
+    call = ", ".join([repr(file), *arguments])
+    point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())
+    lines = [
+        *imports,
+        "",
+        f"model = load({call})",
+        f"# a row for each point: {', '.join(map(repr, subject.inputs))}",
+        f"X = torch.tensor([[{point}]], dtype=torch.float64)",
+        "",
+        f"mean, variance = model.predict(X)  # of {', '.join(map(repr, subject.outputs))}",
+        "lower, upper = model.interval(X, level=0.95)  # where the function is",
+        "lower, upper = model.interval(X, level=0.95, observation_noise=True)  # a measurement",
+    ]
+    return join([tag("p", " ".join(words)), code("\n".join(lines))])
+
+
+def _expression(physics: Mapping[str, str]) -> str:
+    if [*physics] == [""]:
+        return physics[""]
+    pairs = ", ".join(f"{name!r}: {each}" for name, each in physics.items())
+    return f"{{{pairs}}}"

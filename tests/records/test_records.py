@@ -1,0 +1,603 @@
+"""Records of machines: transitions, windows and even steps, and what is no record."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from gpadjust.dynamics import PhysicsDynamics, StateSpec, Trajectories
+from gpadjust.physics import ODEPhysics
+from gpadjust.records import Record, Records
+
+SPEC = StateSpec(["x"], ["u"])
+POINT = StateSpec(["x", "v"], ["u"])
+
+
+def column(*values):
+    return torch.tensor(values, dtype=torch.float64).reshape(-1, 1)
+
+
+def steps_of_episodes(data):
+    """How many steps each episode has, one after the other."""
+    return data.episode.unique_consecutive(return_counts=True)[1].tolist()
+
+
+def counted(num_rows, first=0.0, step=0.01, at=None, **options):
+    """A record whose state is the number of its row from ``first``, and whose action its square."""
+    rows = first + torch.arange(num_rows, dtype=torch.float64)
+    times = step * rows if at is None else at
+    return Record(times, rows.unsqueeze(-1), rows.square().unsqueeze(-1), **options)
+
+
+def pendulum_record(num_rows=81, step=0.01):
+    """A pendulum that turns over, at times that a fine simulation meets, and its physics."""
+    physics = {
+        k: ODEPhysics(
+            lambda s, a: torch.stack([s[:, 1], a[:, 0] - 20 * s[:, 0].sin()], -1),
+            k * step,
+            2,
+            substeps=10 * k,
+        )
+        for k in (1, 5)
+    }
+    states, actions = [torch.tensor([[3.0, 2.0]]).double()], []
+    for k in range(num_rows):
+        actions.append(torch.full((1, 1), 3.0 + (k // 5) % 2).double())
+        states.append(physics[1](torch.cat([states[-1], actions[-1]], -1)))
+    path = torch.cat(states[:-1])
+    path[:, 0] = torch.atan2(path[:, 0].sin(), path[:, 0].cos())
+    return Record(step * np.arange(num_rows), path, torch.cat(actions)), physics[5]
+
+
+def test_a_control_step_is_every_kth_row_with_the_mean_action():
+    data = Records([counted(8)], SPEC).trajectories(0.03)
+    assert data.states.flatten().tolist() == [0, 3]
+    assert data.next_states.flatten().tolist() == [3, 6]
+    assert data.actions.flatten().tolist() == pytest.approx([5 / 3, (9 + 16 + 25) / 3])
+    assert all(tensor.dtype == torch.float64 for tensor in data)
+    assert isinstance(data, Trajectories)
+    every = Records([counted(8)], SPEC).trajectories()
+    assert every.states.flatten().tolist() == [*range(7)]
+
+
+def test_the_steps_of_a_system_are_those_of_its_physics():
+    record, physics = pendulum_record()
+    spec = StateSpec(["theta", "omega"], ["torque"], angles=["theta"])
+    data = Records([record], spec).trajectories(0.05)
+    assert len(data.states) == 16
+    assert record.states[:, 0].diff().abs().max() > 6, "it turns over"
+    windows = data.windows(16)
+    run = PhysicsDynamics(spec, physics).free_run(windows.initial_states, windows.actions)
+    assert run.score(windows.measured).rmse.max() < 1e-6
+
+
+@pytest.mark.parametrize("step", [0.01, 0.02, 0.05])
+def test_no_step_crosses_segments_gaps_or_records(step):
+    k = round(100 * step)
+    segments = ["a"] * 12 + ["b"] * 13 + ["a"] * 6
+    rows = torch.cat([torch.arange(11), torch.arange(13, 30)]).double()  # 11 and 12 are missing
+    records = [
+        counted(31, segments=segments),
+        Record(0.01 * rows, rows.unsqueeze(-1), rows.unsqueeze(-1)),
+        counted(14, first=70.0, name="late"),
+    ]
+    data = Records(records, SPEC).trajectories(step)
+    lengths = [(n - 1) // k for n in (12, 13, 6, 11, 17, 14)]
+    assert (data.next_states - data.states).unique().tolist() == [k]
+    assert steps_of_episodes(data) == lengths
+
+
+def test_windows_do_not_cross_records_that_join():
+    """A machine that starts and ends at rest: one record ends where the other begins."""
+    states = column(0, 1, 2, 2, 1, 0)
+    record = Record(torch.arange(6).double(), states, torch.ones_like(states))
+    data = Records([record, record], SPEC).trajectories()
+    assert torch.equal(data.next_states[4], data.states[5])
+    assert steps_of_episodes(data) == [5, 5]
+    assert len(data.windows(5).actions) == 2
+    with pytest.raises(ValueError, match="the longest stretch has 5"):
+        data.windows(8)
+
+
+def test_the_clock_may_start_anew_in_a_segment():
+    times = torch.cat([torch.arange(5), torch.arange(4)]).double()
+    record = counted(9, at=times, segments=torch.tensor([1] * 5 + [2] * 4))
+    assert Records([record], SPEC).trajectories().states.flatten().tolist() == [0, 1, 2, 3, 5, 6, 7]
+
+
+def test_rounded_times_are_even():
+    """Of 120 Hz in ms; the time from a row to the next is 8 or 9 ms."""
+    times = (torch.arange(500, dtype=torch.float64) / 120).mul(1000).round() / 1000
+    records = Records([counted(500, at=times)], SPEC)
+    assert len(records.trajectories(1 / 24).states) == 99
+    assert records.records[0].sampling_step == pytest.approx(1 / 120, rel=1e-3)
+
+
+def test_states_that_were_not_measured():
+    nan = math.nan
+    states = torch.tensor(
+        [[0, 0], [1, 1], [2, nan], [3, 3], [nan, nan], [5, 5], [6, 6], [nan, nan]]
+    )
+    times, states = torch.arange(8).double(), states.double()
+    records = Records([Record(times, states, torch.zeros(8, 1).double())], POINT)
+    with pytest.warns(UserWarning, match=r"0 of 1 stretches.*4 of 7 steps, 2 of which start at"):
+        data = records.trajectories()
+    assert data.states[:, 0].tolist() == [0, 1, 5]
+    assert data.next_states[1].tolist() == pytest.approx([2, nan], nan_ok=True)
+    assert steps_of_episodes(data) == [2, 1]
+    states[:, 1] = nan
+    never = Records([Record(times, states, torch.zeros(8, 1).double())], POINT)
+    with pytest.raises(ValueError, match=r"found none of 7; .* state by state: x 6, v 0"):
+        never.trajectories()
+
+
+def test_a_row_that_is_left_out_ends_an_episode():
+    """At rest a position alone does not tell the next row from the one after it."""
+    states = torch.zeros(6, 2, dtype=torch.float64)
+    states[0], states[1, 1], states[2, 1], states[5] = 1.0, 1.0, torch.nan, 2.0
+    records = Records([Record(torch.arange(6).double(), states, torch.zeros(6, 1).double())], POINT)
+    with pytest.warns(UserWarning, match="1 of 5 steps, 1 of which"):
+        data = records.trajectories()
+    assert data.next_states[1].isnan().tolist() == [False, True]
+    assert steps_of_episodes(data) == [2, 2]
+
+
+def test_windows_of_a_hidden_state_are_those_of_what_smoothing_finds():
+    states = torch.full((9, 2), torch.nan, dtype=torch.float64)
+    states[:, 0] = torch.arange(9)
+    records = Records([Record(torch.arange(9).double(), states, torch.zeros(9, 1).double())], POINT)
+    for ask in (records.trajectories, lambda: records.windows(3)):
+        with pytest.raises(
+            ValueError, match=r"'v' was never measured.*smooth\(.*draw\(\)\.windows"
+        ):
+            ask()
+
+
+def test_stretches_that_are_too_short_are_left_out():
+    records = Records([counted(9, segments=[1, 2, 2, 2, 2, 2, 3, 3, 3])], SPEC)
+    with pytest.warns(UserWarning, match="1 of 3 stretches"):
+        assert records.trajectories().states.flatten().tolist() == [1, 2, 3, 4, 6, 7]
+    with pytest.warns(UserWarning, match="2 of 3 stretches"):
+        assert records.trajectories(0.04).states.flatten().tolist() == [1]
+    with pytest.raises(ValueError, match=r"6 rows or more, which are a control step, .* none of 3"):
+        records.trajectories(0.05)
+
+
+@pytest.mark.parametrize("step", [0.01, 0.02])
+def test_previous_actions_are_those_of_the_step_before(step):
+    spec = StateSpec(["x", "last"], ["u"], previous={"last": "u"})
+    record = counted(7)
+    states = torch.cat([record.states, torch.full_like(record.states, math.nan)], -1)
+    states[0, 1] = -1.0
+    known = Records([Record(record.times, states, record.actions)], spec)
+    states[0, 1] = math.nan
+    unknown = Records([Record(record.times, states, record.actions)], spec)
+    with pytest.warns(UserWarning, match="1 of which start"):
+        later = unknown.trajectories(step)
+    assert len(later.states) == round(0.06 / step) - 1
+    torch.testing.assert_close(later.next_states[:, 1:], later.actions)
+    torch.testing.assert_close(later.states[1:, 1:], later.actions[:-1])
+    if step == 0.01:
+        data = known.trajectories(step)
+        assert data.states[0, 1] == -1
+    else:  # what was recorded at the first row is of a row before, not of a step
+        with pytest.warns(UserWarning, match="1 of which start"):
+            data = known.trajectories(step)
+    torch.testing.assert_close(later.states, data.states[-len(later.states) :])
+
+
+@pytest.mark.parametrize("names", [("x_1", "x_2", "u_1"), ("u_1", "x_2", "x_1")])
+@pytest.mark.parametrize("step", [0.01, 0.02])
+def test_previous_states_are_those_of_the_steps_before(names, step):
+    k = round(100 * step)
+    lags = {"x_1": "x", "x_2": "x_1", "u_1": "u"}
+    spec = StateSpec([*names, "x"], ["u"], previous={name: lags[name] for name in names})
+    record = counted(24, segments=["a"] * 13 + ["b"] * 11)
+    never = torch.full((24, 3), math.nan, dtype=torch.float64)
+    states = torch.cat([never, record.states], -1)
+    records = Records([Record(record.times, states, record.actions, record.segments)], spec)
+    with pytest.warns(UserWarning, match="4 of which start at a state not measured in full"):
+        data = records.trajectories(step)
+    starts = [*range(2 * k, 13 - k, k), *range(13 + 2 * k, 24 - k, k)]
+    assert data.states[:, 3].tolist() == starts
+    pair = data.states, data.next_states
+    now, after = ({n: t[:, i] for i, n in enumerate(spec.states)} for t in pair)
+    assert (now["x"] - now["x_1"]).unique().tolist() == [k]
+    assert (now["x"] - now["x_2"]).unique().tolist() == [2 * k]
+    before = [sum((row - j) ** 2 for j in range(1, k + 1)) / k for row in starts]
+    assert now["u_1"].tolist() == pytest.approx(before)
+    assert torch.equal(after["x_2"], now["x_1"])
+    assert torch.equal(after["u_1"], data.actions[:, 0])
+    PhysicsDynamics(spec, lambda X: X[:, :1] + k).update(*data)  # as the spec says
+    assert records.windows(3, step).initial_states[0, 3] == 2 * k
+    states[0, :3] = torch.tensor([-1.0, -2.0, -3.0])  # of the first row it is known
+    records = Records([Record(record.times, states, record.actions, record.segments)], spec)
+    left = "2 of which start" if k == 1 else "4 of which start"  # of a row before, not of a step
+    with pytest.warns(UserWarning, match=left):
+        data = records.trajectories(step)
+    assert data.states[0, 3] == (0 if k == 1 else 2 * k)
+
+
+def test_the_step_of_the_spec_is_the_default():
+    spec = StateSpec(["x", "v"], ["u"], integrated={"x": "v"}, step=0.02)
+    record = counted(9)
+    records = Records([Record(record.times, record.states.repeat(1, 2), record.actions)], spec)
+    assert records.trajectories().states[:, 0].tolist() == [0, 2, 4, 6]
+    with pytest.raises(ValueError, match=r"step of the spec, 0\.02, got 0\.04; leave `step` out"):
+        records.trajectories(0.04)
+
+
+def jittery(seed=0, num_rows=200, by=0.3):
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(num_rows, generator=generator, dtype=torch.float64) - 0.5
+    return 0.01 * (torch.arange(num_rows) + by * share)
+
+
+@pytest.mark.parametrize(
+    ("records", "step", "says"),
+    [
+        ([counted(9)], 0.025, r"multiple of .* 0\.01, got 0\.025; take 0\.02, or first `rec"),
+        ([counted(9)], 0.004, r"got 0\.004; take 0\.01\."),
+        ([counted(9), counted(9, step=0.02, name="slow")], 0.04, r"0\.02 of 'slow'; .*d\(0\.02"),
+        ([counted(200, at=jittery(), name="rough")], 0.01, r"'rough': .* a tenth of its step 0\.0"),
+        (
+            [counted(6, at=torch.tensor([0, 1, 3, 4, 7, 8.0]).double())],
+            1,
+            "2 of 5 times .* max_gap",
+        ),
+        ([counted(9)], -0.1, "step to be positive and finite, found -0.1"),
+        ([counted(9)], math.nan, "step to be positive and finite, found nan"),
+    ],
+)
+def test_steps_that_records_do_not_have(records, step, says):
+    for take in (
+        Records(records, SPEC).trajectories,
+        lambda s: Records(records, SPEC).windows(1, s),
+    ):
+        with pytest.raises(ValueError, match=says):
+            take(step)
+
+
+def test_a_step_is_a_number():
+    with pytest.raises(TypeError, match="step as a number, found '50 ms'"):
+        Records([counted(9)], SPEC).trajectories("50 ms")
+
+
+def test_even_records_stay_as_they_are_when_resampled():
+    records = Records([counted(31, segments=[0] * 14 + [1] * 17), counted(23, first=5.0)], SPEC)
+    expected = records.trajectories(0.04)
+    again = records.resampled(0.04)
+    assert [record.name for record in again] == [record.name for record in records]
+    for one, other in zip(again.trajectories(), expected, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_uneven_records_are_interpolated():
+    """Of a state that is a line in time, and an action that is constant from row to row."""
+    times = jittery(by=0.45)
+    actions = times.diff(append=times[-1:] + 1).reciprocal()  # of one unit from row to row
+    record = Record(times, 3 * times.unsqueeze(-1) - 1, actions.unsqueeze(-1))
+    data = Records([record], SPEC).resampled(0.025).trajectories()
+    torch.testing.assert_close(data.next_states - data.states, torch.full_like(data.states, 0.075))
+    passed = np.interp(times[0] + 0.025 * np.arange(len(data.states) + 1), times, np.arange(200))
+    np.testing.assert_allclose(data.actions[:, 0], np.diff(passed) / 0.025)
+
+
+def test_resampled_angles_go_the_shortest_way():
+    spec = StateSpec(["x"], ["u"], angles=["x"])
+    turned = torch.atan2((7 * jittery()).sin(), (7 * jittery()).cos()).unsqueeze(-1)
+    record = Record(jittery(), turned, torch.zeros(200, 1).double())
+    data = Records([record], spec).resampled(0.01).trajectories()
+    change = spec.change(data.states, data.next_states)
+    torch.testing.assert_close(change, torch.full_like(change, 0.07))
+
+
+def test_resampled_states_that_were_not_measured():
+    states = column(0, 1, 2, math.nan, 4, 5, 6)
+    record = Record(torch.arange(7).double(), states, torch.zeros(7, 1).double())
+    half = Records([record], SPEC).resampled(0.5).records[0].states.flatten().tolist()
+    nan = math.nan
+    assert half == pytest.approx([0, 0.5, 1, 1.5, 2, nan, nan, nan, 4, 4.5, 5, 5.5, 6], nan_ok=True)
+    shifted = Records([record], SPEC).resampled(1.5).records[0].states.flatten().tolist()
+    assert shifted == pytest.approx([0, 1.5, nan, 4.5, 6], nan_ok=True)
+
+
+def test_rows_that_are_met_but_for_rounding_need_no_neighbours():
+    times, states = 0.1 * torch.arange(31).double(), torch.full((31, 1), math.nan).double()
+    states[::3, 0] = torch.arange(11).double()
+    record = Record(times, states, torch.zeros(31, 1).double())
+    assert (times[0] + 0.3 * torch.arange(11) != times[::3]).any()
+    (even,) = Records([record], SPEC).resampled(0.3)
+    assert even.states.flatten().tolist() == [*range(11)]
+
+
+def test_gaps_are_not_interpolated_over_unless_they_are_said_to_be_none():
+    times = torch.cat([torch.arange(20), torch.arange(22, 40), torch.arange(49, 60)]).double()
+    record = Record(times, times.unsqueeze(-1), times.unsqueeze(-1))
+    records = Records([record], SPEC)
+    (even,) = records.resampled(2)
+    assert [int(even.times[rows.start]) for rows in even.stretches()] == [0, 22, 49]
+    assert len(records.resampled(2, max_gap=3).records[0].stretches()) == 2
+    bridged = records.resampled(2, max_gap=10)
+    data = bridged.trajectories()
+    assert (data.next_states - data.states).unique().tolist() == [2]
+    assert len(data.states) == 29
+
+
+def test_resampling_that_cannot_be():
+    parts = ["short"] * 5 + ["single"] + ["long"] * 24
+    records = Records([counted(5), counted(30, name="long", segments=parts)], SPEC)
+    with pytest.warns(UserWarning, match="no stretch as long as a step of 0.1: unnamed"):
+        even = records.resampled(0.1)
+    assert [record.name for record in even] == ["long"]
+    with pytest.warns(UserWarning, match="2 of 3 stretches"):
+        assert even.trajectories().states.flatten().tolist() == pytest.approx([6, 16])
+    with pytest.raises(ValueError, match=r"as a step, 0\.5, found none"):
+        records.resampled(0.5)
+    with pytest.raises(ValueError, match=r"half a sampling step, 0\.005, .* got 0\.004"):
+        records.resampled(0.004)
+    with pytest.raises(TypeError, match="max_gap as a number"):
+        records.resampled(0.01, max_gap="1")
+    rough = counted(6, at=torch.tensor([0, 1, 3, 4, 7, 8.0]).double())
+    with pytest.raises(ValueError, match=r"records\.resampled\(step, max_gap="):
+        Records([rough], SPEC).resampled(1)
+    assert len(Records([rough], SPEC).resampled(1, max_gap=3).trajectories().states) == 8
+
+
+def test_windows_have_the_steps_of_transitions():
+    records = Records([counted(31, segments=[0] * 14 + [1] * 17), counted(23, first=50.0)], SPEC)
+    windows = records.windows(3, 0.02)
+    assert windows.initial_states.flatten().tolist() == [0, 6, 14, 20, 50, 56, 62]
+    steps = torch.arange(1, 4) * 2
+    torch.testing.assert_close(windows.measured[..., 0], windows.initial_states + steps)
+    data = records.trajectories(0.02)
+    for i, start in enumerate(windows.initial_states):
+        row = int((data.states == start).nonzero()[0, 0])
+        assert torch.equal(windows.actions[i], data.actions[row : row + 3])
+    sliding = records.windows(3, 0.02, stride=1)
+    assert len(sliding.initial_states) == 4 + 6 + 9
+    with pytest.raises(ValueError, match=r"stretches of 12 steps .* the longest stretch has 11"):
+        records.windows(12, 0.02)
+    with pytest.raises(ValueError, match="length to be a whole number"):
+        records.windows(0)
+    with pytest.raises(ValueError, match="stride to be a whole number"):
+        records.windows(2, stride=0)
+
+
+def test_windows_start_at_what_was_measured():
+    states = column(math.nan, 1, 2, math.nan, math.nan, 5, 6, 7)
+    record = Record(torch.arange(8).double(), states, torch.zeros(8, 1).double())
+    windows = Records([record], SPEC).windows(2)
+    assert windows.initial_states.flatten().tolist() == [1, 5]
+    assert windows.measured[0, :, 0].tolist() == pytest.approx([2, math.nan], nan_ok=True)
+
+
+def test_a_few_transitions_spread_over_all():
+    data = Records([counted(41), counted(62, first=100.0)], SPEC).trajectories()
+    before = torch.get_rng_state()
+    few = data.spread(10, seed=3)
+    assert torch.equal(before, torch.get_rng_state())
+    rows = [data.states.flatten().tolist().index(x) for x in few.states.flatten().tolist()]
+    assert [row * 10 // 101 for row in rows] == [*range(10)]
+    assert torch.equal(few.next_states, few.states + 1)
+    assert torch.equal(few.actions, few.states.square())
+    assert torch.equal(data.spread(10, seed=3).states, few.states)
+    assert not torch.equal(data.spread(10, seed=4).states, few.states)
+    assert torch.equal(data.spread(101).states, data.states)
+    with pytest.raises(ValueError, match=r"number <= 101, .* got 102"):
+        data.spread(102)
+
+
+@pytest.mark.parametrize("kind", ["tensor", "array", "frame"])
+def test_a_record_takes_tensors_arrays_and_frames(kind):
+    frame = pd.DataFrame(
+        {"t": [0.0, 1, 2], "x": [1, 2, 3], "u": [4, 5, 6], "part": ["a", "a", "b"]}
+    )
+    parts = frame["t"], frame[["x"]], frame[["u"]]
+    if kind != "frame":
+        parts = [part.to_numpy(copy=True) for part in parts]
+    if kind == "tensor":
+        parts = [torch.tensor(part).double() for part in parts]
+    record = Record(*parts, segments=frame["part"])
+    assert record.times.tolist() == [0, 1, 2]
+    assert record.states.tolist() == [[1], [2], [3]]
+    assert record.actions.dtype == torch.float64
+    assert record.segments == ("a", "a", "b")
+    assert [(rows.start, rows.stop) for rows in record.stretches()] == [(0, 2), (2, 3)]
+    if kind != "frame":
+        parts[1][0] = 9
+        assert record.states[0] == 1, "it has data of its own"
+
+
+THREE = torch.arange(3).double()
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "says"),
+    [
+        ({"times": torch.tensor([0, 2, 1.0]).double()}, ValueError, "row 2: .*found 1 after 2"),
+        ({"times": torch.tensor([0, 1, 1.0]).double()}, ValueError, "row 2: .*found 1 after 1"),
+        ({"times": torch.tensor([0, math.nan, 1]).double()}, ValueError, "row 1: .*nan .* times"),
+        ({"times": torch.tensor([0, 1, math.inf]).double()}, ValueError, "row 2: .*inf .* times"),
+        ({"times": THREE.unsqueeze(-1)}, ValueError, r"times of shape N, got \(3, 1\)"),
+        ({"states": THREE}, ValueError, r"N x state_dim, got \(3,\); .*reshape\(-1, 1\)"),
+        (
+            {"states": column(0, math.inf, 0)},
+            ValueError,
+            "row 1: .*inf in column 0 of states; put N",
+        ),
+        ({"actions": column(0, 0, math.nan)}, ValueError, "row 2: .*nan in column 0 of actions"),
+        ({"actions": column(0, 0)}, ValueError, "3 of times, 3 of states, 2 of actions"),
+        ({"actions": THREE.new_zeros(3, 0)}, ValueError, r"N x action_dim, got \(3, 0\)"),
+        ({"states": column(0, 0, 0).float()}, TypeError, "states in float64, .*`states.double"),
+        ({"states": [[0], [1], [2]]}, TypeError, "states to be a torch tensor"),
+        ({"states": np.array([["a"], ["b"], ["c"]])}, TypeError, "hold numbers only"),
+        ({"segments": [1, 1]}, ValueError, "3 of actions, 2 of segments"),
+        ({"segments": [1, math.nan, 1]}, ValueError, "row 1: expected a label .*found nan"),
+        ({"segments": [1, 2, 1]}, ValueError, "two rows or more of a segment, .* found 3 in all"),
+    ],
+)
+def test_what_is_no_record(changed, error, says):
+    parts = {"times": THREE, "states": column(0, 1, 2), "actions": column(0, 0, 0), **changed}
+    with pytest.raises(error, match=says):
+        Record(**parts, name="r")
+
+
+def test_one_row_is_no_record():
+    with pytest.raises(ValueError, match=r"two rows or more of a segment, .* found 1 in all"):
+        counted(1)
+
+
+def test_what_are_no_records():
+    with pytest.raises(ValueError, match="one record or more, found none"):
+        Records([], SPEC)
+    with pytest.raises(TypeError, match="each record as a Record"):
+        Records([torch.zeros(3)], SPEC)
+    with pytest.raises(TypeError, match="spec as a StateSpec"):
+        Records([counted(3)], ["x"])
+    with pytest.raises(
+        ValueError, match=r"'unnamed': expected 2 columns of states, x, v, .*found 1"
+    ):
+        Records([counted(3)], POINT)
+    assert len(Records(counted(3), SPEC)) == 1
+    assert repr(Records(counted(3, name="a"), SPEC)) == (
+        "Records([Record('a', 3 rows every 0.01, 1 state, 1 action)])"
+    )
+
+
+@pytest.fixture
+def csv(tmp_path):
+    """Writes a file and returns its path."""
+
+    def write(text, name="log.csv", encoding="utf-8"):
+        path = tmp_path / name
+        path.write_bytes(text.encode(encoding))
+        return path
+
+    return write
+
+
+NAMES = {"states": {"x": "q", "v": "dq"}, "actions": {"u": "tau"}}
+
+
+def test_csv_files_are_read_as_pandas_reads_them(csv, uniform):
+    frames = []
+    for i in range(2):
+        frame = pd.DataFrame(uniform(20, 3, seed=i).numpy(), columns=["q", "tau", "dq"])
+        frame.insert(0, "time", 0.1 * np.arange(20))
+        frame["spare"], frame["part"] = "text", ["one"] * 12 + ["two"] * 8
+        frame.loc[3, "dq"] = math.nan
+        frames.append(frame)
+    files = [csv(frame.to_csv(index=False), f"{i}.csv") for i, frame in enumerate(frames)]
+    records = Records.read_csv(files, POINT, **NAMES, segment="part")
+    assert [record.name for record in records] == [*map(str, files)]
+    for record, frame in zip(records, frames, strict=True):
+        expected = Record(frame["time"], frame[["q", "dq"]], frame[["tau"]], frame["part"])
+        for name in ("times", "states", "actions"):
+            found, wanted = getattr(record, name), getattr(expected, name)
+            torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
+        assert record.segments == expected.segments
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding", "options"),
+    [
+        ("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "utf-8", {}),
+        ("time,q,dq,tau\r\n0,1,2,3\r\n1,4,5,6", "utf-8", {}),
+        ("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "utf-8-sig", {}),
+        ('"time", q ,"dq","tau",\n 0,1, 2,3,\n\n1,4,5,6,\n,,,,\n', "utf-8", {}),
+        ("time;q;dq;tau\n0;1;2;3\n1;4;5;6\n", "utf-8", {"delimiter": ";"}),
+        ("q,dq,tau\n1,2,3\n4,5,6\n", "utf-8", {"time": 1.0}),
+        ("x,q,x,dq,tau,time\na,1,a,2,3,0\na,4,a,5,6,1\n", "utf-8", {}),
+    ],
+)
+def test_csv_files_as_they_come(csv, text, encoding, options):
+    (record,) = Records.read_csv(csv(text, encoding=encoding), POINT, **NAMES, **options)
+    assert record.times.tolist() == [0, 1]
+    assert record.states.tolist() == [[1, 2], [4, 5]]
+    assert record.actions.tolist() == [[3], [6]]
+
+
+def test_columns_of_the_same_names_need_no_words(csv):
+    (record,) = Records.read_csv(str(csv("time,v,u,x\n0,1,2,\n1,4,5,nan\n")), POINT)
+    assert record.states.tolist() == [[pytest.approx(math.nan, nan_ok=True), v] for v in (1, 4)]
+
+
+def test_a_hidden_state_has_no_column(csv):
+    (record,) = Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), POINT, states={"v": None})
+    assert record.states[:, 0].tolist() == [1, 4]
+    assert record.states[:, 1].isnan().all()
+
+
+@pytest.mark.parametrize("held", ["u", "x"])
+def test_previous_values_need_no_column(csv, held):
+    spec = StateSpec(["x", "last"], ["u"], previous={"last": held})
+    (record,) = Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), spec)
+    assert record.states[:, 1].isnan().all()
+    with pytest.raises(ValueError, match="expected a column 'before'"):
+        Records.read_csv(csv("time,x,u\n0,1,2\n1,4,5\n"), spec, states={"last": "before"})
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "expected a line of names and then rows, found an empty file"),
+        ("\n\n", "found an empty file"),
+        ("time,q,dq,tau\n", "found only a line of names"),
+        ("time,q,dq\n0,1,2\n1,2,3\n", "line 1: expected a column 'tau', found 'time', 'q', 'dq'"),
+        ("time,q,dq,q,tau\n0,1,2,3,4\n", "line 1: expected one column 'q', found columns 2 and 4"),
+        ("time,q,dq,tau\n0,1,2,3\n\n1,2,x,3\n", r"line 4, column 3 \('dq'\): .*found 'x'"),
+        ("time,q,dq,tau\n0,1,inf,3\n1,2,3,4\n", r"line 2, column 3 \('dq'\): .*found 'inf'"),
+        ("time,q,dq,tau\n0,1,2,3\n1,2,3,\n", r"line 3, column 4 \('tau'\): .* number, found ''"),
+        ("time,q,dq,tau\n0,1,2,3\n1,2,3,nan\n", r"line 3, column 4 \('tau'\): .*found 'nan'"),
+        ("time,q,dq,tau\n0,1,2,3\n,2,3,4\n", r"line 3, column 1 \('time'\): .*found ''"),
+        ("time,q,dq,tau\n0,1,2,3\n1,2,3\n", "line 3: expected 4 fields, .* found 3"),
+        ("time,q,dq,tau\n0,1,2,3\n2,2,3,4\n1,2,3,4\n", "log.csv', row 2: .*found 1 after 2"),
+        ("time,q,dq,tau\n0,1,2,3\n", "log.csv': expected two rows or more"),
+    ],
+)
+def test_what_is_no_file_of_a_record(csv, text, says):
+    good = csv("time,q,dq,tau\n0,1,2,3\n1,4,5,6\n", "good.csv")
+    with pytest.raises(ValueError, match=f"log.csv.*{says.removeprefix('log.csv')}"):
+        Records.read_csv([good, csv(text)], POINT, **NAMES)
+
+
+def test_what_is_asked_of_files_is_there(csv, tmp_path):
+    file = csv("time,x,v,u,part\n0,1,2,3,a\n1,4,5,6,\n")
+    with pytest.raises(ValueError, match=r"line 3, column 5 \('part'\): expected a text, found ''"):
+        Records.read_csv(file, POINT, segment="part")
+    with pytest.raises(ValueError, match=r"no 'y' among the states of the spec, \('x', 'v'\)"):
+        Records.read_csv(file, POINT, states={"y": "q"})
+    with pytest.raises(TypeError, match=r"actions as a dictionary .*\{'u': 'q'\}, found \['u'\]"):
+        Records.read_csv(file, POINT, actions=["u"])
+    with pytest.raises(TypeError, match="spec as a StateSpec"):
+        Records.read_csv(file, ["x"])
+    with pytest.raises(ValueError, match="time to be positive"):
+        Records.read_csv(file, POINT, time=0)
+    with pytest.raises(ValueError, match="one record or more, found none"):
+        Records.read_csv([], POINT)
+    with pytest.raises(FileNotFoundError):
+        Records.read_csv(tmp_path / "none.csv", POINT)
+    with pytest.raises(ValueError, match="expected a CSV file in UTF-8, but"):
+        Records.read_csv(csv("time,é\n", encoding="latin-1"), POINT)
+
+
+def test_windows_are_drawn_evenly_and_are_records_again():
+    record = counted(40)
+    windows = Records([record], SPEC).windows(3, 0.01)
+    drawn = windows.spread(4, seed=1)
+    assert drawn.states.shape == (4, 4, 1)
+    numbers = (drawn.states[:, 0, 0] / 3).tolist()  # of 13, one of each of four parts
+    ends = pairwise((0, 3, 6, 9, 13))
+    assert all(low <= i < high for i, (low, high) in zip(numbers, ends, strict=True))
+    assert torch.equal(windows.spread(4, seed=1).states, drawn.states)
+    again = Records.of_windows(drawn, SPEC, 0.01)
+    assert [len(each.times) for each in again] == [4] * 4
+    back = again.windows(3, 0.01)
+    for part, other in zip(back, drawn, strict=True):
+        assert torch.equal(part, other)
+    with pytest.raises(ValueError, match="number <= 13, the windows that there are, got 14"):
+        windows.spread(14)

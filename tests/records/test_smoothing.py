@@ -1,0 +1,386 @@
+"""States of records: by a dense Gaussian, by what was simulated, and by bad input."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.dynamics import StateSpec
+from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
+from gpadjust.records import Record, Records, SmoothingWarning, smooth
+from gpadjust.records.kalman import Link, draw_paths, smooth_chain
+
+STEP, LENGTH = 0.1, 150
+SPEC = StateSpec(["x", "v"], ["force"])
+STIFFNESS, DAMPING = 2.25, 0.2
+NOISE, SCATTER = torch.tensor([0.02, 0.1]).double(), torch.tensor([0.002, 0.03]).double()
+
+
+def rates(state, action, p):
+    pull = -p["stiffness"] * state[:, 0] - p["damping"] * state[:, 1]
+    return torch.stack([state[:, 1], pull + action[:, 0]], dim=-1)
+
+
+def spring(**given):
+    unknowns = {"stiffness": Unknown(1.5, factor=1.5), "damping": Unknown(0.5, factor=2.0)}
+    return ODEPhysics(rates, step=STEP, state_dim=2, unknowns=unknowns, **given)
+
+
+def simulated(seed, length=LENGTH, scatter=SCATTER):
+    """True states of a driven spring, and the actions."""
+    generator = torch.Generator().manual_seed(seed)
+    physics, truth = spring(), torch.tensor([STIFFNESS, DAMPING]).double()
+    actions = torch.randn(length // 10, 1, generator=generator).repeat_interleave(10, 0).double()
+    states = [torch.tensor([1.0, 0.0]).double()]
+    for action in actions[:-1]:
+        following = physics(torch.cat([states[-1], action]).unsqueeze(0), truth)[0]
+        states.append(following + scatter * torch.randn(2, generator=generator))
+    return torch.stack(states), actions
+
+
+def measured(states, actions, seed=0, noise=NOISE):
+    generator = torch.Generator().manual_seed(seed + 1000)
+    errors = noise * torch.randn(states.shape, generator=generator).double()
+    return Record(STEP * torch.arange(len(states)).double(), states + errors, actions)
+
+
+def inside(truth, interval):
+    low, high = interval
+    return bool(((low <= truth) & (truth <= high)).all())
+
+
+@pytest.fixture
+def chain():
+    """Two short stretches of two states and a constant, some of it not measured."""
+    rng = np.random.default_rng(0)
+    links = []
+    for steps in (3, 2):
+        matrices = np.tile(np.eye(3), (steps, 1, 1))
+        matrices[:, :2] = rng.normal(size=(steps, 2, 3)) / 2
+        offsets = np.concatenate([rng.normal(size=(steps, 2)), np.zeros((steps, 1))], axis=1)
+        links.append(Link(matrices, offsets, rng.normal(size=(steps + 1, 2))))
+    links[0].measured[1, 0] = links[1].measured[0] = np.nan
+    starts = [(rng.normal(size=3), rng.uniform(0.5, 2, size=3)) for _ in links]
+    return links, starts, np.array([0.3, 0.1]), np.array([0.2, 0.05])
+
+
+def dense(links, starts, noise, scatter):
+    """The joint distribution of all states given what was measured, by one linear system."""
+    rows = [3 * sum(len(link.measured) for link in links[:i]) for i in range(len(links) + 1)]
+    mean, shape = np.zeros(rows[-1]), (rows[-1], rows[-1])
+    root = np.zeros((rows[-1], 1 + 2 * rows[-1]))  # states by independent standard normal ones
+    constant = np.zeros(root.shape[1])
+    constant[0] = math.sqrt(starts[0][1][2])
+    free = iter(range(1, root.shape[1]))
+    for row, link, (first, spread) in zip(rows, links, starts, strict=False):
+        mean[row : row + 3] = [*first[:2], starts[0][0][2]]
+        for i in range(2):
+            root[row + i, next(free)] = math.sqrt(spread[i])
+        root[row + 2] = constant
+        for t, matrix in enumerate(link.matrices):
+            here, there = slice(row + 3 * t, row + 3 * t + 3), row + 3 * t + 3
+            mean[there : there + 3] = matrix @ mean[here] + link.offsets[t]
+            root[there : there + 3] = matrix @ root[here]
+            for i in range(2):
+                root[there + i, next(free)] += math.sqrt(scatter[i])
+    prior = root @ root.T
+    assert prior.shape == shape
+    values = np.concatenate([np.pad(k.measured, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+                             for k in links])  # fmt: skip
+    seen = np.flatnonzero(~np.isnan(values))
+    errors = np.tile([*noise, 0.0], rows[-1] // 3)[seen]
+    spread = prior[np.ix_(seen, seen)] + np.diag(errors)
+    gain = np.linalg.solve(spread, prior[seen]).T
+    off = values[seen] - mean[seen]
+    normal = torch.distributions.MultivariateNormal(torch.zeros(len(seen)).double(),
+                                                    torch.from_numpy(spread))  # fmt: skip
+    return mean + gain @ off, prior - gain @ prior[seen], float(normal.log_prob(torch.tensor(off)))
+
+
+def test_the_smoother_is_the_conditional_distribution_of_all_states(chain):
+    mean, covariance, log_density = dense(*chain)
+    found, density = smooth_chain(*chain)
+    assert density == pytest.approx(log_density, abs=1e-9)
+    row = 0
+    for (means, covariances), crossed in found:
+        for t in range(len(means)):
+            own = slice(row, row + 3)
+            np.testing.assert_allclose(means[t], mean[own], atol=1e-8)
+            np.testing.assert_allclose(covariances[t], covariance[own, own], atol=1e-8)
+            if t:
+                before = covariance[own, row - 3 : row]
+                np.testing.assert_allclose(crossed[t - 1], before, atol=1e-8)
+            row += 3
+
+
+def test_draws_have_the_moments_and_one_constant(chain):
+    mean, covariance, _ = dense(*chain)
+    found, rng = smooth_chain(*chain)[0], np.random.default_rng(0)
+    draws = [np.concatenate(draw_paths(found, 1, rng)) for _ in range(4000)]
+    assert all(np.ptp(path[:, 2]) == 0 for path in draws)
+    paths = np.stack([path.ravel() for path in draws])
+    np.testing.assert_allclose(paths.mean(0), mean, atol=0.05)
+    np.testing.assert_allclose(np.cov(paths.T), covariance, atol=0.06)
+
+
+def test_noise_process_noise_parameters_and_states_are_found():
+    runs = [simulated(seed) for seed in range(2)]
+    records = Records([measured(*run, seed) for seed, run in enumerate(runs)], SPEC)
+    found = smooth(records, spring())
+    assert inside(torch.tensor([STIFFNESS, DAMPING]), found.physics_parameters.interval(0.99))
+    torch.testing.assert_close(found.noise, NOISE, rtol=0.25, atol=0)
+    assert 0.6 < found.process_noise[1] / SCATTER[1] < 1.5
+    for (truth, _), record, seen, sd in zip(
+        runs, found.records.records, records.records, found.sd, strict=True
+    ):
+        errors = record.states - truth
+        assert (errors.square().mean(0) < 0.4 * (seen.states - truth).square().mean(0)).all()
+        assert 0.85 < (errors.abs() < 1.96 * sd).double().mean() <= 1
+
+
+@pytest.mark.slow
+def test_parameters_are_not_biased_by_noise_in_the_inputs():
+    """Single steps from noisy states find less decay in more noise; free runs do not."""
+    decay = FunctionPhysics(lambda X, p: p.a * X[:, 0] + X[:, 1],
+                            unknowns={"a": Unknown(0.5, sd=0.5)})  # fmt: skip
+    spec, generator = StateSpec(["x"], ["u"]), torch.Generator().manual_seed(0)
+    actions = torch.randn(400, 1, generator=generator).double()
+    states = [torch.zeros(1).double()]
+    for action in actions[:-1]:
+        states.append(0.9 * states[-1] + action)
+    states = torch.stack(states)
+    noisy = states + 1.5 * torch.randn(states.shape, generator=generator)
+    records = Records(Record(torch.arange(400.0).double(), noisy, actions), spec)
+    before, u, after = records.trajectories()
+    by_steps = float(before.mT @ (after - u) / before.square().sum())
+    found = smooth(records, decay)
+    assert by_steps < 0.75
+    assert found.physics_parameters.mean == pytest.approx(0.9, abs=0.02)
+    assert float(found.noise) == pytest.approx(1.5, rel=0.1)
+
+
+def test_a_hidden_state_and_rows_that_were_not_measured():
+    truth, actions = simulated(0)
+    states = measured(truth, actions).states
+    states[:, 1] = math.nan
+    states[20:30, 0] = math.nan
+    record = Record(STEP * torch.arange(LENGTH).double(), states, actions)
+    physics = spring()
+    found = smooth(Records(record, SPEC), physics, start={"v": (0.0, 1.0)}, num_starts=1)
+    velocities = found.records.records[0].states[:, 1]
+    assert (velocities - truth[:, 1]).square().mean().sqrt() < 0.1 * truth[:, 1].std()
+    assert found.noise.isnan().tolist() == [False, True]
+    assert found.sd[0][25, 0] > 1.5 * found.sd[0][60, 0]
+    # What is left of f_p's steps along the states is no more than the process noise.
+    path = found.records.records[0].states
+    rows = torch.cat([path[:-1], actions[:-1]], dim=-1)
+    steps = path[1:] - physics(rows, found.physics_parameters.mean)
+    assert (steps.square().mean(0).sqrt() < 1.2 * found.process_noise).all()
+    assert inside(torch.tensor([STIFFNESS, DAMPING]), found.physics_parameters.interval(0.99))
+
+
+def test_what_is_known_of_the_errors_is_kept():
+    truth, actions = simulated(0)
+    noise = torch.tensor([0.02, math.nan])
+    found = smooth(Records(measured(truth, actions), SPEC), spring(), noise=noise)
+    assert found.noise[0] == pytest.approx(0.02)
+    assert found.noise[1] == pytest.approx(0.1, rel=0.25)
+
+
+def test_angles_may_come_wrapped_and_the_physics_may_wrap_them():
+    def turn(X):
+        q = X[:, 0] + STEP * X[:, 1]
+        return torch.stack([torch.atan2(q.sin(), q.cos()), X[:, 1] + STEP * X[:, 2]], dim=-1)
+
+    spec = StateSpec(["q", "dq"], ["u"], angles=["q"])
+    times = STEP * torch.arange(60).double()
+    generator = torch.Generator().manual_seed(0)
+    turned = torch.stack([2 * times, torch.full_like(times, 2.0)], dim=-1)
+    turned += 0.01 * torch.randn(turned.shape, generator=generator)
+    wrapped = turned.clone()
+    wrapped[:, 0] = torch.atan2(turned[:, 0].sin(), turned[:, 0].cos())
+    still = torch.zeros(60, 1).double()
+    paths = [
+        smooth(Records(Record(times, states, still), spec), turn).records.records[0].states
+        for states in (turned, wrapped)
+    ]
+    torch.testing.assert_close(*paths)
+
+
+def test_a_model_learns_from_draws_segment_by_segment():
+    truth, actions = simulated(0)
+    record = measured(truth, actions)
+    labels = [0] * 70 + [1] * 79 + [2]
+    parts = Record(record.times, record.states, record.actions, labels, "spring")
+    with pytest.warns(UserWarning, match="1 of 3 stretches, shorter than a step"):
+        found = smooth(Records(parts, SPEC), spring())
+    assert [record.name for record in found.records.records] == ["spring"]
+    transitions = [found.draw(seed).trajectories() for seed in (0, 0, 1)]
+    assert len(transitions[0].states) == 69 + 78
+    assert torch.equal(transitions[0].states, transitions[1].states)
+    assert not torch.equal(transitions[0].states, transitions[2].states)
+    known = torch.tensor([STIFFNESS, DAMPING]).double()
+
+    def scatter(data):
+        rows = torch.cat([data.states, data.actions], dim=-1)
+        return (data.next_states - spring()(rows, known)).std(0)
+
+    drawn, likely = scatter(transitions[0]), scatter(found.records.trajectories())
+    torch.testing.assert_close(drawn[1], found.process_noise[1], rtol=0.25, atol=0)
+    assert likely[1] < 0.8 * drawn[1]
+
+
+@pytest.mark.slow
+def test_a_state_that_one_record_lacks_starts_about_where_it_is_in_others():
+    truth, actions = simulated(0)
+    level = torch.tensor([0.0, 300.0])  # far from zero
+
+    def shifted(state, action, p):
+        return rates(state - level, action, p)
+
+    physics = ODEPhysics(shifted, step=STEP, state_dim=2, unknowns=dict(spring().unknowns))
+    other = simulated(1)
+    records = [measured(truth + level, actions), measured(other[0] + level, other[1], seed=1)]
+    records[1].states[:, 1] = math.nan
+    found = smooth(Records(records, SPEC), physics)
+    error = found.records.records[1].states[:, 1] - (other[0] + level)[:, 1]
+    assert error.square().mean().sqrt() < 0.15
+    assert found.process_noise[1] < 0.1
+
+
+def test_a_turning_angle_goes_on_over_a_gap():
+    spec = StateSpec(["q", "dq"], ["u"], angles=["q"])
+    times = STEP * torch.arange(80).double()
+    generator = torch.Generator().manual_seed(0)
+    states = torch.stack([12 * times, torch.full_like(times, 12.0)], dim=-1)
+    states += 0.01 * torch.randn(states.shape, generator=generator)
+    states[30:37] = math.nan
+    record = Record(times, states, torch.zeros(80, 1).double())
+
+    def turn(X):
+        return torch.stack([X[:, 0] + STEP * X[:, 1], X[:, 1]], dim=-1)
+
+    found = smooth(Records(record, spec), turn)
+    assert found.process_noise[0] < 0.02
+    torch.testing.assert_close(found.records.records[0].states[:, 0], 12 * times, atol=0.1, rtol=0)
+
+
+def test_earlier_outputs_are_those_of_the_smoothed_states():
+    truth, actions = simulated(0)
+    spec = StateSpec(["x", "v", "x_1"], ["force"], previous={"x_1": "x"})
+    record = measured(truth, actions)
+    lagged = torch.cat([record.states, torch.full((LENGTH, 1), math.nan).double()], dim=-1)
+    found = smooth(Records(Record(record.times, lagged, actions), spec), spring())
+    states, noise = found.records.records[0].states, found.noise
+    assert torch.equal(states[1:, 2], states[:-1, 0])
+    assert noise[2] == found.process_noise[2] == 0
+
+
+def test_a_step_that_goes_where_the_physics_fails_is_taken_in_part():
+    truth, actions = simulated(0)
+
+    def fragile(state, action, p):
+        fails = (p["stiffness"] > 2.6) | (p["stiffness"] < 1.2)
+        return torch.where(fails.unsqueeze(-1), math.nan, rates(state, action, p))
+
+    unknowns = {"stiffness": Unknown(1.3, factor=1.5), "damping": Unknown(0.5, factor=2.0)}
+    physics = ODEPhysics(fragile, step=STEP, state_dim=2, unknowns=unknowns)
+    found = smooth(Records(measured(truth, actions), SPEC), physics)
+    assert found.physics_parameters.mean[0] == pytest.approx(STIFFNESS, rel=0.05)
+
+
+def test_a_physics_that_fails_at_measured_states_is_told():
+    truth, actions = simulated(0)
+    physics = FunctionPhysics(lambda X: torch.where(X[:, :2] > 0.9, math.nan, X[:, :2]))
+    with pytest.raises(PhysicsError, match=r"fails at .* where smoothing begins"):
+        smooth(Records(measured(truth, actions), SPEC), physics)
+
+
+def test_states_that_do_not_settle_are_told():
+    truth, actions = simulated(0)
+    with pytest.warns(SmoothingWarning, match="did not settle in 2 rounds"):
+        smooth(Records(measured(truth, actions), SPEC), spring(), max_rounds=2)
+
+
+@pytest.mark.slow
+def test_small_process_noise_fits_free_runs_from_several_starts():
+    """Of a spring that is too stiff by a priori factors, and only seen every fifth time."""
+    truth, actions = simulated(3, scatter=torch.zeros(2))
+    states = measured(truth, actions).states
+    states[:, 1] = math.nan
+    states[torch.arange(LENGTH) % 5 > 0, 0] = math.nan
+    record = Record(STEP * torch.arange(LENGTH).double(), states, actions)
+    unknowns = {"stiffness": Unknown(12.0, factor=3.0), "damping": Unknown(0.5, factor=2.0)}
+    physics = ODEPhysics(rates, step=STEP, state_dim=2, unknowns=unknowns)
+    small, start = torch.tensor([1e-3, 1e-3]), {"v": (0.0, 1.0)}
+    given = {"start": start, "process_noise": small}
+    one, several = (smooth(Records(record, SPEC), physics, num_starts=k, **given) for k in (1, 4))
+    assert several.log_density >= one.log_density - 0.1
+    found = several.physics_parameters.mean
+    torch.testing.assert_close(found, torch.tensor([STIFFNESS, DAMPING]).double(), rtol=0.1, atol=0)
+    torch.testing.assert_close(several.process_noise, small.double())
+
+
+def test_states_that_diverge_from_all_starts_are_told():
+    truth, actions = simulated(0, length=60)
+    physics = FunctionPhysics(lambda X: 1e200 * X[:, :2])
+    with pytest.raises(RuntimeError, match="diverged from each of 1 starts"):
+        smooth(Records(measured(truth, actions), SPEC), physics)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ({"start": {"y": (0.0, 1.0)}}, ValueError, "there is no 'y' among the states"),
+        ({"start": {"x": (0.0, 0.0)}}, ValueError, "mean and standard deviation of 'x'"),
+        ({"start": {"x": 1.0}}, ValueError, "mean and standard deviation of 'x'"),
+        ({"start": [0.0, 1.0]}, TypeError, "start as a dictionary"),
+        ({"noise": [0.1]}, ValueError, "noise of shape 2"),
+        ({"process_noise": [0.1, 0.0]}, ValueError, "process_noise as standard deviations above 0"),
+        ({"max_rounds": 0}, ValueError, "max_rounds"),
+        ({"num_starts": 1.5}, ValueError, "num_starts"),
+        ({"step": 0.15}, ValueError, "whole multiple of the sampling step"),
+    ],
+)
+def test_bad_input_is_refused(given, error, message):
+    truth, actions = simulated(0, length=20)
+    with pytest.raises(error, match=re.escape(message)):
+        smooth(Records(measured(truth, actions), SPEC), spring(), **given)
+
+
+def test_a_physics_of_another_step_or_other_outputs_is_refused():
+    records = Records(measured(*simulated(0, length=20)), SPEC)
+    slow = ODEPhysics(lambda x, u: x, step=2 * STEP, state_dim=2)
+    with pytest.raises(ValueError, match=r"makes steps of 0.2, but the control step .* is 0.1"):
+        smooth(records, slow)
+    with pytest.raises(ValueError, match=r"next values of the 2 states .* got 1 columns"):
+        smooth(records, lambda X: X[:, :1])
+    with pytest.raises(ValueError, match="Expected one physics to follow"):
+        smooth(records, [lambda X: X[:, :2], lambda X: X[:, :2]])
+    with pytest.raises(ValueError, match="seed as a whole number"):
+        smooth(records, spring(), noise=NOISE, process_noise=SCATTER).draw(1.5)
+
+
+def test_hidden_states_need_a_start_and_something_must_be_measured():
+    truth, actions = simulated(0, length=20)
+    times = STEP * torch.arange(20).double()
+    for columns, message in (([1], "'v' was never measured; say where"), ([0, 1], "found none of")):
+        states = truth.clone()
+        states[:, columns] = math.nan
+        with pytest.raises(ValueError, match=message):
+            smooth(Records(Record(times, states, actions), SPEC), spring())
+    with pytest.raises(TypeError, match="records as Records"):
+        smooth(truth, spring())
+
+
+@pytest.mark.slow
+def test_intervals_of_parameters_hold_as_often_as_they_say():
+    truth, held = torch.tensor([STIFFNESS, DAMPING]), 0
+    for seed in range(40):
+        run = simulated(seed, length=100)
+        found = smooth(Records(measured(*run, seed), SPEC), spring())
+        low, high = found.physics_parameters.interval()
+        held += int(((low <= truth) & (truth <= high)).sum())
+    assert 0.88 <= held / 80 <= 1
