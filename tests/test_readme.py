@@ -14,6 +14,7 @@ import gpadjust
 from gpadjust import CKA, FunctionPhysics, Unknown
 from gpadjust.__main__ import main
 from gpadjust.control import CrossEntropy, Planner
+from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
 WITH_DATA = {"check", "control", "measure", "records", "saving"}  # pages that are tested below
@@ -90,7 +91,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
 
 def abilities(name):
     """Samples, rho, delta, several physics, unknown parameters: what a model has of these."""
-    X = torch.linspace(0.1, 1, 6, dtype=torch.float64).unsqueeze(-1)
+    X = line(6, 0.1)
     unknown = FunctionPhysics(lambda X, p: p.a[:, None] * X, unknowns={"a": Unknown(1.0, sd=0.5)})
     options = {"bounds": [[0.0], [1.0]]} if name == "AR1" else {}
 
@@ -129,7 +130,7 @@ def test_measuring(tmp_path, monkeypatch):
     (code,) = blocks("docs/guide/measure.md")
     names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
     exec(code, names)
-    X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
+    X = line(5)
     error = names["result"].model.predict(X).mean - 2 * names["f_p"](X) - X
     assert error.abs().max() < 1e-2
     assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import time
 import warnings
 from abc import ABC, abstractmethod
@@ -18,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gpadjust.checks import checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
     RandomState,
@@ -28,7 +28,6 @@ from gpadjust.control.checkpoint import (
     unpacked,
 )
 from gpadjust.control.learning import learn_dynamics
-from gpadjust.control.option_checks import check_fraction, check_whole
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
@@ -130,9 +129,9 @@ class Agent(Resumable, ABC):
         score_horizons: Sequence[int] = (1, 5, 15),
         seed: int | None = None,
     ) -> None:
-        check_whole("random_steps", random_steps, 0)
+        checked_whole("random_steps", random_steps, 0)
         if reward_tolerance is not None:
-            check_fraction("reward_tolerance", reward_tolerance, most=math.inf)
+            checked_number("reward_tolerance", reward_tolerance, least=0)
         self.task = task
         self.env = env
         check_spaces(task, env.observation_space, env.action_space)

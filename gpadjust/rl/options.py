@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import get_args
 
-from gpadjust.control.option_checks import check_fraction, check_whole
+from gpadjust.checks import check_choice, check_switch, checked_number, checked_whole
 from gpadjust.dynamics.free_run import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
@@ -54,24 +53,20 @@ class DynaOptions:
 
     def __post_init__(self) -> None:
         """Check them."""
-        check_whole("model_episodes", self.model_episodes, 0)
+        checked_whole("model_episodes", self.model_episodes, 0)
         for name, least in (
             ("last_model_episode", 0),
             ("model_buffer_size", 1),
             ("num_particles", 1),
         ):
             if getattr(self, name) is not None:
-                check_whole(name, getattr(self, name), least)
-        check_fraction("updates_per_model_step", self.updates_per_model_step, most=math.inf)
-        if self.real_fraction != 1:
-            check_fraction("real_fraction", self.real_fraction)
+                checked_whole(name, getattr(self, name), least)
+        checked_number("updates_per_model_step", self.updates_per_model_step, least=0)
+        checked_number("real_fraction", self.real_fraction, least=0, most=1)
+        check_switch("refresh_model_data", self.refresh_model_data)
+        check_choice("sampling", self.sampling, get_args(Sampling))
         if self.reward_tolerance is not None:
-            check_fraction("reward_tolerance", self.reward_tolerance, most=math.inf)
-        if not isinstance(self.refresh_model_data, bool):
-            found = self.refresh_model_data
-            raise TypeError(f"refresh_model_data must be True or False; found {found!r}.")
-        if self.sampling not in get_args(Sampling):
-            raise ValueError(f"Unknown sampling {self.sampling!r}; use 'step' or 'trajectory'.")
+            checked_number("reward_tolerance", self.reward_tolerance, least=0)
         if self.score_horizons != ():
             object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
 
