@@ -27,8 +27,7 @@ from gpadjust.control.checkpoint import (
     pickled_environment,
     unpacked,
 )
-from gpadjust.control.learning import learn_dynamics
-from gpadjust.control.recorded_episodes import RecordedEpisodes
+from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
 from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.free_run import checked_horizons

@@ -34,7 +34,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
 from gpadjust.control.agent import check_spaces
 from gpadjust.control.checkpoint import RandomState, Resumable, packed, unpacked
-from gpadjust.control.learning import learn_dynamics
+from gpadjust.control.recorded_episodes import learn_dynamics
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
 from gpadjust.rl.checkpoint import (
     CheckpointCallback,
