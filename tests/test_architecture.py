@@ -4,12 +4,17 @@ import ast
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 import gpadjust
 from gpadjust import CKA, fit
 from gpadjust.__main__ import main
+from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import as_physics
+from gpadjust.records import Records, smooth
+from gpadjust.states import StateSpec
+from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
@@ -18,6 +23,7 @@ FLOORS = [
 ]
 
 
+CSV_TO_FREE_RUN = 45  # files that a log passes on the way to a judged free run
 FILES, CLASSES, FUNCTIONS = 32, 36, 256  # that the ten lines of the README pass; fewer are better
 REPORT, WITH_A_REPORT = 13, 34  # of report and validation, and of what is below, by a point fit
 
@@ -48,14 +54,10 @@ def passed(call):
     return files, classes, functions
 
 
-def sine(X):
-    return torch.sin(6 * X)
-
-
 def ten_lines():
     """Those of the README, with the default fit."""
-    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-    model = CKA(X, 2 * sine(X) + X, physics=sine)
+    X = line(8)
+    model = CKA(X, 2 * wave(X) + X, physics=wave)
     fit(model)
     return model.predict(X)
 
@@ -65,6 +67,32 @@ def test_the_ten_lines_pass_few_files_classes_and_functions():
     assert len(files) <= FILES, sorted(files)
     assert len(classes) <= CLASSES, sorted(classes)
     assert len(functions) <= FUNCTIONS, sorted(functions)
+
+
+def csv_to_free_run(file):
+    """From the log of an oscillator to scores of free runs, as the guide does it."""
+
+    def oscillator(X):
+        x, v, force = X.unbind(-1)
+        return torch.stack([x + 0.1 * v, v + 0.1 * (force - x)], dim=-1)
+
+    spec = StateSpec(["x", "v"], ["force"], step=0.1)
+    records = Records.read_csv(file, spec)
+    states = smooth(records, oscillator).draw()
+    dynamics = LearnedDynamics(spec, oscillator, fit_options={"method": "map"})
+    dynamics.update(*states.trajectories())
+    windows = states.windows(10)
+    return dynamics.free_run(windows.initial_states, windows.actions).score(windows.measured)
+
+
+@pytest.mark.filterwarnings("ignore::gpadjust.records.SmoothingWarning")
+def test_a_log_passes_few_files_on_the_way_to_a_free_run(tmp_path):
+    t = 0.1 * torch.arange(31, dtype=torch.float64)
+    columns = torch.stack([t, t.cos(), -t.sin(), 0.1 * (3 * t).sin()], dim=-1)
+    rows = [",".join(map(str, row)) for row in columns.tolist()]
+    (tmp_path / "log.csv").write_text("\n".join(["time,x,v,force", *rows]))
+    files, _, _ = passed(lambda: csv_to_free_run(tmp_path / "log.csv"))
+    assert len(files) <= CSV_TO_FREE_RUN, sorted(files)
 
 
 def report_of_a_file():
@@ -88,7 +116,7 @@ def test_a_report_passes_few_files(tmp_path, monkeypatch):
 
 
 def test_a_formula_is_called_through_few_functions():
-    physics = as_physics(sine)
+    physics = as_physics(wave)
     X = torch.rand(5, 1, dtype=torch.float64)
     _, _, functions = passed(lambda: physics(X))
     assert len(functions) <= 6, sorted(functions)

@@ -13,9 +13,8 @@ import torch
 from gpadjust.checks import checked_number
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.files import CsvColumns
-from gpadjust.records.record import Record
+from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.resampling import resampled
-from gpadjust.records.stretches import Stretch, in_control_steps
 from gpadjust.states import StateSpec
 
 Column = TypeVar("Column", bound=str | None)

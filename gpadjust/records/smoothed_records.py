@@ -20,11 +20,9 @@ from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import Array, draw_paths
-from gpadjust.records.record import Record
+from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.records import Records
-from gpadjust.records.smoothing import Estimate, estimate
-from gpadjust.records.stretches import Stretch, in_control_steps
-from gpadjust.records.variation import variation
+from gpadjust.records.smoothing import Estimate, estimate, variation
 
 _DRAWS = 256  # of the parameters
 _SAME = 0.01  # of a step, by which another one may differ from it
@@ -125,6 +123,7 @@ def smooth(
     process_noise: Tensor | None = None,
     num_starts: int | None = None,
     max_rounds: int = 100,
+    progress: bool = False,
 ) -> SmoothedRecords:
     r"""Estimate the states of a machine, measured with noise or not at all, along its records.
 
@@ -155,7 +154,9 @@ def smooth(
             that persist, as of a wrong f_p, would otherwise be noise.
         num_starts: How many starts to take the best end of, if there is something to learn of
             the physics. Default: 4 with hidden states, else 1.
-        max_rounds: The most rounds of smoothing of each.
+        max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
+            needed: 4 starts of 100 rounds, half a minute for 300 rows and a physics of formulas.
+        progress: Whether to show a progress bar.
 
     Returns:
         The states, their uncertainty, and what decided them.
@@ -214,7 +215,7 @@ def smooth(
     if num_starts is None:
         num_starts = 4 if hidden and whole.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
-    found = estimate(whole, spec, stretches, known, max_rounds, num_starts)
+    found = estimate(whole, spec, stretches, known, max_rounds, num_starts, progress)
     variances = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
     still = [each._replace(states=torch.zeros_like(each.states)) for each in stretches]
     sd = _by_record(records, still, [np.sqrt(v.clip(0)) for v in variances], remember=False)

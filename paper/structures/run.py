@@ -15,7 +15,6 @@ from torch import Tensor
 import gpadjust
 from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.scores import score_transitions
 from gpadjust.inference import SampleResult, SamplingWarning
 from gpadjust.models import TermsGP
 from paper.calibration import PUMP
@@ -73,12 +72,11 @@ def _of_system(data: System, name: Model) -> Record:
     def learnt() -> LearnedDynamics:
         physics = None if name == "gp" else data.physics
         dynamics = LearnedDynamics(data.spec, physics, model=getattr(gpadjust, CLASSES[name]))
-        dynamics.fit(*data.train)
+        dynamics.update(*data.train)
         return dynamics
 
     dynamics, found = _timed(learnt)
-    prediction = dynamics.predict(data.test.states, data.test.actions)
-    scores = score_transitions(data.spec, prediction, data.test)
+    scores = dynamics.score(*data.test)
     change = data.spec.change(data.test.states, data.test.next_states)[:, data.spec.moving]
     sd = change.std(0)
     return {

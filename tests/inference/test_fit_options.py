@@ -7,18 +7,15 @@ from botorch.exceptions.warnings import OptimizationWarning
 from gpadjust import CKA, compare, fit
 from gpadjust.inference import FitResult, fitting
 from gpadjust.inference.targets import LogLikelihood
+from tests.systems import ripple
 
 QUICK = {"num_screened": 16, "num_starts": 2}
-
-
-def crude(X):
-    return 2 + (3 * X).sin()
 
 
 @pytest.fixture
 def model(uniform):
     X = uniform(9, 2)
-    return CKA(X, 1.5 * crude(X) + X.flip(-1) + 0.1 * uniform(9, 2, seed=5), physics=crude)
+    return CKA(X, 1.5 * ripple(X) + X.flip(-1) + 0.1 * uniform(9, 2, seed=5), physics=ripple)
 
 
 BAD = [
@@ -150,7 +147,7 @@ class TestThreads:
     def test_a_small_problem_takes_one(self, model, seen):
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
         fit(model, "map", **QUICK)
-        compare(X, Y, crude, structures=["physics mean", "CKA"], **QUICK)
+        compare(X, Y, ripple, structures=["physics mean", "CKA"], **QUICK)
         fit(model, num_draws=64, **QUICK)
         assert set(seen) == {1}
         assert torch.get_num_threads() == 2
@@ -158,7 +155,7 @@ class TestThreads:
     @pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
     def test_a_large_fit_takes_the_users(self, seen, uniform):
         X = uniform(300, 1)
-        fit(CKA(X, 2 * crude(X), physics=crude), "map", num_screened=0, max_iterations=1)
+        fit(CKA(X, 2 * ripple(X), physics=ripple), "map", num_screened=0, max_iterations=1)
         assert set(seen) == {2}
 
     def test_after_an_error(self, model):
@@ -167,7 +164,7 @@ class TestThreads:
 
         torch.linalg.cholesky_ex = fail
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
-        for attempt in (lambda: fit(model), lambda: compare(X, Y, crude)):
+        for attempt in (lambda: fit(model), lambda: compare(X, Y, ripple)):
             with pytest.raises(KeyboardInterrupt):
                 attempt()
             assert torch.get_num_threads() == 2

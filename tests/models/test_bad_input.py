@@ -9,6 +9,7 @@ from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.likelihoods import BernoulliLikelihood, GaussianLikelihood
 
 from gpadjust import AR1, CKA, BlackBoxPhysics, PhysicsError, ScaleGP
+from tests.systems import crude
 
 
 @pytest.fixture
@@ -86,10 +87,10 @@ def expired(X):
 
 
 @pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA", "RRA-paper"])
-def test_physics(build, kind, XY, crude_physics):
+def test_physics(build, kind, XY):
     wrong = "outputs as the high one has, got 2 and 2" if kind == "AR1" else "returned 2 col"
     for physics, error, says in (
-        (crude_physics, ValueError, wrong),
+        (crude, ValueError, wrong),
         (lambda X: X.sum(), PhysicsError, "returned shape"),
         (lambda X: X.sum(-1) / 0, PhysicsError, "returned NaN or inf"),
         (expired, PhysicsError, "'expired' raised RuntimeError: licence expired"),

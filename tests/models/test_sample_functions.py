@@ -12,6 +12,7 @@ from gpytorch.kernels import ConstantKernel, RBFKernel, RFFKernel, ScaleKernel
 from gpadjust import CKA
 from gpadjust.gp import Term
 from gpadjust.gp.features import TermFeatures
+from tests.systems import line
 
 
 def test_moments(data, build, costly_kind, num_outputs, uniform):
@@ -55,7 +56,7 @@ class TestWithoutNoise:
 
     @pytest.fixture
     def model(self, uniform, num_outputs):
-        X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        X = line(8)
         Y = torch.cat([2 * (6 * X).sin() + X, (5 * X).cos()], -1)[:, :num_outputs]
         model = CKA(X, Y, physics=lambda X: (6 * X).sin().expand(-1, num_outputs))
         with torch.no_grad():
@@ -65,7 +66,7 @@ class TestWithoutNoise:
                 term.kernel.raw_outputscale.fill_(8.0)  # of which the nugget is a share
         return model.eval()
 
-    Z = torch.linspace(0.05, 0.95, 7, dtype=torch.float64).unsqueeze(-1)
+    Z = line(7, 0.05, 0.95)
 
     def test_spread(self, model):
         assert ((self.spread(model, self.Z) - 1).abs() < 0.1).all()
