@@ -82,7 +82,7 @@ def test_points_for_other_functions(data, build, kind, uniform):
     functions = model.sample_functions(3, seed=0)
     assert functions.each(uniform(3, 4, 2)).shape == (3, 4, 1)
     for shape in ((2, 4, 2), (4, 2), (1, 3, 4, 2)):
-        with pytest.raises(ValueError, match=r"each of 3 functions, 3 x q x d, got shape"):
+        with pytest.raises(ValueError, match=r"3 functions, 3 x q x d"):
             functions.each(uniform(*shape))
 
 
@@ -125,9 +125,9 @@ def test_a_later_fit_leaves_them(data, build, kind, shuffle, uniform):
 def test_wrong_numbers(data, build, kind):
     model = build(kind, *data())
     for number in (0, -1, 2.5):
-        with pytest.raises(ValueError, match="num_functions to be a whole number >= 1"):
+        with pytest.raises(ValueError, match=r"num_functions .*whole number"):
             model.sample_functions(number)
-        with pytest.raises(ValueError, match="num_features to be a whole number >= 1"):
+        with pytest.raises(ValueError, match=r"num_features .*whole number"):
             model.sample_functions(1, num_features=number)
     with pytest.raises(ValueError, match="num_features to be even"):
         model.sample_functions(1, num_features=7)
