@@ -141,8 +141,8 @@ class Control(Experiment):
 
         return described(self, kind[0])
 
-    def run(self, *task: Any, unfinished: Path) -> Record:
+    def run(self, *case: Any) -> Record:
         """Learn, or go on with it."""
         from paper.control.learner import run
 
-        return run(self, task[0], task[1], unfinished=unfinished)
+        return run(self, *case, unfinished=self.unfinished(*case))

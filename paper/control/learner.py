@@ -21,7 +21,8 @@ from gpadjust.physics import Physics
 from gpadjust.rl import Dyna, DynaOptions, DynaSAC, EpisodeCheckpoint, resume
 from gpadjust.states import StateSpec
 from paper.common.experiment import Record
-from paper.common.runner import Refused, differences, versions
+from paper.common.runner import Refused
+from paper.common.runs import differences, versions
 from paper.control import Control, Scenario, Settings
 from paper.control.recorder import Recorder
 

@@ -17,6 +17,7 @@ from gpadjust.models.sampled_functions import seeded
 from paper.arm import Arm
 from paper.cartpole import Settings
 from paper.common.experiment import Record
+from paper.control import learner
 from paper.floor import Floor
 
 
@@ -54,5 +55,5 @@ def _arm(experiment: Floor, seed: int, unfinished: Path) -> dict[str, Any]:
         updates=settings.arm_updates,
         evaluate_every=every,
     )
-    found = replace(arm, settings=longer).run("mf", seed, unfinished=unfinished)["evaluations"]
+    found = learner.run(replace(arm, settings=longer), "mf", seed, unfinished)["evaluations"]
     return {"found": min(found["all_steps"]), "all_steps": found["all_steps"]}

@@ -26,7 +26,7 @@ def run(
     following = given.step(states, actions)
     dynamics = LearnedDynamics(given.spec, given.physics)
     begin = time.process_time()
-    dynamics.fit(states[:n], actions[:n], following[:n])
+    dynamics.update(states[:n], actions[:n], following[:n])
     seconds = time.process_time() - begin
     X = dynamics.targets.inputs(states[n:], actions[n:])
     Y = dynamics.targets.encode(states[n:], following[n:])

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from gpadjust.dynamics import Dynamics, FreeRun, FreeRunScores, TransitionScores, Windows
+from gpadjust.dynamics import Dynamics, FreeRun, Windows
 from gpadjust.inference import SamplingWarning
 from paper.common.experiment import Record
 from paper.real import HORIZONS, OF_STRETCHES, UNTAUGHT, Real, Settings
@@ -61,7 +61,6 @@ def _scores(
     start at measured ones), and there is no process noise.
     """
     (dynamics, noise, _), windows = made, windows_of(known, test, settings)
-    single: TransitionScores | FreeRunScores
     if noise is None:
         single = dynamics.score(*known.steps(test))
         free = _follow(dynamics, windows, settings, start_noise="learnt")
@@ -70,7 +69,7 @@ def _scores(
         states, actions, following = known.steps(test)
         steps = Windows(states, actions.unsqueeze(1), following.unsqueeze(1))
         score = _follow(dynamics, steps, settings, **given).score(steps.measured)
-        single = FreeRunScores(*(part[0] for part in score))
+        single = score[0]
         free = _follow(dynamics, windows, settings, **given)
     after = free.score(windows.measured)
     scores: dict[str, Any] = {}

@@ -23,14 +23,14 @@ BAD = [
         (method, option, value, error, says)
         for method in ("map", "bayes")
         for option, value, error, says in (
-            ("num_starts", 0, ValueError, "Expected num_starts >= 1, got 0"),
-            ("num_starts", 1.5, TypeError, r"Expected num_starts .* whole number, got 1\.5"),
-            ("num_starts", True, TypeError, "Expected num_starts .* whole number, got True"),
-            ("num_screened", -1, ValueError, "Expected num_screened >= 0, got -1"),
-            ("max_iterations", 0, ValueError, "Expected max_iterations >= 1, got 0"),
-            ("max_iterations", None, TypeError, "Expected max_iterations .* got None"),
-            ("seed", None, TypeError, "Expected seed .* whole number, got None"),
-            ("seed", -1, ValueError, "Expected seed >= 0, got -1"),
+            ("num_starts", 0, ValueError, "num_starts must be at least 1; found 0"),
+            ("num_starts", 1.5, TypeError, r"num_starts must be a whole number; found 1\.5"),
+            ("num_starts", True, TypeError, "num_starts must be a whole number; found True"),
+            ("num_screened", -1, ValueError, "num_screened must be at least 0; found -1"),
+            ("max_iterations", 0, ValueError, "max_iterations must be at least 1; found 0"),
+            ("max_iterations", None, TypeError, "max_iterations .* found None"),
+            ("seed", None, TypeError, "seed must be a whole number; found None"),
+            ("seed", -1, ValueError, "seed must be at least 0; found -1"),
             ("nmu_starts", 2, ValueError, "no option 'nmu_starts'; expected num_starts, "),
         )
     ),
@@ -38,8 +38,8 @@ BAD = [
         ("map", option, 64, ValueError, f"'map' has no option '{option}'; .* method 'bayes'")
         for option in ("num_samples", "num_draws")
     ),
-    ("bayes", "num_samples", 0, ValueError, "Expected num_samples >= 1"),
-    ("bayes", "num_draws", 15, ValueError, "Expected num_draws >= 16"),
+    ("bayes", "num_samples", 0, ValueError, "num_samples must be at least 1"),
+    ("bayes", "num_draws", 15, ValueError, "num_draws must be at least 16"),
     ("gibbs", "seed", 0, ValueError, "expected 'bayes' or 'map'"),
 ]
 
@@ -96,7 +96,7 @@ class TestMethodsOfOnesOwn:
         assert model.is_fitted
 
     def test_its_options_are_checked(self, model):
-        with pytest.raises(ValueError, match="Expected steps >= 1, got 0"):
+        with pytest.raises(ValueError, match="steps must be at least 1; found 0"):
             fit(model, "nudge", steps=0)
         with pytest.raises(ValueError, match=r"no option 'steps'.*'nudge'"):
             fit(model, "map", steps=2)

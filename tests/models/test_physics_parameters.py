@@ -142,7 +142,7 @@ class TestPhysicsParameters:
 
     @pytest.mark.parametrize("level", [0.0, 1.0, 95, float("nan")])
     def test_of_no_level(self, parameters, level):
-        with pytest.raises(ValueError, match=f"between 0 and 1, got {level}"):
+        with pytest.raises(ValueError, match=f"between 0 and 1; found {level}"):
             parameters.interval(level)
 
     def test_are_shown_as_a_table(self, parameters):

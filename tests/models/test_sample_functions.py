@@ -125,9 +125,9 @@ def test_a_later_fit_leaves_them(data, build, kind, shuffle, uniform):
 def test_wrong_numbers(data, build, kind):
     model = build(kind, *data())
     for number in (0, -1, 2.5):
-        with pytest.raises(ValueError, match=r"num_functions .*whole number"):
+        with pytest.raises((TypeError, ValueError), match="num_functions must be"):
             model.sample_functions(number)
-        with pytest.raises(ValueError, match=r"num_features .*whole number"):
+        with pytest.raises((TypeError, ValueError), match="num_features must be"):
             model.sample_functions(1, num_features=number)
     with pytest.raises(ValueError, match="num_features to be even"):
         model.sample_functions(1, num_features=7)

@@ -6,13 +6,13 @@ import re
 import numpy as np
 import pytest
 import torch
+from gpadjust.records.stretches import in_control_steps
 
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
 from gpadjust.records import Record, Records, SmoothingWarning, smooth
 from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import Link, Moments, Smoothed, draw_paths, smooth_chain
-from gpadjust.records.stretches import in_control_steps
 
 STEP, LENGTH = 0.1, 150
 SPEC = StateSpec(["x", "v"], ["force"])
@@ -125,6 +125,14 @@ def test_draws_have_the_moments_and_one_constant(chain):
     paths = np.stack([path.ravel() for path in draws])
     np.testing.assert_allclose(paths.mean(0), mean, atol=0.05)
     np.testing.assert_allclose(np.cov(paths.T), covariance, atol=0.06)
+
+
+def test_progress_is_shown_when_it_is_asked_for(capsys):
+    t = 0.1 * torch.arange(12, dtype=torch.float64)
+    record = Record(t, torch.stack([t.sin(), t.cos()], -1), torch.zeros(12, 1).double())
+    for progress in (False, True):
+        smooth(Records(record, SPEC), spring(), num_starts=2, max_rounds=40, progress=progress)
+        assert ("start 2 of 2" in capsys.readouterr().err) == progress
 
 
 def test_noise_process_noise_parameters_and_states_are_found():
@@ -358,7 +366,7 @@ def test_states_that_diverge_from_all_starts_are_told():
         ({"noise": [0.1]}, ValueError, "noise of shape 2"),
         ({"process_noise": [0.1, 0.0]}, ValueError, "process_noise as standard deviations above 0"),
         ({"max_rounds": 0}, ValueError, "max_rounds"),
-        ({"num_starts": 1.5}, ValueError, "num_starts"),
+        ({"num_starts": 1.5}, TypeError, "num_starts"),
         ({"step": 0.15}, ValueError, "whole multiple of the sampling step"),
     ],
 )
@@ -377,7 +385,7 @@ def test_a_physics_of_another_step_or_other_outputs_is_refused():
         smooth(records, lambda X: X[:, :1])
     with pytest.raises(ValueError, match="Expected one physics to follow"):
         smooth(records, [lambda X: X[:, :2], lambda X: X[:, :2]])
-    with pytest.raises(ValueError, match="seed as a whole number"):
+    with pytest.raises(TypeError, match="seed must be a whole number"):
         smooth(records, spring(), noise=NOISE, process_noise=SCATTER).draw(1.5)
 
 

@@ -102,8 +102,8 @@ def test_equal_specs_are_equal_and_hashable():
         ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'a' is not"),
         ({"previous": {"x": "a", "v": "a"}}, ValueError, "No state is left to predict"),
         ({"step": "fast"}, TypeError, "step must be a number or None; found 'fast'"),
-        ({"step": 0}, ValueError, "step must be positive and finite; found 0"),
-        ({"step": math.inf}, ValueError, "step must be positive and finite; found inf"),
+        ({"step": 0}, ValueError, "step must be finite and above 0; found 0"),
+        ({"step": math.inf}, ValueError, "step must be finite and above 0; found inf"),
     ],
 )
 def test_bad_declarations_are_refused(options, error, message):
