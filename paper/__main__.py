@@ -25,19 +25,19 @@ EXPERIMENTS = {
     "active": ("active:Active", "error over measurements, by who chooses them"),
     "cartpole": ("cartpole:CartPole", "learners that swing up a cart-pole"),
     "arm": ("arm:Arm", "learners that reach with a muscle arm"),
-    "foresight": ("foresight:Foresight", "do dynamics foresee the next trial, and know how well?"),
-    "planning": ("planning:Planning", "cart-poles that are swung up by planning in several models"),
+    "foresight": ("machines:Foresight", "do dynamics foresee the next trial, and know how well?"),
+    "planning": ("cartpole:Planning", "cart-poles that are swung up by planning in several models"),
     "reaching": (
-        "reaching:Reaching",
+        "arm:Reaching",
         "muscle arms that reach after a few trials, by several models",
     ),
     "parameters": (
         "parameters:Parameters",
         "intervals of a physics' parameters, by several discrepancies",
     ),
-    "real": ("real:Real", "learners of real machines, by free runs beside what was measured"),
-    "elsewhere": ("elsewhere:Elsewhere", "free runs on other torques, loads, days and machines"),
-    "tanks": ("tanks:Tanks", "cascaded tanks: structures of f_p and GPs, by a free run"),
+    "real": ("machines:Real", "learners of real machines, by free runs beside what was measured"),
+    "elsewhere": ("machines:Elsewhere", "free runs on other torques, loads, days and machines"),
+    "tanks": ("machines:Tanks", "cascaded tanks: structures of f_p and GPs, by a free run"),
     "large": ("large:Large", "100,000 observations: inducing points, or an exact model of some"),
     "optimisation": (
         "optimisation:Optimisation",
@@ -46,7 +46,7 @@ EXPERIMENTS = {
     "misled": ("misled:Misled", "Bayesian optimisation with a physics that misleads, or helps"),
     "choice": ("structures:Choice", "a physics of no use, and what compare recommends"),
     "kinks": (
-        "kinks:Kinks",
+        "machines:Kinks",
         "next states of systems with dry friction, impacts, gaps and switches",
     ),
     "ridges": (
@@ -58,7 +58,7 @@ EXPERIMENTS = {
         "CKA, AR1 and MFK on functions that are nearly polynomials",
     ),
     "seeds": ("calibration:Seeds", "fits of the same data by several seeds, beside long sampling"),
-    "floor": ("floor:Floor", "what the control tasks cost at best"),
+    "floor": ("cartpole:Floor", "what the control tasks cost at best"),
 }
 """By name, its class (with the chapter that declares it) and what it is about."""
 _OTHER = {
