@@ -62,7 +62,7 @@ def take_samples(model: Any, index: Tensor, as_mixture: bool = False) -> Any:
 
 @torch.no_grad()
 def uses_physics(model: Any) -> Tensor:
-    """Which samples that a model holds have its physics; ``S x batch_shape x (m)``."""
+    """Mask of the samples of a model that have its physics; ``S x batch_shape x (m)``."""
     known = [term for term in model.terms if not term.learns_mean]
     same = [(term.mean == term.given_mean).squeeze(-1) for term in known]
     return torch.stack(same).all(0) if same else model.terms[0].mean.squeeze(-1).isfinite()

@@ -179,7 +179,7 @@ def check_finite(tensor: Tensor, name: str) -> None:
 
 
 def check_observed(Y: Tensor, name: str) -> None:
-    """As :func:`check_finite`, but NaN is a missing value; a row of them is an error."""
+    """Check that values are finite or missing (NaN); a row of NaN alone is an error."""
     _check_rows(Y.isinf().any(-1), name, "to be finite, found infinity")
     expected = "to hold an observation in each row, found nothing but NaN"
     _check_rows(Y.isnan().all(-1), name, expected)
@@ -209,7 +209,7 @@ def _check_rows(bad: Tensor, name: str, expected: str) -> None:
 
 
 def _last(marked: Tensor) -> list[int]:
-    """Where in the last dimension something is marked."""
+    """Return the positions in the last dimension at which something is marked."""
     return sorted({int(index[-1]) for index in marked.nonzero()})
 
 
