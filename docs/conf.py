@@ -40,7 +40,7 @@ include_patterns = [
     "docs/**",
     "paper/*.md",
     "paper/*/README.md",
-    "paper/real/data/README.md",
+    "paper/machines/data/README.md",
     "paper/results/*/tables.md",
     "tutorials/*",
 ]

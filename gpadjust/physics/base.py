@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from operator import index
-from typing import Any, Self, SupportsIndex
+from typing import Any, Self
 
 import torch
 from torch import Size, Tensor
@@ -360,11 +360,3 @@ def _beside(columns: Tensor, values: Tensor) -> Tensor:
     rows = columns.expand(*batch, *columns.shape[-2:])
     values = values.unsqueeze(-2).expand(*rows.shape[:-1], values.shape[-1])
     return torch.cat([rows, values], dim=-1)
-
-
-def whole_number(name: str, value: SupportsIndex) -> int:
-    """A setting as an int, or a TypeError."""
-    try:
-        return index(value)
-    except TypeError:
-        raise TypeError(f"{name} must be a whole number; found {value!r}.") from None

@@ -20,7 +20,7 @@ from gpadjust.envs.cart_pole.system import SUBSTEP, TIME_STEP
 from gpadjust.physics import ODEPhysics
 from paper.active import PROBLEMS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
-from paper.multifidelity.problem import pair
+from paper.pairs.functions import pair
 
 Model = Literal["CKA", "physics mean", "GP"]
 CART_POLE_LIMITS = (1.0, math.pi, 3.0, 8.0, 10.0)  # m, rad, m/s, rad/s, N, to either side

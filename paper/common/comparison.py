@@ -1,4 +1,4 @@
-"""Experiments that compare learners on several systems."""
+"""Goes when no chapter needs it: use ``axes`` of an experiment."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from paper.common.experiment import Experiment, Task
+from paper.common.experiment import Case, Experiment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,15 +15,11 @@ class Comparison(Experiment):
 
     settings: Any
     systems: tuple[str, ...] = ()
-    """the systems, by name; all of them, unless some are given"""
     learners: tuple[str, ...] = ()
-    """the models, by name; all of them, unless some are given"""
 
     key: ClassVar[tuple[str, ...]] = ("system", "learner", "seed")
     known_systems: ClassVar[Mapping[str, str]]
-    """their labels, by name"""
     known_learners: ClassVar[Mapping[str, str]]
-    """their labels, by name"""
 
     def check(self) -> None:
         """Whether there are the systems and the models."""
@@ -39,7 +35,7 @@ class Comparison(Experiment):
         if self.settings.trials < 1:
             raise ValueError(f"--trials: expected at least 1, got {self.settings.trials}")
 
-    def tasks(self) -> list[Task]:
+    def tasks(self) -> list[Case]:
         """System by system, seed by seed, so that what is done first can be compared."""
         return [
             (system, learner, seed)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from paper.multifidelity.functions import hartmann6_high, hartmann6_low
+from paper.pairs.functions import PAIRS
 
 _GRAVITY = 9.81  # m / s^2
 _LENGTHS = (0.5, 0.4)  # m
@@ -85,7 +85,7 @@ def _crude_links(X: Tensor) -> Tensor:
 
 
 def _hartmann(X: Tensor, high: bool) -> Tensor:
-    function = hartmann6_high if high else hartmann6_low
+    function = PAIRS["hartmann6"].high if high else PAIRS["hartmann6"].low
     return torch.as_tensor(function(X.detach().numpy())).unsqueeze(-1)
 
 

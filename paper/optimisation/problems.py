@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from gpadjust import BlackBoxPhysics
-from paper.multifidelity.problem import pair
 from paper.optimisation import PROBLEMS, reactor
+from paper.pairs.functions import pair
 
 
 @dataclass(frozen=True)
