@@ -38,8 +38,8 @@ def release_samples(model: Any) -> None:
     """Reverse :func:`hold_samples`, with the first sample; see :meth:`TermsGP.release_samples`."""
     if model.train_targets.dim() > len(model._aug_batch_shape) + 1:
         raise RuntimeError(
-            "A model of fantasies cannot let go of its samples; take the model that they were made "
-            "of."
+            "A model of fantasies cannot drop its samples; take the model that the fantasies were "
+            "made of."
         )
     _change(model, lambda tensor: tensor[0], None)
     with torch.no_grad():

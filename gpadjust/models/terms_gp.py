@@ -80,7 +80,7 @@ class TermsGP(TermsModel, SingleTaskGP):
             warnings.warn(
                 f"{type(self).__name__} is exact: of {n} points a fit takes from many minutes to "
                 f"hours, and each covariance {8e-9 * n**2:.1f} GB. gpadjust.VariationalCKA takes "
-                "the arguments of CKA and learns from all of them in minutes.",
+                "the arguments of CKA and is fitted to all of them in minutes.",
                 stacklevel=3,
             )
         made.warn_of_physics(stacklevel=3)
