@@ -6,7 +6,7 @@ from paper.foresight import METHODS, NOISES, Foresight, Settings
 from paper.foresight.run import measured
 
 from gpadjust.dynamics import Trajectories
-from gpadjust.envs import CART_POLE_SPEC
+from gpadjust.systems.cart_pole import CART_POLE_SPEC
 from paper.common.runner import rounded
 
 TINY = Settings(

@@ -14,8 +14,7 @@ from paper.planning.systems import (
     mc_pilco_reward,
 )
 
-from gpadjust.envs import REAL_CART_POLE, random_cart_pole_physics
-from gpadjust.envs.cart_pole.system import START_MEAN, equation_physics
+from gpadjust.systems.cart_pole import REAL_CART_POLE, START_MEAN, equation_physics
 from paper.common.runner import rounded
 
 TINY = Settings(
@@ -130,7 +129,7 @@ def test_fitted_physics_finds_the_parameters():
         actions.append(torch.from_numpy(action).double())
         rows.append(env.unwrapped.state)
     states = torch.stack([torch.from_numpy(row) for row in rows])
-    fitted = FittedPhysics(random_cart_pole_physics(3).rhs, 0.1)
+    fitted = FittedPhysics(cart_pole(3).physics.rhs, 0.1)
     fitted.update(states[:-1], torch.stack(actions), states[1:])
     real = (REAL_CART_POLE.cart_mass, REAL_CART_POLE.pole_mass)
     real = torch.tensor([*real, REAL_CART_POLE.pole_length, REAL_CART_POLE.damping])
