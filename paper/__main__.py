@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import warnings
 from importlib import import_module
+from pathlib import Path
 from pkgutil import resolve_name
 
 EXPERIMENTS = {
@@ -43,13 +44,13 @@ EXPERIMENTS = {
         "trials of Bayesian optimisation in Ax, with and without f_p",
     ),
     "misled": ("misled:Misled", "Bayesian optimisation with a physics that misleads, or helps"),
-    "choice": ("choice:Choice", "a physics of no use, and what compare recommends"),
+    "choice": ("structures:Choice", "a physics of no use, and what compare recommends"),
     "kinks": (
         "machines:Kinks",
         "next states of systems with dry friction, impacts, gaps and switches",
     ),
     "ridges": (
-        "ridges:Ridges",
+        "parameters:Ridges",
         "intervals of parameters on a ridge, or of which several values do",
     ),
     "polynomials": (
@@ -60,7 +61,10 @@ EXPERIMENTS = {
     "floor": ("cartpole:Floor", "what the control tasks cost at best"),
 }
 """By name, its class (with the chapter that declares it) and what it is about."""
-_OTHER = {"report": "copy the results that are committed into the pages"}
+_OTHER = {
+    "all": "run what is missing of every experiment, with --out paper/results/NAME, then report",
+    "report": "copy the results that are committed into the pages",
+}
 
 
 def main() -> None:
@@ -68,6 +72,11 @@ def main() -> None:
     name, *arguments = sys.argv[1:] or ["--help"]
     if name in EXPERIMENTS:
         _run(name, arguments)
+    elif name == "all":  # options are those that all experiments have
+        for each in EXPERIMENTS:
+            print(f"\n{each}: {EXPERIMENTS[each][1]}")
+            _run(each, ["--out", f"{Path(__file__).parent}/results/{each}", *arguments])
+        import_module("paper.report").report()
     elif name == "report" and not arguments:
         import_module("paper.report").report()
     else:

@@ -14,6 +14,7 @@ import gpadjust
 from gpadjust import CKA, FunctionPhysics, Unknown
 from gpadjust.__main__ import main
 from gpadjust.control import CrossEntropy, Planner
+from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
 WITH_DATA = {"check", "control", "measure", "records", "saving"}  # pages that are tested below
@@ -90,7 +91,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
 
 def abilities(name):
     """Samples, rho, delta, several physics, unknown parameters: what a model has of these."""
-    X = torch.linspace(0.1, 1, 6, dtype=torch.float64).unsqueeze(-1)
+    X = line(6, 0.1)
     unknown = FunctionPhysics(lambda X, p: p.a[:, None] * X, unknowns={"a": Unknown(1.0, sd=0.5)})
     options = {"bounds": [[0.0], [1.0]]} if name == "AR1" else {}
 
@@ -129,7 +130,7 @@ def test_measuring(tmp_path, monkeypatch):
     (code,) = blocks("docs/guide/measure.md")
     names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
     exec(code, names)
-    X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
+    X = line(5)
     error = names["result"].model.predict(X).mean - 2 * names["f_p"](X) - X
     assert error.abs().max() < 1e-2
     assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8
@@ -168,10 +169,10 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:rich is experimental")
-def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
+@pytest.mark.filterwarnings("ignore:A step of the last real episode")
+def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    code, again = blocks("docs/guide/control.md")
+    code, again, own = blocks("docs/guide/control.md")
     assert "=2 * 25" in code
     quick = "Planner(search=CrossEntropy(1), horizon=3, num_random=16)"
     code = code.replace("=2 * 25", "=25").replace(
@@ -181,7 +182,9 @@ def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch):
     exec(code, names)
     assert names["agent"].num_episodes == 1
     files = {path.name for path in tmp_path.iterdir()}
-    assert files == {"cart_pole.ckpt", "cart_pole.ckpt.lock", "cart_pole.zip"}
+    assert files == {"cart_pole.ckpt", "cart_pole.ckpt.lock"}
     assert "5 * 25" in again
     exec(again.replace("5 * 25", "2 * 25"), names)
     assert names["agent"].num_episodes == 2
+    exec(own, names)  # with the dynamics that have learnt already
+    assert "Greedy(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes" in capsys.readouterr().out

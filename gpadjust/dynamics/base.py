@@ -9,12 +9,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_columns
 from gpadjust.dynamics.free_run import FreeRun, free_run
 from gpadjust.dynamics.state import fingerprint
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.models import Prediction
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import check_columns
 from gpadjust.validation import Scores
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
@@ -259,8 +259,8 @@ class Dynamics(ABC):
         return data
 
     def _check_pair(self, states: Tensor, actions: Tensor) -> None:
-        check_columns(states, self.spec.state_dim, "states")
-        check_columns(actions, self.spec.action_dim, "actions")
+        check_columns("states", states, self.spec.state_dim)
+        check_columns("actions", actions, self.spec.action_dim)
         if states.dtype != torch.float64:
             raise TypeError(
                 f"Expected states in float64, got {states.dtype}; use `states.double()`."

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from numbers import Real
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_columns, check_finite, check_level, checked_whole
 from gpadjust.dynamics.particles import (
     Move,
     about_centre,
@@ -19,10 +19,7 @@ from gpadjust.dynamics.particles import (
     of_states,
     step_or_nan,
 )
-from gpadjust.models.sampled_functions import check_number
-from gpadjust.models.training_data import check_finite
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import check_columns
 from gpadjust.validation import Scores, energy_score
 
 _ROWS = 1024  # whose noise is asked for at once
@@ -107,7 +104,7 @@ class FreeRun(NamedTuple):
             >>> dynamics.free_run(x, v).score(measured).rmse.flatten()
             tensor([0.0000, 0.7071, 1.0000], dtype=torch.float64)
         """
-        check_columns(measured, self.spec.state_dim, "measured")
+        check_columns("measured", measured, self.spec.state_dim)
         if measured.dtype != torch.float64:
             raise TypeError(
                 f"Expected measured in float64, got {measured.dtype}; use `measured.double()`."
@@ -172,7 +169,7 @@ def checked_horizons(horizons: Sequence[int]) -> tuple[int, ...]:
             f"{horizons!r}."
         )
     for each in given:
-        check_number(each, "each horizon")
+        checked_whole("each horizon", each, 1)
     return tuple(sorted(given))
 
 
@@ -208,8 +205,7 @@ def free_run(
         seed: The seed.
     """
     _check_start(spec, initial_states, actions)
-    if not isinstance(level, Real) or not 0 < level < 1:
-        raise ValueError(f"Expected level as a probability between 0 and 1, got {level!r}.")
+    check_level(level)
     check_enough(num_functions, level)
     if state_bounds is not None:
         state_bounds = of_states(state_bounds, "state_bounds", (2, spec.state_dim))
@@ -239,8 +235,10 @@ def free_run(
         lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
         path, lost_by_then = [], []
         for each in actions.unbind(1):
-            added, before = process_noise, particles
-            if isinstance(process_noise, str):
+            before, added = particles, None
+            if not isinstance(process_noise, str):
+                added = process_noise
+            else:
                 middle = about_centre(spec, particles)[0]
                 added = step_or_nan(noise_variance, middle, each).nan_to_num(nan=0.0).sqrt()
             particles, lost = move_on(functions, particles, lost, each, state_bounds)
@@ -258,7 +256,7 @@ def free_run(
         centre, cloud = about_centre(spec, torch.stack(path, dim=2))
         centre = _without_jumps(spec, initial_states, centre)
         mean = centre + cloud.mean(0)
-        if sensors is not None:
+        if isinstance(sensors, Tensor):
             error = sensors.expand_as(centre)
             cloud = cloud + measurement_noise(spec, error, num_functions, generator)
         elif noise:
@@ -323,8 +321,8 @@ def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Ten
 
 def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> None:
     """Raise an error unless each state has a sequence of actions, all of them finite."""
-    check_columns(initial_states, spec.state_dim, "initial_states")
-    check_columns(actions, spec.action_dim, "actions")
+    check_columns("initial_states", initial_states, spec.state_dim)
+    check_columns("actions", actions, spec.action_dim)
     for name, tensor in (("initial_states", initial_states), ("actions", actions)):
         if tensor.dtype != torch.float64:
             raise TypeError(
@@ -339,8 +337,8 @@ def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> No
             f"{shapes[0]} and {shapes[1]}; of a single run, use `initial_state.unsqueeze(0)` and "
             "`actions.unsqueeze(0)`."
         )
-    check_finite(initial_states, "initial_states")
-    check_finite(actions, "actions")
+    check_finite("initial_states", initial_states)
+    check_finite("actions", actions)
 
 
 def typical_change(spec: StateSpec, states: Tensor, next_states: Tensor) -> Tensor:

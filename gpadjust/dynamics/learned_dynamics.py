@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_switch
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.learning import (
     DynamicsFitOptions,
     Learnt,
-    ModelFactory,
     Recipe,
     check_enough_observed,
     checked_fit_options,
@@ -25,6 +25,7 @@ from gpadjust.dynamics.targets import Target, Targets, check_physics
 from gpadjust.dynamics.varying_parameters import VaryingParameters
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
+from gpadjust.models.factory import ModelFactory
 from gpadjust.models.sampled_functions import check_num_features
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.states import StateSpec
@@ -96,8 +97,7 @@ class LearnedDynamics(Dynamics):
     ) -> None:
         super().__init__(spec)
         check_num_features(num_features)
-        if not isinstance(encode_angles, bool):
-            raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
+        check_switch("encode_angles", encode_angles)
         self.targets = Targets(spec, target)
         self.physics = None if physics is None else check_physics(physics, spec)
         self.encode_angles = encode_angles

@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import pairwise
-from numbers import Real
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_number
 from gpadjust.models.training_data import ArrayLike, to_tensor
 from gpadjust.states import StateSpec
 
@@ -247,20 +247,6 @@ def in_control_steps(
     return stretches
 
 
-def checked_step(step: float, name: str = "step") -> float:
-    """A time that is positive and finite.
-
-    Raises:
-        TypeError: If it is no number.
-        ValueError: If it is none above zero.
-    """
-    if isinstance(step, bool) or not isinstance(step, Real):
-        raise TypeError(f"Expected {name} as a number, found {step!r}.")
-    if not 0 < step < math.inf:
-        raise ValueError(f"Expected {name} to be positive and finite, found {step}.")
-    return float(step)
-
-
 def _rows_a_step(records: Sequence[Record], spec: StateSpec, step: float | None) -> int:
     """How many rows of the records make a control step."""
     for record in records:
@@ -273,7 +259,7 @@ def _rows_a_step(records: Sequence[Record], spec: StateSpec, step: float | None)
             f"{slow.sampling_step:.4g} of {slow.name!r}; bring them to one by "
             f"`records.resampled({slow.sampling_step:.4g})`."
         )
-    wanted = spec.step if step is None else checked_step(step)
+    wanted = spec.step if step is None else checked_number("step", step, above=0)
     if wanted is None:
         return 1
     if spec.step is not None and abs(wanted - spec.step) > _SAME * spec.step:

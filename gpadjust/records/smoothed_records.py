@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.dynamics.particles import of_states
 from gpadjust.dynamics.targets import check_physics, parts_of
 from gpadjust.models.physics_parameters import PhysicsParameters
-from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import Array, draw_paths
@@ -101,9 +101,7 @@ class SmoothedRecords:
         Raises:
             ValueError: If it is no whole number of 0 or more.
         """
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise ValueError(f"Expected seed as a whole number of 0 or more, got {seed!r}.")
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(checked_whole("seed", seed, 0))
         paths = draw_paths(self._found.stretches, len(self._physics.unknowns), rng)
         return _records(self.records, self._stretches, paths)
 
@@ -196,7 +194,7 @@ def smooth(
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
     spec = records.spec
-    check_number(max_rounds, "max_rounds")
+    checked_whole("max_rounds", max_rounds, 1)
     stretches = in_control_steps(records.records, spec, step)
     if short := sum(not len(stretch.actions) for stretch in stretches):
         warnings.warn(
@@ -216,7 +214,7 @@ def smooth(
     hidden = [i for i in spec.moving if measured[:, i].isnan().all()]
     if num_starts is None:
         num_starts = 4 if hidden and whole.unknowns else 1
-    check_number(num_starts, "num_starts")
+    checked_whole("num_starts", num_starts, 1)
     found = estimate(whole, spec, stretches, known, max_rounds, num_starts, progress)
     variances = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
     still = [each._replace(states=torch.zeros_like(each.states)) for each in stretches]

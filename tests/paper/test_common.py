@@ -32,7 +32,7 @@ from paper.common.verdicts import (
     reproduced,
     within,
 )
-from paper.report import PAPER, READMES, results
+from paper.report import PAGES, PAPER, results
 
 
 def curves(**runs):
@@ -145,8 +145,8 @@ def test_fragments_replace_what_stands_between_their_markers():
         filled("<!-- y -->\nold\n<!-- end -->", {"x": "new"})
 
 
-@pytest.mark.parametrize("path", READMES, ids=["README.md", "paper/README.md"])
-def test_readmes_show_the_committed_results(path):
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.parent.name)
+def test_pages_show_the_committed_results(path):
     text = path.read_text()
     assert filled(text, results(PAPER / "results")) == text
 

@@ -1,0 +1,149 @@
+"""Real episodes, and what they tell."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from gpadjust.control.task import Task
+from gpadjust.dynamics import Dynamics, Trajectories
+from gpadjust.physics import PhysicsError
+from gpadjust.states import StateSpec
+
+_REACH = 10.0  # half ranges of the recorded states, from their middle to the bounds
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedEpisodes:
+    """Steps of real episodes, each after the one before it.
+
+    Args:
+        spec: The entries of states and actions.
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+        next_states: ``N x state_dim``.
+        rewards: ``N``.
+        terminated: Whether the next state ended the episode, ``N`` booleans.
+        episode: The number of the episode, ``N`` integers.
+        begins: Whether the step is the first one of its episode, ``N`` booleans.
+        whole: Whether the episode has ended, ``N`` booleans.
+    """
+
+    spec: StateSpec
+    states: Tensor
+    actions: Tensor
+    next_states: Tensor
+    rewards: Tensor
+    terminated: Tensor
+    episode: Tensor
+    begins: Tensor
+    whole: Tensor
+
+    @property
+    def num_transitions(self) -> int:
+        """Number of steps."""
+        return len(self.states)
+
+    @property
+    def trajectories(self) -> Trajectories:
+        """States, actions and next states, of which dynamics learn."""
+        return Trajectories(self.states, self.actions, self.next_states, self.episode)
+
+    def some(self, rows: Any) -> Self:
+        """The steps that an index of rows selects."""
+        names = [field.name for field in fields(self)[1:]]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def draw_starts(self, n: int) -> Tensor:
+        """Draw states at which episodes started, ``n x state_dim``, from PyTorch's generator."""
+        starts = self.states[self.begins]
+        return starts[torch.randint(len(starts), (n,))]
+
+    def bounds(self) -> Tensor | None:
+        """Bounds ``2 x state_dim`` far beyond the states of episodes that have ended.
+
+        They are infinite for angles, constants and previous values; None if no episode has ended.
+        """
+        if not self.whole.any():
+            return None
+        seen = torch.cat([self.states[self.whole], self.next_states[self.whole]])
+        low, high = seen.amin(0), seen.amax(0)
+        reach = _REACH * (high - low) / 2
+        reach[high == low] = torch.inf  # that it has not moved yet tells nothing
+        for i, name in enumerate(self.spec.states):
+            if name in (*self.spec.angles, *self.spec.exogenous, *self.spec.previous):
+                reach[i] = torch.inf
+        return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
+
+    def complete(self, task: Task, episode_length: int) -> Task:
+        """The task with length, starts and bounds of these episodes where it has none."""
+        found: dict[str, Any] = {"episode_length": episode_length}
+        if self.num_transitions:
+            found |= {"initial_states": self.draw_starts, "state_bounds": self.bounds()}
+        return replace(task, **{k: v for k, v in found.items() if getattr(task, k) is None})
+
+    def learnable(self, dynamics: Dynamics) -> Trajectories:
+        """All steps but those at which the physics fails.
+
+        Raises:
+            PhysicsError: If it does not say where, or everywhere.
+        """
+        works = torch.ones(self.num_transitions, dtype=torch.bool)
+        while True:
+            try:
+                dynamics.try_physics(self.states[works], self.actions[works])
+            except PhysicsError as error:
+                rows = works.nonzero().flatten()[list(error.rows)]
+                if not len(rows) or len(rows) == works.sum():
+                    raise
+                warnings.warn(
+                    f"The physics fails at {len(rows)} of {len(works)} new transitions, which the "
+                    f"dynamics do not learn: {error}",
+                    UserWarning,
+                    stacklevel=4,
+                )
+                works[rows] = False
+            else:
+                return self.trajectories.some(works)
+
+    def check(self, task: Task, tolerance: float = 1e-3) -> None:
+        """Compare the functions of a task with the recorded rewards and terminations.
+
+        Args:
+            task: The user's.
+            tolerance: Greatest error of the reward, relative to the largest recorded one.
+
+        Raises:
+            ValueError: If they differ; it shows the worst transition.
+        """
+        rewards = task.rewards(self.states, self.actions, self.next_states).double()
+        error = (rewards - self.rewards).abs()
+        if (error > tolerance * self.rewards.abs().max().clamp_min(1e-6)).any():
+            i = int(error.argmax())
+            raise ValueError(
+                "reward(states, actions, next_states) is not the environment's: transition "
+                f"{i} gave {self.rewards[i]:.6g}, but the function says {rewards[i]:.6g}; "
+                f"{self._row(i)}. Correct the function, or the spec of the state (its order, and "
+                "which entries are angles, seen as sine and then cosine). If rewards or "
+                "observations are noisy, raise reward_tolerance; None checks nothing."
+            )
+        says = task.terminations(self.next_states)
+        wrong = says != self.terminated
+        if wrong.any():
+            i = int(wrong.nonzero()[0])
+            given = (
+                "the function says" if task.terminated is not None else "none was given, that is"
+            )
+            raise ValueError(
+                f"terminated(states) is not the environment's: transition {i} was recorded with "
+                f"terminated={bool(self.terminated[i])}, but {given} {bool(says[i])}; "
+                f"{self._row(i)}. Pass the termination that the environment has."
+            )
+
+    def _row(self, i: int) -> str:
+        parts = ("states", "actions", "next_states")
+        return ", ".join(f"{part}[{i}] = {getattr(self, part)[i].tolist()}" for part in parts)
