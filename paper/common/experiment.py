@@ -38,11 +38,11 @@ class Experiment:
     ``axes``, and with settings as further fields; it imports nothing slow, because the command line
     is made of it. Beside it lies a module with the ``name`` of each experiment, which has
 
-    - ``run(experiment, *case)``: runs a case with one thread; returns what it found, as JSON has it.
+    - ``run(experiment, *case)``: runs a case with one thread; returns what it found, for JSON.
       A run that can go on after an interruption keeps its state at ``experiment.unfinished(*case)``
       (a path, to which it adds a suffix) and removes it when it ends.
     - ``tables(runs, experiment)``: tables of all runs, by name.
-    - ``first_look(runs)``, if wanted: a short table of the first few runs, None if they are too few.
+    - ``first_look(runs)``, if wanted: a short table of the first runs, None if they are too few.
     - ``draw(runs, experiment)``, if there are figures: draws them into ``experiment.out`` and
       returns their files.
     """
@@ -63,8 +63,8 @@ class Experiment:
     only_tables: bool = False
     """run nothing; make tables and figures of the runs that are there"""
     other_versions: Literal["refuse", "keep", "replace"] = "refuse"
-    """what becomes of runs of other versions of the packages, or of other defaults of the library,
-    if more are to be run: nothing is run, they are kept beside the new ones, or they are run again"""
+    """what becomes of runs of other versions of the packages, or of other defaults of the library, if
+    more are to be run: nothing is run, they are kept beside the new ones, or they are run again"""
 
     name: ClassVar[str]
     """on the command line, and in the markers of the pages"""

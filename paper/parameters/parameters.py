@@ -16,8 +16,8 @@ from torch import Size, Tensor
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, fit
 from gpadjust.gp import PhysicsScaledKernel
 from gpadjust.inference import ParameterWarning, SamplingWarning
-from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models import TermsGP, orthogonal_rbf
+from gpadjust.models.parameters import scaled_rbf
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
 from paper.common.tables import claims_table, markdown, number
