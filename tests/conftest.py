@@ -8,6 +8,8 @@ import torch
 
 from gpadjust import AR1, CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.models import PaperRRA
+from tests import systems
+from tests.systems import around, crude, truth
 
 torch.set_num_threads(1)
 
@@ -74,13 +76,8 @@ def _seed():
 
 @pytest.fixture
 def uniform():
-    """Draws float64 numbers of a shape, uniform on [low, high], the same ones for a seed."""
-
-    def draw(*shape, low=0.0, high=1.0, seed=0):
-        generator = torch.Generator().manual_seed(seed)
-        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-    return draw
+    """`systems.uniform`, which draws the same numbers for a seed."""
+    return systems.uniform
 
 
 @pytest.fixture
@@ -97,13 +94,12 @@ def forrester():
             return 0.25 * ((6 * X - 2) ** 2 * (12 * X - 4).sin() / 2 + 10 * (X - 0.5) + 5)
 
         def data(self, seed, num_points=8):
-            generator = torch.Generator().manual_seed(seed)
-            X = -0.6 + 1.6 * torch.rand(num_points, 1, generator=generator, dtype=torch.float64)
+            X = systems.uniform(num_points, 1, low=-0.6, seed=seed)
             return X, self.truth(X)
 
         @property
         def test_X(self):
-            return torch.linspace(-0.6, 1, 40, dtype=torch.float64).unsqueeze(-1)
+            return systems.line(40, -0.6)
 
         def rmse(self, model):
             """Root mean square error of the posterior mean at 40 points."""
@@ -143,16 +139,6 @@ _CLASSES = {
 _KINDS = [kind for kind in _CLASSES if kind != "BiasGP"]  # a PhysicsMeanGP by another name
 
 
-def crude(X):
-    """Two outputs of two inputs, neither of them near zero on [0, 2]^2."""
-    return torch.stack([2 + (3 * X[..., 0]).sin() + X[..., 1], 4 + (2 * X[..., 1]).cos()], dim=-1)
-
-
-def truth(X):
-    bias = torch.stack([X[..., 1].square(), X[..., 0].exp()], dim=-1) / 4
-    return crude(X) * (1.2 + 0.2 * X[..., :1]) + bias
-
-
 @pytest.fixture(params=_KINDS)
 def kind(request):
     """The name of each model, for `build`."""
@@ -176,11 +162,11 @@ def num_outputs(request):
 
 
 @pytest.fixture
-def data(uniform):
+def data():
     """Makes inputs on [0, 2]^2 and targets: `data(batch_shape=(), n=9, num_outputs=1)`."""
 
     def make(batch_shape=(), n=9, num_outputs=1, seed=0):
-        X = uniform(*batch_shape, n, 2, high=2.0, seed=seed)
+        X = systems.uniform(*batch_shape, n, 2, high=2.0, seed=seed)
         return X, truth(X)[..., :num_outputs]
 
     return make
@@ -244,11 +230,6 @@ def gradient_is_right():
 
 
 @pytest.fixture
-def crude_physics():
-    return crude
-
-
-@pytest.fixture
 def held(build):
     """Makes a model that holds samples, and one plain model for each of them.
 
@@ -260,13 +241,7 @@ def held(build):
             return make() if make else build(*args, **options)
 
         model = construct()
-        generator = torch.Generator().manual_seed(0)
-        samples = {
-            name: p.detach()
-            + spread * torch.randn(num_samples, *p.shape, generator=generator, dtype=torch.float64)
-            for name, p in model.named_parameters()
-            if p.requires_grad
-        }
+        samples = around(model, num_samples, spread)
         singles = [construct() for _ in range(num_samples)]
         for i, single in enumerate(singles):
             named = dict(single.named_parameters())

@@ -14,6 +14,7 @@ import gpadjust
 from gpadjust import CKA, FunctionPhysics, Unknown
 from gpadjust.__main__ import main
 from gpadjust.control import CrossEntropy, Planner
+from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
 WITH_DATA = {"check", "control", "measure", "records", "saving"}  # pages that are tested below
@@ -90,7 +91,7 @@ def test_the_examples_run(capsys, tmp_path, monkeypatch):
 
 def abilities(name):
     """Samples, rho, delta, several physics, unknown parameters: what a model has of these."""
-    X = torch.linspace(0.1, 1, 6, dtype=torch.float64).unsqueeze(-1)
+    X = line(6, 0.1)
     unknown = FunctionPhysics(lambda X, p: p.a[:, None] * X, unknowns={"a": Unknown(1.0, sd=0.5)})
     options = {"bounds": [[0.0], [1.0]]} if name == "AR1" else {}
 
@@ -129,7 +130,7 @@ def test_measuring(tmp_path, monkeypatch):
     (code,) = blocks("docs/guide/measure.md")
     names = {"CKA": CKA, "f_p": lambda X: torch.sin(6 * X)}
     exec(code, names)
-    X = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
+    X = line(5)
     error = names["result"].model.predict(X).mean - 2 * names["f_p"](X) - X
     assert error.abs().max() < 1e-2
     assert len((tmp_path / "measurements.jsonl").read_text().splitlines()) == 1 + 2 * 8
@@ -140,7 +141,7 @@ def test_measuring(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore:The draws of")
 def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (law,), (log,) = blocks("docs/guide/parameters.md"), blocks("docs/guide/records.md")
+    (law,), (log, hidden) = blocks("docs/guide/parameters.md"), blocks("docs/guide/records.md")
     names = {}
     exec(law, names)
     truth = torch.tensor([0.19, 3.65, 0.1], dtype=torch.float64)  # inertia, moment, friction
@@ -157,6 +158,14 @@ def test_the_log_of_a_pendulum_tells_its_parameters(tmp_path, monkeypatch, capsy
     torch.testing.assert_close(found, truth, rtol=1e-3, atol=0)
     error = names["run"].mean - names["windows"].measured
     assert error.abs().max() < 1e-2
+    noise = 0.005 * torch.randn(len(lines), generator=torch.Generator().manual_seed(0))
+    rows = [line.split(",") for line in lines[1:]]
+    noisy = [f"{t},{float(q) + e},{u}" for (t, q, _, u), e in zip(rows, noise, strict=False)]
+    (tmp_path / "angle.csv").write_text("\n".join(["time,q,u", *noisy]))
+    exec(hidden, names)
+    assert names["scores"].rmse[-1, 0] < 0.01
+    assert (names["scores"].coverage.mean(0) > 0.8).all()
+    assert names["smoothed"].noise[0] == pytest.approx(0.005, rel=0.2)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from gpadjust.gp.kernels import PROFILES
 from gpadjust.inference import fitting
 from gpadjust.inference.distributions import StationaryTerms
 from gpadjust.inference.targets import LogLikelihood
+from tests.systems import wave
 
 PAGE = Path(__file__).parents[1] / "docs" / "architecture.md"
 
@@ -26,22 +27,18 @@ def recipe(heading):
     return names
 
 
-def crude(X):
-    return torch.sin(6 * X[:, :1])
-
-
 @pytest.fixture
 def data(uniform):
     X = uniform(14, 1)
-    return X, 2 * crude(X) + X + 0.05 * uniform(14, 1, seed=1)
+    return X, 2 * wave(X) + X + 0.05 * uniform(14, 1, seed=1)
 
 
 def test_a_structure(data, uniform):
     X, Y = data
-    model = recipe("A structure")["SeasonalCKA"](X, Y, physics=crude)
+    model = recipe("A structure")["SeasonalCKA"](X, Y, physics=wave)
     fit(model, num_starts=2, num_screened=16, num_draws=32)
     assert model.term_names == ("rho", "delta", "season")
-    parts = model.rho(X).mean * crude(X) + model.delta(X).mean + model.term("season", X).mean
+    parts = model.rho(X).mean * wave(X) + model.delta(X).mean + model.term("season", X).mean
     # Of a mixture, the mean of a product of rho and f_p is that of rho times f_p.
     torch.testing.assert_close(parts, model.predict(X).mean, atol=1e-6, rtol=1e-6)
 
@@ -50,7 +47,7 @@ def test_a_kernel_is_fast_and_right(data, monkeypatch):
     monkeypatch.setattr("gpadjust.gp.kernels.PROFILES", PROFILES)
     kernel_class = recipe("A kernel")["RationalQuadratic"]
     X, Y = data
-    model = CKA(X, Y, physics=crude, delta_covar_module=ScaleKernel(kernel_class()).double())
+    model = CKA(X, Y, physics=wave, delta_covar_module=ScaleKernel(kernel_class()).double())
     model.posterior(X)
     delta = model.terms[1]
     expected = delta.kernel(X, X[:3]).to_dense()
@@ -71,9 +68,9 @@ def test_a_noise(data, uniform):
     X, _ = data
     X = torch.cat([X, uniform(40, 1, seed=2)])
     torch.manual_seed(0)
-    Y = crude(X) * (1 + 0.2 * torch.randn_like(X))
+    Y = wave(X) * (1 + 0.2 * torch.randn_like(X))
     noise = recipe("A noise")["PartlyRelativeNoise"]()
-    model = CKA(X, Y, physics=crude, likelihood=noise)
+    model = CKA(X, Y, physics=wave, likelihood=noise)
     fit(model, "map", num_starts=4)
     assert isinstance(LogLikelihood(model).distribution, StationaryTerms)
     model.eval()
@@ -91,7 +88,7 @@ def test_an_inference_method(data, monkeypatch):
     method = recipe("An inference method")["METHODS"]["laplace"]
     fitting.METHODS["laplace"] = method
     X, Y = data
-    model = CKA(X, Y, physics=crude)
+    model = CKA(X, Y, physics=wave)
     before = torch.random.get_rng_state()
     fit(model, "laplace", num_samples=8)
     assert model.num_samples == 8
@@ -99,7 +96,7 @@ def test_an_inference_method(data, monkeypatch):
     low, high = model.interval(X)
     assert ((low < Y + 0.1) & (high > Y - 0.1)).all()
     bounded = RBFKernel(lengthscale_constraint=Interval(0.1, 1.0)).double()
-    models = [CKA(X, Y, physics=crude, delta_covar_module=bounded), CKA(X, Y, physics=crude)]
+    models = [CKA(X, Y, physics=wave, delta_covar_module=bounded), CKA(X, Y, physics=wave)]
     results = fit(ModelListGP(*models), "laplace", num_samples=5)
     assert [each.num_samples for each in models] == [5, 5]
     lengthscale = results[0].draws["covar_module.terms.1.kernel.raw_lengthscale"]

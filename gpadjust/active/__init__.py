@@ -1,4 +1,4 @@
-"""Where to measure next."""
+"""Active data collection: the choice of the next measurement."""
 
 from gpadjust.active.collection import (
     Collection,

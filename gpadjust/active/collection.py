@@ -18,18 +18,16 @@ from tqdm import tqdm
 from gpadjust.active.measurement_log import LogError, MeasurementLog, Record
 from gpadjust.active.measurements import (
     Measurements,
-    as_bounds,
     as_options,
-    as_outcomes,
-    as_points,
-    as_points_within,
+    checked_outcomes,
     measurement,
     refusal,
 )
 from gpadjust.active.points import among, best_points, sobol_points
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
+from gpadjust.checks import checked_bounds, checked_points, checked_whole
 from gpadjust.models.factory import ModelFactory, make_model
-from gpadjust.models.sampled_functions import check_number, seeded
+from gpadjust.models.sampled_functions import seeded
 
 
 class MeasurementWarning(UserWarning):
@@ -43,7 +41,7 @@ class CollectionError(RuntimeError):
         message: What happened.
         collection: The collection so far.
         X: The points that were being measured, ``q x d``.
-        result: What the oracle returned for them, if the collection could not take it.
+        result: The values of the oracle, if the collection could not take them.
     """
 
     def __init__(self, message: str, collection: Collection, X: Tensor, result: Any = None) -> None:
@@ -139,9 +137,9 @@ class Collection(Measurements):
         if fit is not None and not callable(fit):
             raise TypeError(f"Expected fit to be callable, got {fit!r}.")
         self.model_factory, self.acquisition = model_factory, acquisition
-        self.bounds = as_bounds(bounds)
+        self.bounds = checked_bounds("bounds", bounds)
         d = self.bounds.shape[-1]
-        check_number(batch_size, "batch_size")
+        checked_whole("batch_size", batch_size, 1)
         if not isinstance(seed, int) or not 0 <= seed < 2**63:
             raise ValueError(
                 f"Expected seed to be a whole number >= 0 and below 2^63, got {seed!r}."
@@ -150,20 +148,17 @@ class Collection(Measurements):
         initial = 2 * (d + 1) if initial is None else initial
         self._first_points = self.bounds[:0]
         if not isinstance(initial, int | float | str):
-            self._first_points, initial = as_points_within(initial, self.bounds, "initial"), 2
+            self._first_points = checked_points("initial", initial, d, self.bounds)
+            initial = 2
             if len(self._first_points.unique(dim=0)) < len(self._first_points):
                 raise ValueError(
                     "Expected the points of initial to differ, got some twice. To measure a point "
                     "again, tell() what came out."
                 )
-        if not isinstance(initial, int) or initial < 2:
-            raise ValueError(
-                f"Expected initial to be a number of points >= 2, or the points, got {initial!r}."
-            )
-        self._initial, self._fit = initial, fit
+        self._fit, self._initial = fit, checked_whole("initial, a number of points,", initial, 2)
         self._options = as_options(optimizer_options)
         if num_outputs is not None:
-            check_number(num_outputs, "num_outputs")
+            checked_whole("num_outputs", num_outputs, 1)
         super().__init__(self.bounds, num_outputs, data)
         self._model: Any = None
         self._last_model: tuple[Any, int] = (None, 0)
@@ -184,7 +179,7 @@ class Collection(Measurements):
         self.close()
 
     def __repr__(self) -> str:
-        """What was measured, in a line."""
+        """The state of the collection in a line."""
         m = "unknown" if self.num_outputs is None else self.num_outputs
         return (
             f"Collection({len(self.X)} measurements, {len(self.failed_X)} failed, "
@@ -233,7 +228,7 @@ class Collection(Measurements):
             LogError: If the points cannot be logged; then they are not pending.
         """
         q = self.batch_size if q is None else q
-        check_number(q, "q")
+        checked_whole("q", q, 1)
         record: Record = {}
         points = self._design(q)
         if points is None:
@@ -264,8 +259,8 @@ class Collection(Measurements):
         Warns:
             MeasurementWarning: If one of them has failed.
         """
-        X = as_points(X, self.bounds.shape[-1])
-        Y = as_outcomes(Y, len(X), self.num_outputs)
+        X = checked_points("X", X, self.bounds.shape[-1])
+        Y = checked_outcomes(Y, len(X), self.num_outputs)
         records = [measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)]
         self._enter(records)
         self._warn(records)
@@ -280,7 +275,7 @@ class Collection(Measurements):
         Warns:
             MeasurementWarning: In any case.
         """
-        X = as_points(X, self.bounds.shape[-1])
+        X = checked_points("X", X, self.bounds.shape[-1])
         message = reason if isinstance(reason, str) else f"{type(reason).__name__}: {reason}"
         records: list[Record] = [{"x": x, "failed": message} for x in X.tolist()]
         self._enter(records)
@@ -292,7 +287,7 @@ class Collection(Measurements):
         Args:
             X: The points, ``n x d``. Default: all that are pending.
         """
-        X = self.pending if X is None else as_points(X, self.bounds.shape[-1])
+        X = self.pending if X is None else checked_points("X", X, self.bounds.shape[-1])
         self._enter([{"withdrawn": X.tolist()}])
 
     def run(
@@ -335,8 +330,8 @@ class Collection(Measurements):
         """
         if not callable(oracle):
             raise TypeError(f"Expected the oracle to be callable, got {oracle!r}.")
-        check_number(budget, "budget")
-        check_number(max_failures, "max_failures")
+        checked_whole("budget", budget, 1)
+        checked_whole("max_failures", max_failures, 1)
         done, failures = min(budget, self.num_measured), 0
         with tqdm(total=budget, initial=done, unit="measurement", disable=not progress) as bar:
             while (left := budget - self.num_measured) > 0:
@@ -441,7 +436,7 @@ class Collection(Measurements):
             self.fail(X, error)
             return error
         try:
-            Y = as_outcomes(result, len(X), self.num_outputs)
+            Y = checked_outcomes(result, len(X), self.num_outputs)
         except (TypeError, ValueError) as error:
             if self.log is not None:
                 with suppress(LogError):
@@ -463,7 +458,7 @@ class Collection(Measurements):
         return None
 
     def _place(self) -> str:
-        """Where the log is."""
+        """The place of the log."""
         return "no log was kept" if self.log is None else f"the log is at {self.log.path}"
 
 

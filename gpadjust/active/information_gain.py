@@ -1,4 +1,4 @@
-"""Where a measurement would teach most about the error of the physics."""
+"""Information of measurements about the error of the physics."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
     Raises:
         TypeError: If the model has no such adjustment, or is no adjustment of a physics. What is
             told of unknown parameters of the physics does not count.
-        ValueError: If ``about`` is unknown, or ``"delta"`` of a model with a centre, as by default,
+        ValueError: If ``about`` is unknown, or ``"delta"`` of a model with a center, as by default,
             whose delta is not independent of rho a priori; with ``center=0.0`` it is.
 
     Example:
@@ -122,14 +122,14 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         return information_gain(model, X, rest.whole, rest.remaining)
 
     def _rests(self) -> _Rest:
-        """What is unknown given the data; made anew after the model is given other data."""
+        """The unknown given the data; made again after the model is given other data."""
         if self._rest is None or self._rest.source is not self.model.conditioning():
             self._rest = _Rest(self.model, self.about)
         return self._rest
 
 
 class _Rest:
-    """What the data leave unknown of f_a, and what they and the adjustment in question would.
+    """Covariance of f_a given the data, and given also the adjustment in question.
 
     Args:
         model: The model, in eval mode.
@@ -145,7 +145,7 @@ class _Rest:
 
 
 def _posterior_covariance(model: TermsModel) -> Callable[[Tensor], Tensor]:
-    """What the data leave unknown of f_a at transformed inputs."""
+    """The posterior covariance of f_a at transformed inputs."""
     if not isinstance(model, VariationalCKA):
         return UnknownCovariance(model)
     return lambda inputs: model.conditioning().joint(model.at(inputs))[1]
@@ -183,14 +183,14 @@ def _check(model: Any, about: str) -> None:
         raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
     if about == "delta" and model.has_centre:
         raise ValueError(
-            f"The {name} takes a centre from f_p (by default it is learnt), so that delta is not "
+            f"The {name} takes a center from f_p (by default it is learnt), so that delta is not "
             "independent of rho a priori and its information has no closed form: ask about 'rho' "
             "or 'both', or build and fit the model with center=0.0."
         )
 
 
 class UnknownCovariance:
-    r"""What the data leave unknown of a sum of terms, as if they were of these and noise alone.
+    r"""Posterior covariance of a sum of terms, as if the data were of these and noise alone.
 
     With the terms' covariance K of the data, noise included, and U of new points with the data,
 
@@ -264,8 +264,8 @@ def information_gain(
     Args:
         model: The model, in eval mode.
         X: Raw inputs, ``batch_shape x q x d``.
-        unknown: What the data leave unknown.
-        remaining: What would be unknown if the function in question were known. Default: nothing.
+        unknown: The covariance given the data.
+        remaining: The covariance if the function in question were known, too. Default: none.
         counted: Which observations are made, ``batch_shape x q`` booleans. Default: all.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What was measured, what failed, and what is being measured; and the checks of what is told."""
+"""Measurements: made, failed and pending; and the checks of their numbers."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from torch import Tensor
 
 from gpadjust.active.measurement_log import Record
 from gpadjust.active.points import NEAR, among, distances
-from gpadjust.models.training_data import check_observed
-from gpadjust.physics.row_calls import real_array
+from gpadjust.checks import check_observed, checked_points, checked_tensor
 
 
 class Measurements:
@@ -38,8 +37,8 @@ class Measurements:
 
     Attributes:
         X: The points measured, ``n x d``, those of ``data`` first.
-        Y: What was measured there, ``n x m``; NaN where an output was not.
-        failed_X: Where measuring failed, ``k x d``.
+        Y: The values measured there, ``n x m``; NaN where an output was not.
+        failed_X: Points at which measuring failed, ``k x d``.
         pending: Points asked for and not told yet, ``l x d``.
         num_measured: Number of measurements, failed ones included, those of ``data`` not.
         num_outputs: Number ``m`` of outputs; None before the first measurement.
@@ -58,9 +57,9 @@ class Measurements:
         if data is not None:
             if not isinstance(data, tuple | list) or len(data) != 2:
                 raise TypeError(f"Expected data to be a pair (X, Y), got {data!r}.")
-            X = as_points(data[0], bounds.shape[-1], "the X of data")
-            Y = as_outcomes(data[1], len(X), num_outputs)
-            check_observed(Y, "the Y of data")
+            X = checked_points("the X of data", data[0], bounds.shape[-1])
+            Y = checked_outcomes(data[1], len(X), num_outputs)
+            check_observed("the Y of data", Y)
             self.X, self.Y, self.num_outputs = X, Y, Y.shape[-1]
 
     @property
@@ -93,8 +92,8 @@ class Measurements:
             self.failed_X = torch.cat([self.failed_X, x])
         else:
             values = [math.nan if value is None else value for value in record["y"]]
-            y = as_outcomes([values], 1, self.num_outputs)
-            check_observed(y, "y")
+            y = checked_outcomes([values], 1, self.num_outputs)
+            check_observed("y", y)
             self.num_outputs = y.shape[-1]
             self.X, self.Y = torch.cat([self.X, x]), torch.cat([self.Y, y]) if len(self.Y) else y
         self._no_longer_pending(x[0])
@@ -117,7 +116,7 @@ class Measurements:
     def _points(self, rows: list[list[float]]) -> Tensor:
         """The points of a record, ``n x d``."""
         d = self.X.shape[-1]
-        return as_points(rows, d) if rows else self.X.new_zeros(0, d)
+        return checked_points("X", rows, d) if rows else self.X.new_zeros(0, d)
 
 
 def refusal(X: Tensor, result: Any, error: Exception) -> Record:
@@ -153,77 +152,7 @@ def measurement(x: list[float], y: list[float]) -> Record:
     return record | ({"failed": f"measured {y}"} if failed else {})
 
 
-def as_numbers(values: Any, name: str) -> Tensor:
-    """Return a copy of real numbers as a tensor, float64.
-
-    Raises:
-        TypeError: If they are anything else.
-    """
-    try:
-        if not isinstance(values, Tensor):
-            return torch.from_numpy(real_array(values))
-        if not values.is_complex():
-            return values.detach().to("cpu", torch.float64, copy=True)
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise TypeError(f"Expected {name} to be real numbers, got {values!r}.") from error
-    raise TypeError(f"Expected {name} to be real numbers, got {values.dtype}.")
-
-
-def as_bounds(bounds: Any) -> Tensor:
-    """Return bounds as ``2 x d``, float64.
-
-    Raises:
-        TypeError: If they are no numbers.
-        ValueError: If they are not finite, lower below upper.
-    """
-    bounds = as_numbers(bounds, "bounds")
-    if bounds.dim() != 2 or len(bounds) != 2 or not bounds.shape[1]:
-        raise ValueError(
-            "Expected bounds of shape 2 x d, the lower ones and then the upper ones, got "
-            f"{tuple(bounds.shape)}."
-        )
-    if not bounds.isfinite().all() or (bounds[0] >= bounds[1]).any():
-        raise ValueError(
-            f"Expected finite bounds, each lower one below its upper one, got {bounds.tolist()}."
-        )
-    return bounds
-
-
-def as_points(X: Any, num_inputs: int, name: str = "X") -> Tensor:
-    """Return points as ``n x d``, float64.
-
-    Raises:
-        TypeError: If they are no numbers.
-        ValueError: If they have another number of columns, or are not finite.
-    """
-    X = as_numbers(X, name)
-    if X.dim() != 2 or X.shape[-1] != num_inputs:
-        raise ValueError(
-            f"Expected {name} of shape n x {num_inputs}, a row for each point, got "
-            f"{tuple(X.shape)}."
-        )
-    if not X.isfinite().all():
-        raise ValueError(f"Expected {name} to be finite, got {X.tolist()}.")
-    return X
-
-
-def as_points_within(X: Any, bounds: Tensor, name: str) -> Tensor:
-    """Return points within bounds ``2 x d`` as ``n x d``, float64.
-
-    Raises:
-        TypeError: As :func:`as_points`.
-        ValueError: As :func:`as_points`, or if one is out of bounds.
-    """
-    X = as_points(X, bounds.shape[-1], name)
-    outside = (X.clamp(bounds[0], bounds[1]) != X).any(-1)
-    if outside.any():
-        raise ValueError(
-            f"Expected {name} within the bounds {bounds.tolist()}, got {X[outside][0].tolist()}."
-        )
-    return X
-
-
-def as_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
+def checked_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
     """Return measured values as ``n x m``, float64; they may be NaN or infinite.
 
     Args:
@@ -235,7 +164,7 @@ def as_outcomes(Y: Any, num_points: int, num_outputs: int | None) -> Tensor:
         TypeError: If they are no numbers.
         ValueError: If they have another shape.
     """
-    Y = as_numbers(Y, "measured values")
+    Y = checked_tensor("measured values", Y)
     columns = Y.reshape(-1, 1) if Y.dim() < 2 else Y
     right = columns.dim() == 2 and len(columns) == num_points and columns.shape[-1] > 0
     if not right or num_outputs not in (None, columns.shape[-1]):

@@ -5,9 +5,9 @@ try:
 except ImportError as error:
     raise ImportError('gpadjust.ax needs Ax; run `pip install "gpadjust[ax]"`.') from error
 
-from gpadjust.ax import storage, surrogate
+from gpadjust.ax import surrogate
 from gpadjust.ax.parameter_physics import ParameterPhysics
-from gpadjust.ax.physics_optimum_node import PhysicsOptimumNode
+from gpadjust.ax.physics_optimum import PhysicsOptimumNode
 from gpadjust.ax.strategy import TRANSFORMS, generation_strategy, generator_kwargs
 from gpadjust.ax.tell_physics import TellPhysics
 
@@ -21,4 +21,3 @@ __all__ = [
 ]
 
 surrogate.register()
-storage.register()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter, signature
 from typing import Any, Self
 
@@ -87,7 +87,7 @@ class ParameterPhysics:
         return tuple(parameters)
 
     def of(self, names: tuple[str, ...]) -> Physics:
-        """It as a physics of rows with the columns ``names``, those of :meth:`names_of`.
+        """The same as a physics of rows with the columns ``names``, those of :meth:`names_of`.
 
         It is made once, so that what is remembered of f_p outlives a model.
         """
@@ -126,6 +126,24 @@ class ParameterPhysics:
             return {}
         kinds = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
         return {name: p.default for name, p in found.items() if p.kind in kinds}
+
+
+def parts_of(physics: Any) -> list[Any]:
+    """The physics of a metric: several are a list, a tuple, or a dictionary; None is none."""
+    if isinstance(physics, Mapping):
+        return [*physics.values()]
+    if isinstance(physics, list | tuple):
+        return [*physics]
+    return [] if physics is None else [physics]
+
+
+def of_each(change: Callable[[Any], Any], physics: Any) -> Any:
+    """The physics of a metric, each changed, in the form in which they are given."""
+    if isinstance(physics, Mapping):
+        return {name: change(part) for name, part in physics.items()}
+    if isinstance(physics, list | tuple):
+        return [change(part) for part in physics]
+    return change(physics)
 
 
 class _OfColumns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from ax.adapter.registry import MBM_X_trans
@@ -16,8 +17,8 @@ from ax.generation_strategy.generation_strategy import GenerationStrategy
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 
-from gpadjust.ax.parameter_physics import ParameterPhysics
-from gpadjust.ax.physics_optimum_node import PhysicsOptimumNode
+from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
+from gpadjust.ax.physics_optimum import PhysicsOptimumNode
 from gpadjust.ax.tell_physics import TellPhysics
 from gpadjust.models import CKA, TermsGP, ZeroMeanGP
 
@@ -29,8 +30,7 @@ says (``Winsorize``, ``BilogY``); and ``TellPhysics``."""
 def generator_kwargs(
     physics: Mapping[str, Any],
     *,
-    model: type[TermsGP] = CKA,
-    model_options: Mapping[str, Any] | None = None,
+    model: type[TermsGP] | partial[TermsGP] = CKA,
     fit_options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The arguments of Ax's ``BOTORCH_MODULAR`` generator, for a ``GeneratorSpec`` of one's own.
@@ -38,9 +38,9 @@ def generator_kwargs(
     Args:
         physics: For each metric that has one, its physics, as :class:`ParameterPhysics` takes it;
             several of one metric as a list, or a dictionary with their names.
-        model: The model of these metrics; the others have a :class:`~gpadjust.ZeroMeanGP`.
-        model_options: Further arguments of ``model``; numbers with units are in those after Ax's
-            transforms.
+        model: The model of these metrics: a class, or ``functools.partial`` of one with further
+            arguments, of which numbers with units are in those after Ax's transforms. The other
+            metrics have a :class:`~gpadjust.ZeroMeanGP`.
         fit_options: Arguments of :func:`gpadjust.fit`, such as ``{"method": "map"}``, for all
             metrics.
 
@@ -48,7 +48,8 @@ def generator_kwargs(
         ``surrogate_spec`` and ``transforms``.
 
     Raises:
-        TypeError: If ``physics`` is no mapping of metrics, or holds something else than physics.
+        TypeError: If ``physics`` is no mapping of metrics, or holds something else than physics, or
+            ``model`` is no such class.
     """
     if not isinstance(physics, Mapping) or not physics:
         raise TypeError(
@@ -56,11 +57,12 @@ def generator_kwargs(
             f"{physics!r}."
         )
     fitted = {"mll_options": dict(fit_options or {})}
+    model_class, options = _class_of(model)
     configs = {
         metric: ModelConfig(
-            botorch_model_class=model,
-            model_options={**(model_options or {}), "physics": _stored(given)},
-            name=f"{model.__name__} of {metric}",
+            botorch_model_class=model_class,
+            model_options={**options, "physics": of_each(ParameterPhysics, given)},
+            name=f"{model_class.__name__} of {metric}",
             **fitted,
         )
         for metric, given in physics.items()
@@ -76,8 +78,7 @@ def generator_kwargs(
 def generation_strategy(
     physics: Mapping[str, Any],
     *,
-    model: type[TermsGP] = CKA,
-    model_options: Mapping[str, Any] | None = None,
+    model: type[TermsGP] | partial[TermsGP] = CKA,
     fit_options: Mapping[str, Any] | None = None,
     initialize_with_center: bool | None = None,
     **options: Any,
@@ -86,15 +87,14 @@ def generation_strategy(
 
     Its first trial is where the physics says that the objective is best, by a search that asks f_p
     1,024 points at once and four times 64 (:class:`PhysicsOptimumNode`). If a metric of the
-    objective has no physics, or f_p fails, it is at the centre of the search space, as Ax's. Sobol
+    objective has no physics, or f_p fails, it is at the center of the search space, as Ax's. Sobol
     points follow, and then what the models choose.
 
     Args:
-        physics: As in :func:`generator_kwargs`, like the next three.
+        physics: As in :func:`generator_kwargs`, like the next two.
         model: As there.
-        model_options: As there.
         fit_options: As there.
-        initialize_with_center: True: the first trial is at the centre whatever the physics says.
+        initialize_with_center: True: the first trial is at the center whatever the physics says.
             False: at none of both, the Sobol points come first. Default: at the optimum of the
             physics.
         options: The others of ``Client.configure_generation_strategy`` but ``method``, such as
@@ -120,13 +120,13 @@ def generation_strategy(
         >>> strategy.name
         'PhysicsOptimum+Sobol+MBM:CKA'
     """
-    own = generator_kwargs(
-        physics, model=model, model_options=model_options, fit_options=fit_options
-    )
+    own = generator_kwargs(physics, model=model, fit_options=fit_options)
     struct = GenerationStrategyDispatchStruct(
         method="custom", initialize_with_center=initialize_with_center is not False, **options
     )
-    strategy = choose_generation_strategy(struct, model_config=ModelConfig(name=model.__name__))
+    strategy = choose_generation_strategy(
+        struct, model_config=ModelConfig(name=_class_of(model)[0].__name__)
+    )
     for node in strategy._nodes:
         if node.name == "MBM":
             node.generator_specs[0].generator_kwargs.update(own)
@@ -143,9 +143,15 @@ def generation_strategy(
     return GenerationStrategy(name=name, nodes=[at_optimum, *others])
 
 
-def _stored(physics: Any) -> Any:
-    if isinstance(physics, Mapping):
-        return {name: _stored(part) for name, part in physics.items()}
-    if isinstance(physics, list | tuple):
-        return [_stored(part) for part in physics]
-    return ParameterPhysics(physics)
+def _class_of(model: Any) -> tuple[type[TermsGP], dict[str, Any]]:
+    """The class that a model factory is of, and the arguments that it adds."""
+    options: dict[str, Any] = {}
+    factory = model
+    if isinstance(model, partial) and not model.args:
+        factory, options = model.func, dict(model.keywords)
+    if not isinstance(factory, type) or not issubclass(factory, TermsGP):
+        raise TypeError(
+            "Expected model as a class of models, such as CKA, or functools.partial of one with "
+            f"keyword arguments, as Ax makes models of classes, got {model!r}."
+        )
+    return factory, options

@@ -1,21 +1,36 @@
-"""How Ax's surrogate builds and fits these models."""
+"""Registration in Ax: building, fitting, saving and loading of this room's models."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from ax.core.search_space import SearchSpaceDigest
+from ax.exceptions.storage import JSONEncodeError
 from ax.generators.torch.botorch_modular.surrogate import (
     Surrogate,
     submodel_input_constructor,
 )
 from ax.generators.torch.botorch_modular.utils import ModelConfig, fit_botorch_model
+from ax.storage.botorch_modular_registry import register_model
+from ax.storage.json_store.registry import CORE_DECODER_REGISTRY, CORE_ENCODER_REGISTRY
+from ax.storage.transform_registry import register_transform
 from botorch.utils.datasets import SupervisedDataset
 from botorch.utils.types import DEFAULT
 
-from gpadjust.ax.physics_in_units import PhysicsInUnits
+from gpadjust.ax.parameter_physics import ParameterPhysics, parts_of
+from gpadjust.ax.physics_optimum import PhysicsOptimumNode
+from gpadjust.ax.tell_physics import TellPhysics
+from gpadjust.ax.units import PhysicsInUnits
 from gpadjust.inference import fit
-from gpadjust.models import TermsGP
+from gpadjust.models import (
+    CKA,
+    RRA,
+    CalibratedPhysics,
+    PhysicsMeanGP,
+    ScaleGP,
+    TermsGP,
+    ZeroMeanGP,
+)
 
 _PARTS = (
     "covar_module_class",
@@ -26,9 +41,15 @@ _PARTS = (
 
 
 def register() -> None:
-    """Enter both functions where Ax looks for them."""
+    """Enter functions, models, transform, node and physics where Ax looks for them."""
     submodel_input_constructor.register(TermsGP)(model_inputs)
     fit_botorch_model.register(TermsGP)(fit_model)
+    for model in (CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, CalibratedPhysics):
+        register_model(model)
+    register_transform(TellPhysics)
+    CORE_ENCODER_REGISTRY[ParameterPhysics] = as_dict
+    CORE_DECODER_REGISTRY[ParameterPhysics.__name__] = ParameterPhysics
+    CORE_DECODER_REGISTRY[PhysicsOptimumNode.__name__] = PhysicsOptimumNode
 
 
 def model_inputs(
@@ -65,7 +86,7 @@ def model_inputs(
             "OneHot (transforms=gpadjust.ax.TRANSFORMS), and give each task or fidelity a model of "
             "its own."
         )
-    for each in _parts(model_config.model_options.get("physics")):
+    for each in parts_of(model_config.model_options.get("physics")):
         if not isinstance(each, PhysicsInUnits) or each.units.names != tuple(dataset.feature_names):
             raise ValueError(
                 f"The physics of {', '.join(dataset.outcome_names)} was not told what Ax's "
@@ -82,8 +103,17 @@ def fit_model(model: TermsGP, mll_class: Any, mll_options: dict[str, Any] | None
     fit(model, **(mll_options or {}))
 
 
-def _parts(physics: Any) -> list[Any]:
-    if physics is None:
-        return []
-    several = physics.values() if isinstance(physics, dict) else physics
-    return [*several] if isinstance(physics, dict | list) else [physics]
+def as_dict(physics: ParameterPhysics) -> dict[str, Any]:
+    """A physics as Ax saves it: by its import path.
+
+    Raises:
+        JSONEncodeError: If it has none.
+    """
+    if physics.path is None:
+        raise JSONEncodeError(
+            f"Ax cannot save the physics {physics.name!r}: found a lambda or a function or object "
+            "inside of another, expected one with a name in a module. Write `def f_p(...)`, or "
+            "`f_p = BlackBoxPhysics(...)`, in a file that can be imported, and make the generation "
+            "strategy of that."
+        )
+    return {"__type": ParameterPhysics.__name__, "physics": physics.path}

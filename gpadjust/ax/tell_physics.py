@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ax.adapter.base import Adapter
@@ -14,9 +15,8 @@ from ax.generators.torch.botorch_modular.generator import BoTorchGenerator
 from ax.generators.torch.botorch_modular.surrogate import SurrogateSpec
 from ax.generators.torch.botorch_modular.utils import ModelConfig
 
-from gpadjust.ax.parameter_physics import ParameterPhysics
-from gpadjust.ax.physics_in_units import PhysicsInUnits
-from gpadjust.ax.units import Units
+from gpadjust.ax.parameter_physics import ParameterPhysics, of_each
+from gpadjust.ax.units import PhysicsInUnits, Units
 
 
 class TellPhysics(Transform):
@@ -121,13 +121,9 @@ class _Told:
                 "it is of: SurrogateSpec(metric_to_model_configs={'the metric': [ModelConfig(...)]"
                 "}), or gpadjust.ax.generation_strategy({'the metric': f_p})."
             )
-        told = self.physics(physics, metrics[0])
+        told = of_each(partial(self.physics, metrics[0]), physics)
         return replace(config, model_options={**config.model_options, "physics": told})
 
-    def physics(self, physics: Any, metric: str) -> Any:
-        if isinstance(physics, dict):
-            return {name: self.physics(part, metric) for name, part in physics.items()}
-        if isinstance(physics, list | tuple):
-            return [self.physics(part, metric) for part in physics]
+    def physics(self, metric: str, physics: Any) -> PhysicsInUnits:
         origin = physics.origin if isinstance(physics, PhysicsInUnits) else physics
         return PhysicsInUnits(ParameterPhysics(origin), metric, self.units, self.parameters)

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gpadjust.control.option_checks import ArrayLike, check_fraction, checked_action_bounds
+from gpadjust.checks import checked_bounds, checked_number
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.task import Task
@@ -111,7 +111,7 @@ class MPC:
         seed: int = 0,
     ) -> None:
         if tolerance is not None:
-            check_fraction("tolerance", tolerance, most=math.inf, zero=False)
+            checked_number("tolerance", tolerance, above=0)
         length = task.episode_length
         if each_step is None:
             third = 0 if length is None else length // 3
@@ -132,7 +132,8 @@ class MPC:
                 "horizon."
             )
         self.task = task
-        self.action_bounds = checked_action_bounds(action_bounds, task.dynamics.spec)
+        dim = task.dynamics.spec.action_dim
+        self.action_bounds = checked_bounds("action_bounds", action_bounds, dim)
         self.each_step = each_step
         self.first = first
         self.tolerance = tolerance

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
@@ -10,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass
 import torch
 from torch import Tensor
 
-from gpadjust.control.option_checks import check_fraction
+from gpadjust.checks import checked_number
 from gpadjust.control.rollouts import Rollout
 from gpadjust.control.task import Task, per_row
 
@@ -66,11 +65,10 @@ class Return(Objective):
 
     def __post_init__(self) -> None:
         """Check numbers and function."""
-        if self.discount != 1:
-            check_fraction("discount", self.discount, zero=False)
+        checked_number("discount", self.discount, above=0, most=1)
         if self.quantile is not None:
-            check_fraction("quantile", self.quantile)
-        check_fraction("effort", self.effort, most=math.inf)
+            checked_number("quantile", self.quantile, least=0, below=1)
+        checked_number("effort", self.effort, least=0)
         if self.terminal_value is not None and not callable(self.terminal_value):
             raise TypeError(
                 "terminal_value must be a function of states, or None; found "

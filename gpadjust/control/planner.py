@@ -8,15 +8,11 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from gpadjust.checks import checked_bounds, checked_number, checked_whole
 from gpadjust.control.objectives import Objective, Return
-from gpadjust.control.option_checks import (
-    ArrayLike,
-    check_fraction,
-    check_whole,
-    checked_action_bounds,
-)
 from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
 from gpadjust.control.task import Task
@@ -108,14 +104,14 @@ class Planner:
                 f"found {self.search!r}."
             )
         for name in ("num_random", "max_hold", "restarts"):
-            check_whole(name, getattr(self, name), 1)
+            checked_whole(name, getattr(self, name), 1)
         for name in ("horizon", "num_functions"):
             if getattr(self, name) is not None:
-                check_whole(name, getattr(self, name), 1)
+                checked_whole(name, getattr(self, name), 1)
         self.objective.check_functions(self.num_functions)
-        check_fraction("spread", self.spread, zero=False)
+        checked_number("spread", self.spread, above=0, below=1)
         if self.seconds is not None:
-            check_fraction("seconds", self.seconds, most=math.inf, zero=False)
+            checked_number("seconds", self.seconds, above=0)
 
     @torch.no_grad()
     def plan(
@@ -145,7 +141,8 @@ class Planner:
             PhysicsError: If the physics fails at ``state``, whatever the action.
         """
         begun = time.perf_counter()
-        action_bounds = checked_action_bounds(action_bounds, task.dynamics.spec)
+        dim = task.dynamics.spec.action_dim
+        action_bounds = checked_bounds("action_bounds", action_bounds, dim)
         num_steps = self._checked_steps(task, state, num_steps)
         score = self.objective.of(task)
         rollouts = Rollouts(task, self.num_functions)

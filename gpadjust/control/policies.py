@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from gpadjust.control.option_checks import ArrayLike, checked_action_bounds
+from gpadjust.checks import checked_bounds
 from gpadjust.states import StateSpec
 
 _NEAR = 0.95  # of the way to a bound: beyond, the tanh has hardly any slope
@@ -43,7 +44,7 @@ class BoundedPolicy(nn.Module):
 
     def __init__(self, body: nn.Module, spec: StateSpec, action_bounds: ArrayLike) -> None:
         super().__init__()
-        low, high = checked_action_bounds(action_bounds, spec)
+        low, high = checked_bounds("action_bounds", action_bounds, spec.action_dim)
         self.body = body
         self.spec = spec
         self.register_buffer("middle", (low + high) / 2)
@@ -95,7 +96,7 @@ def mlp_policy(
     last = nn.Linear(widths[-1], spec.action_dim, dtype=torch.float64)
     with torch.no_grad():
         last.weight.mul_(0.1)  # gentle actions at first
-        last.bias.copy_(_before_tanh(first_actions, checked_action_bounds(action_bounds, spec)))
+        last.bias.copy_(_before_tanh(first_actions, action_bounds, spec.action_dim))
     return BoundedPolicy(nn.Sequential(*layers, last), spec, action_bounds)
 
 
@@ -128,14 +129,14 @@ def rbf_policy(
     """
     last = nn.Linear(num_centres, spec.action_dim, dtype=torch.float64)
     with torch.no_grad():
-        last.bias.copy_(_before_tanh(first_actions, checked_action_bounds(action_bounds, spec)))
+        last.bias.copy_(_before_tanh(first_actions, action_bounds, spec.action_dim))
     body = nn.Sequential(_Bells(spec.observation_dim, num_centres), last)
     return BoundedPolicy(body, spec, action_bounds)
 
 
-def _before_tanh(actions: Sequence[float] | None, action_bounds: Tensor) -> Tensor:
+def _before_tanh(actions: Sequence[float] | None, action_bounds: ArrayLike, dim: int) -> Tensor:
     """What the tanh of a policy makes these actions of, ``action_dim``; 0 for None."""
-    low, high = action_bounds
+    low, high = checked_bounds("action_bounds", action_bounds, dim)
     if actions is None:
         return torch.zeros_like(low)
     given = torch.as_tensor(actions, dtype=torch.float64)

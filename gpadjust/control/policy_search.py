@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from gpadjust.checks import checked_number, checked_whole
 from gpadjust.control.objectives import Objective, Return
-from gpadjust.control.option_checks import check_fraction, check_whole
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy
 from gpadjust.control.rollouts import Rollouts
@@ -103,12 +103,12 @@ class PolicySearch:
                 f"{self.objective!r}."
             )
         for name in ("updates", "num_starts", "redraw_every", "num_guides"):
-            check_whole(name, getattr(self, name), 1)
+            checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
-            check_whole("num_functions", self.num_functions, 1)
+            checked_whole("num_functions", self.num_functions, 1)
         self.objective.check_functions(self.num_functions)
         for name in ("learning_rate", "max_grad_norm"):
-            check_fraction(name, getattr(self, name), most=math.inf, zero=False)
+            checked_number(name, getattr(self, name), above=0)
         if not isinstance(self.guide, Planner | None):
             raise TypeError(f"guide must be a Planner, or None; found {self.guide!r}.")
 

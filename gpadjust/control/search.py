@@ -11,7 +11,7 @@ from dataclasses import KW_ONLY, dataclass
 import torch
 from torch import Tensor
 
-from gpadjust.control.option_checks import check_fraction, check_whole
+from gpadjust.checks import checked_number, checked_whole
 
 SequenceScore = Callable[[Tensor], Tensor]
 """Scores ``n`` of sequences ``n x T x action_dim``, higher is better."""
@@ -65,9 +65,9 @@ class CrossEntropy(Search):
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole("rounds", self.rounds, 0)
-        check_whole("num_elites", self.num_elites, 1)
-        check_fraction("correlation", self.correlation)
+        checked_whole("rounds", self.rounds, 0)
+        checked_whole("num_elites", self.num_elites, 1)
+        checked_number("correlation", self.correlation, least=0, below=1)
 
     def best(
         self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf
@@ -118,10 +118,10 @@ class PathIntegral(Search):
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole("rounds", self.rounds, 0)
-        check_fraction("temperature", self.temperature, most=math.inf, zero=False)
-        check_fraction("spread", self.spread, zero=False)
-        check_fraction("correlation", self.correlation)
+        checked_whole("rounds", self.rounds, 0)
+        checked_number("temperature", self.temperature, above=0)
+        checked_number("spread", self.spread, above=0, below=1)
+        checked_number("correlation", self.correlation, least=0, below=1)
 
     def best(
         self, score: SequenceScore, first: Tensor, bounds: Tensor, deadline: float = math.inf

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
 
@@ -94,11 +95,8 @@ class Task:
             )
         for name, arguments in (("reward", 3), ("terminated", 1), ("initial_states", 1)):
             _check_function(getattr(self, name), name, arguments)
-        length = self.episode_length
-        if length is not None and (not isinstance(length, int) or isinstance(length, bool)):
-            raise TypeError(f"episode_length must be a whole number; found {length!r}.")
-        if length is not None and length < 1:
-            raise ValueError(f"episode_length must be at least 1; found {length}.")
+        if self.episode_length is not None:
+            checked_whole("episode_length", self.episode_length, 1)
         if self.state_bounds is not None:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)

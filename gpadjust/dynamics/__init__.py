@@ -5,7 +5,6 @@ from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.free_run import FreeRun
 from gpadjust.dynamics.learned_dynamics import LearnedDynamics
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
-from gpadjust.dynamics.scores import FreeRunScores, TransitionScores
 from gpadjust.dynamics.trajectories import Trajectories, Windows
 from gpadjust.states import StateSpec
 
@@ -13,12 +12,10 @@ __all__ = [
     "AngleInput",
     "Dynamics",
     "FreeRun",
-    "FreeRunScores",
     "LearnedDynamics",
     "PhysicsDynamics",
     "StateSpec",
     "Trajectories",
     "TransitionFunctions",
-    "TransitionScores",
     "Windows",
 ]

@@ -9,13 +9,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_columns
 from gpadjust.dynamics.free_run import FreeRun, free_run
-from gpadjust.dynamics.scores import TransitionScores, score_transitions
 from gpadjust.dynamics.state import fingerprint
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.models import Prediction
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import check_columns
+from gpadjust.validation import Scores
 
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
@@ -83,8 +83,14 @@ class Dynamics(ABC):
         """What is known of the system before there are transitions; None if that is nothing."""
         return self if self.is_fitted else None
 
-    def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> TransitionScores:
-        """Judge the predictions by transitions that were not learnt from.
+    def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Scores:
+        r"""Judge the predictions by transitions that were not learnt from.
+
+        The outputs are the states that move, in the spec's order; exogenous ones and previous
+        values are left out. The variance of an integrated state is what the dynamics say,
+        :math:`(h / 2)^2` times that of its velocity: the more certain the velocity, the more the
+        trapezoid's own error counts in its ``nlpd`` and ``coverage``. Of a state that has a
+        variance of zero, which says nothing of errors, there are ``rmse`` and ``median`` only.
 
         Args:
             states: ``N x state_dim``.
@@ -96,8 +102,16 @@ class Dynamics(ABC):
             TypeError: If they are not float64 tensors.
             ValueError: If shapes disagree or values are not finite.
         """
-        data = Trajectories.checked(self.spec, states, actions, next_states)
-        return score_transitions(self.spec, self.predict(data.states, data.actions), data)
+        data, moving = (
+            Trajectories.checked(self.spec, states, actions, next_states),
+            self.spec.moving,
+        )
+        mean, variance = self.predict(data.states, data.actions)
+        # Angles the shortest way round.
+        found = (mean + self.spec.change(mean, data.next_states))[:, moving]
+        mean, variance = mean[:, moving], variance[:, moving]
+        says = variance.masked_fill((variance <= 0).any(0), torch.nan)
+        return Scores.of(mean, says, found, output_names=[self.spec.states[i] for i in moving])
 
     def free_run(
         self,
@@ -245,8 +259,8 @@ class Dynamics(ABC):
         return data
 
     def _check_pair(self, states: Tensor, actions: Tensor) -> None:
-        check_columns(states, self.spec.state_dim, "states")
-        check_columns(actions, self.spec.action_dim, "actions")
+        check_columns("states", states, self.spec.state_dim)
+        check_columns("actions", actions, self.spec.action_dim)
         if states.dtype != torch.float64:
             raise TypeError(
                 f"Expected states in float64, got {states.dtype}; use `states.double()`."

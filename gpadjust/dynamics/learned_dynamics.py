@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_switch
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.learning import (
     DynamicsFitOptions,
     Learnt,
-    ModelFactory,
     Recipe,
     check_enough_observed,
     checked_fit_options,
@@ -22,10 +22,10 @@ from gpadjust.dynamics.learning import (
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state import LearntState, check_fingerprint, fingerprint
 from gpadjust.dynamics.targets import Target, Targets, check_physics
-from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.dynamics.varying_parameters import VaryingParameters
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
+from gpadjust.models.factory import ModelFactory
 from gpadjust.models.sampled_functions import check_num_features
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.states import StateSpec
@@ -97,8 +97,7 @@ class LearnedDynamics(Dynamics):
     ) -> None:
         super().__init__(spec)
         check_num_features(num_features)
-        if not isinstance(encode_angles, bool):
-            raise TypeError(f"Expected encode_angles to be True or False, found {encode_angles!r}.")
+        check_switch("encode_angles", encode_angles)
         self.targets = Targets(spec, target)
         self.physics = None if physics is None else check_physics(physics, spec)
         self.encode_angles = encode_angles
@@ -126,13 +125,15 @@ class LearnedDynamics(Dynamics):
         """Number of transitions that it has learnt from."""
         return 0 if self._learnt is None else len(self._learnt.data.states)
 
-    def fit(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Learn from these transitions only, by a full search of the hyper-parameters.
+    def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
+        """Learn from further transitions, beside the earlier ones.
 
-        If this raises an error, what was learnt before stands; so it does in all methods below.
+        The hyper-parameters are searched for anew at first and whenever the number of transitions
+        has doubled since the last search; else they are fitted again from where they were. If this
+        raises an error, what was learnt before stands; so it does in all methods below.
 
         Args:
-            states: ``N x state_dim``, with ``N >= 2``.
+            states: ``N x state_dim``.
             actions: ``N x action_dim``.
             next_states: ``N x state_dim``; NaN where an entry was not measured: each state is
                 learnt from its own rows.
@@ -140,41 +141,25 @@ class LearnedDynamics(Dynamics):
         Raises:
             TypeError: If they are not float64 tensors.
             ValueError: If shapes disagree, values are not finite, a row of next states is NaN in
-                all that the model predicts, there are fewer than 2 rows of a state, or states are
-                not what the spec says (:meth:`StateSpec.check_transitions`).
+                all that the model predicts, there are fewer than 2 rows of a state in all, or
+                states are not what the spec says (:meth:`StateSpec.check_transitions`).
             PhysicsError: If the physics fails.
         """
         data = self._checked(states, actions, next_states)
-        self._learn(data, self._recipe.physics_at(data.states, data.actions), None)
-
-    def update(
-        self, states: Tensor, actions: Tensor, next_states: Tensor, *, refit: bool = True
-    ) -> None:
-        """Learn from further transitions, beside the earlier ones.
-
-        The hyper-parameters are fitted again from where they were, and searched for anew whenever
-        the number of transitions has doubled since the last search.
-
-        Args:
-            states: ``N x state_dim``.
-            actions: ``N x action_dim``.
-            next_states: ``N x state_dim``; NaN as in :meth:`fit`.
-            refit: Whether to fit the hyper-parameters again; if not, the model is conditioned on
-                the new transitions with those that it has (:meth:`condition`).
-
-        Raises:
-            TypeError: As :meth:`fit`.
-            ValueError: As :meth:`fit`; two rows in all will do.
-            PhysicsError: As :meth:`fit`.
-        """
-        if not refit and self.is_fitted:
-            self.condition(states, actions, next_states)
-            return
-        data = self._checked(states, actions, next_states)
-        known = self._recipe.physics_at(data.states, data.actions)
-        if self._learnt is not None:
-            data, known = self._learnt.with_rows(data, known)
-        self._learn(data, known, self._learnt)
+        known, previous = self._recipe.physics_at(data.states, data.actions), self._learnt
+        if previous is not None:
+            data, known = previous.with_rows(data, known)
+        check_enough_observed(self.spec, data)
+        with self._recipe.restored_on_error():
+            if previous is None and not self._compared:
+                self._recipe.compare_physics(data, known)
+            self._recipe.tell_physics(data, known)
+            model, result, searched_at = self._recipe.fit(data, previous, self.fit_options)
+            if self._recipe.physics_learns:
+                known = self._recipe.physics_at(data.states, data.actions)
+        self._compared = self._compared or previous is None
+        self.fit_result = result
+        self._learnt = Learnt(data, known, (len(data.states),), searched_at, model, model)
 
     def try_physics(self, states: Tensor, actions: Tensor) -> None:
         """Call the physics once, to find what is wrong with it before there are transitions."""
@@ -371,19 +356,6 @@ class LearnedDynamics(Dynamics):
             return step
 
         return sample_functions
-
-    def _learn(self, data: Trajectories, known: Tensor | None, previous: Learnt | None) -> None:
-        check_enough_observed(self.spec, data)
-        with self._recipe.restored_on_error():
-            if previous is None and not self._compared:
-                self._recipe.compare_physics(data, known)
-            self._recipe.tell_physics(data, known)
-            model, result, searched_at = self._recipe.fit(data, previous, self.fit_options)
-            if self._recipe.physics_learns:
-                known = self._recipe.physics_at(data.states, data.actions)
-        self._compared = self._compared or previous is None
-        self.fit_result = result
-        self._learnt = Learnt(data, known, (len(data.states),), searched_at, model, model)
 
     def _known_so_far(self) -> Learnt:
         if self._learnt is None:

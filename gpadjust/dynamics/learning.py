@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from functools import partial
@@ -23,11 +23,9 @@ from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
 from gpadjust.inference.fitting import check_options
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models import TermsModel, ZeroMeanGP
+from gpadjust.models.factory import ModelFactory, make_model
 from gpadjust.physics import Physics, as_physics
 from gpadjust.states import StateSpec
-
-ModelFactory = Callable[..., TermsModel]
-"""Makes a model of inputs and targets, ``(X, Y, **physics)``: a class, a partial, a function."""
 
 _SEARCH = FitOptions(num_screened=64, num_starts=4, max_iterations=30)
 _REFIT = FitOptions(num_screened=0, num_starts=1, max_iterations=15)
@@ -108,12 +106,8 @@ class Recipe:
         with warnings.catch_warnings():
             if quiet:
                 warnings.simplefilter("ignore")
-            model = _own_modules(self.make)(*self._rows(data), **_copied(self.options))
-        if not isinstance(model, TermsModel):
-            raise TypeError(
-                f"Expected model(X, Y, ...) to return a model of gpadjust.models, such as CKA, or "
-                f"one of your own on TermsGP; found {type(model).__name__}."
-            )
+            make, given = _own_modules(self.make), _copied(self.options)
+            model: TermsModel = make_model(make, *self._rows(data), kind=TermsModel, **given)
         model.input_names = self.targets.input_names
         model.output_names = self.targets.output_names
         return model
@@ -181,7 +175,6 @@ class Recipe:
             of the hyper-parameters.
         """
         n, given = len(data.states), dict[str, Any](options)
-        check_enough_observed(self.targets.spec, data)
         model = self.build(data, quiet=previous is not None)
         if previous is None:
             return model, fit(model, **given), n

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gpadjust.models.sampled_functions import check_number
+from gpadjust.checks import checked_whole
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 
@@ -118,7 +118,7 @@ def central_interval(sample: Tensor, level: float) -> tuple[Tensor, Tensor]:
 
 def check_enough(num_functions: int, level: float) -> None:
     """Raise a ValueError unless so many particles have an interval of this probability."""
-    check_number(num_functions, "num_functions")
+    checked_whole("num_functions", num_functions, 1)
     least = math.ceil(2 / (1 - level) - 1 - _ROUNDING)  # whose outermost two are its ends
     if num_functions < least:
         raise ValueError(

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.state import PhysicsProbes, check_fingerprint, fingerprint
 from gpadjust.dynamics.targets import check_physics, next_values, parts_of, warn_of_differences
 from gpadjust.models import Prediction
-from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 
@@ -97,7 +97,7 @@ class PhysicsDynamics(Dynamics):
         Raises:
             ValueError: If ``num_functions`` is no positive whole number.
         """
-        check_number(num_functions, "num_functions")
+        checked_whole("num_functions", num_functions, 1)
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_blocks(states, actions, num_functions)

@@ -9,10 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.models.sampled_functions import check_number
-from gpadjust.models.training_data import check_finite, check_observed
+from gpadjust.checks import check_columns, check_finite, check_observed, checked_whole
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import check_columns
 
 
 class Windows(NamedTuple):
@@ -115,7 +113,7 @@ class Trajectories:
         named = {"states": states, "actions": actions, "next_states": next_states}
         for name, tensor in named.items():
             columns = spec.action_dim if name == "actions" else spec.state_dim
-            check_columns(tensor, columns, name)
+            check_columns(name, tensor, columns)
             if tensor.dtype != torch.float64:
                 raise TypeError(
                     f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`."
@@ -126,10 +124,10 @@ class Trajectories:
                     f"one; got shapes {', '.join(str(tuple(t.shape)) for t in named.values())}."
                 )
             if name == "next_states":
-                check_observed(tensor, name)
-                check_observed(tensor[:, spec.predicted], "the predicted entries of next_states")
+                check_observed(name, tensor)
+                check_observed("the predicted entries of next_states", tensor[:, spec.predicted])
             else:
-                check_finite(tensor, name)
+                check_finite(name, tensor)
         return cls(*(tensor.detach().clone() for tensor in named.values()), episode)
 
     def __iter__(self) -> Iterator[Tensor]:
@@ -201,9 +199,9 @@ class Trajectories:
                     [2., 3., 4.],
                     [4., 5., 6.]], dtype=torch.float64)
         """
-        check_number(length, "length")
+        checked_whole("length", length, 1)
         stride = length if stride is None else stride
-        check_number(stride, "stride")
+        checked_whole("stride", stride, 1)
         complete, starts, end = (~self.states.isnan().any(-1)).tolist(), [], 0
         lengths = self.episode.unique_consecutive(return_counts=True)[1].tolist()
         for steps in lengths:
@@ -227,7 +225,7 @@ def spread_rows(total: int, number: int, seed: int, what: str) -> Tensor:
     Raises:
         ValueError: If there are fewer, or ``number`` is no positive whole number.
     """
-    check_number(number, "number")
+    checked_whole("number", number, 1)
     if number > total:
         raise ValueError(f"Expected number <= {total}, the {what} that there are, got {number}.")
     edges = torch.arange(number + 1) * total // number

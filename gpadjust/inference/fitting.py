@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
-from numbers import Integral
 from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, Unpack, overload
 
 import torch
@@ -15,6 +14,7 @@ from botorch.models import ModelListGP
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from botorch.utils.transforms import is_fully_bayesian
 
+from gpadjust.checks import checked_whole
 from gpadjust.gp import AppendedPhysics
 from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SampleResult, default_num_samples, sample
@@ -230,10 +230,7 @@ def check_options(method: str, options: dict[str, Any]) -> None:
             raise ValueError(f"Method {method!r} has no option {name!r}; {hint}.")
         if value is None and Search._field_defaults.get(name) is None:
             continue
-        if not isinstance(value, Integral) or isinstance(value, bool):
-            raise TypeError(f"Expected {name} to be a whole number, got {value!r}.")
-        if value < least[name]:
-            raise ValueError(f"Expected {name} >= {least[name]}, got {value}.")
+        checked_whole(name, value, least[name])
 
 
 def _fit_list(

@@ -14,6 +14,7 @@ from gpytorch.likelihoods import Likelihood
 from torch import Size, Tensor
 from torch.nn import Parameter
 
+from gpadjust.checks import checked_bounds, checked_whole
 from gpadjust.gp.kernels import Batched
 from gpadjust.gp.physics_columns import appended, check_one_to_one
 from gpadjust.models.component_noise import ComponentNoise
@@ -28,7 +29,6 @@ from gpadjust.models.training_data import (
     training_data,
 )
 from gpadjust.physics import as_physics
-from gpadjust.physics.base import whole_number
 
 
 class LevelInput(InputTransform):
@@ -252,15 +252,7 @@ def _samples(train_X: Tensor, bounds: Tensor | None, num_low: int, seed: int) ->
     if bounds is None:
         raise ValueError("AR1 samples f_p in `bounds` (2 x d); pass them, or `low_X` and `low_Y`.")
     d = train_X.shape[-1]
-    bounds = torch.as_tensor(bounds, dtype=train_X.dtype, device=train_X.device)
-    if bounds.shape != (2, d):
-        raise ValueError(f"Expected bounds of shape (2, {d}), got {tuple(bounds.shape)}.")
-    if not bounds.isfinite().all() or (bounds[0] >= bounds[1]).any():
-        raise ValueError(
-            "Expected finite bounds with each lower one (row 0) below the upper one (row 1), got "
-            f"{bounds.tolist()}."
-        )
-    if whole_number("num_low", num_low) < 2:
-        raise ValueError(f"Expected num_low >= 2 samples of f_p, got {num_low}.")
-    points = draw_sobol_samples(bounds, n=num_low, q=1, seed=whole_number("seed", seed)).squeeze(-2)
+    bounds = checked_bounds("bounds", bounds, d).to(train_X.device)
+    n, seed = checked_whole("num_low", num_low, 2), checked_whole("seed", seed)
+    points = draw_sobol_samples(bounds, n=n, q=1, seed=seed).squeeze(-2)
     return points.expand(*train_X.shape[:-2], num_low, d)

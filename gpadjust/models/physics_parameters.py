@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_level
 from gpadjust.gp import PhysicsInput
 from gpadjust.physics import Unknown
 
@@ -64,8 +65,7 @@ class PhysicsParameters(dict[str, Tensor]):
 
     def interval(self, level: float = 0.95) -> tuple[Tensor, Tensor]:
         """Lower and upper ends of the central intervals of probability ``level``, ``p`` each."""
-        if not 0 < level < 1:
-            raise ValueError(f"Expected level between 0 and 1, got {level}.")
+        check_level(level)
         ends = torch.tensor([(1 - level) / 2, (1 + level) / 2]).to(self.draws)
         low, high = self.draws.quantile(ends, dim=0)
         return low, high

@@ -10,6 +10,7 @@ from botorch.posteriors import Posterior
 from torch import Tensor
 from torch.nn import Module
 
+from gpadjust.checks import check_level, checked_whole
 from gpadjust.models.posteriors import (
     HyperparameterMixture,
     MarginalMixture,
@@ -17,9 +18,8 @@ from gpadjust.models.posteriors import (
     mixture_moments,
     mixture_quantile,
 )
-from gpadjust.models.sampled_functions import DRAWING, check_num_features, check_number, seeded
+from gpadjust.models.sampled_functions import DRAWING, check_num_features, seeded
 from gpadjust.models.training_data import ArrayLike
-from gpadjust.physics.base import whole_number
 
 
 class Prediction(NamedTuple):
@@ -123,8 +123,7 @@ class PredictiveModel(Model):
             level: The probability that it holds; a ValueError if it is not between 0 and 1.
             observation_noise: As in :meth:`predict`.
         """
-        if not isinstance(level, float) or not 0 < level < 1:
-            raise ValueError(f"Expected level as a number between 0 and 1, got {level!r}.")
+        check_level(level)
         parts = self.components(X, observation_noise)
         return mixture_quantile(*parts, (1 - level) / 2), mixture_quantile(*parts, (1 + level) / 2)
 
@@ -158,10 +157,10 @@ class PredictiveModel(Model):
             >>> functions(torch.rand(5, 1, dtype=torch.float64)).shape
             torch.Size([3, 5, 1])
         """
-        check_number(num_functions, "num_functions")
+        checked_whole("num_functions", num_functions, 1)
         check_num_features(num_features)
         self.eval()
-        with DRAWING, seeded(None if seed is None else whole_number("seed", seed)):
+        with DRAWING, seeded(None if seed is None else checked_whole("seed", seed)):
             return self.draw_functions(num_functions, num_features)
 
     @property

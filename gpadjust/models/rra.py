@@ -13,15 +13,15 @@ from gpytorch.likelihoods import Likelihood
 from linear_operator.operators import RootLinearOperator
 from torch import Size, Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.gp import WeightedSum
 from gpadjust.gp.features import term_features
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.parameters import LogInterval
-from gpadjust.models.sampled_functions import SampledFunctions
+from gpadjust.models.sampled_functions import SampledFunctions, check_num_features
 from gpadjust.models.term_builder import Center, Means, ModelOptions, PhysicsLike, TermBuilder
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.training_data import ArrayLike
-from gpadjust.physics.base import whole_number
 
 
 class WeightConditioning(ExactConditioning):
@@ -109,12 +109,8 @@ class RRA(TermsGP):
         seed: int = 0,
         **options: Unpack[ModelOptions],
     ) -> None:
-        if not isinstance(num_features, int) or num_features < 2 or num_features % 2:
-            raise ValueError(
-                "Expected num_features to be an even whole number >= 2 (sines and cosines), got "
-                f"{num_features!r}."
-            )
-        generator = torch.Generator().manual_seed(whole_number("seed", seed))
+        check_num_features(num_features)
+        generator = torch.Generator().manual_seed(checked_whole("seed", seed))
         kernel = partial(fourier_kernel, num_features=num_features, generator=generator)
         make = TermBuilder.of_adjustment(
             train_X, train_Y, train_Yvar, physics, rho_mean=rho_mean, center=center, **options

@@ -12,6 +12,7 @@ import torch
 from torch import Size, Tensor
 from torch.nn import Module, ModuleDict
 
+from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, WeightedSum
 from gpadjust.gp.features import term_features
 
@@ -179,12 +180,6 @@ def seeded(seed: int | None) -> Iterator[None]:
         yield
 
 
-def check_number(number: int, name: str) -> None:
-    """Raise a ValueError unless ``number`` is a whole number of at least 1."""
-    if not isinstance(number, int) or isinstance(number, bool) or number < 1:
-        raise ValueError(f"Expected {name} to be a whole number >= 1, got {number!r}.")
-
-
 def check_each(X: Tensor, number: int) -> None:
     """Raise a ValueError unless ``X`` has points for each of so many functions."""
     if X.dim() != 3 or len(X) != number:
@@ -196,6 +191,6 @@ def check_each(X: Tensor, number: int) -> None:
 
 def check_num_features(number: int) -> None:
     """Raise a ValueError unless random features may be so many."""
-    check_number(number, "num_features")
+    checked_whole("num_features", number, 1)
     if number % 2:
         raise ValueError(f"Expected num_features to be even (sines and cosines), got {number}.")

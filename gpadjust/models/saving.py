@@ -22,7 +22,7 @@ _FORMAT = 3
 
 
 class Saved(NamedTuple):
-    """What :func:`save` wrote.
+    """Manifest of a file that :func:`save` wrote.
 
     Attributes:
         path: The file.
@@ -96,7 +96,7 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> Saved:
 
 
 def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
-    """What a file holds of a model; the errors are those of :func:`save`."""
+    """The contents of a file of a model; the errors are those of :func:`save`."""
     if isinstance(model, StackedGP):
         return {
             "format": _FORMAT,
@@ -184,7 +184,7 @@ def load(path: str | Path, **objects: Any) -> Any:
 
 
 def _loaded(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel | StackedGP:
-    """What a file holds, with what is given beside it."""
+    """The model of a file, with the objects that are given beside it."""
     stacked = "models" in content
     models = content["models"] if stacked else {"": content}
     known = {name for each in models.values() for name in each["missing"]}
@@ -249,7 +249,7 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
 
 
 def _not_taken(model_class: type[TermsModel], names: list[str]) -> list[str]:
-    """Which arguments of data the constructor of a class does not take by name."""
+    """The arguments of data that the constructor of a class does not take by name."""
     own = [*signature(model_class.__init__).parameters.values()][1:]
     needed = {p.name for p in own if p.kind is p.POSITIONAL_OR_KEYWORD and p.default is p.empty}
     passes = any(p.kind is p.VAR_KEYWORD for p in own) and needed <= {*names}

@@ -14,9 +14,10 @@ from torch import Size, Tensor
 from torch.nn import Module, ModuleList
 from torch.quasirandom import SobolEngine
 
+from gpadjust.checks import checked_whole
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
-from gpadjust.models.sampled_functions import check_each, check_number
+from gpadjust.models.sampled_functions import check_each
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
 
@@ -101,7 +102,7 @@ class StackedGP(PredictiveModel):
         num_components: int = 32,
     ) -> None:
         super().__init__()
-        check_number(num_components, "num_components")
+        checked_whole("num_components", num_components, 1)
         first, shares = _checked(models, weights)
         parts = []
         for j, share in enumerate(shares.unbind(-1)):

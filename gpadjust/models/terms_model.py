@@ -15,16 +15,17 @@ from gpytorch.settings import detach_test_caches
 from torch import Tensor
 from torch.nn import Module
 
+from gpadjust.checks import checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
-from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions, check_number
+from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.term_builder import ModelOptions
-from gpadjust.models.training_data import ArrayLike, check_columns, to_tensor
+from gpadjust.models.training_data import ArrayLike, check_order, to_tensor
 from gpadjust.physics import Physics
 
 _SHARED = "Unpack[ModelOptions]"  # how a constructor says that it takes these and no others
@@ -332,7 +333,7 @@ class TermsModel(PredictiveModel):
             single one.
         """
         if most is not None:
-            check_number(most, "most")
+            checked_whole("most", most, 1)
         self.eval()
         if self.num_samples is None:
             return self._functions_of_batches(None)
@@ -358,7 +359,7 @@ class TermsModel(PredictiveModel):
         """
         if self.training:
             self.eval()
-        check_columns(X, self.input_names)
+        check_order(X, self.input_names)
         X = to_tensor(X, "X")
         d = len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:

@@ -11,6 +11,8 @@ import torch
 from botorch.models.transforms.outcome import OutcomeTransform, Standardize
 from torch import Tensor
 
+from gpadjust.checks import check_finite, check_observed, marked_rows
+
 ArrayLike = Any
 """A float64 tensor, or a NumPy array or pandas DataFrame of numbers."""
 
@@ -79,13 +81,13 @@ def training_data(
             f"Expected at least 2 points in {name_X}, got {X.shape[-2]}: with fewer there is "
             "nothing to learn a scale from. Use the physics alone until there are two."
         )
-    check_finite(X, name_X)
-    check_observed(Y, name_Y)
+    check_finite(name_X, X)
+    check_observed(name_Y, Y)
     seldom = (~Y.isnan()).sum(-2) < 2
     if seldom.any():
         raise ValueError(
             f"Expected at least 2 observations of each output, but {name_Y} has fewer in "
-            f"column(s) {_last(seldom)}; leave these out."
+            f"column(s) {marked_rows(seldom)}; leave these out."
         )
     Yvar = None if train_Yvar is None else _variances(train_Yvar, Y, f"{prefix}_Yvar")
     names = column_names(train_X) or default_names("x", X.shape[-1])
@@ -96,16 +98,16 @@ def new_observations(
     X: ArrayLike, Y: ArrayLike, input_names: tuple[str, ...], num_outputs: int
 ) -> tuple[Tensor, Tensor]:
     """Further observations of a model as tensors ``... x k x d`` and ``... x k x m``, checked."""
-    check_columns(X, input_names)
+    check_order(X, input_names)
     X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
-    check_finite(X, "X")
+    check_finite("X", X)
     rows = X.dim() > 1 and Y.dim() > 1 and X.shape[-2] == Y.shape[-2]
     if not rows or Y.shape[-1] != num_outputs:
         raise ValueError(
             f"Expected X of shape ... x k x {len(input_names)} and Y of shape ... x k x "
             f"{num_outputs}, with a row for each point, got {tuple(X.shape)} and {tuple(Y.shape)}."
         )
-    check_observed(Y, "Y")
+    check_observed("Y", Y)
     return X, Y
 
 
@@ -161,7 +163,7 @@ def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     return None if name is None or isinstance(values, Tensor) else (str(name),)
 
 
-def check_columns(values: ArrayLike, names: tuple[str, ...]) -> None:
+def check_order(values: ArrayLike, names: tuple[str, ...]) -> None:
     """Raise a ValueError if a frame has columns of these names in another order."""
     found = column_names(values)
     if found is not None and found != names and sorted(found) == sorted(names):
@@ -171,18 +173,6 @@ def check_columns(values: ArrayLike, names: tuple[str, ...]) -> None:
 def default_names(letter: str, number: int) -> tuple[str, ...]:
     """``x``, or ``x1`` and so on."""
     return (letter,) if number == 1 else tuple(f"{letter}{i + 1}" for i in range(number))
-
-
-def check_finite(tensor: Tensor, name: str) -> None:
-    """Raise a ValueError that names the rows of ``tensor`` (``... x n x k``) with NaN or inf."""
-    _check_rows(~tensor.isfinite().all(-1), name, "to be finite, found NaN or infinity")
-
-
-def check_observed(Y: Tensor, name: str) -> None:
-    """As :func:`check_finite`, but NaN is a missing value; a row of them is an error."""
-    _check_rows(Y.isinf().any(-1), name, "to be finite, found infinity")
-    expected = "to hold an observation in each row, found nothing but NaN"
-    _check_rows(Y.isnan().all(-1), name, expected)
 
 
 def check_noise(noise: object, Y: Tensor) -> None:
@@ -198,21 +188,6 @@ def check_noise(noise: object, Y: Tensor) -> None:
         raise ValueError("Expected noise (variances) to be finite and not negative.")
 
 
-def _check_rows(bad: Tensor, name: str, expected: str) -> None:
-    if bad.any():
-        rows = _last(bad)
-        shown = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
-        raise ValueError(
-            f"Expected {name} {expected} in {len(rows)} of {bad.shape[-1]} rows (row {shown}); "
-            "remove these points."
-        )
-
-
-def _last(marked: Tensor) -> list[int]:
-    """Where in the last dimension something is marked."""
-    return sorted({int(index[-1]) for index in marked.nonzero()})
-
-
 def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Tensor:
     """Known variances of the shape of ``Y``; their mean where there is no observation."""
     if isinstance(values, int | float | list | tuple):
@@ -225,7 +200,7 @@ def _variances(values: ArrayLike | Sequence[float], Y: Tensor, name: str) -> Ten
         )
     variances = given.expand(Y.shape).masked_fill(Y.isnan(), torch.nan)
     variances = variances.where(~Y.isnan(), variances.nanmean(-2, keepdim=True))
-    check_finite(variances, name)
+    check_finite(name, variances)
     if (variances < 0).any():
         raise ValueError(
             f"Expected {name} (variances) not to be negative, got {variances.min():.3g}."

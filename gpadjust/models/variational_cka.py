@@ -15,9 +15,9 @@ from gpytorch.likelihoods import FixedNoiseGaussianLikelihood
 from torch import Size, Tensor
 from torch.nn import Buffer
 
+from gpadjust.checks import checked_whole
 from gpadjust.gp import Term, TermsMean, Unit, WeightedSum
 from gpadjust.models.parameters import scaled_rbf
-from gpadjust.models.sampled_functions import check_number
 from gpadjust.models.sparse_conditioning import SparseConditioning
 from gpadjust.models.structures import CKA
 from gpadjust.models.term_builder import (
@@ -32,7 +32,6 @@ from gpadjust.models.term_builder import (
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
-from gpadjust.physics.base import whole_number
 
 _SEARCHED = 1000  # observations that an exact model of some takes
 NOTHING = -60.0
@@ -115,7 +114,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
                 f"Expected train_X of one data set, n x d, got shape {tuple(data.X.shape)}; make a "
                 "model of each."
             )
-        check_number(num_inducing, "num_inducing")
+        checked_whole("num_inducing", num_inducing, 1)
         order, searched = _some_of_each_output(data.Y, seed)
         rows = order[:searched]
         # An exact model of some rows makes terms, units and noise.
@@ -303,7 +302,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
 
 def _some_of_each_output(Y: Tensor, seed: int) -> tuple[Tensor, int]:
     """Row numbers in a random order, and how many of the first have observations of each output."""
-    generator = torch.Generator().manual_seed(whole_number("seed", seed))
+    generator = torch.Generator().manual_seed(checked_whole("seed", seed))
     order = torch.randperm(len(Y), generator=generator).to(Y.device)
     observed = ~Y.isnan()[order]
     taken = (observed & (observed.cumsum(0) <= max(2, _SEARCHED // Y.shape[-1]))).any(-1)

@@ -10,11 +10,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gpadjust.physics.base import Physics, whole_number
+from gpadjust.checks import checked_whole, real_array
+from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError, described
 from gpadjust.physics.gradient import ExternalCall
 from gpadjust.physics.memo import RowMemo
-from gpadjust.physics.row_calls import call_rows, real_array
+from gpadjust.physics.row_calls import call_rows
 from gpadjust.physics.unknown import ParameterValues, Unknown
 
 NumpyFunction = Callable[..., ArrayLike]
@@ -85,8 +86,7 @@ class BlackBoxPhysics(Physics):
         if steps.size == 0 or not (np.isfinite(steps) & (steps > 0)).all():
             raise ValueError(f"fd_step must be positive, in the units of X; found {fd_step}.")
         name = name or getattr(function, "__name__", type(function).__name__)
-        if whole_number("memo", memo) < 0:
-            raise ValueError(f"memo must be a number of rows, 0 for no memo; found {memo}.")
+        checked_whole("memo", memo, 0)
         super().__init__(unknowns=unknowns, inputs=inputs, name=name)
         self._memo, self._remembered_for = RowMemo(memo), list[Tensor]()
         self.function = function
@@ -131,7 +131,7 @@ class BlackBoxPhysics(Physics):
         return Y
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, by the memory and with the gradient asked for."""
+        """Return the outputs of rows from the memory, with the gradient that was chosen."""
         if not torch.is_grad_enabled() or not rows.requires_grad or len(rows) == 0:
             return self._recall(rows.detach())
         if self.gradient is None:
@@ -156,7 +156,7 @@ class BlackBoxPhysics(Physics):
         self._memo = RowMemo(self._memo.capacity)
 
     def _recall(self, rows: Tensor) -> Tensor:
-        """``N x m`` outputs, from the memory as far as it knows them."""
+        """Return ``N x m`` outputs, from the memory where it has them."""
         if not self._memo.capacity or len(rows) == 0:
             return super().of_rows(rows)
         # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.

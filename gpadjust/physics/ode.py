@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -10,7 +9,8 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint
 
-from gpadjust.physics.base import Physics, whole_number
+from gpadjust.checks import checked_number, checked_whole
+from gpadjust.physics.base import Physics
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.gradient import ExternalCall
 from gpadjust.physics.unknown import ParameterValues, Unknown
@@ -79,15 +79,12 @@ class ODEPhysics(Physics):
     ) -> None:
         if not callable(rhs):
             raise TypeError(f"rhs must be callable; found {type(rhs).__name__}.")
-        if not (is_finite("step", step) and step > 0):
-            raise ValueError(f"step must be a positive duration; found {step}.")
+        checked_number("step", step, above=0)
         for setting, tolerance in (("rtol", rtol), ("atol", atol)):
-            if not (is_finite(setting, tolerance) and tolerance >= 0):
-                raise ValueError(f"{setting} must be a tolerance of 0 or more; found {tolerance}.")
+            checked_number(setting, tolerance, least=0)
         counts = {"state_dim": state_dim, "substeps": substeps, "max_steps": max_steps}
         for setting, count in counts.items():
-            if whole_number(setting, count) < 1:
-                raise ValueError(f"{setting} must be at least 1; found {count}.")
+            checked_whole(setting, count, 1)
         if method not in FIXED_STEP + ADAPTIVE_STEP:
             raise ValueError(
                 f"Unknown method {method!r}; use one with a fixed step, {', '.join(FIXED_STEP)}, "
@@ -156,7 +153,7 @@ class ODEPhysics(Physics):
         return path[-1] - state if self.difference else path[-1]
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, with the gradient in X by differences if that was asked for."""
+        """Return the outputs of rows, with the gradient in X by differences if that was chosen."""
         by_differences = self.gradient == "finite-difference" and torch.is_grad_enabled()
         by_differences = by_differences and rows.requires_grad
         if not by_differences or any(p.requires_grad for p in self.parameters()):
@@ -185,11 +182,3 @@ class ODEPhysics(Physics):
 
     def _times(self, intervals: int, X: Tensor) -> Tensor:
         return torch.linspace(0.0, self.step, intervals + 1, dtype=X.dtype, device=X.device)
-
-
-def is_finite(name: str, value: float) -> bool:
-    """Whether a setting is finite; a TypeError if it is no number."""
-    try:
-        return math.isfinite(value)
-    except TypeError:
-        raise TypeError(f"{name} must be a number; found {value!r}.") from None

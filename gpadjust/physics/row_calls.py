@@ -1,4 +1,4 @@
-"""Row-by-row calls of a NumPy function, in parallel where joblib is told so."""
+"""Row-by-row calls of a NumPy function, in parallel under ``joblib.parallel_config``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike, NDArray
+
+from gpadjust.checks import real_array
 
 RowFunction = Callable[..., ArrayLike]
 
@@ -29,22 +31,6 @@ def call_rows(
         delayed(_call_row)(function, *row) for row in zip(X, *more, strict=True)
     )
     return results
-
-
-def real_array(values: ArrayLike) -> NDArray[np.float64]:
-    """A copy of real numbers as a float64 array; a TypeError if they are anything else.
-
-    NumPy would drop the imaginary part of complex numbers, and take None for NaN and text for
-    numbers.
-    """
-    array = np.array(values)
-    # Objects may be numbers, such as fractions.
-    if array.dtype.kind not in "biufO" or (
-        array.dtype.kind == "O" and None in array.ravel().tolist()
-    ):
-        found = "None" if array.dtype.kind == "O" else array.dtype
-        raise TypeError(f"expected real numbers, found {found}")
-    return array.astype(np.float64, copy=False)
 
 
 def _call_row(function: RowFunction, *row: Any) -> NDArray[np.float64] | Exception:

@@ -11,7 +11,7 @@ import torch
 from gpadjust.dynamics.targets import check_next_values
 from gpadjust.physics import Physics, PhysicsError
 from gpadjust.records.kalman import Array, Link, Smoothed
-from gpadjust.records.stretches import Stretch
+from gpadjust.records.record import Stretch
 from gpadjust.states import StateSpec
 
 _STEP = 1e-4  # of differences, in standard deviations of a parameter or a state

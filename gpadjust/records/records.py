@@ -10,11 +10,11 @@ from typing import TypeVar
 
 import torch
 
+from gpadjust.checks import checked_number
 from gpadjust.dynamics import Trajectories, Windows
 from gpadjust.files import CsvColumns
-from gpadjust.records.record import Record
+from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.resampling import resampled
-from gpadjust.records.stretches import Stretch, checked_step, in_control_steps
 from gpadjust.states import StateSpec
 
 Column = TypeVar("Column", bound=str | None)
@@ -152,7 +152,9 @@ class Records:
             spec: What the entries of states and actions are.
             step: The control step.
         """
-        times = checked_step(step) * torch.arange(windows.states.shape[1], dtype=torch.float64)
+        times = checked_number("step", step, above=0) * torch.arange(
+            windows.states.shape[1], dtype=torch.float64
+        )
         actions = torch.cat([windows.actions, windows.actions[:, -1:]], dim=1)  # the last: not read
         parts = enumerate(zip(windows.states, actions, strict=True))
         return cls([Record(times, *part, name=f"window {i}") for i, part in parts], spec)
@@ -237,8 +239,8 @@ class Records:
         Warns:
             UserWarning: If whole records are left out.
         """
-        step = checked_step(step, "step")
-        max_gap = None if max_gap is None else checked_step(max_gap, "max_gap")
+        step = checked_number("step", step, above=0)
+        max_gap = None if max_gap is None else checked_number("max_gap", max_gap, above=0)
         found = [resampled(record, self.spec, step, max_gap) for record in self.records]
         records = [record for record in found if record is not None]
         if not records:
@@ -311,7 +313,9 @@ def _read(
     if isinstance(time, str):
         times = table.numbers(time)
     else:
-        times = checked_step(time, "time") * torch.arange(len(table), dtype=torch.float64)
+        times = checked_number("time", time, above=0) * torch.arange(
+            len(table), dtype=torch.float64
+        )
     measured = []
     for name, column in states.items():
         filled_in = name in spec.previous and name == column and name not in table.names

@@ -13,18 +13,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.dynamics.particles import of_states
 from gpadjust.dynamics.targets import check_physics, parts_of
 from gpadjust.models.physics_parameters import PhysicsParameters
-from gpadjust.models.sampled_functions import check_number
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import Array, draw_paths
-from gpadjust.records.record import Record
+from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.records import Records
-from gpadjust.records.smoothing import Estimate, estimate
-from gpadjust.records.stretches import Stretch, in_control_steps
-from gpadjust.records.variation import variation
+from gpadjust.records.smoothing import Estimate, estimate, variation
 
 _DRAWS = 256  # of the parameters
 _SAME = 0.01  # of a step, by which another one may differ from it
@@ -103,9 +101,7 @@ class SmoothedRecords:
         Raises:
             ValueError: If it is no whole number of 0 or more.
         """
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise ValueError(f"Expected seed as a whole number of 0 or more, got {seed!r}.")
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(checked_whole("seed", seed, 0))
         paths = draw_paths(self._found.stretches, len(self._physics.unknowns), rng)
         return _records(self.records, self._stretches, paths)
 
@@ -127,6 +123,7 @@ def smooth(
     process_noise: Tensor | None = None,
     num_starts: int | None = None,
     max_rounds: int = 100,
+    progress: bool = False,
 ) -> SmoothedRecords:
     r"""Estimate the states of a machine, measured with noise or not at all, along its records.
 
@@ -157,7 +154,9 @@ def smooth(
             that persist, as of a wrong f_p, would otherwise be noise.
         num_starts: How many starts to take the best end of, if there is something to learn of
             the physics. Default: 4 with hidden states, else 1.
-        max_rounds: The most rounds of smoothing of each.
+        max_rounds: The most rounds of smoothing of each. With hidden states all of them may be
+            needed: 4 starts of 100 rounds, half a minute for 300 rows and a physics of formulas.
+        progress: Whether to show a progress bar.
 
     Returns:
         The states, their uncertainty, and what decided them.
@@ -195,7 +194,7 @@ def smooth(
     if not isinstance(records, Records):
         raise TypeError(f"Expected records as Records([record, ...], spec), found {records!r}.")
     spec = records.spec
-    check_number(max_rounds, "max_rounds")
+    checked_whole("max_rounds", max_rounds, 1)
     stretches = in_control_steps(records.records, spec, step)
     if short := sum(not len(stretch.actions) for stretch in stretches):
         warnings.warn(
@@ -215,8 +214,8 @@ def smooth(
     hidden = [i for i in spec.moving if measured[:, i].isnan().all()]
     if num_starts is None:
         num_starts = 4 if hidden and whole.unknowns else 1
-    check_number(num_starts, "num_starts")
-    found = estimate(whole, spec, stretches, known, max_rounds, num_starts)
+    checked_whole("num_starts", num_starts, 1)
+    found = estimate(whole, spec, stretches, known, max_rounds, num_starts, progress)
     variances = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
     still = [each._replace(states=torch.zeros_like(each.states)) for each in stretches]
     sd = _by_record(records, still, [np.sqrt(v.clip(0)) for v in variances], remember=False)

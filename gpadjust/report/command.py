@@ -31,7 +31,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     """Read a file, compare, and write the page; nothing is written if anything fails.
 
     Args:
-        arguments: What :func:`gpadjust.__main__.parser` makes of a command line.
+        arguments: A command line as parsed by :func:`gpadjust.__main__.parser`.
         command: The command line, for the page.
 
     Raises:
@@ -101,7 +101,7 @@ def _fitted(
 
 
 def _mark(text: str) -> str:
-    """What is between two fields; a tab may be written as in Python."""
+    """The mark between two fields; a tab may be written as in Python."""
     mark = {"\\t": "\t", "tab": "\t"}.get(text, text)
     if len(mark) != 1:
         raise ValueError(f"Expected --delimiter as one character, or tab, found {text!r}.")

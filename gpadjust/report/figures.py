@@ -16,7 +16,7 @@ from gpadjust.report.subject import Subject
 from gpadjust.validation.plots import (
     plot_adjustment,
     plot_adjustment_pair,
-    plot_calibration,
+    plot_coverage,
     plot_leave_one_out,
     plot_pit,
     plot_trust,
@@ -111,7 +111,7 @@ def pairs(subject: Subject, output: int) -> list[Markup]:
 
 
 def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> list[Markup]:
-    """What predictions rest on, over both of two inputs or along each."""
+    """The basis of predictions, over both of two inputs or along each."""
     alt = f"whether the prediction of {page_output} rests on physics, data or neither"
     if len(trusted.input_names) == 2:
         figure = Figure(figsize=(_WIDTH, 2.8), layout="constrained")
@@ -135,10 +135,10 @@ def left_out(subject: Subject, output: int) -> list[Markup]:
     return [image(figure, alt) for figure, alt in zip(figures, alts, strict=True)]
 
 
-def calibration(subject: Subject, output: int) -> list[Markup]:
+def coverage(subject: Subject, output: int) -> list[Markup]:
     """Observed against nominal coverage, and the histogram of PIT values."""
     figures = [Figure(figsize=(_WIDTH, 2.9), layout="constrained") for _ in range(2)]
-    plot_calibration(subject.loo, output=output, ax=figures[0].subplots())
+    plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
     n = int((~subject.Y[:, output].isnan()).sum())
     plot_pit(subject.loo, output=output, bins=max(4, min(10, n // 4)), ax=figures[1].subplots())
     name = subject.outputs[output]

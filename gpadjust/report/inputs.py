@@ -1,4 +1,4 @@
-"""What the command line of a report names: the columns of a CSV file, and the physics."""
+"""Inputs of the command line of a report: the columns of a CSV file, and the physics."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class CsvData(NamedTuple):
         X: The inputs, ``n x d``.
         Y: The outputs, ``n x m``, NaN where there is none.
         lines: The line of each row in the file.
-        remarks: What was left out or is missing, in sentences.
+        remarks: Rows left out and outputs missing, in sentences.
         digest: The beginning of the file's SHA-256.
     """
 
@@ -98,7 +98,7 @@ def read_csv(
         inputs: The columns of the inputs, in the order in which the physics takes them.
         outputs: Those of the outputs, in the order in which the physics returns them.
         units: Units of columns whose names do not have them.
-        delimiter: What is between two fields.
+        delimiter: The mark between two fields.
         decimal: The decimal mark.
 
     Raises:
@@ -239,9 +239,10 @@ def named_physics(paths: Sequence[str], data: CsvData) -> NamedPhysics:
         parts[key] = physics
         code[key] = f"BlackBoxPhysics({expression})" if is_numpy else expression
     modules = tuple(dict.fromkeys(path.partition(":")[0] for path in paths))
-    if len(parts) == 1:
-        return NamedPhysics(*parts.values(), {"": next(iter(code.values()))}, modules)
-    return NamedPhysics(as_physics({**parts}), code, modules)
+    if len(parts) > 1:
+        return NamedPhysics(as_physics({**parts}), code, modules)
+    ((key, physics),) = parts.items()
+    return NamedPhysics(physics, {"": code[key]}, modules)
 
 
 def _imported(path: str) -> Any:

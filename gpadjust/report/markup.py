@@ -52,7 +52,7 @@ def tag(name: str, /, *children: str, **attributes: str) -> Markup:
 
     Args:
         name: Its name.
-        children: What it holds: :class:`Markup` as it is, other texts escaped.
+        children: Its contents: :class:`Markup` as it is, other texts escaped.
         attributes: Its attributes; ``class_`` is ``class``, and ``aria_label`` ``aria-label``.
 
     Example:
@@ -67,7 +67,7 @@ def tag(name: str, /, *children: str, **attributes: str) -> Markup:
 
 
 def join(children: Iterable[str]) -> Markup:
-    """What is beside one another, without an element around it."""
+    """Texts beside one another, without an element around them."""
     return Markup(
         "".join(child if isinstance(child, Markup) else escape(child) for child in children)
     )
@@ -84,11 +84,11 @@ def table(
     """A table whose first column names its rows, in a box that scrolls on a narrow screen.
 
     Args:
-        caption: What it shows.
+        caption: Its title.
         head: The names of its columns.
         rows: Its cells.
         marked: The row that is set off.
-        kind: What is in its cells, ``"numbers"`` or ``"words"``.
+        kind: The kind of its cells, ``"numbers"`` or ``"words"``.
     """
     body = []
     for i, (name, *cells) in enumerate(rows):
@@ -135,7 +135,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def failure(error: PhysicsError) -> str:
-    """What a physics failed at, in a line, with the first inputs at which it did."""
+    """The failure of a physics in a line, with the first inputs at which it fails."""
     message = str(error.args[0]).rstrip(": ")
     if error.inputs is None or not len(error.inputs):
         return message

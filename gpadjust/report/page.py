@@ -49,9 +49,9 @@ def report(
             replaced; where the model cannot be saved, the page says why, and an old file of it is
             removed.
         title: The title. Default: the names of the outputs.
-        rows: What to call each observation, ``n``, such as its line in your file. Default: by its
+        rows: The name of each observation, ``n``, such as its line in your file. Default: by its
             number, from 0.
-        settings: What else to tell of how it came about, such as ``{"seed": 3}``.
+        settings: Further settings to show, such as ``{"seed": 3}``.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -81,7 +81,7 @@ def report(
 
 
 def checked_path(file: str | Path) -> Path:
-    """Where a page can be written.
+    """The path of a page that can be written.
 
     Raises:
         ValueError: If it is not ``*.html``.
@@ -143,10 +143,10 @@ def page(
     """A page of HTML that needs nothing else.
 
     Args:
-        subject: What it is of.
+        subject: Its subject.
         title: Its title.
         saved: The model's file beside it; or why there is none.
-        origin: Where the subject comes from.
+        origin: The origin of the subject.
         progress: Whether to show a progress bar.
     """
     made_by = {
@@ -155,7 +155,7 @@ def page(
         "Where is the physics wrong?": lambda: sections.where_wrong(subject),
         "Where trust lies": lambda: sections.trusted(subject),
         "Left-out predictions": lambda: sections.predictions(subject),
-        "Calibration": lambda: sections.calibration(subject),
+        "Do the intervals hold?": lambda: sections.coverage(subject),
         "Parameters of the physics": lambda: sections.parameters(subject),
         "What was learnt": lambda: sections.summary(subject),
         "Advice": lambda: sections.advice(subject, [*origin.notes]),

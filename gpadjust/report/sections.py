@@ -63,7 +63,7 @@ _LIBRARIES = ("torch", "gpytorch", "botorch", "numpy")
 
 @dataclass(frozen=True)
 class Origin:
-    """Where what is reported on comes from, as far as the model does not know.
+    """Origin of a report's subject, as far as the model does not know it.
 
     Attributes:
         settings: Names and values of settings.
@@ -84,10 +84,10 @@ class Origin:
 
 
 def verdicts(subject: Subject, how: str = COMPARE) -> Markup:
-    """Whether the physics helps with each output, below the errors of formula, adjustment and data.
+    """The verdict on each output, below the errors of formula, adjustment and data.
 
     Args:
-        subject: What it is of.
+        subject: The subject of the page.
         how: Code or a command that compares, for a subject that was not compared.
     """
     cards = []
@@ -112,7 +112,7 @@ def headline(subject: Subject, how: str = COMPARE) -> str:
 
 
 def verdict(subject: Subject, output: int, how: str = COMPARE) -> tuple[str, list[str]]:
-    """Whether the physics helps with an output, and sentences: those of the comparison, if any."""
+    """The answer for an output, and sentences: those of the comparison, if any."""
     name, comparison = subject.outputs[output], subject.comparison
     if not subject.physics and not subject.is_sampled:
         return "No physics", [f"The model of {name} has no physics to be judged."]
@@ -131,7 +131,7 @@ def verdict(subject: Subject, output: int, how: str = COMPARE) -> tuple[str, lis
 
 
 def recommendation(subject: Subject) -> Markup:
-    """Which model is recommended, and why."""
+    """The recommended model, and the reason."""
     comparison = subject.comparison
     if comparison is None:
         what = f"This page is of a given model, {subject.model!r}. It was not compared with others."
@@ -199,7 +199,7 @@ def structures(subject: Subject) -> Markup:
 
 
 def advice(subject: Subject, notes: list[str]) -> Markup:
-    """What the comparison says in sentences, and warnings of the fit."""
+    """Further sentences of the comparison, and warnings of the fit."""
     told = [] if subject.comparison is None else subject.comparison.advice
     sentences = [text.replace("+-", "±") for text in (*told, *notes)]
     return bullets(sentences) if sentences else Markup()
@@ -212,7 +212,7 @@ def spread_of(subject: Subject, output: int) -> float:
 
 
 def _errors(subject: Subject, output: int) -> list[Markup]:
-    """How far off the formula, its adjustment and the data alone are, in a line."""
+    """The errors of the formula, its adjustment and the data alone, in a line."""
     name = subject.outputs[output]
     if subject.comparison is not None:
         errors = subject.comparison.errors()[name]
@@ -248,7 +248,7 @@ def _weights(subject: Subject) -> Markup:
 
 
 def _what(name: str) -> str:
-    """What a structure is; of one of several physics, of which."""
+    """The description of a structure, with the physics if it is of one of several."""
     short, of, physics = name.partition(" of ")
     what = _WHAT.get(short, "a structure of your own")
     return f"{what} ({physics})" if of else what
@@ -271,7 +271,7 @@ def where_wrong(subject: Subject) -> Markup:
 
 
 def trusted(subject: Subject) -> Markup:
-    """Which share of the predictions rests on the physics, on data, or on neither."""
+    """Shares of the predictions that rest on the physics, on data, or on neither."""
     shares: list[tuple[str, Adjusted, Trust]] = []
     parts: list[str] = []
     for name, shown in zip(subject.outputs, subject.adjusted, strict=True):
@@ -296,14 +296,14 @@ def trusted(subject: Subject) -> Markup:
         "were seen), on the data (its interval excludes f_p: the model is sure that the physics is "
         "wrong there), or on neither (too few data to tell)."
     )
-    parts += [tag("p", words), table("What predictions rest on", head, rows)]
+    parts += [tag("p", words), table("Basis of the predictions", head, rows)]
     inputs = figures.inputs_drawn(subject)
     for name, shown, found in shares:
         parts.append(drawn(partial(figures.trusts, found, shown.output, inputs, name)))
     over = {1: "Along the input", 2: "Over both inputs"}.get(len(subject.inputs))
     over = over or "Along each input, for all values of the others"
-    colours = "blue where it rests on the physics, orange on the data, grey on neither"
-    parts.append(tag("p", f"{over}: {colours}.", class_="note"))
+    colors = "blue where it rests on the physics, orange on the data, grey on neither"
+    parts.append(tag("p", f"{over}: {colors}.", class_="note"))
     return join(parts)
 
 
@@ -315,7 +315,7 @@ def _none(subject: Subject) -> str:
 
 
 def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
-    """What the figures of an output show."""
+    """The words above the figures of an output."""
     if shown is None:
         return [f"{_none(subject)} The figures show the prediction. {_BANDS}"]
     name = subject.outputs[output]
@@ -372,8 +372,8 @@ def predictions(subject: Subject) -> Markup:
     return join(parts)
 
 
-def calibration(subject: Subject) -> Markup:
-    """Whether intervals hold what they promise."""
+def coverage(subject: Subject) -> Markup:
+    """Coverage of the intervals of left-out observations."""
     rows, parts = [], []
     held_by = {level: subject.loo.score(level).coverage for level in _LEVELS}
     for j, name in enumerate(subject.outputs):
@@ -385,8 +385,8 @@ def calibration(subject: Subject) -> Markup:
             says = "too narrow" if held < low else "too wide" if held > high else "in that range"
             cells = [f"{held} of {n}", percent(share), f"{low} to {high} of {n}", says]
             rows.append([f"{name}, {percent(level)}", *cells])
-        parts.append(drawn(partial(figures.calibration, subject, j)))
-    head = ["interval", "holds", "share", "if calibrated", "the intervals are"]
+        parts.append(drawn(partial(figures.coverage, subject, j)))
+    head = ["interval", "holds", "share", "if they hold", "the intervals are"]
     words = (
         "If intervals are honest, those of 95 % hold 95 % of left-out observations, but for "
         "chance: the fourth column has the range that 95 of 100 honest models would be in. The "
@@ -397,7 +397,7 @@ def calibration(subject: Subject) -> Markup:
 
 
 def _how(subject: Subject) -> str:
-    """How observations were left out."""
+    """The way in which observations were left out."""
     first = "Each observation is predicted by a model that has not seen it"
     if subject.comparison is not None and subject.comparison.left_out:
         return (
@@ -409,7 +409,7 @@ def _how(subject: Subject) -> str:
             "parameters of the physics) stay as they are, and have seen it: with few data the "
             "errors are too small."
         )
-    return f"{first}, nor have its hyper-parameters: their samples are weighted anew for each."
+    return f"{first}, nor have its hyper-parameters: their samples are weighted again for each."
 
 
 def _worst(subject: Subject, j: int) -> Markup:
@@ -494,7 +494,7 @@ def data(subject: Subject, origin: Origin) -> Markup:
 
 
 def _repeats(subject: Subject) -> list[str]:
-    """How many rows have the inputs of another, and how far their outputs differ."""
+    """The number of rows with the inputs of another, and the spread of their outputs."""
     _, index = subject.X.unique(dim=0, return_inverse=True)
     counts = index.bincount()
     repeated = int(counts[counts > 1].sum())
@@ -541,9 +541,9 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     """Code that loads the model beside the page, and predicts.
 
     Args:
-        subject: What the page is of.
+        subject: The subject of the page.
         saved: The model's file; or why there is none.
-        origin: Where the physics comes from.
+        origin: The origin of the physics.
     """
     if isinstance(saved, str):
         return tag("p", f"The model could not be saved: {saved}", class_="caution")

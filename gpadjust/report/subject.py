@@ -1,4 +1,4 @@
-"""What a report is of, brought into one form."""
+"""The subject of a report: a model, a mixture or a comparison, in one form."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class Adjusted(NamedTuple):
 
 @dataclass(frozen=True)
 class Subject:
-    """What a report is of.
+    """The subject of a report.
 
     Attributes:
-        model: What predicts: a model, or a mixture of several.
+        model: The model that predicts, or a mixture of several.
         comparison: The comparison that recommends it, if there is one.
         X: Inputs of the observations, ``n x d``.
         Y: Observations, ``n x m``, NaN where there is none.
         loo: Predictions of left-out observations.
-        rows: What each row is called, ``n``.
+        rows: The name of each row, ``n``.
         adjusted: For each output what is shown of rho and delta; None if no physics is adjusted.
     """
 
@@ -91,12 +91,12 @@ class Subject:
 
     @property
     def as_it_is(self) -> str:
-        """How the physics is told from what it is adjusted to."""
+        """Description of the unadjusted physics."""
         unknown = any(physics.unknowns for physics in self.physics.values())
         return "with fitted parameters" if unknown else "as it is"
 
     def physics_at(self, X: Tensor, output: int) -> list[tuple[str, Tensor]]:
-        """What each physics that is shown says of an output, ``n``, parameters at their means."""
+        """Values of an output by each physics shown, ``n``, parameters at their means."""
         shown = self.adjusted[output]
         if shown is None:
             return []
@@ -114,11 +114,11 @@ class Subject:
 
 
 def subject_of(thing: object, rows: Sequence[object] | None = None) -> Subject:
-    """What to report of a model, a mixture of models, or a comparison.
+    """The subject that a model, a mixture of models, or a comparison is.
 
     Args:
         thing: One of these.
-        rows: What to call the rows of its data. Default: by their numbers, from 0.
+        rows: Names of the rows of its data. Default: by their numbers, from 0.
 
     Raises:
         TypeError: If it is none of these.

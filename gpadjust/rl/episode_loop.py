@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from gpadjust.control.option_checks import check_whole
+from gpadjust.checks import checked_whole
 
 _FIXED = {
     "learning_starts": "random_steps",
@@ -45,7 +45,7 @@ class EpisodeLoop(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
-        check_whole("random_steps", random_steps, 0)
+        checked_whole("random_steps", random_steps, 0)
         for name, instead in _FIXED.items():
             if name in kwargs:
                 raise TypeError(

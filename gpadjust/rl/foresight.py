@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gpadjust.control import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
-from gpadjust.dynamics.scores import typical_change
+from gpadjust.dynamics.free_run import typical_change
 from gpadjust.models import TermsModel
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.recorded_episodes import RecordedEpisodes

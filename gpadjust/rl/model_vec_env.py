@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 from torch import Tensor
 
+from gpadjust.checks import check_choice
 from gpadjust.control import Step, Task
 from gpadjust.dynamics import TransitionFunctions
 from gpadjust.physics import PhysicsError
@@ -99,8 +100,7 @@ class ModelVecEnv(VecEnv):
         for name in ("initial_states", "episode_length"):
             if getattr(task, name) is None:
                 raise ValueError(f"A ModelVecEnv needs a task with {name}; found None.")
-        if sampling not in get_args(Sampling):
-            raise ValueError(f"Unknown sampling {sampling!r}; use 'step' or 'trajectory'.")
+        check_choice("sampling", sampling, get_args(Sampling))
         self.render_mode = None
         super().__init__(num_envs, observation_space, action_space)
         self.task = task

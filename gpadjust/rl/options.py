@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
-from numbers import Integral, Real
 from typing import get_args
 
+from gpadjust.checks import check_choice, check_switch, checked_number, checked_whole
 from gpadjust.dynamics.free_run import checked_horizons
 from gpadjust.rl.model_vec_env import Sampling
 
@@ -16,7 +15,6 @@ _WHOLE = {  # the least of each
     "model_buffer_size": 1,
     "num_particles": 1,
 }
-_FRACTIONAL = {"updates_per_model_step": math.inf, "real_fraction": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +41,7 @@ class ModelOptions:
     def __post_init__(self) -> None:
         """Check them."""
         if self.reward_tolerance is not None:
-            check_number("reward_tolerance", self.reward_tolerance, math.inf)
+            checked_number("reward_tolerance", self.reward_tolerance, least=0)
         if self.score_horizons != ():
             object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
 
@@ -99,27 +97,13 @@ class DynaOptions(ModelOptions):
             value = getattr(self, name)
             if value is None and name in optional:
                 continue
-            if not isinstance(value, Integral) or isinstance(value, bool):
-                raise TypeError(f"{name} must be a whole number; found {value!r}.")
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}; found {value}.")
-        for name, most in _FRACTIONAL.items():
-            check_number(name, getattr(self, name), most)
+            checked_whole(name, value, least)
+        checked_number("updates_per_model_step", self.updates_per_model_step, least=0)
+        checked_number("real_fraction", self.real_fraction, least=0, most=1)
         for name in ("keep_model_data", "refresh_model_data"):
-            if not isinstance(getattr(self, name), bool):
-                raise TypeError(f"{name} must be True or False; found {getattr(self, name)!r}.")
-        if self.sampling not in get_args(Sampling):
-            raise ValueError(f"Unknown sampling {self.sampling!r}; use 'step' or 'trajectory'.")
+            check_switch(name, getattr(self, name))
+        check_choice("sampling", self.sampling, get_args(Sampling))
 
     def uses_model(self, num_episodes: int) -> bool:
         """Whether the model serves after so many real episodes."""
         return self.last_model_episode is None or num_episodes < self.last_model_episode
-
-
-def check_number(name: str, value: object, most: float) -> None:
-    """Raise an error unless an option is a number from 0 to ``most``, and finite."""
-    if not isinstance(value, Real) or isinstance(value, bool):
-        raise TypeError(f"{name} must be a number; found {value!r}.")
-    if not 0 <= float(value) <= most or math.isinf(value):
-        bounds = "finite and at least 0" if most == math.inf else f"in [0, {most}]"
-        raise ValueError(f"{name} must be {bounds}; found {value}.")

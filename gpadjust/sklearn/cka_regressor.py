@@ -17,6 +17,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Size, Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.inference import FitResult, SampleResult, fit
 from gpadjust.models import (
     CKA,
@@ -88,7 +89,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Attributes:
         model_: The fitted model; its own methods take and return float64 tensors.
-        fit_result_: What :func:`gpadjust.fit` returned.
+        fit_result_: The result of :func:`gpadjust.fit`.
         physics_parameters_: The :class:`~gpadjust.models.PhysicsParameters`, draws of the unknown
             parameters of the physics by their names. Only if it has some.
         n_features_in_: The number ``d`` of columns of X.
@@ -227,8 +228,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             NotFittedError: If the regressor was not fitted.
             ValueError: If ``n_samples`` is not positive; and as :meth:`predict`.
         """
-        if not isinstance(n_samples, Integral) or n_samples < 1:
-            raise ValueError(f"Expected n_samples as a whole number >= 1, got {n_samples!r}.")
+        checked_whole("n_samples", n_samples, 1)
         inputs, held = self._inputs(X), self.model_.num_samples or 1
         with torch.no_grad(), manual_seed(_seed(random_state)):
             posterior = self.model_.posterior(inputs, observation_noise=observation_noise)
@@ -284,7 +284,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def _hints(X: Array, Y: Array) -> str:
-    """What to do about scaled data in the terms of scikit-learn."""
+    """Advice on scaled data in the terms of scikit-learn."""
     hints = ""
     if is_standardised(torch.tensor(X)):
         hints += (

@@ -1,4 +1,4 @@
-"""Whether a spec names states properly, and they are what it says; `StateSpec` has the rules."""
+"""Checks of a spec, and of states by it; `StateSpec` has the rules."""
 
 from __future__ import annotations
 

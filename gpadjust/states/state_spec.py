@@ -1,8 +1,7 @@
-"""What the entries of a system's state are."""
+"""Names and kinds of the entries of a system's state."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
@@ -10,6 +9,7 @@ from numbers import Real
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_columns, checked_number
 from gpadjust.states.spec_checks import (
     check_exogenous,
     check_integrated,
@@ -24,7 +24,7 @@ _OFF_CIRCLE = 0.3  # of a sine and cosine that noisy sensors show
 
 @dataclass(frozen=True)
 class StateSpec:
-    r"""What the entries of a system's state and action are, said once.
+    r"""Names and kinds of the entries of a system's state and action.
 
     A *state* is a row of physical quantities; an *observation* is what a policy sees: the state
     with each angle :math:`\theta` replaced, in its place, by :math:`\sin\theta, \cos\theta`.
@@ -112,9 +112,8 @@ class StateSpec:
             )
         if self.integrated and self.step is None:
             raise ValueError("step must be the duration of a step, as some states are integrated.")
-        if self.step is not None and not 0 < self.step < math.inf:
-            raise ValueError(f"step must be positive and finite; found {self.step}.")
-        object.__setattr__(self, "step", None if self.step is None else float(self.step))
+        if self.step is not None:
+            object.__setattr__(self, "step", checked_number("step", self.step, above=0))
 
     @property
     def state_dim(self) -> int:
@@ -157,7 +156,7 @@ class StateSpec:
 
     def observe(self, states: Tensor) -> Tensor:
         """Observations ``... x observation_dim`` of states ``... x state_dim``."""
-        check_columns(states, self.state_dim, "states")
+        check_columns("states", states, self.state_dim)
         columns = []
         for name, column in zip(self.states, states.unbind(-1), strict=True):
             columns += [column.sin(), column.cos()] if name in self.angles else [column]
@@ -165,7 +164,7 @@ class StateSpec:
 
     def decode(self, observations: Tensor) -> Tensor:
         r"""States ``... x state_dim`` of observations; angles are in :math:`(-\pi, \pi]`."""
-        check_columns(observations, self.observation_dim, "observations")
+        check_columns("observations", observations, self.observation_dim)
         rest = iter(observations.unbind(-1))
         columns = [
             torch.atan2(next(rest), next(rest)) if name in self.angles else next(rest)
@@ -182,7 +181,7 @@ class StateSpec:
         Raises:
             ValueError: If the two entries of an angle are far from the unit circle.
         """
-        check_columns(observations, self.observation_dim, "observations")
+        check_columns("observations", observations, self.observation_dim)
         first = 0
         for name in self.states:
             if name not in self.angles:
@@ -245,8 +244,8 @@ class StateSpec:
         Warns:
             UserWarning: If an integrated state is far from what its velocity says.
         """
-        check_columns(states, self.state_dim, "states")
-        check_columns(next_states, self.state_dim, "next_states")
+        check_columns("states", states, self.state_dim)
+        check_columns("next_states", next_states, self.state_dim)
         if states.shape != next_states.shape:
             raise ValueError(
                 "Expected states and next_states with as many rows, got shapes "
@@ -283,7 +282,7 @@ class StateSpec:
             )
         if actions is None:
             actions = states.new_zeros(*states.shape[:-1], self.action_dim)
-        check_columns(actions, self.action_dim, "actions")
+        check_columns("actions", actions, self.action_dim)
         expected = self.remember(next_states.clone(), states, actions)
         gap = self.change(expected, next_states).abs()
         for name, other in self.previous.items():
@@ -329,15 +328,3 @@ class StateSpec:
             assert self.step is not None, "checked at the start"
             full[..., i] = (self.step / 2) ** 2 * full[..., v]
         return full
-
-
-def check_columns(tensor: Tensor, columns: int, name: str) -> None:
-    """Raise an error unless a tensor is floating-point and has the last dimension expected."""
-    if not torch.is_tensor(tensor) or not tensor.is_floating_point():
-        found = tensor.dtype if torch.is_tensor(tensor) else type(tensor).__name__
-        raise TypeError(
-            f"Expected {name} as a floating-point tensor, got {found}; convert with "
-            f"`torch.as_tensor({name}, dtype=torch.float64)`."
-        )
-    if tensor.dim() < 1 or tensor.shape[-1] != columns:
-        raise ValueError(f"Expected {name} of shape ... x {columns}, got {tuple(tensor.shape)}.")

@@ -1,4 +1,4 @@
-"""What a comparison of structures says about the physics: the verdict, and advice."""
+"""The verdict on the physics that a comparison of structures gives, and advice."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, diff
 from gpadjust.validation.structures import Structure
 
 _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
+_DECADES = 1000.0  # ratio of an output's ends from which on a logarithm is advised
 _ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
 
@@ -105,7 +106,7 @@ def physics_gain(
     density: Mapping[str, Tensor],
     relevance: Mapping[str, float] = MappingProxyType({}),
 ) -> Gain | None:
-    """What the physics is worth; None if there is nothing with it, or nothing without it.
+    """The gain by the physics; None if no structure uses it, or none is without it.
 
     Args:
         structures: The structures by their names.
@@ -143,10 +144,10 @@ def advice(
     table: dict[str, list[Candidate]],
     X: Tensor,
 ) -> tuple[dict[str, Gain], list[str]]:
-    """What the physics is worth to each output, and sentences on all else.
+    """The gain of each output by the physics, and sentences on all else.
 
     Args:
-        structures: What was fitted.
+        structures: The structures that were fitted.
         models: The models by the names of their structures.
         left_out: Their leave-one-out predictions.
         converged: Whether their samples are of the posterior, ``m`` each.
@@ -176,6 +177,7 @@ def advice(
             f"By the evidence of {name} with and without it, f_p is of use: {probability:.2f}."
             for name, probability in probable.items()
         ]
+        found += _spread(next(iter(left_out.values())).Y[:, j])
         found += _preferred(models[rows[0].structure], X, j)
         found += _unsampled(rows, converged, j)
         sentences += [where + sentence for sentence in found]
@@ -190,7 +192,7 @@ def advice(
 
 
 def _best(rows: list[Candidate]) -> str:
-    """Which structure is best, and how sure that is."""
+    """The best structure, and those not shown to be worse."""
     best, *others = rows
     near = [row for row in others if not sign_of(row.elpd_diff, row.se_diff)]
     sentence = f"{best.structure} predicts left-out observations best (weight {best.weight:.2f})"
@@ -205,7 +207,7 @@ def _best(rows: list[Candidate]) -> str:
 def _scaling(
     structures: dict[str, Structure], order: list[str], density: dict[str, Tensor]
 ) -> list[str]:
-    """Whether to scale the physics is better than to take it as the mean."""
+    """The gain of scaling the physics over taking it as the mean."""
     adjusting = next((name for name in order if structures[name].adjusts), None)
     plain = next((n for n in order if structures[n].uses_physics and not structures[n].adjusts), "")
     if adjusting is None or not plain:
@@ -221,8 +223,21 @@ def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -
     return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
 
 
+def _spread(y: Tensor) -> list[str]:
+    """A hint at logarithms, for a positive output over decades."""
+    y = y[~y.isnan()]
+    if not len(y) or (y <= 0).any() or y.max() < _DECADES * y.min():
+        return []
+    decades = (y.max() / y.min()).log10().item()
+    return [
+        f"The output is positive and spans {decades:.1f} decades, so that its largest values "
+        "decide scale and noise: if errors are relative, fit its logarithm, with the logarithm of "
+        "the physics."
+    ]
+
+
 def _unsampled(rows: list[Candidate], converged: dict[str, Tensor], output: int) -> list[str]:
-    """Which of the structures that count are known by draws that are not of their posterior."""
+    """The structures with weight whose draws are not of their posterior."""
     names = [row.structure for row in rows if row.weight > _COUNTS]
     low = [name for name in names if not converged[name][output]]
     if not low:
@@ -234,7 +249,7 @@ def _unsampled(rows: list[Candidate], converged: dict[str, Tensor], output: int)
 
 
 def _preferred(model: TermsGP, X: Tensor, output: int) -> list[str]:
-    """Which physics a model of several relies on, and where."""
+    """The physics that a model of several relies on, and where."""
     names = getattr(model, "rho_names", ())
     if len(names) < 2:
         return []

@@ -52,9 +52,9 @@ class Comparison:
         models: The fitted models by the names of their structures.
         stacked: All of them, stacked with the weights of the tables.
         table: The candidates of each output, best first, by the names of the outputs.
-        advice: What else the comparison says, in sentences.
-        gain: The verdict: what the physics is worth to each output, by the names of the outputs;
-            empty without a structure that uses none.
+        advice: Further findings, in sentences.
+        gain: The verdict on the physics, by the names of the outputs; empty if no structure is
+            without it.
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
@@ -300,7 +300,7 @@ def compare(
 
 
 def _told(name: str) -> str:
-    """What an error is of; the physics alone is the same, left out or not."""
+    """The name of an error; that of the physics alone is the same, left out or not."""
     return name if name.startswith(ALONE) else f"{name}, left out"
 
 
@@ -310,7 +310,7 @@ def _weight_of(row: Candidate) -> str:
 
 
 def _number(num_points: int) -> int:
-    """How many samples of the hyper-parameters leave-one-out is told by."""
+    """Number of samples of the hyper-parameters for leave-one-out."""
     least, most = _DRAWS
     return max(least, min(most, _MEMORY // num_points))
 

@@ -169,10 +169,10 @@ def mixture_of(
     mean: Tensor, variance: Tensor, density: Tensor, weight: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, variance and log density of mixtures with weights, 1 in all, along ``MCMC_DIM``."""
-    centre = (weight * mean).sum(MCMC_DIM, keepdim=True)
-    spread = (mean - centre).square()
+    center = (weight * mean).sum(MCMC_DIM, keepdim=True)
+    spread = (mean - center).square()
     total = (weight.log() + density).logsumexp(MCMC_DIM)
-    return centre.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
+    return center.squeeze(MCMC_DIM), (weight * (variance + spread)).sum(MCMC_DIM), total
 
 
 def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
@@ -184,11 +184,11 @@ def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
 
 def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
     """The predictions by a mixture of ``K`` models with weights ``K x 1 x m``, 1 in all."""
-    predicted = [
+    mean, variance, density = (
         torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
         for name in ("mean", "variance", "log_density")
-    ]
-    mean, variance, density = mixture_of(*predicted, weight)
+    )
+    mean, variance, density = mixture_of(mean, variance, density, weight)
     return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 

@@ -1,4 +1,4 @@
-"""Which structure predicts an output best, how sure that is, and weights to stack them by."""
+"""Ranking of structures by their predictions of an output, and weights for a mixture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WORST = -1e6  # nats; a density of zero would make others' differences infinite
 
 
 class Candidate(NamedTuple):
-    """How well a structure predicts an output's left-out observations, in the user's units.
+    """Quality of the predictions of an output's left-out observations by a structure.
 
     Attributes:
         structure: Its name.
@@ -115,7 +115,7 @@ def difference(first: Tensor, second: Tensor) -> tuple[float, float]:
 
 
 def sign_of(value: float, error: float) -> int:
-    """Which sign a difference is shown to have, or 0."""
+    """The sign that a difference is shown to have, or 0."""
     shown = abs(value) > max(SURE * error, _LEAST)
     return 0 if not shown else 1 if value > 0 else -1
 
@@ -133,7 +133,7 @@ def stacking_weights(
 
     Args:
         density: Log predictive densities of left-out observations, ``n x K``.
-        prior: How many observations the weight of each structure is worth beforehand, ``K``.
+        prior: Observations that the weight of each structure counts for beforehand, ``K``.
             Default: none.
         seed: Of the bootstrap.
     """

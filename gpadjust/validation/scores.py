@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from numbers import Real
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,6 +16,8 @@ from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM, GaussianMixturePosterior
 from torch import Tensor
 from torch.distributions import Normal
+
+from gpadjust.checks import check_level
 
 
 def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -82,18 +83,16 @@ def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
         - \frac{1}{2 S^2} \sum_{i, j} A(\mu_i - \mu_j, \sigma_i^2 + \sigma_j^2)
 
     Args:
-        mean: Predicted means, as in :func:`rmse`.
-        variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``, NaN where not observed.
-        mixture_dim: As in :func:`rmse`.
+        mean: As in :func:`nlpd`, like the others.
+        variance: As there.
+        y: As there.
+        mixture_dim: As there.
 
     Returns:
         ``... x m``, in the units of ``y``.
 
     Raises:
-        TypeError: If one of the three is no tensor of numbers.
-        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
-            negative.
+        TypeError: As :func:`nlpd`, like ``ValueError``.
 
     Example:
         >>> import torch
@@ -113,19 +112,17 @@ def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = 
     """Probability integral transform: the predicted distribution function at the true value.
 
     Args:
-        mean: Predicted means, as in :func:`rmse`.
-        variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``, NaN where not observed.
-        mixture_dim: As in :func:`rmse`.
+        mean: As in :func:`nlpd`, like the others.
+        variance: As there.
+        y: As there.
+        mixture_dim: As there.
 
     Returns:
-        ``... x n x m``, between 0 and 1, or NaN where not observed; uniform for calibrated
-        predictions (Dawid 1984).
+        ``... x n x m``, between 0 and 1, or NaN where not observed; uniform if intervals
+        of all levels hold (Dawid 1984).
 
     Raises:
-        TypeError: If one of the three is no tensor of numbers.
-        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
-            negative.
+        TypeError: As :func:`nlpd`, like ``ValueError``.
 
     Example:
         >>> import torch
@@ -148,14 +145,14 @@ def coverage(
     """Share of the points that lie within the central interval of a given level.
 
     Args:
-        mean: Predicted means, as in :func:`rmse`.
-        variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``, NaN where not observed.
+        mean: As in :func:`nlpd`.
+        variance: As there.
+        y: As there.
         level: Nominal coverage, between 0 and 1.
-        mixture_dim: As in :func:`rmse`.
+        mixture_dim: As there.
 
     Returns:
-        ``... x m``, between 0 and 1; calibrated predictions have it near ``level``.
+        ``... x m``, between 0 and 1; near ``level`` if the intervals hold.
 
     Raises:
         TypeError: As :func:`nlpd`, or if ``level`` is not a number.
@@ -175,17 +172,9 @@ def central_share(pit: Tensor, level: float) -> Tensor:
     return _mean_over_observed(((pit - 0.5).abs() <= level / 2).to(pit.dtype), pit)
 
 
-def check_level(level: float) -> None:
-    """Raise a TypeError or a ValueError unless ``level`` is a number between 0 and 1."""
-    if not isinstance(level, Real):
-        raise TypeError(f"Expected level to be a number such as 0.95, got {level!r}.")
-    if not 0 < level < 1:
-        raise ValueError(f"Expected level between 0 and 1, got {level}; 95 % is 0.95.")
-
-
 @dataclass(frozen=True)
 class Scores:
-    """How good predictions were, at the points that were observed.
+    """Quality of predictions at the observed points.
 
     One type for all: of a posterior (:func:`score`), of left-out observations
     (:meth:`~gpadjust.validation.LeaveOneOut.score`), of transitions and of free runs. Leading
@@ -284,10 +273,9 @@ class Scores:
             raise IndexError(
                 "These scores have no batch to take a part of; an output is `scores.rmse[j]`."
             )
-        tensors = {
-            name: value[part] for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **tensors)
+        given: dict[str, Any] = vars(self)
+        parts = {name: v[part] for name, v in given.items() if isinstance(v, Tensor)}
+        return Scores(**{**given, **parts})
 
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
@@ -366,7 +354,7 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
 
     Args:
         y: True values, ``... x n x m``.
-        mixture_dim: Where the components are, if any.
+        mixture_dim: The dimension of the components, if any.
         predicted: ``mean`` and, if need be, ``variance``.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What :func:`gpadjust.compare` compares: structures, and the physics alone beside them."""
+"""The structures that :func:`gpadjust.compare` fits, and the physics alone beside them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Structure(NamedTuple):
         model: A callable that makes the model of ``X`` and ``Y``, of any number of outputs, each by
             itself: a class, or ``functools.partial`` of one. It is given as keywords the
             ``physics``, if it uses that, and ``train_Yvar`` and ``input_transform``, if there are.
-        unknowns: How many constant means are unknown, for one physics.
+        unknowns: Number of unknown constant means, for one physics.
         uses_physics: Whether it reads the physics at all.
         adjusts: Whether it does more than to take the physics as a mean.
         joins: Whether it takes several physics at once.
         calibrates: Whether it is of a physics with unknown parameters only.
-        prior: How many observations its weight is worth beforehand, see
+        prior: Observations that its weight counts for beforehand, see
             :func:`~gpadjust.validation.stacking_weights`; of several physics, that of all at once.
     """
 
@@ -84,7 +84,7 @@ def known_structures(structures: Sequence[str | Structure]) -> list[Structure]:
 def candidates(
     structures: list[Structure], physics: Physics, num_points: int
 ) -> list[tuple[Structure, Physics]]:
-    """What is to be fitted: structures of one physics, or of each of several and of all.
+    """The structures to be fitted: of one physics, or of each of several and of all.
 
     Those with too many unknown constants for the points are left out, if there are others.
     """

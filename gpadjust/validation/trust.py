@@ -1,19 +1,18 @@
-"""Whether predictions are those of the physics, of the data, or of neither."""
+"""The basis of predictions: the physics, the data, or neither."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Integral
 from statistics import NormalDist
 
 import torch
 from botorch.utils.sampling import draw_sobol_samples
 from torch import Tensor
 
+from gpadjust.checks import check_level, checked_whole
 from gpadjust.models import StackedGP, TermsModel
 from gpadjust.models.training_data import ArrayLike, to_tensor
 from gpadjust.validation.leave_one_out import observations
-from gpadjust.validation.scores import check_level
 
 SIDES = ("physics", "data", "neither")
 _NOTHING = 1e-3  # of the targets' standard deviation: what makes no difference
@@ -21,11 +20,11 @@ _NOTHING = 1e-3  # of the targets' standard deviation: what makes no difference
 
 @dataclass(frozen=True)
 class Trust:
-    r"""What the predictions of a model at some points rest on; see :func:`trust`.
+    r"""The basis of a model's predictions at some points; see :func:`trust`.
 
     Attributes:
         X: The points, raw inputs ``n x d``.
-        override: How far the data move the prediction from the physics, ``n x m``: the distance
+        override: Shift of the prediction from the physics by the data, ``n x m``: the distance
             :math:`|\mu - f_p|` in half widths w of the model's interval. Above 1 the interval
             excludes the physics.
         doubt: The half width in typical discrepancies, :math:`w / D`, ``n x m``.
@@ -41,7 +40,7 @@ class Trust:
 
     @property
     def side(self) -> Tensor:
-        """What each prediction rests on, ``n x m``: 0, 1 or 2 for physics, data or neither."""
+        """The basis of each prediction, ``n x m``: 0, 1 or 2 for physics, data or neither."""
         open_ = torch.where(self.doubt > 1, 2, 0)
         return torch.where(self.override > 1, 1, open_)
 
@@ -94,7 +93,7 @@ def trust(
         X: Raw inputs, ``n x d``, such as states and actions that were visited. Default:
             ``num_points`` in the box of the training inputs, by Sobol's sequence.
         level: Nominal coverage of the interval.
-        num_points: How many points there are if there is no ``X``.
+        num_points: Number of points if there is no ``X``.
 
     Raises:
         TypeError: If the model has no physics to be trusted, or is a :class:`~gpadjust.StackedGP`,
@@ -153,10 +152,9 @@ def trust(
 
 def _points(train_X: Tensor, num_points: int) -> Tensor:
     """Points in the box of the training inputs."""
-    if not isinstance(num_points, Integral) or num_points < 1:
-        raise ValueError(f"Expected num_points to be a whole number >= 1, got {num_points!r}.")
+    num_points = checked_whole("num_points", num_points, 1)
     bounds = torch.stack([train_X.amin(0), train_X.amax(0)])
-    return draw_sobol_samples(bounds, n=int(num_points), q=1, seed=0).squeeze(-2)
+    return draw_sobol_samples(bounds, n=num_points, q=1, seed=0).squeeze(-2)
 
 
 def _rms(values: Tensor) -> Tensor:

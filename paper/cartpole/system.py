@@ -24,10 +24,8 @@ from gpadjust.envs import (
 from gpadjust.envs.cart_pole.system import START_MEAN, START_STD
 from gpadjust.physics import ODEPhysics
 from gpadjust.rl import DynaSAC, ModelVecEnv
-from paper.cartpole import NUM_STARTS, Settings
-from paper.control import Scenario
-from paper.control.learner import System, dynamics
-from paper.control.recorder import Recorder
+from paper.cartpole import NUM_STARTS, Scenario, Settings
+from paper.cartpole.control import Recorder, System, dynamics
 
 
 def system(scenario: Scenario, settings: Settings, seed: int) -> System:
@@ -43,7 +41,7 @@ def system(scenario: Scenario, settings: Settings, seed: int) -> System:
         initial_states=cart_pole_start,
         episode_length=settings.episode_length,
     )
-    return System(env, task, CartPoleRecorder(settings, scenario.model is None, seed))
+    return System(env, task, CartPoleRecorder(settings, scenario.kind == "none", seed))
 
 
 def true_physics() -> ODEPhysics:

@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 from botorch.exceptions.warnings import OptimizationWarning
+from gpadjust.dynamics.scores import score_transitions
 from torch import Tensor
 
 from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.dynamics.scores import score_transitions
 from gpadjust.inference import SampleResult, SamplingWarning
 from gpadjust.models import TermsGP
 from paper.calibration import PUMP, label

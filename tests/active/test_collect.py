@@ -482,7 +482,7 @@ class TestErrors:
     @pytest.mark.parametrize("name", ["budget", "batch_size", "max_failures", "num_outputs"])
     @pytest.mark.parametrize("value", [0, -1, 2.5, "3"])
     def test_numbers(self, laboratory, name, value):
-        with pytest.raises(ValueError, match=f"Expected {name} to be a whole number >= 1, got"):
+        with pytest.raises((TypeError, ValueError), match=f"{name} must be (at|a whole)"):
             collect(**laboratory(**{name: value}))
 
     @pytest.mark.parametrize(
@@ -522,7 +522,7 @@ class TestErrors:
 
     @pytest.mark.parametrize("initial", [1, 0, 3.0, "three"])
     def test_initial(self, laboratory, initial):
-        with pytest.raises(ValueError, match="Expected initial to be a number of points >= 2"):
+        with pytest.raises((TypeError, ValueError), match="initial, a number of points, must"):
             collect(**laboratory(initial=initial))
 
     def test_initial_points(self, laboratory):

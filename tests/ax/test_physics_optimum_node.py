@@ -235,7 +235,7 @@ def logged(caplog, monkeypatch):
 
 def test_a_failure_is_logged(logged):
     first(client([X], {"cost": lambda x: x * torch.nan}))
-    assert "centre of the search space: The physics of cost fail at each of 1024" in logged.text
+    assert "center of the search space: The physics of cost fail at each of 1024" in logged.text
 
 
 def test_that_choices_repeat_is_not(logged):

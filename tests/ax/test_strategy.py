@@ -1,6 +1,7 @@
 """generation_strategy in Ax's client: trials, constraints, predictions, cross-validation."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -123,12 +124,13 @@ def test_a_strategy_is_ax_s_own_but_for_the_model():
 
 
 def test_other_models_and_their_options():
-    kwargs = generator_kwargs(
-        {"output": crude}, model=PhysicsMeanGP, model_options={"rho_mean": 2.0}
-    )
+    kwargs = generator_kwargs({"output": crude}, model=partial(PhysicsMeanGP, rho_mean=2.0))
     (config,) = kwargs["surrogate_spec"].metric_to_model_configs["output"]
     assert config.botorch_model_class is PhysicsMeanGP
     assert config.model_options["rho_mean"] == 2.0
+    for model in (lambda X, Y, physics: CKA(X, Y, physics=physics), 3, partial(CKA, None)):
+        with pytest.raises(TypeError, match=r"class of models, such as CKA, or functools\.partial"):
+            generator_kwargs({"output": crude}, model=model)
 
 
 @pytest.mark.slow

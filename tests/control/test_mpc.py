@@ -151,11 +151,15 @@ def test_returns_are_as_described(task, objective, expected):
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Return(0.0), ValueError, "discount must be above 0 and below 1; found 0.0"),
+        (lambda: Return(0.0), ValueError, "discount must be above 0 and at most 1; found 0.0"),
         (lambda: Return(quantile=1.0), ValueError, "quantile must be at least 0 and below 1"),
         (lambda: Return(terminal_value=3), TypeError, "must be a function of states, or None"),
         (lambda: CrossEntropy(1.5), TypeError, "rounds must be a whole number; found 1.5"),
-        (lambda: PathIntegral(temperature=0), ValueError, "temperature must be above 0; found 0"),
+        (
+            lambda: PathIntegral(temperature=0),
+            ValueError,
+            "temperature must be finite and above 0; found 0",
+        ),
         (lambda: CrossEntropy(correlation=1.0), ValueError, "correlation must be .* below 1"),
     ],
 )

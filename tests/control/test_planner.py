@@ -190,7 +190,7 @@ def test_bad_arguments_of_a_plan_are_refused(known_left, origin):
     options = Planner(Return())
     with pytest.raises(ValueError, match=r"state of shape 1, found \(2,\)"):
         options.plan(task_of(known_left), origin.repeat(2), BOUNDS, 3)
-    with pytest.raises(ValueError, match=r"finite action_bounds of shape 2 x 1, .* found .*inf"):
+    with pytest.raises(ValueError, match=r"finite action_bounds, .*inf"):
         options.plan(task_of(known_left), origin, BOUNDS * torch.inf, 3)
     with pytest.raises(RuntimeError, match="has not learnt"):
         options.plan(task_of(LearnedDynamics(SPEC, model=ZeroMeanGP)), origin, BOUNDS, 3)
@@ -323,7 +323,7 @@ def test_no_search_begins_when_time_is_up(origin):
 
 
 def test_impossible_bounds_and_careful_plans_of_the_mean_are_refused(origin):
-    with pytest.raises(ValueError, match="Each lower one of action_bounds must be below its upp"):
+    with pytest.raises(ValueError, match="action_bounds, each lower one below its upper"):
         Planner().plan(half_steps(), origin, [[1.0], [-1.0]], 2)
     with pytest.raises(ValueError, match="is one over functions, but num_functions is 1, one of"):
         Planner(Return(quantile=0.1), num_functions=1)

@@ -265,8 +265,8 @@ def test_runs_are_the_same_again_and_draw_from_no_generator():
         ((STATES, ACTIONS.float()), {}, TypeError, "actions in float64"),
         ((STATES / 0, ACTIONS), {}, ValueError, "initial_states to be finite"),
         ((STATES, ACTIONS * torch.nan), {}, ValueError, "actions to be finite"),
-        ((STATES, ACTIONS), {"level": 95}, ValueError, "probability between 0 and 1, got 95"),
-        ((STATES, ACTIONS), {"level": "95 %"}, ValueError, "probability between 0 and 1"),
+        ((STATES, ACTIONS), {"level": 95}, ValueError, "level must be.* found 95"),
+        ((STATES, ACTIONS), {"level": "95 %"}, TypeError, "level must be"),
         (
             (STATES, ACTIONS),
             {"start_noise": "known"},
@@ -292,7 +292,7 @@ def test_runs_are_the_same_again_and_draw_from_no_generator():
             "say the noise of these, such as noise=smoothed.noise",
         ),
         ((STATES, ACTIONS), {"noise": "learnt"}, ValueError, "noise as True or False or a tensor"),
-        ((STATES, ACTIONS), {"num_functions": 39.0}, ValueError, "num_functions to be a whole"),
+        ((STATES, ACTIONS), {"num_functions": 39.0}, TypeError, "num_functions must be a whole"),
         (
             (STATES, ACTIONS),
             {"state_bounds": torch.ones(2)},

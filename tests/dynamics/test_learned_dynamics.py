@@ -68,8 +68,10 @@ def test_scores_are_those_of_the_predictions(cart_pole_system, make):
     torch.testing.assert_close(scores.nlpd, -density.mean(0))
     torch.testing.assert_close(scores.rmse, (mean - next_states).square().mean(0).sqrt())
     turned = next_states + torch.tensor([0, 2 * math.pi, 0, 0])
-    for turn, score in zip(dynamics.score(states, actions, turned), scores, strict=True):
-        torch.testing.assert_close(turn, score, rtol=1e-3, atol=1e-6)
+    turn = dynamics.score(states, actions, turned)
+    for name in ("rmse", "nlpd", "coverage"):
+        pair = getattr(turn, name), getattr(scores, name)
+        torch.testing.assert_close(*pair, rtol=1e-3, atol=1e-6)
 
 
 def test_whole_turns_of_an_angle_change_nothing(cart_pole_system, make):
@@ -230,7 +232,7 @@ def test_a_function_makes_the_model(cart_pole_system):
     assert torch.equal(*pair)
     assert asked == [["input_transform", "physics"]]
     assert by_function.describe()["model"] == "made"
-    with pytest.raises(TypeError, match=r"return a model of gpadjust\.models.*NoneType"):
+    with pytest.raises(TypeError, match="make a gpadjust TermsModel, got NoneType"):
         LearnedDynamics(system.spec, model=lambda X, Y, **given: None).update(*system.trial(0))
 
 
@@ -391,7 +393,7 @@ def test_the_model_has_the_names_of_the_spec(uniform):
     following = torch.cat([states[:, :2] + 0.1 * states[:, :2].sin(), actions], -1)
     options = {"method": "map", "num_starts": 1, "num_screened": 8}
     dynamics = LearnedDynamics(spec, lambda X: 0.9 * X[:, :2], fit_options=options)
-    dynamics.fit(states, actions, following)
+    dynamics.update(states, actions, following)
     model = dynamics.model
     assert model.input_names == ("theta", "omega", "torque", "last")
     assert model.output_names == ("change of theta", "change of omega")

@@ -64,26 +64,16 @@ def test_conditioning_is_the_exact_posterior(cart_pole_system, make):
     first, second = system.trial(0), system.trial(1)
     dynamics.update(*first)
     before = [p.clone() for p in dynamics.model.parameters()]
-    dynamics.update(*second, refit=False)
+    dynamics.condition(*second)
     assert all(map(torch.equal, dynamics.model.parameters(), before))
     assert dynamics.num_transitions == 50
     whole = make("CKA", system.spec, system.crude)
-    whole.fit(*(torch.cat(pair) for pair in zip(first, second, strict=True)))
+    whole.update(*(torch.cat(pair) for pair in zip(first, second, strict=True)))
     state = {**whole.state_dict(), "model": dynamics.state_dict()["model"]}
     whole.load_state_dict(state)
     test = system.trial(9)[:2]
     for one, other in zip(dynamics.predict(*test), whole.predict(*test), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
-
-
-def test_fit_replaces_the_data(cart_pole_system, make):
-    system = cart_pole_system
-    once, twice = (make("CKA", system.spec, system.crude) for _ in range(2))
-    twice.update(*system.trial(0))
-    for dynamics in (once, twice):
-        dynamics.fit(*system.trial(1))
-    assert twice.num_transitions == 25
-    assert agree(once, twice, *system.trial(9)[:2])
 
 
 def test_refits_are_quiet_and_leave_the_generator_alone(cart_pole_system, make):

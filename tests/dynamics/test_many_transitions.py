@@ -73,7 +73,7 @@ def test_a_free_run(dynamics):
 
 def test_they_are_not_conditioned_or_sampled(dynamics):
     with pytest.raises(NotImplementedError, match="build it of all data"):
-        dynamics.update(*transitions(5), refit=False)
+        dynamics.condition(*transitions(5))
     assert dynamics.num_transitions == 100
     with pytest.raises(ValueError, match="got 'bayes'"):
         make(fit_options={"method": "bayes"})

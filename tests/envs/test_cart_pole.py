@@ -152,18 +152,18 @@ def test_what_is_no_number_or_state_is_refused():
         cart_pole_physics("heavy", 0.5, 0.6, 0.1)
     with pytest.raises(TypeError, match=r"seed must be a whole number; found 1\.5"):
         random_cart_pole_physics(1.5)
-    with pytest.raises(ValueError, match="seed must not be negative; found -1"):
+    with pytest.raises(ValueError, match="seed must be at least 0; found -1"):
         random_cart_pole_physics(-1)
     for time_step in (0, -0.1, math.nan):
-        with pytest.raises(ValueError, match="time_step must be a positive number of seconds"):
+        with pytest.raises(ValueError, match="time_step must be finite and above 0"):
             random_cart_pole_physics(0, time_step)
     for start in (cart_pole_start, arm_start):
-        with pytest.raises(ValueError, match="n must not be negative; found -1"):
+        with pytest.raises(ValueError, match="n must be at least 0; found -1"):
             start(-1)
         with pytest.raises(TypeError, match="n must be a whole number"):
             start(0.5)
     for function, columns in ((cart_pole_cost, 5), (hand_distance_cm, 4), (hand_position, 3)):
-        with pytest.raises(ValueError, match=rf"of shape \.\.\. x \d, got \(2, {columns}\)"):
+        with pytest.raises(ValueError, match=rf"of shape \.\.\. x \d.*, got \(2, {columns}\)"):
             function(torch.zeros(2, columns))
         with pytest.raises(TypeError, match=r"convert with `torch\.as_tensor"):
             function(np.zeros((2, columns)))

@@ -122,7 +122,7 @@ def test_any_data(kind, problem):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
-@profile(400)
+@profile(150)
 @given(kind=st.sampled_from(list(BUILD)), problem=problems())
 def test_any_data_at_length(kind, problem):
     check(kind, problem)

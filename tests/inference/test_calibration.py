@@ -229,6 +229,23 @@ def test_the_linearisation_is_that_of_autograd():
     torch.testing.assert_close(near.residual[0], model.train_targets - mean(z))
 
 
+def test_what_other_outputs_say_is_a_prior_to_each():
+    X, Y = data()
+    law = FunctionPhysics(lines, unknowns=PRIORS)
+    calibration = Calibration(CalibratedPhysics(X, Y, NOISE**2, physics=law).train())
+    z, variance = torch.tensor([0.3, -0.7], dtype=torch.float64), 0.3
+    near = calibration.linearized(z)
+    covariance = variance * torch.eye(len(X)).double().expand(2, -1, -1)
+    information = calibration.information(near, calibration.factor(covariance))
+    found = calibration.marginalized(near, information)
+    for i in range(2):
+        own, G, r = near.slope[i], near.slope[1 - i], near.residual[1 - i]
+        prior = torch.linalg.inv(torch.eye(2).double() + G.T @ G / variance)
+        mean = prior @ G.T @ (r + G @ z) / variance
+        torch.testing.assert_close(found.mean[i], own @ (mean - z), rtol=1e-5, atol=1e-8)
+        torch.testing.assert_close(found.covariance[i], own @ prior @ own.T, rtol=1e-5, atol=1e-8)
+
+
 def test_what_cannot_be_calibrated_is_told():
     X, Y = data()
     law = FunctionPhysics(lines, unknowns=PRIORS)

@@ -7,18 +7,15 @@ from botorch.exceptions.warnings import OptimizationWarning
 from gpadjust import CKA, compare, fit
 from gpadjust.inference import FitResult, fitting
 from gpadjust.inference.targets import LogLikelihood
+from tests.systems import ripple
 
 QUICK = {"num_screened": 16, "num_starts": 2}
-
-
-def crude(X):
-    return 2 + (3 * X).sin()
 
 
 @pytest.fixture
 def model(uniform):
     X = uniform(9, 2)
-    return CKA(X, 1.5 * crude(X) + X.flip(-1) + 0.1 * uniform(9, 2, seed=5), physics=crude)
+    return CKA(X, 1.5 * ripple(X) + X.flip(-1) + 0.1 * uniform(9, 2, seed=5), physics=ripple)
 
 
 BAD = [
@@ -26,14 +23,14 @@ BAD = [
         (method, option, value, error, says)
         for method in ("map", "bayes")
         for option, value, error, says in (
-            ("num_starts", 0, ValueError, "Expected num_starts >= 1, got 0"),
-            ("num_starts", 1.5, TypeError, r"Expected num_starts .* whole number, got 1\.5"),
-            ("num_starts", True, TypeError, "Expected num_starts .* whole number, got True"),
-            ("num_screened", -1, ValueError, "Expected num_screened >= 0, got -1"),
-            ("max_iterations", 0, ValueError, "Expected max_iterations >= 1, got 0"),
-            ("max_iterations", None, TypeError, "Expected max_iterations .* got None"),
-            ("seed", None, TypeError, "Expected seed .* whole number, got None"),
-            ("seed", -1, ValueError, "Expected seed >= 0, got -1"),
+            ("num_starts", 0, ValueError, "num_starts must be at least 1; found 0"),
+            ("num_starts", 1.5, TypeError, r"num_starts must be a whole number; found 1\.5"),
+            ("num_starts", True, TypeError, "num_starts must be a whole number; found True"),
+            ("num_screened", -1, ValueError, "num_screened must be at least 0; found -1"),
+            ("max_iterations", 0, ValueError, "max_iterations must be at least 1; found 0"),
+            ("max_iterations", None, TypeError, "max_iterations .* found None"),
+            ("seed", None, TypeError, "seed must be a whole number; found None"),
+            ("seed", -1, ValueError, "seed must be at least 0; found -1"),
             ("nmu_starts", 2, ValueError, "no option 'nmu_starts'; expected num_starts, "),
         )
     ),
@@ -41,8 +38,8 @@ BAD = [
         ("map", option, 64, ValueError, f"'map' has no option '{option}'; .* method 'bayes'")
         for option in ("num_samples", "num_draws")
     ),
-    ("bayes", "num_samples", 0, ValueError, "Expected num_samples >= 1"),
-    ("bayes", "num_draws", 15, ValueError, "Expected num_draws >= 16"),
+    ("bayes", "num_samples", 0, ValueError, "num_samples must be at least 1"),
+    ("bayes", "num_draws", 15, ValueError, "num_draws must be at least 16"),
     ("gibbs", "seed", 0, ValueError, "expected 'bayes' or 'map'"),
 ]
 
@@ -99,7 +96,7 @@ class TestMethodsOfOnesOwn:
         assert model.is_fitted
 
     def test_its_options_are_checked(self, model):
-        with pytest.raises(ValueError, match="Expected steps >= 1, got 0"):
+        with pytest.raises(ValueError, match="steps must be at least 1; found 0"):
             fit(model, "nudge", steps=0)
         with pytest.raises(ValueError, match=r"'map' has no option 'steps'; it is one .* 'nudge'"):
             fit(model, "map", steps=2)
@@ -150,7 +147,7 @@ class TestThreads:
     def test_a_small_problem_takes_one(self, model, seen):
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
         fit(model, "map", **QUICK)
-        compare(X, Y, crude, structures=["physics mean", "CKA"], **QUICK)
+        compare(X, Y, ripple, structures=["physics mean", "CKA"], **QUICK)
         fit(model, num_draws=64, **QUICK)
         assert set(seen) == {1}
         assert torch.get_num_threads() == 2
@@ -158,7 +155,7 @@ class TestThreads:
     @pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
     def test_a_large_fit_takes_the_users(self, seen, uniform):
         X = uniform(300, 1)
-        fit(CKA(X, 2 * crude(X), physics=crude), "map", num_screened=0, max_iterations=1)
+        fit(CKA(X, 2 * ripple(X), physics=ripple), "map", num_screened=0, max_iterations=1)
         assert set(seen) == {2}
 
     def test_after_an_error(self, model):
@@ -167,7 +164,7 @@ class TestThreads:
 
         torch.linalg.cholesky_ex = fail
         X, Y = model.train_inputs[0][0, :, :2], model.train_targets.mT
-        for attempt in (lambda: fit(model), lambda: compare(X, Y, crude)):
+        for attempt in (lambda: fit(model), lambda: compare(X, Y, ripple)):
             with pytest.raises(KeyboardInterrupt):
                 attempt()
             assert torch.get_num_threads() == 2

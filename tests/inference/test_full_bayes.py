@@ -26,19 +26,16 @@ from gpadjust.inference.proposals import Both, Mixture, laplace_root
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.validation import leave_one_out
 from gpadjust.validation.plots import plot_adjustment, plot_adjustment_pair
+from tests.systems import Sine, line, ripple
 
 quick = pytest.mark.filterwarnings("ignore::gpadjust.inference.SamplingWarning")  # few draws
 SHORT = {"num_samples": 8, "num_draws": 64, "num_starts": 1, "num_screened": 8}
 
 
-def crude(X):
-    return 2 + (3 * X[..., :1]).sin()
-
-
 @pytest.fixture
 def XY(uniform):
     X = uniform(8, 1)
-    return X, 1.5 * crude(X) + X + 0.02 * torch.randn(8, 1, dtype=torch.float64)
+    return X, 1.5 * ripple(X) + X + 0.02 * torch.randn(8, 1, dtype=torch.float64)
 
 
 @quick
@@ -70,7 +67,7 @@ def test_result_and_model(build, data, kind, num_outputs, uniform):
 
 @quick
 def test_seed_and_global_state(XY):
-    models = [CKA(*XY, physics=crude) for _ in range(3)]
+    models = [CKA(*XY, physics=ripple) for _ in range(3)]
     torch.manual_seed(1)
     expected = torch.rand(1)
     torch.manual_seed(1)
@@ -86,7 +83,7 @@ def test_seed_and_global_state(XY):
 @quick
 def test_model_list(XY):
     X, Y = XY
-    models = ModelListGP(CKA(X, Y, physics=crude), BiasGP(X[:6], Y[:6], physics=crude))
+    models = ModelListGP(CKA(X, Y, physics=ripple), BiasGP(X[:6], Y[:6], physics=ripple))
     results = fit(models, "bayes", **SHORT)
     assert [type(result) for result in results] == [SampleResult] * 2
     assert models.posterior(X).mean.shape == (8, 8, 2)
@@ -101,13 +98,13 @@ def test_figures(build, data):
 
 
 def test_a_warning_when_the_draws_are_not_of_the_posterior(XY, monkeypatch):
-    result = fit(CKA(*XY, physics=crude), **SHORT)
+    result = fit(CKA(*XY, physics=ripple), **SHORT)
     size = result.effective_size
     assert result.converged.all()
     assert 1 <= size <= len(result.draws["likelihood.noise_covar.noise"])
     monkeypatch.setattr(bayes, "_OFF", -1.0)
     with pytest.warns(SamplingWarning, match=rf"sample size {size.item():.2g}\). Raise num_draws"):
-        again = fit(CKA(*XY, physics=crude), **SHORT)
+        again = fit(CKA(*XY, physics=ripple), **SHORT)
     assert not again.converged.any()
 
 
@@ -155,7 +152,7 @@ def test_it_errs_less_than_a_point_estimate_and_its_intervals_hold(noise):
 
 
 def test_the_default_samples_where_it_can(XY, build, data):
-    model = CKA(*XY, physics=crude)
+    model = CKA(*XY, physics=ripple)
     assert isinstance(fit(model, **SHORT), SampleResult)
     point = {"num_starts": 1, "num_screened": 8}
     for other in (
@@ -169,15 +166,7 @@ def test_the_default_samples_where_it_can(XY, build, data):
 
 
 def test_a_physics_that_learns_is_at_its_most_likely_parameters(XY):
-    class Wave(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.rate = torch.nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
-
-        def forward(self, X):
-            return 2 + (self.rate * X).sin()
-
-    physics, other = Wave(), Wave()
+    physics, other = Sine(2.0, 2.0), Sine(2.0, 2.0)
     options = {"num_starts": 2, "num_screened": 16}
     model = CKA(*XY, physics=physics)
     fit(model, num_draws=64, **options)
@@ -195,7 +184,7 @@ def best_of(objective):
 
 
 def test_laplaces_root_is_triangular_and_of_the_inverse_of_the_hessian(XY):
-    model = CKA(*XY, physics=crude)
+    model = CKA(*XY, physics=ripple)
     register_priors(model)
     objective = LogPosterior(model)
     optimum = best_of(objective)
@@ -262,7 +251,7 @@ def nuts(model, num_samples, num_warmup, num_chains=2, seed=0):
 
 @pytest.mark.slow
 def test_nuts_agrees(XY):
-    model = CKA(*XY, physics=crude, center=0.0)
+    model = CKA(*XY, physics=ripple, center=0.0)
     # With the vague defaults NUTS needs very long.
     prior, kernel = LogNormalPrior(-1.0, 1.0), model.terms[1].kernel
     kernel.register_prior("outputscale_prior", prior, "outputscale")
@@ -288,11 +277,11 @@ def test_nuts_agrees(XY):
 @quick
 def test_missing_targets(uniform):
     X = uniform(10, 1)
-    Y = torch.cat([1.5 * crude(X) + X, crude(X) * X], -1)
+    Y = torch.cat([1.5 * ripple(X) + X, ripple(X) * X], -1)
     Y[2:5, 1] = torch.nan
     seen = ~Y[:, 1].isnan()
-    both = CKA(X, Y, physics=lambda X: crude(X).expand(*X.shape[:-1], 2))
-    alone = CKA(X[seen], Y[seen][:, 1:], physics=crude)
+    both = CKA(X, Y, physics=lambda X: ripple(X).expand(*X.shape[:-1], 2))
+    alone = CKA(X[seen], Y[seen][:, 1:], physics=ripple)
     for model in (both, alone):
         fit(model, num_samples=64)
     found, expected = both.predict(X), alone.predict(X)
@@ -306,7 +295,7 @@ def test_missing_targets(uniform):
 @pytest.mark.slow
 def test_pyros_nuts_in_gpytorchs_way(XY):
     X, Y = XY
-    model = CKA(X, Y, physics=crude)
+    model = CKA(X, Y, physics=ripple)
     register_priors(model)
     model.train()
 
@@ -338,7 +327,7 @@ def test_constraints_hold(XY, lengths, noises, options):
     base = RBFKernel(ard_num_dims=1, lengthscale_constraint=lengths)
     model = CKA(
         *XY,
-        physics=crude,
+        physics=ripple,
         delta_covar_module=ScaleKernel(base),
         likelihood=GaussianLikelihood(noise_constraint=noises),
     )
@@ -355,18 +344,9 @@ class TestBeforeAndAfter:
 
     @pytest.mark.parametrize("before", ["predicted", "fitted"])
     def test_a_physics_that_learns(self, before):
-        X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        X = line(8)
         Y = 2 * (6 * X).sin() + X
-
-        class Wave(torch.nn.Module):
-            def __init__(self):
-                super().__init__()
-                self.rate = torch.nn.Parameter(torch.tensor(5.0, dtype=torch.float64))
-
-            def forward(self, X):
-                return (self.rate * X).sin()
-
-        model = CKA(X, Y, physics=Wave())
+        model = CKA(X, Y, physics=Sine(5.0))
         model.predict(X)
         if before == "fitted":
             fit(model, **SHORT)
@@ -376,7 +356,7 @@ class TestBeforeAndAfter:
         assert (model.predict(X).mean - Y).abs().max() < 0.05
 
     def test_the_most_likely_values_after_samples(self, XY):
-        first, second = (CKA(*XY, physics=crude) for _ in range(2))
+        first, second = (CKA(*XY, physics=ripple) for _ in range(2))
         fit(first)
         found = fit(first, "map").log_likelihood
         torch.testing.assert_close(found, fit(second, "map").log_likelihood, rtol=1e-4, atol=1e-4)
@@ -386,8 +366,8 @@ class TestBeforeAndAfter:
 @quick
 def test_a_list_of_models_of_few_and_many_points(uniform):
     X = uniform(45, 1)
-    Y = crude(X) + X.exp() + 0.1 * torch.randn(45, 1, dtype=torch.float64)
-    few, many = CKA(X[:8], Y[:8], physics=crude), BiasGP(X, Y, physics=crude)
+    Y = ripple(X) + X.exp() + 0.1 * torch.randn(45, 1, dtype=torch.float64)
+    few, many = CKA(X[:8], Y[:8], physics=ripple), BiasGP(X, Y, physics=ripple)
     models = ModelListGP(few, many)
     fit(models, num_draws=64, num_starts=1, num_screened=8)
     assert few.num_samples == many.num_samples == 8

@@ -10,6 +10,7 @@ from gpadjust import AR1, CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP
 from gpadjust.gp.noise import Noise
 from gpadjust.inference.distributions import ByModules, StationaryTerms
 from gpadjust.inference.targets import LogLikelihood, Target
+from tests.systems import normal
 
 D = 2
 SEEDS = st.integers(0, 2**31)
@@ -53,9 +54,8 @@ def assert_equal_to_autograd(
         None if noise is None else noise[..., kept],
         kind.random_means,
     )
-    generator = torch.Generator().manual_seed(seed)
     current = by_hand.parameters.current()
-    noise = torch.randn(3, *current.shape[1:], generator=generator, dtype=torch.float64)
+    noise = normal(3, *current.shape[1:], seed=seed)
     vectors = current + spread * noise
     values, gradient = by_hand.value_and_gradient(vectors)
     expected_values, expected = reference.value_and_gradient(vectors)

@@ -6,6 +6,7 @@ import torch
 from gpadjust import CKA, RRA, PhysicsMeanGP, ScaleGP, ZeroMeanGP, fit
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models.parameters import KINDS
+from tests.systems import line
 
 pytestmark = pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
 QUICK = {"num_screened": 32, "num_starts": 4}
@@ -20,7 +21,7 @@ def of(Y):
     return lambda X: crude(X).expand(*X.shape[:-1], Y.shape[-1])
 
 
-X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+X = line(8)
 BUILD = {
     "ZeroMeanGP": ZeroMeanGP,
     "PhysicsMeanGP": lambda X, Y: PhysicsMeanGP(X, Y, physics=of(Y)),

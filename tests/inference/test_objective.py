@@ -16,10 +16,7 @@ from gpadjust.gp.gaussian import log_likelihood, negative_log_likelihood, nugget
 from gpadjust.inference.targets import LogLikelihood, LogPosterior, Target
 from gpadjust.models import PaperRRA
 from gpadjust.models.parameters import KINDS
-
-
-def crude(X):
-    return 2 + (3 * X).sin()
+from tests.systems import line, ripple, uniform
 
 
 class Gain(torch.nn.Module):
@@ -28,14 +25,14 @@ class Gain(torch.nn.Module):
         self.gain = torch.nn.Parameter(torch.tensor(1.3, dtype=torch.float64))
 
     def forward(self, X):
-        return self.gain * crude(X)
+        return self.gain * ripple(X)
 
 
 def with_priors(X, Y, first, second=None):
     batch = torch.Size([2])
     base = RBFKernel(batch_shape=batch, lengthscale_prior=first)
     kernel = ScaleKernel(base, batch_shape=batch, outputscale_prior=second).double()
-    return CKA(X, Y, physics=crude, delta_covar_module=kernel)
+    return CKA(X, Y, physics=ripple, delta_covar_module=kernel)
 
 
 def prior_of_what_is_fixed(X, Y):
@@ -45,13 +42,13 @@ def prior_of_what_is_fixed(X, Y):
 
 
 def fixed_noise(X, Y):
-    model = CKA(X, Y, physics=crude)
+    model = CKA(X, Y, physics=ripple)
     model.likelihood.requires_grad_(False).noise = 1e-11
     return model
 
 
 def learnt_basis(X, Y):
-    model = CKA(X, Y, physics=crude, rho_mean="learn")
+    model = CKA(X, Y, physics=ripple, rho_mean="learn")
     term = model.terms[0]
     scale = torch.nn.Parameter(term.basis.scale.clone())
     del term.basis.scale
@@ -64,32 +61,32 @@ BUILD = {
     "fixed noise": fixed_noise,
     "learnt basis": learnt_basis,
     "ZeroMeanGP": ZeroMeanGP,
-    "PhysicsMeanGP": lambda X, Y: PhysicsMeanGP(X, Y, physics=crude),
-    "ScaleGP": lambda X, Y: ScaleGP(X, Y, physics=crude),
-    "CKA": lambda X, Y: CKA(X, Y, physics=crude),
-    "known noise": lambda X, Y: CKA(X, Y, torch.full_like(Y, 0.01), physics=crude),
-    "learnt means": lambda X, Y: CKA(X, Y, physics=crude, rho_mean="learn", delta_mean="learn"),
-    "learnt centre": lambda X, Y: CKA(X, Y, physics=crude, center="learn"),
+    "PhysicsMeanGP": lambda X, Y: PhysicsMeanGP(X, Y, physics=ripple),
+    "ScaleGP": lambda X, Y: ScaleGP(X, Y, physics=ripple),
+    "CKA": lambda X, Y: CKA(X, Y, physics=ripple),
+    "known noise": lambda X, Y: CKA(X, Y, torch.full_like(Y, 0.01), physics=ripple),
+    "learnt means": lambda X, Y: CKA(X, Y, physics=ripple, rho_mean="learn", delta_mean="learn"),
+    "learnt centre": lambda X, Y: CKA(X, Y, physics=ripple, center="learn"),
     "learnt centre and means": lambda X, Y: CKA(
-        X, Y, physics=crude, center="learn", rho_mean="learn", delta_mean="learn"
+        X, Y, physics=ripple, center="learn", rho_mean="learn", delta_mean="learn"
     ),
-    "two physics": lambda X, Y: CKA(X, Y, physics=[crude, lambda X: X], rho_mean=[1.0, 0.5]),
+    "two physics": lambda X, Y: CKA(X, Y, physics=[ripple, lambda X: X], rho_mean=[1.0, 0.5]),
     "learnt physics": lambda X, Y: CKA(X, Y, physics=Gain()),
     "learnt physics and means": lambda X, Y: CKA(
         X, Y, physics=Gain(), rho_mean="learn", delta_mean="learn"
     ),
     "prior": lambda X, Y: with_priors(X, Y, LogNormalPrior(0.0, 1.0)),
     "other priors": lambda X, Y: with_priors(X, Y, GammaPrior(3.0, 6.0), GammaPrior(2.0, 0.5)),
-    "AR1": lambda X, Y: AR1(X, Y, physics=crude, bounds=torch.tensor([[0.0, 0], [1, 1]])),
-    "RRA": lambda X, Y: RRA(X, Y, physics=crude, num_features=16),
-    "PaperRRA": lambda X, Y: PaperRRA(X, Y, physics=crude, num_features=16),
+    "AR1": lambda X, Y: AR1(X, Y, physics=ripple, bounds=torch.tensor([[0.0, 0], [1, 1]])),
+    "RRA": lambda X, Y: RRA(X, Y, physics=ripple, num_features=16),
+    "PaperRRA": lambda X, Y: PaperRRA(X, Y, physics=ripple, num_features=16),
 }
 
 
 @pytest.fixture
 def XY(uniform):
     X = uniform(9, 2)
-    return X, 1.5 * crude(X) + X.flip(-1)
+    return X, 1.5 * ripple(X) + X.flip(-1)
 
 
 @pytest.fixture(params=list(BUILD))
@@ -154,7 +151,7 @@ def test_its_gradient_is_that_of_finite_differences(model, kind):
 def test_rows_are_those_of_a_model_of_them(XY):
     X, Y = XY
     rows = torch.tensor([0, 2, 3, 6, 8])
-    options = {"physics": crude, "outcome_transform": None, "center": 0.0}
+    options = {"physics": ripple, "outcome_transform": None, "center": 0.0}
     part = Target(CKA(X, Y, **options), rows=rows)
     alone = Target(CKA(X[rows], Y[rows], **options))
     vectors = neighbours(alone)
@@ -163,7 +160,7 @@ def test_rows_are_those_of_a_model_of_them(XY):
 
 def test_a_covariance_that_is_not_positive_definite_is_infinitely_bad(XY):
     X = XY[0][:, :1]
-    objective = Target(CKA(X, crude(X), torch.full_like(X, 1e-6), physics=crude))
+    objective = Target(CKA(X, ripple(X), torch.full_like(X, 1e-6), physics=ripple))
     vectors = objective.parameters.current().repeat(2, 1, 1)
     vectors[1] = 800.0
     values, gradient = objective.value_and_gradient(vectors)
@@ -181,9 +178,8 @@ class TestConcentration:
         factor=st.floats(1e-6, 1e6),
     )
     def test_a_common_factor_of_the_variances_makes_no_difference(self, name, seed, factor):
-        generator = torch.Generator().manual_seed(seed)
-        X = torch.rand(9, 2, generator=generator, dtype=torch.float64)
-        objective = LogLikelihood(BUILD[name](X, 1.5 * crude(X) + X.flip(-1)))
+        X = uniform(9, 2, seed=seed)
+        objective = LogLikelihood(BUILD[name](X, 1.5 * ripple(X) + X.flip(-1)))
         assert objective.concentrated
         variances = objective.parameters.variances
         point = objective.parameters.current()
@@ -225,7 +221,7 @@ class TestConcentration:
         at_scale, _ = objective.at_best_scale(point)
         torch.testing.assert_close(objective(point), marginal(at_scale), rtol=1e-9, atol=1e-9)
         objective.assign(point[0])
-        size = (XY[1] - crude(XY[0])).square().mean(0).minimum(XY[1].var(0, correction=0))
+        size = (XY[1] - ripple(XY[0])).square().mean(0).minimum(XY[1].var(0, correction=0))
         floor = KINDS["noise"].bounds[0] * size
         ratio = model.likelihood.noise.mT * model.outcome_transform.stdvs.square() / floor
         expected = torch.full_like(ratio, math.exp(max(0.0, -excess)))
@@ -256,15 +252,15 @@ class TestVectors:
 class TestVagueTrend:
     @pytest.mark.parametrize("name", ["CKA", "AR1", "RRA", "missing", "two outputs"])
     def test_gradient(self, name):
-        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
-        Y = crude(X) + X.square()
+        X = line(9)
+        Y = ripple(X) + X.square()
         Y = torch.cat([Y, 2 * Y - X], -1) if name == "two outputs" else Y
         if name == "missing":
             Y[3] = torch.nan
             Y = torch.cat([Y, X], -1)
-        physics = (lambda X: crude(X).expand(*X.shape[:-1], 2)) if Y.shape[-1] > 1 else crude
+        physics = (lambda X: ripple(X).expand(*X.shape[:-1], 2)) if Y.shape[-1] > 1 else ripple
         if name == "AR1":
-            model = AR1(X, Y, physics=crude, bounds=torch.tensor([[0.0], [1.0]]))
+            model = AR1(X, Y, physics=ripple, bounds=torch.tensor([[0.0], [1.0]]))
         elif name == "RRA":
             model = BUILD[name](X, Y)
         else:
@@ -278,8 +274,8 @@ class TestVagueTrend:
 
     def test_functions_that_a_wider_prior_allows_beside_cost_nothing(self):
         # delta is nearly linear at this lengthscale, so that its variance is that of a line.
-        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
-        model = CKA(X, crude(X) + 3 + 2 * X, physics=crude)
+        X = line(9)
+        model = CKA(X, ripple(X) + 3 + 2 * X, physics=ripple)
         model.terms[1].kernel.base_kernel.lengthscale = 100.0
         model.likelihood.noise = 1e-2
 
@@ -299,7 +295,7 @@ class TestVagueTrend:
         assert slope(LogPosterior) == pytest.approx(0.0, abs=0.05)
 
     def test_a_variance_that_cannot_make_the_trend_is_ruled_out(self):
-        X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+        X = line(9)
         model = ZeroMeanGP(X, 1 + X)
         model.terms[0].kernel.base_kernel.lengthscale = 10.0
         model.likelihood.noise = 1e-6

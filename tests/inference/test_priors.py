@@ -9,6 +9,7 @@ from torch.distributions import LogNormal, Normal
 from gpadjust import CKA
 from gpadjust.inference import register_priors
 from gpadjust.inference.targets import LogPosterior, Target
+from tests.systems import crude
 
 
 def priors(model):
@@ -56,13 +57,11 @@ def test_of_ar1(build, data, num_outputs, unit):
     assert (noise.scale == 4).all()
 
 
-def test_a_users_priors_and_fixed_parameters_are_left_alone(data, crude_physics):
+def test_a_users_priors_and_fixed_parameters_are_left_alone(data):
     X, Y = data()
     own = GammaPrior(3.0, 6.0)
     kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=own))
-    model = CKA(
-        X, Y, center=0.0, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel
-    )
+    model = CKA(X, Y, center=0.0, physics=lambda X: crude(X)[..., :1], rho_covar_module=kernel)
     model.terms[1].kernel.raw_outputscale.requires_grad_(False)
     register_priors(model)
     assert kernel.base_kernel.lengthscale_prior is own
@@ -89,12 +88,10 @@ def test_objective_is_gpytorchs_log_posterior(build, data, shuffle, kind, num_ou
 
 
 @pytest.mark.parametrize("prior", [None, GammaPrior(3.0, 6.0), LogNormalPrior(0.1, 0.7)])
-def test_potential_has_the_jacobian_of_the_logarithm(data, crude_physics, prior):
+def test_potential_has_the_jacobian_of_the_logarithm(data, prior):
     X, Y = data()
     kernel = ScaleKernel(RBFKernel(ard_num_dims=2, lengthscale_prior=prior))
-    model = CKA(
-        X, Y, center=0.0, physics=lambda X: crude_physics(X)[..., :1], rho_covar_module=kernel
-    )
+    model = CKA(X, Y, center=0.0, physics=lambda X: crude(X)[..., :1], rho_covar_module=kernel)
     register_priors(model)
     objective = Target(model)
     of_logs = LogPosterior(model)
@@ -109,9 +106,9 @@ def test_potential_has_the_jacobian_of_the_logarithm(data, crude_physics, prior)
     torch.testing.assert_close(gradient[0, 0], numeric[:, 0], rtol=1e-5, atol=1e-5)
 
 
-def test_two_priors_of_one_parameter_both_count(data, crude_physics):
+def test_two_priors_of_one_parameter_both_count(data):
     X, Y = data()
-    model = CKA(X, Y, physics=lambda X: crude_physics(X)[..., :1])
+    model = CKA(X, Y, physics=lambda X: crude(X)[..., :1])
     kernel = model.terms[0].kernel
     values = []
     for i, prior in enumerate([LogNormalPrior(0.1, 0.7), LogNormalPrior(-2.0, 0.3)]):

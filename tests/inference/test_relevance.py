@@ -15,6 +15,7 @@ from gpadjust.inference.relevance import mixed, probability, without_physics
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.validation import trust
+from tests.systems import around, line, normal, same, uniform
 
 # Physics of no use is what this is about.
 pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
@@ -42,9 +43,8 @@ def unrelated_and_double(X):
 @pytest.fixture(scope="module")
 def data():
     """15 points, where the truth is seen without noise, and others."""
-    generator = torch.Generator().manual_seed(0)
-    X = torch.rand(15, 1, generator=generator, dtype=torch.float64)
-    return X, truth(X), torch.linspace(0, 1, 40, dtype=torch.float64).unsqueeze(-1)
+    X = uniform(15, 1)
+    return X, truth(X), line(40)
 
 
 @pytest.fixture(scope="module")
@@ -61,21 +61,10 @@ def fitted(_fitted):
     return deepcopy(model), result
 
 
-def drawn(model, number, seed=0):
-    """Samples around the learnable parameters of a model, by their names."""
-    generator = torch.Generator().manual_seed(seed)
-    return {
-        name: p.detach()
-        + 0.3 * torch.randn(number, *p.shape, generator=generator, dtype=torch.float64)
-        for name, p in model.named_parameters()
-        if p.requires_grad
-    }
-
-
 def half_off(model, share, number=4):
     """Samples of a model, of which some have the physics switched off; with those of both."""
     other = without_physics(model)
-    on, off = drawn(model, number), drawn(other, number, seed=1)
+    on, off = around(model, number), around(other, number, seed=1)
     return mixed(on, off, model, other, torch.as_tensor(share, dtype=torch.float64)), on, off
 
 
@@ -143,8 +132,7 @@ class TestWithoutPhysics:
             ours, theirs = ((k.outputscale * unit).squeeze() for k, unit in kernels)
             other.likelihood.noise = one.likelihood.noise * kernels[0][1] / kernels[1][1]
             kernels[1][0].outputscale = kernels[1][0].outputscale * ours / theirs
-        for a, b in zip(other.predict(Z), one.predict(Z), strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-8)
+        same(other.predict(Z), one.predict(Z), rtol=1e-6, atol=1e-8)
 
     @pytest.mark.parametrize(
         "build",
@@ -224,8 +212,7 @@ class TestConstant:
     @pytest.mark.parametrize("offset", [0.0, 1e5])
     def test_it_does_not_count_against_the_physics(self, data, offset):
         X, Y, _ = data
-        generator = torch.Generator().manual_seed(1)
-        Y = Y + 0.1 * torch.randn(Y.shape, generator=generator, dtype=torch.float64) + offset
+        Y = Y + 0.1 * normal(*Y.shape, seed=1) + offset
         assert fit(CKA(X, Y, physics=double)).relevance > 0.8
         assert fit(CKA(X, Y, physics=unrelated)).relevance < 0.5
 
@@ -372,8 +359,7 @@ class TestPartlyOff:
         expected = CKA(torch.cat([X, new_X]), torch.cat([every, new_Y]), **options)
         expected.hold_samples(samples)
         Z = torch.cat([Z, 1.5 + Z])
-        for a, b in zip(found.components(Z, False), expected.components(Z, False), strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+        same(found.components(Z, False), expected.components(Z, False), rtol=1e-5, atol=1e-7)
         for name in ("rho", "delta"):
             a, b = (m.term(name, Z) for m in (found, expected))
             torch.testing.assert_close(a.mean, b.mean, rtol=1e-5, atol=1e-6)

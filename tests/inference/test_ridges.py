@@ -8,6 +8,7 @@ import torch
 
 from gpadjust import CalibratedPhysics, FunctionPhysics, Unknown, fit
 from gpadjust.inference import SamplingWarning
+from tests.systems import line
 
 
 def beam(X, p):
@@ -80,7 +81,7 @@ def test_intervals_are_those_of_a_grid(name):
 def test_intervals_hold():
     held = []
     for name in PROBLEMS:
-        for seed in range(25):
+        for seed in range(12):
             X, Y, physics, true = case(name, seed)
             model = CalibratedPhysics(X, Y, physics=physics)
             fit(model)
@@ -92,7 +93,7 @@ def test_intervals_hold():
 def fold(law, unknowns, seed, noise=0.1):
     """Data of a law of one input, and a fit of it; its true parameters are drawn from the prior."""
     options = {"generator": torch.Generator().manual_seed(seed), "dtype": torch.float64}
-    X = torch.linspace(0.1, 2.0, 12, dtype=torch.float64).unsqueeze(-1)
+    X = line(12, 0.1, 2.0)
     physics = FunctionPhysics(law, unknowns=unknowns)
     true = physics.unknowns.at(torch.randn(len(unknowns), **options))
     Y = physics(X, true) + noise * torch.randn(len(X), 1, **options)
@@ -113,7 +114,7 @@ def test_all_optima_are_found(seed):
 @pytest.mark.filterwarnings("ignore::gpadjust.inference.ParameterWarning")
 def test_draws_go_beyond_a_fold():
     """Of a square of which the data say that it is small: the root has either sign."""
-    X = torch.linspace(0.1, 2.0, 12, dtype=torch.float64).unsqueeze(-1)
+    X = line(12, 0.1, 2.0)
     physics = FunctionPhysics(
         lambda X, p: p.a.square() * X[:, 0], unknowns={"a": Unknown(0.3, sd=1.0)}
     )

@@ -43,7 +43,7 @@ def error(forrester):
     return error
 
 
-CASES = [(kind, seed) for kind in BUILD for seed in range(3)]
+CASES = [*((kind, 0) for kind in BUILD), ("CKA", 1)]
 QUICK = [("CKA", 0), ("PhysicsMeanGP", 0)]
 
 
@@ -81,11 +81,7 @@ def test_units_of_the_inputs(error, kind, stretch, shift):
     assert actual == pytest.approx(expected, rel=0.05, abs=EXACT)
 
 
-@pytest.mark.parametrize("num_seeds", [3, pytest.param(10, marks=pytest.mark.slow)])
-def test_cka_is_exact_on_a_pair_within_its_class(error, num_seeds):
-    errors = [error(BUILD["CKA"], seed) for seed in range(num_seeds)]
+def test_cka_is_exact_on_a_pair_within_its_class(error):
+    errors = [error(BUILD["CKA"], seed) for seed in range(3)]
     assert statistics.median(errors) <= 0.002
-
-
-def test_cka_beats_the_physics_mean(error):
-    assert error(BUILD["CKA"], 0) < 0.3 * error(BUILD["PhysicsMeanGP"], 0)
+    assert errors[0] < 0.3 * error(BUILD["PhysicsMeanGP"], 0)

@@ -15,12 +15,9 @@ from gpadjust.inference.collapsed_bound import CollapsedBound, Observations
 from gpadjust.inference.unexplained import unexplained
 from gpadjust.inference.warm_start import warm_start
 from gpadjust.models.sparse_conditioning import INDUCING_NUGGET
+from tests.systems import Sine, line, wave
 
 QUICK = {"num_screened": 16, "num_starts": 2}
-
-
-def wave(X):
-    return torch.sin(6 * X[..., :1])
 
 
 def problem(n, seed=0, fine=0.0, noise=0.1):
@@ -197,7 +194,7 @@ def test_noise_is_no_function(uniform):
 
 
 def test_a_function_in_residuals_is_found():
-    X = torch.linspace(0, 1, 400, dtype=torch.float64).unsqueeze(-1)
+    X = line(400)
     noise = 0.1 * torch.randn(2, 400, generator=torch.Generator().manual_seed(0)).double()
     residuals = torch.stack([(40 * X).sin().squeeze(-1), 0 * X.squeeze(-1)]) + noise
     residuals[0, ::5] = torch.nan
@@ -261,30 +258,21 @@ def test_unknown_parameters_of_the_physics():
     assert later.evidence > model.evidence - 1.0
 
 
-class Network(torch.nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.w = torch.nn.Parameter(torch.tensor(5.0, dtype=torch.float64))
-
-    def forward(self, X):
-        return torch.sin(self.w * X)
-
-
 def test_a_physics_that_learns(monkeypatch):
     X, f, Y = problem(60)
-    network = Network()
+    network = Sine(5.0)
     model = make(X, Y, physics=network)
     options = {"num_screened": 4, "num_starts": 1, "max_iterations": 10}
     fit(model, **options)
-    assert network.w.requires_grad
-    assert network.w != 5.0
+    assert network.rate.requires_grad
+    assert network.rate != 5.0
     torch.testing.assert_close(model.train_inputs[0][:, 1:], network(X))
     assert (model.predict(X).mean - f).std() < 0.1
     before, columns = copy.deepcopy(model.state_dict()), model.train_inputs[0].clone()
 
     def fail(*args):
         with torch.no_grad():
-            network.w += 1.0
+            network.rate += 1.0
         raise RuntimeError("no more")
 
     monkeypatch.setattr(variational_fit, "unexplained", fail)

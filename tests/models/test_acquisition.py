@@ -15,6 +15,7 @@ from botorch.optim import optimize_acqf
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust import CKA, BlackBoxPhysics
+from tests.systems import crude
 
 BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
 QUICK = {"num_restarts": 2, "raw_samples": 8, "options": {"maxiter": 5, "batch_limit": 2}}
@@ -55,9 +56,9 @@ def test_gradients_through_the_physics(data, build, uniform, gradient_is_right, 
 
 
 @pytest.mark.parametrize("name", ["variance", "deviation", "noisy improvement"])
-def test_gradients_of_a_black_box(data, uniform, crude_physics, gradient_is_right, name):
+def test_gradients_of_a_black_box(data, uniform, gradient_is_right, name):
     X, Y = data()
-    physics = BlackBoxPhysics(lambda X: crude_physics(torch.from_numpy(X))[:, :1].numpy())
+    physics = BlackBoxPhysics(lambda X: crude(torch.from_numpy(X))[:, :1].numpy())
     function, q = acquisition_function(name, CKA(X, Y, physics=physics).eval(), X, X)
     gradient_is_right(function, uniform(1, q, 2, high=2.0, seed=5))
 

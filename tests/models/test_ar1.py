@@ -7,13 +7,14 @@ from botorch.models.transforms import Normalize
 
 from gpadjust import AR1, fit
 from gpadjust.inference.targets import LogPosterior
+from tests.systems import crude, line
 
 
 @pytest.fixture
-def levels(uniform, crude_physics):
+def levels(uniform):
     X, low_X = uniform(7, 2, high=2.0, seed=1), uniform(11, 2, high=2.0, seed=2)
-    low_Y = crude_physics(low_X)[:, :1]
-    Y = 1.7 * crude_physics(X)[:, :1] + X.sum(-1, keepdim=True).sin()
+    low_Y = crude(low_X)[:, :1]
+    Y = 1.7 * crude(X)[:, :1] + X.sum(-1, keepdim=True).sin()
     return X, Y, low_X, low_Y
 
 
@@ -55,11 +56,11 @@ def test_joint_co_kriging(ar1, users_units, levels, close, uniform):
     close(noisy.detach(), covariance.diagonal() + noise[1])
 
 
-def test_recursive_co_kriging_on_nested_designs(rbf, close, uniform, crude_physics, kernel_of):
+def test_recursive_co_kriging_on_nested_designs(rbf, close, uniform, kernel_of):
     """Le Gratiet and Garnier's recursion equals the joint model when there is no noise."""
     low_X = uniform(12, 2, high=2.0, seed=2)
     X = low_X[:6]
-    low_Y = crude_physics(low_X)[:, :1]
+    low_Y = crude(low_X)[:, :1]
     Y = 1.7 * low_Y[:6] + X.sum(-1, keepdim=True).sin()
     model = AR1(X, Y, low_X=low_X, low_Y=low_Y, outcome_transform=None)
     with torch.no_grad():
@@ -102,13 +103,13 @@ def test_each_level_has_a_noise_of_its_own(ar1, levels):
     torch.testing.assert_close(noise.detach(), expected)
 
 
-def test_the_samples_lie_within_the_bounds(data, crude_physics):
+def test_the_samples_lie_within_the_bounds(data):
     X, Y = data()
     seen = []
 
     def physics(X):
         seen.append(X)
-        return crude_physics(X)[:, :1]
+        return crude(X)[:, :1]
 
     bounds = torch.tensor([[-3.0, 1.0], [-2.0, 5.0]], dtype=torch.float64)
     AR1(X, Y, physics=physics, bounds=bounds, num_low=33)
@@ -126,10 +127,10 @@ def test_the_seed_makes_the_samples(data, build):
     assert not torch.equal(first, other)
 
 
-def test_low_values_are_computed_where_only_inputs_are_given(levels, crude_physics, uniform):
+def test_low_values_are_computed_where_only_inputs_are_given(levels, uniform):
     X, Y, low_X, low_Y = levels
     given = AR1(X, Y, low_X=low_X, low_Y=low_Y)
-    computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude_physics(X)[:, :1])
+    computed = AR1(X, Y, low_X=low_X, physics=lambda X: crude(X)[:, :1])
     Z = uniform(5, 2)
     torch.testing.assert_close(given.posterior(Z).mean, computed.posterior(Z).mean)
 
@@ -137,11 +138,11 @@ def test_low_values_are_computed_where_only_inputs_are_given(levels, crude_physi
 @pytest.mark.parametrize("transform", [{}, {"outcome_transform": None}])
 @pytest.mark.parametrize("small", [1.0, 0.1])
 def test_known_noise_of_a_prediction_is_the_high_levels(
-    data, build, uniform, crude_physics, num_outputs, transform, small
+    data, build, uniform, num_outputs, transform, small
 ):
     X, Y = data(num_outputs=num_outputs)
     Yvar = torch.linspace(0.01, 0.03, len(Y), dtype=torch.float64).unsqueeze(-1).expand_as(Y)
-    physics = {"physics": lambda X: small * crude_physics(X)[..., :num_outputs]}
+    physics = {"physics": lambda X: small * crude(X)[..., :num_outputs]}
     model = build("AR1", X, small * Y, Yvar, **physics, **transform)
     Z = uniform(4, 2, high=2.0, seed=3)
     added = model.posterior(Z, observation_noise=True).variance - model.posterior(Z).variance
@@ -149,9 +150,9 @@ def test_known_noise_of_a_prediction_is_the_high_levels(
 
 
 @pytest.mark.parametrize("Yvar", [None, 0.01])
-def test_low_values_that_are_missing(uniform, crude_physics, close, Yvar):
+def test_low_values_that_are_missing(uniform, close, Yvar):
     X, low_X, Z = (uniform(n, 2, high=2.0, seed=n) for n in (7, 11, 5))
-    Y, low_Y = crude_physics(X)[:, :1].cos(), crude_physics(low_X)[:, :1]
+    Y, low_Y = crude(X)[:, :1].cos(), crude(low_X)[:, :1]
     fewer = AR1(X, Y, Yvar, low_X=low_X[1:], low_Y=low_Y[1:])
     both = low_Y.expand(-1, 2).clone()
     both[0, 1] = torch.nan
@@ -162,7 +163,7 @@ def test_low_values_that_are_missing(uniform, crude_physics, close, Yvar):
     torch.testing.assert_close(two.predict(Z).mean[:, 1:], fewer.predict(Z).mean, rtol=1e-4, atol=0)
 
 
-def test_what_a_transform_learnt_stays(uniform, crude_physics):
+def test_what_a_transform_learnt_stays(uniform):
     X, low_X, Z = uniform(7, 1), uniform(11, 1, seed=1), 3 + uniform(2, 1, seed=2)
     low_Y, Y = low_X.sin(), X.sin() + X
     model = AR1(X, Y, low_X=low_X, low_Y=low_Y, input_transform=Normalize(1))
@@ -189,8 +190,8 @@ def test_a_low_level_that_does_not_vary_says_nothing_of_rho():
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_the_size_of_a_trend_of_either_level_has_no_vote(which):
-    low_X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
-    X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
+    low_X = line(20)
+    X = line(9)
     low, high = 1 - 2 * low_X, 3 + 2 * X
     if which == 1:  # it is delta that has a trend
         low, high = (5 * low_X).sin(), high + 2 * (5 * X).sin()
@@ -216,12 +217,12 @@ def test_a_discrepancy_that_is_nearly_polynomial(unit):
     def high(X):
         return (6 * X - 2).square() * (12 * X - 4).sin()
 
-    X = torch.linspace(0.05, 0.95, 6, dtype=torch.float64).unsqueeze(-1)
-    low_X = torch.cat([X, torch.linspace(0, 1, 15, dtype=torch.float64).unsqueeze(-1)])
+    X = line(6, 0.05, 0.95)
+    low_X = torch.cat([X, line(15)])
     low_Y = unit * (0.25 * high(low_X) + 20 * low_X.square() - 10)
     model = AR1(X, high(X), low_X=low_X, low_Y=low_Y)
     fit(model)
-    Z = torch.linspace(0, 1, 50, dtype=torch.float64).unsqueeze(-1)
+    Z = line(50)
     assert (model.predict(Z).mean - high(Z)).square().mean().sqrt() < 0.1 * high(Z).std()
     lower, upper = model.interval(Z)
     assert ((lower <= high(Z)) & (high(Z) <= upper)).double().mean() > 0.9

@@ -9,6 +9,7 @@ from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.likelihoods import BernoulliLikelihood, GaussianLikelihood
 
 from gpadjust import AR1, CKA, BlackBoxPhysics, PhysicsError, ScaleGP
+from tests.systems import crude
 
 
 @pytest.fixture
@@ -86,10 +87,10 @@ def expired(X):
 
 
 @pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA", "RRA-paper"])
-def test_physics(build, kind, XY, crude_physics):
+def test_physics(build, kind, XY):
     wrong = "outputs as the high one has, got 2 and 2" if kind == "AR1" else "returned 2 col"
     for physics, error, says in (
-        (crude_physics, ValueError, wrong),
+        (crude, ValueError, wrong),
         (lambda X: X.sum(), PhysicsError, "returned shape"),
         (lambda X: X.sum(-1) / 0, PhysicsError, "returned NaN or inf"),
         (expired, PhysicsError, "'expired' raised RuntimeError: licence expired"),
@@ -135,8 +136,12 @@ BAD_OPTIONS = [
         for center in ("median", NAN, torch.ones(3))
     ),
     *(
-        ("RRA", {"num_features": n}, ValueError, f"an even whole number >= 2 .* got {n}")
-        for n in (0, -3, 10.5, 7)
+        ("RRA", {"num_features": n}, error, f"num_features .*{says}.*{n}")
+        for n, error, says in (
+            (0, ValueError, "at least 1"),
+            (10.5, TypeError, "whole"),
+            (7, ValueError, "even"),
+        )
     ),
     ("CKA", {"rho_mean": "learnt"}, ValueError, "rho_mean to be 'learn', a number, or 1 num"),
     ("CKA", {"rho_mean": [1.0, 2.0]}, ValueError, "rho_mean to be 'learn', a number, or 1 num"),
@@ -152,12 +157,12 @@ BAD_OPTIONS = [
         for kind in ("CKA", "RRA", "AR1")
     ),
     ("AR1", {"bounds": None}, ValueError, r"in `bounds` \(2 x d\)"),
-    ("AR1", {"bounds": torch.zeros(2, 1)}, ValueError, r"bounds of shape \(2, 2\), got \(2, 1\)"),
+    ("AR1", {"bounds": torch.zeros(2, 1)}, ValueError, r"bounds of shape 2 x 2, .* got \(2, 1\)"),
     *(
-        ("AR1", {"bounds": [[0.0, 0.0], upper]}, ValueError, "each lower one .* below the upper")
+        ("AR1", {"bounds": [[0.0, 0.0], upper]}, ValueError, "each lower one below its upper")
         for upper in ([1.0, -1.0], [1.0, INF], [1.0, NAN])
     ),
-    ("AR1", {"num_low": 1}, ValueError, "num_low >= 2 samples of f_p, got 1"),
+    ("AR1", {"num_low": 1}, ValueError, "num_low must be at least 2; found 1"),
     ("AR1", {"num_low": 2.5}, TypeError, r"num_low must be a whole number; found 2\.5"),
     *(
         (kind, {"seed": seed}, TypeError, f"seed must be a whole number; found {seed!r}")

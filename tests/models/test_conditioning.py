@@ -8,6 +8,7 @@ from botorch.models.transforms import Normalize
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust.models.exact_conditioning import batched_product
+from tests.systems import crude
 
 
 def sampler(num_fantasies):
@@ -15,11 +16,11 @@ def sampler(num_fantasies):
 
 
 @pytest.fixture
-def low_level(kind, uniform, crude_physics, num_outputs):
+def low_level(kind, uniform, num_outputs):
     if kind != "AR1":
         return {}
     low_X = uniform(10, 2, high=2.0, seed=8)
-    return {"low_X": low_X, "low_Y": crude_physics(low_X)[:, :num_outputs]}
+    return {"low_X": low_X, "low_Y": crude(low_X)[:, :num_outputs]}
 
 
 @pytest.mark.parametrize("sizes", [(3,), (1, 1, 1), (2, 1)], ids=str)

@@ -7,6 +7,7 @@ import torch
 from botorch.utils.datasets import SupervisedDataset
 
 from gpadjust.models.terms_gp import arguments_of
+from tests.systems import crude
 
 
 @pytest.fixture(autouse=True)
@@ -16,9 +17,7 @@ def _without_ax(monkeypatch):
 
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
-def test_a_model_from_a_dataset(
-    data, build, kind, num_outputs, crude_physics, uniform, known_noise
-):
+def test_a_model_from_a_dataset(data, build, kind, num_outputs, uniform, known_noise):
     X, Y = data(num_outputs=num_outputs)
     Yvar = uniform(*Y.shape, low=0.01, high=0.1) if known_noise else None
     dataset = SupervisedDataset(
@@ -26,7 +25,7 @@ def test_a_model_from_a_dataset(
     )
     options = {}
     if kind != "ZeroMeanGP":
-        options["physics"] = lambda X: crude_physics(X)[:, :num_outputs]
+        options["physics"] = lambda X: crude(X)[:, :num_outputs]
     if kind == "AR1":
         options |= {"bounds": torch.tensor([[0.0, 0.0], [2.0, 2.0]]), "num_low": 12}
     if kind.startswith("RRA"):

@@ -5,6 +5,7 @@ import torch
 from botorch.models.transforms import Normalize, Standardize
 
 from gpadjust import CKA
+from tests.systems import crude, line
 
 QUANTITIES = ["posterior", "rho", "delta"]
 
@@ -47,7 +48,7 @@ def test_mean_and_covariance(uniform, shuffle, dense, close, d, scale, center):
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
 @pytest.mark.parametrize("options", [{}, {"outcome_transform": Standardize(1)}], ids=["", "std"])
 def test_variances_that_are_small(dense, close, scale, options):
-    X = torch.linspace(0, 1, 30, dtype=torch.float64).unsqueeze(-1)
+    X = line(30)
     Y = scale * (1 + X + 0.1 * (5 * X).sin())
 
     def physics(X):
@@ -87,16 +88,16 @@ def test_known_noise(uniform, shuffle, dense, close):
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("transform", ["default", "none", "standardize"])
 def test_several_outputs_and_transforms(
-    data, uniform, shuffle, dense, close, crude_physics, transform, normalize, center
+    data, uniform, shuffle, dense, close, transform, normalize, center
 ):
     X, Y = data(num_outputs=2)
     options = {"input_transform": Normalize(2)} if normalize else {}
     if transform != "default":
         options["outcome_transform"] = Standardize(2) if transform == "standardize" else None
-    model = shuffle(CKA(X, Y, physics=crude_physics, center=center, **options))
+    model = shuffle(CKA(X, Y, physics=crude, center=center, **options))
     units = {"center": center, "ranges": X.amax(0) - X.amin(0) if normalize else 1.0}
     for j in range(2):
-        formula = dense(model, X, Y, crude_physics, output=j, **units)
+        formula = dense(model, X, Y, crude, output=j, **units)
         agree(model, formula, uniform(5, 2, high=2.0, seed=5), close, j=j)
 
 
@@ -122,12 +123,12 @@ def test_a_batch_of_data_sets_is_as_many_models(
 
 
 def test_rho_times_physics_plus_delta_is_the_models_mean(
-    data, build, uniform, shuffle, close, crude_physics, num_outputs
+    data, build, uniform, shuffle, close, num_outputs
 ):
     X, Y = data(num_outputs=num_outputs)
     Z = uniform(6, 2, low=-1.0, high=3.0, seed=4)
     for center in (0.0, "mean"):
         model = shuffle(build("CKA", X, Y, center=center))
-        f_p = crude_physics(Z)[:, :num_outputs]
+        f_p = crude(Z)[:, :num_outputs]
         sum_of_parts = model.rho(Z).mean * f_p + model.delta(Z).mean
         close(sum_of_parts.detach(), model.posterior(Z).mean.detach())

@@ -22,6 +22,7 @@ from gpytorch.priors import LogNormalPrior
 from gpadjust import CKA, CalibratedPhysics, fit
 from gpadjust.inference.targets import LogLikelihood
 from gpadjust.physics import FunctionPhysics, Unknown
+from tests.systems import line
 
 REST = ("AR1", "RRA", "RRA-paper")  # of models in lists
 
@@ -76,7 +77,7 @@ def test_without_noise(data, center, seed, normalised):
 
 
 def test_parameters_of_the_physics():
-    t = torch.linspace(0.1, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    t = line(8, 0.1)
     law = FunctionPhysics(
         lambda t, p: 0.5 * p.g * t[:, 0] ** 2, unknowns={"g": Unknown(9.0, sd=1.0)}
     )

@@ -9,6 +9,7 @@ from botorch.sampling import IIDNormalSampler, SobolQMCNormalSampler
 from torch.distributions import MultivariateNormal
 
 from gpadjust.models.posteriors import MarginalMixture, ScaleFreePosterior
+from tests.systems import crude, holding
 
 DRAWS = 20_000
 KINDS = ["CKA", "RRA", "PhysicsMeanGP", "ScaleGP", "ZeroMeanGP", "AR1"]
@@ -34,12 +35,12 @@ def agree(make, Z):
 
 
 @pytest.fixture
-def model_of(data, build, crude_physics):
+def model_of(data, build):
     def model_of(kind, noisy, size, num_outputs=1):
         X, Y = data(n=12, num_outputs=num_outputs)
         options = {}
         if kind != "ZeroMeanGP":
-            options["physics"] = lambda X: size * crude_physics(X)[..., :num_outputs]
+            options["physics"] = lambda X: size * crude(X)[..., :num_outputs]
         model = build(kind, X, size * Y, **options).eval()
         noise = model.likelihood.noise_covar
         with torch.no_grad():
@@ -83,10 +84,7 @@ def held(model_of, uniform):
 
     def held(kind, noisy=True, num_outputs=1):
         model, X = model_of(kind, noisy, 1e3, num_outputs)
-        learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
-        spread = 0.3 * torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
-        model.hold_samples({n: torch.stack([p + s for s in spread]) for n, p in learnt.items()})
-        return model, torch.cat([X[:3], uniform(9, 2, high=2.0, seed=1)])
+        return holding(model, -0.3, 0.0, 0.3), torch.cat([X[:3], uniform(9, 2, high=2.0, seed=1)])
 
     return held
 

@@ -6,6 +6,7 @@ import torch
 from botorch.models.transforms import Normalize, Standardize
 
 from gpadjust import CKA, RRA, BiasGP, PhysicsMeanGP, ScaleGP, ZeroMeanGP
+from tests.systems import crude
 
 NOTHING = 1e-14  # an outputscale that switches a kernel off
 
@@ -80,7 +81,7 @@ def test_the_physics_returns_far_from_the_data(data, build, kind, transform):
 @pytest.mark.parametrize("transform", ["default", "none", "standardize"])
 @pytest.mark.parametrize("kind", ["PhysicsMeanGP", "ScaleGP", "CKA", "RRA"])
 def test_the_prior_mean_is_the_physics(
-    data, build, kind, num_outputs, crude_physics, close, Z, transform, normalize
+    data, build, kind, num_outputs, close, Z, transform, normalize
 ):
     X, Y = data(num_outputs=num_outputs)
     options = {
@@ -95,18 +96,16 @@ def test_the_prior_mean_is_the_physics(
         prior = model(model.model_inputs(Z)).mean.reshape(num_outputs, 6).mT
     if transform != "none":
         prior = model.outcome_transform.untransform(prior)[0]
-    close(prior, crude_physics(Z)[:, :num_outputs], 1e-12)
+    close(prior, crude(Z)[:, :num_outputs], 1e-12)
 
 
-def test_the_physics_mean_gp_is_a_gp_of_the_residual(
-    data, build, shuffle, close, crude_physics, Z, num_outputs
-):
+def test_the_physics_mean_gp_is_a_gp_of_the_residual(data, build, shuffle, close, Z, num_outputs):
     assert BiasGP is PhysicsMeanGP
     X, Y = data(num_outputs=num_outputs)
     model = shuffle(build("PhysicsMeanGP", X, Y))
-    residual = ZeroMeanGP(X, Y - crude_physics(X)[:, :num_outputs])
+    residual = ZeroMeanGP(X, Y - crude(X)[:, :num_outputs])
     posterior = give(residual, model, f="delta").posterior(Z)
-    f_p = crude_physics(Z)[:, :num_outputs]
+    f_p = crude(Z)[:, :num_outputs]
     for mean, ours in (
         (posterior.mean + f_p, model.posterior(Z)),
         (posterior.mean, model.delta(Z)),

@@ -6,6 +6,7 @@ from torch import Size
 
 from gpadjust import CKA, RRA, fit, load, save
 from gpadjust.models.local_errors import LocalErrors
+from tests.systems import line, uniform
 
 KINK = 0.6
 
@@ -22,8 +23,7 @@ def physics(X):
 
 @pytest.fixture(scope="module")
 def fitted():
-    generator = torch.Generator().manual_seed(4)
-    X = torch.rand(60, 2, generator=generator, dtype=torch.float64)
+    X = uniform(60, 2, seed=4)
     model = CKA(X, truth(X), physics=physics)
     fit(model, num_draws=256)
     return model
@@ -31,8 +31,7 @@ def fitted():
 
 @pytest.fixture(scope="module")
 def Z():
-    generator = torch.Generator().manual_seed(5)
-    return torch.rand(400, 2, generator=generator, dtype=torch.float64)
+    return uniform(400, 2, seed=5)
 
 
 def without(model):
@@ -136,7 +135,7 @@ def test_a_refit_that_fails_leaves_them(fitted, Z, monkeypatch):
 
 def test_who_has_none():
     """A point fit, whose intervals are too narrow anyway, and kernels without lengthscales."""
-    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+    X = line(8)
     Y = (X - 0.5).abs()
     point = CKA(X, Y, physics=torch.zeros_like)
     fit(point, "map", num_starts=1, num_screened=8)

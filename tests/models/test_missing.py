@@ -5,6 +5,7 @@ import torch
 
 from gpadjust import fit
 from gpadjust.validation import leave_one_out
+from tests.systems import crude
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def single_of(build, kind, model, X, Y, Yvar, physics, j):
 
 @pytest.mark.parametrize("known_noise", [False, True], ids=["learnt", "known"])
 def test_each_output_is_the_model_of_its_own_rows(
-    gaps, build, costly_kind, shuffle, uniform, crude_physics, same, close, known_noise
+    gaps, build, costly_kind, shuffle, uniform, same, close, known_noise
 ):
     X, Y = gaps
     Yvar = uniform(*Y.shape, low=0.01, high=0.1, seed=2) if known_noise else None
@@ -43,7 +44,7 @@ def test_each_output_is_the_model_of_its_own_rows(
     loo = leave_one_out(model)
     assert torch.equal(loo.Y.isnan(), Y.isnan())
     for j in range(2):
-        single, rows = single_of(build, costly_kind, model, X, Y, Yvar, crude_physics, j)
+        single, rows = single_of(build, costly_kind, model, X, Y, Yvar, crude, j)
         same(single, model, Z, 1e-8, [j])
         same(model.subset_output([j]), single, Z, 1e-8)
         own = leave_one_out(single)

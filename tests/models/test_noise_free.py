@@ -6,10 +6,7 @@ import torch
 
 from gpadjust import CKA, RRA
 from gpadjust.gp.gaussian import nugget
-
-
-def physics(X):
-    return 2 + (3 * X).sin()
+from tests.systems import line, ripple
 
 
 def covariance(kernel, A, B):
@@ -27,7 +24,7 @@ def variances(model, X, Z):
     exact = [[mp.mpf(v) for v in values.flatten().tolist()] for values in (X, Z)]
     x, z = exact
     scale, n = mp.mpf(model.outcome_transform.stdvs.item()), len(x)
-    f, g = (mp.diag([mp.mpf(v) / scale for v in physics(P).flatten().tolist()]) for P in (X, Z))
+    f, g = (mp.diag([mp.mpf(v) / scale for v in ripple(P).flatten().tolist()]) for P in (X, Z))
     rho, delta = (term.kernel for term in model.terms)
     K = f * covariance(rho, x, x) * f + covariance(delta, x, x)
     K += mp.mpf(model.likelihood.noise.item()) * mp.eye(n)
@@ -49,10 +46,10 @@ def variances(model, X, Z):
 @pytest.mark.parametrize("n", [8, 20, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("cls", [CKA, RRA])
 def test_variances(cls, n, length):
-    X = torch.linspace(0, 1, n, dtype=torch.float64).unsqueeze(-1)
-    Y = 1.5 * physics(X) + X.square()
+    X = line(n)
+    Y = 1.5 * ripple(X) + X.square()
     options = {"center": 0.0} | ({"num_features": 40} if cls is RRA else {})
-    model = cls(X, Y, physics=physics, **options).eval()
+    model = cls(X, Y, physics=ripple, **options).eval()
     noise = model.likelihood.noise_covar
     with torch.no_grad():
         noise.raw_noise.fill_(1.0001 * noise.raw_noise_constraint.lower_bound.log())
@@ -70,7 +67,7 @@ def test_variances(cls, n, length):
         ):
             torch.testing.assert_close(posterior.variance.squeeze(-1), exact, rtol=0.02, atol=0.0)
         # Half of the data come later; the nugget of the first half is another one.
-        half = cls(X[::2], Y[::2], physics=physics, **options)
+        half = cls(X[::2], Y[::2], physics=ripple, **options)
         half.load_state_dict(model.state_dict())
         later = half.eval().condition_on_observations(X[1::2], Y[1::2])
         ratio = later.posterior(Z).variance.squeeze(-1) / whole

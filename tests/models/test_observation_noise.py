@@ -7,9 +7,12 @@ from botorch.models.transforms import Standardize
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust import CKA, PhysicsMeanGP, StackedGP
+from tests.systems import holding
 
 # The targets are 60 times those of the physics, so that their units matter.
 pytestmark = pytest.mark.filterwarnings("ignore::gpadjust.PhysicsWarning")
+
+STEPS = (-0.2, 0.0, 0.2)
 
 
 def added(model, Z, noise, **options):
@@ -27,14 +30,6 @@ def large(data):
         return X / 2, 60 * Y  # in the unit cube, as BoTorch wants it
 
     return large
-
-
-def held(model, num_samples=3):
-    """The model, with samples of its hyper-parameters."""
-    learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
-    steps = torch.linspace(-0.2, 0.2, num_samples).tolist()
-    model.hold_samples({n: torch.stack([p + s for s in steps]) for n, p in learnt.items()})
-    return model
 
 
 class TestPosterior:
@@ -76,7 +71,7 @@ class TestPosterior:
 
     def test_of_samples(self, large, build, num_outputs, uniform):
         X, Y = large(num_outputs)
-        model = held(build("CKA", X, Y, outcome_transform=Standardize(num_outputs)))
+        model = holding(build("CKA", X, Y, outcome_transform=Standardize(num_outputs)), *STEPS)
         noise = uniform(5, num_outputs, low=0.1, seed=2)
         expected = (noise * Y.var(0)).expand(3, 5, num_outputs)
         torch.testing.assert_close(added(model, uniform(5, 2), noise), expected)
@@ -88,7 +83,7 @@ class TestPosterior:
             return 60 * torch.stack([X.sum(-1), X.prod(-1)], -1)[..., :num_outputs]
 
         models = {
-            "CKA": held(CKA(X, Y, physics=f)),
+            "CKA": holding(CKA(X, Y, physics=f), *STEPS),
             "standardised": PhysicsMeanGP(
                 X, Y, physics=f, outcome_transform=Standardize(num_outputs)
             ),
@@ -129,7 +124,7 @@ class TestInTheUsersUnits:
         if transform == "standardize":
             options["outcome_transform"] = Standardize(num_outputs)
         model = build("CKA", X, Y, **options)
-        model = held(model) if samples else model
+        model = holding(model, *STEPS) if samples else model
         Z, noise = uniform(5, 2), uniform(5, num_outputs, low=0.1, seed=2)
         with torch.no_grad():
             silent, noisy = model.predict(Z), model.predict(Z, noise)
@@ -147,7 +142,7 @@ class TestRefused:
         if request.param == "mixture":
             return StackedGP({"CKA": build("CKA", X, Y)}, [[1.0, 1.0]], num_components=2)
         if request.param == "samples":
-            return held(build("CKA", X, Y))
+            return holding(build("CKA", X, Y), *STEPS)
         return build(request.param, X, Y)
 
     @pytest.mark.parametrize("wrong", [-1.0, -1e-300, float("nan"), float("inf")])

@@ -8,6 +8,7 @@ from gpytorch.kernels import PeriodicKernel, ScaleKernel
 
 from gpadjust import fit
 from gpadjust.models import TermBuilder, TermsGP
+from tests.systems import holding
 
 
 def season(num_inputs, batch_shape):
@@ -65,7 +66,6 @@ def test_it_is_a_model_like_others(problem, shuffle, same, close):
     same(model.subset_output([1]), model, Z, 1e-9, [1])
     with pytest.raises(NotImplementedError, match="PeriodicKernel"):
         model.sample_functions(2)
-    learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
     before = model.term("season", Z).variance
-    model.hold_samples({n: torch.stack([p, p + 0.2]) for n, p in learnt.items()})
+    holding(model, 0.0, 0.2)
     close(model.term("season", Z, mixed=False).variance[0], before)

@@ -7,10 +7,11 @@ import torch
 from botorch.sampling import SobolQMCNormalSampler
 
 from gpadjust import BlackBoxPhysics, FunctionPhysics, fit
+from tests.systems import crude
 
 
 @pytest.fixture
-def counting(crude_physics):
+def counting():
     class Counting:
         """The crude physics, with a record of the rows it was asked for."""
 
@@ -20,7 +21,7 @@ def counting(crude_physics):
 
         def __call__(self, X):
             self.rows.update(tuple(row) for row in X.detach().tolist())
-            return crude_physics(X)[..., : self.num_outputs]
+            return crude(X)[..., : self.num_outputs]
 
     return Counting()
 

@@ -22,6 +22,7 @@ from gpadjust import (
 )
 from gpadjust.gp import OrthogonalKernel
 from gpadjust.models import PhysicsParameters, orthogonal_rbf
+from tests.systems import line, normal, same
 
 UNKNOWNS = {"a": Unknown(1.0, sd=0.5, unit="m"), "b": Unknown(2.0, factor=1.3)}
 FEW = {"num_samples": 3, "num_draws": 32, "num_starts": 1, "num_screened": 8}
@@ -80,10 +81,9 @@ def waves(uniform):
 
 def hold(model, num_samples=3):
     """Make a model hold samples that nobody fitted; return values of the parameters."""
-    generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
-        return torch.randn(shape, generator=generator, dtype=torch.float64)
+        return normal(shape)
 
     def around(parameter):
         return parameter.detach() + 0.3 * draw(num_samples, *parameter.shape)
@@ -118,15 +118,10 @@ def mixture(parts):
     return means.mean(0), variances.mean(0) + means.var(0, correction=0)
 
 
-def same(ours, theirs, tolerance=1e-8):
-    for one, other in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance)
-
-
 class TestPhysicsParameters:
     @pytest.fixture
     def parameters(self):
-        draws = torch.linspace(0.0, 1.0, 101, dtype=torch.float64).unsqueeze(-1)
+        draws = line(101, 0.0, 1.0)
         return PhysicsParameters(UNKNOWNS, torch.cat([draws, 2 + draws.square()], -1))
 
     def test_are_a_mapping(self, parameters):
@@ -147,7 +142,7 @@ class TestPhysicsParameters:
 
     @pytest.mark.parametrize("level", [0.0, 1.0, 95, float("nan")])
     def test_of_no_level(self, parameters, level):
-        with pytest.raises(ValueError, match=f"level between 0 and 1, got {level}"):
+        with pytest.raises(ValueError, match=f"level must be between 0 and 1; found {level}"):
             parameters.interval(level)
 
     def test_are_shown_as_a_table(self, parameters):
@@ -240,7 +235,7 @@ def test_each_sample_has_its_own_physics(build, make, waves, num_outputs):
     more = Z[:, :num_outputs]
     new = model.condition_on_observations(Z, more)
     others = [one.condition_on_observations(Z, more) for one in alone]
-    same(new.predict(X), mixture([one.predict(X) for one in others]), 1e-6)
+    same(new.predict(X), mixture([one.predict(X) for one in others]), rtol=1e-6, atol=1e-6)
     assert torch.equal(new.physics_parameters.draws, model.physics_parameters.draws)
 
 

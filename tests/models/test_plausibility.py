@@ -19,6 +19,7 @@ from gpadjust import (
     load,
     save,
 )
+from tests.systems import line
 
 
 def law(X):
@@ -31,7 +32,7 @@ def warm(X):
 
 @pytest.fixture
 def X():
-    return torch.linspace(0.05, 1, 12, dtype=torch.float64).unsqueeze(-1)
+    return line(12, 0.05)
 
 
 @pytest.fixture

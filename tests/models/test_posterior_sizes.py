@@ -6,14 +6,11 @@ from botorch.acquisition.objective import ScalarizedPosteriorTransform
 from botorch.posteriors.fully_bayesian import GaussianMixturePosterior
 
 from gpadjust import CKA, PhysicsMeanGP, StackedGP, fit
+from tests.systems import crude, holding, line, wave
 
 SIZES = [1e-12, 1e-6, 1e-3, 1e6, 1e12]
 LEVELS = torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
 WEIGHTS = torch.tensor([1.0, -3.0], dtype=torch.float64)
-
-
-def physics(X):
-    return torch.stack([2 + (3 * X[..., 0]).sin() + X[..., 1], 4 + (2 * X[..., 1]).cos()], -1)
 
 
 @pytest.fixture
@@ -22,14 +19,12 @@ def sized(data):
 
     def sized(of, size, num_outputs, noisy, num_samples):
         X, Y = data(n=12, num_outputs=num_outputs)
-        model = of(X, size * Y, physics=lambda X: size * physics(X)[..., :num_outputs])
+        model = of(X, size * Y, physics=lambda X: size * crude(X)[..., :num_outputs])
         raw = model.likelihood.noise_covar.raw_noise
         with torch.no_grad():
             raw.fill_(-4.0 if noisy else -20.0)
         if num_samples:
-            learnt = {n: p.detach() for n, p in model.named_parameters() if p.requires_grad}
-            steps = torch.linspace(-0.3, 0.2, num_samples).tolist()
-            model.hold_samples({n: torch.stack([p + s for s in steps]) for n, p in learnt.items()})
+            holding(model, *torch.linspace(-0.3, 0.2, num_samples).tolist())
         return model.eval()
 
     return sized
@@ -64,12 +59,11 @@ def moments(model, Z, size):
     return found
 
 
-def same(found, expected):
+def alike(found, expected):
     assert found.keys() == expected.keys()
     for name, values in expected.items():
-        torch.testing.assert_close(
-            found[name], values, rtol=1e-3, atol=1e-9 * values.abs().max().item(), msg=name
-        )
+        size = values.abs().max().item()
+        torch.testing.assert_close(found[name], values, rtol=1e-3, atol=1e-9 * size, msg=name)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -80,7 +74,7 @@ def test_multiples_of_the_size(sized, uniform, of, size, num_outputs, noisy, num
     Z = uniform(7, 2, high=2.0, seed=1)
     with torch.no_grad():
         one, other = (sized(of, s, num_outputs, noisy, num_samples) for s in (1.0, size))
-        same(moments(other, Z, size), moments(one, Z, 1.0))
+        alike(moments(other, Z, size), moments(one, Z, 1.0))
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -94,7 +88,7 @@ def test_mixtures_of_structures(sized, uniform, size, num_outputs):
         return StackedGP(models, weights, num_components=8)
 
     with torch.no_grad():
-        same(moments(stacked(size), Z, size), moments(stacked(1.0), Z, 1.0))
+        alike(moments(stacked(size), Z, size), moments(stacked(1.0), Z, 1.0))
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -128,8 +122,8 @@ def test_levels_out_of_range(sized, uniform, level):
 @pytest.mark.parametrize("size", [1e-6, 1.0])
 def test_eight_points_without_noise(uniform, method, size):
     """Variances of 1e-11 and less, without a warning (each is an error here)."""
-    X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
-    model = CKA(X, size * (2 * (6 * X).sin() + X), physics=lambda X: size * (6 * X).sin())
+    X = line(8)
+    model = CKA(X, size * (2 * wave(X) + X), physics=lambda X: size * wave(X))
     fit(model, method)
     Z = uniform(5, 1)
     with torch.no_grad():

@@ -9,6 +9,7 @@ from botorch.models.transforms import Normalize, Standardize
 from pyro.infer.autoguide import AutoLaplaceApproximation
 
 from gpadjust.models import PaperRRA
+from tests.systems import crude
 
 
 @pytest.fixture(autouse=True)
@@ -156,7 +157,7 @@ def test_evidence_is_that_of_the_weights_marginalised(data, build, shuffle):
 
 
 @pytest.mark.parametrize("known_noise", [False, True])
-def test_the_papers_closed_form(data, build, shuffle, close, crude_physics, uniform, known_noise):
+def test_the_papers_closed_form(data, build, shuffle, close, uniform, known_noise):
     X, Y = data(num_outputs=2)
     Yvar = torch.full_like(Y, 0.3) if known_noise else None
     model = shuffle(build("RRA-paper", X, Y, Yvar, num_features=6))
@@ -171,7 +172,7 @@ def test_the_papers_closed_form(data, build, shuffle, close, crude_physics, unif
             for kernel in kernels:
                 angles = (X / kernel.lengthscale[j].detach()) @ kernel.randn_weights[j]
                 parts.append(torch.cat([angles.cos(), angles.sin()], dim=-1) / 3**0.5)
-            return torch.cat([crude_physics(X)[:, [j]] * parts[0], parts[1]], dim=-1)
+            return torch.cat([crude(X)[:, [j]] * parts[0], parts[1]], dim=-1)
 
         ridge = 0.3 if known_noise else model.likelihood.noise[j].item()
         eye = torch.eye(12, dtype=torch.float64)

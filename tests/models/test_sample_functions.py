@@ -12,6 +12,7 @@ from gpytorch.kernels import ConstantKernel, RBFKernel, RFFKernel, ScaleKernel
 from gpadjust import CKA
 from gpadjust.gp import Term
 from gpadjust.gp.features import TermFeatures
+from tests.systems import line
 
 
 def test_moments(data, build, costly_kind, num_outputs, uniform):
@@ -55,7 +56,7 @@ class TestWithoutNoise:
 
     @pytest.fixture
     def model(self, uniform, num_outputs):
-        X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+        X = line(8)
         Y = torch.cat([2 * (6 * X).sin() + X, (5 * X).cos()], -1)[:, :num_outputs]
         model = CKA(X, Y, physics=lambda X: (6 * X).sin().expand(-1, num_outputs))
         with torch.no_grad():
@@ -65,7 +66,7 @@ class TestWithoutNoise:
                 term.kernel.raw_outputscale.fill_(8.0)  # of which the nugget is a share
         return model.eval()
 
-    Z = torch.linspace(0.05, 0.95, 7, dtype=torch.float64).unsqueeze(-1)
+    Z = line(7, 0.05, 0.95)
 
     def test_spread(self, model):
         assert ((self.spread(model, self.Z) - 1).abs() < 0.1).all()
@@ -124,9 +125,9 @@ def test_a_later_fit_leaves_them(data, build, kind, shuffle, uniform):
 def test_wrong_numbers(data, build, kind):
     model = build(kind, *data())
     for number in (0, -1, 2.5):
-        with pytest.raises(ValueError, match="num_functions to be a whole number >= 1"):
+        with pytest.raises((TypeError, ValueError), match="num_functions must be"):
             model.sample_functions(number)
-        with pytest.raises(ValueError, match="num_features to be a whole number >= 1"):
+        with pytest.raises((TypeError, ValueError), match="num_features must be"):
             model.sample_functions(1, num_features=number)
     with pytest.raises(ValueError, match="num_features to be even"):
         model.sample_functions(1, num_features=7)

@@ -4,6 +4,7 @@ import torch
 from botorch.models.transforms.input import FilterFeatures
 
 from gpadjust import FunctionPhysics, PhysicsMeanGP, Unknown, fit
+from tests.systems import normal
 
 SESSIONS = 3
 ZEROS = torch.tensor([0.05, -0.08, 0.02], dtype=torch.float64)  # m
@@ -27,8 +28,7 @@ def sessions(length=8):
     X = torch.stack([times, numbers], dim=-1)
     truth = torch.cat([torch.tensor([GRAVITY], dtype=torch.float64), ZEROS])
     Y = FunctionPhysics(fall, unknowns=UNKNOWNS)(X, truth)
-    generator = torch.Generator().manual_seed(0)
-    return X, Y + 0.005 * torch.randn(Y.shape, generator=generator, dtype=torch.float64)
+    return X, Y + 0.005 * normal(*Y.shape)
 
 
 def test_a_fit_of_all_tells_each_zero_and_what_they_share():

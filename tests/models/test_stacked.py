@@ -12,21 +12,16 @@ from gpadjust import CKA, PhysicsMeanGP, StackedGP, ZeroMeanGP
 from gpadjust.models.stacked import allocation
 from gpadjust.validation import leave_one_out
 from gpadjust.validation.leave_one_out import observations
+from tests.systems import around, same
 
 
 def f_p(X):
     return torch.stack([(6 * X[..., 0]).sin(), 100 * X[..., 1]], -1)
 
 
-def held(model, num_samples, seed):
+def held(model, number, seed):
     """The model with samples around its hyper-parameters."""
-    generator = torch.Generator().manual_seed(seed)
-    samples = {
-        name: p.detach()
-        + 0.3 * torch.randn(num_samples, *p.shape, generator=generator, dtype=torch.float64)
-        for name, p in model.named_parameters()
-    }
-    model.hold_samples(samples)
+    model.hold_samples(around(model, number, seed=seed))
     return model
 
 
@@ -85,8 +80,7 @@ def test_moments_are_those_of_the_weighted_mixture(models, weights, Z):
 def test_of_one_model_it_is_that_model(models, Z):
     stacked = StackedGP({"CKA": models["CKA"]}, torch.ones(1, 2).double(), num_components=8)
     torch.testing.assert_close(stacked.predict(Z, True), models["CKA"].predict(Z, True))
-    for ours, theirs in zip(stacked.interval(Z), models["CKA"].interval(Z), strict=True):
-        torch.testing.assert_close(ours, theirs)
+    same(stacked.interval(Z), models["CKA"].interval(Z))
     ours, theirs = stacked.posterior(Z), models["CKA"].posterior(Z)
     torch.testing.assert_close(ours.covariance_matrix, theirs.covariance_matrix)
     ours, theirs = leave_one_out(stacked), leave_one_out(models["CKA"])
@@ -186,8 +180,7 @@ def test_conditioning_with_known_noise(data, Z, holds_samples):
         row = slice(k, k + 1)
         model = model.condition_on_observations(Z[row], new_Y[row], noise=noise)
         stacked = stacked.condition_on_observations(Z[row], new_Y[row], noise=noise)
-    for ours, theirs in zip(stacked.predict(X, True), model.predict(X, True), strict=True):
-        torch.testing.assert_close(ours, theirs)
+    same(stacked.predict(X, True), model.predict(X, True))
     assert stacked.subset_output([1]).parts[0][0].model.data()["train_Yvar"].max() == pytest.approx(
         0.3
     )

@@ -7,6 +7,7 @@ from botorch.models.transforms import Normalize, Standardize
 from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from gpadjust import fit
+from tests.systems import crude
 
 KINDS = ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "AR1", "RRA", "RRA-paper"]
 CASES = [(kind, indices) for kind in KINDS for indices in ([1], [2, 0])]
@@ -14,7 +15,7 @@ QUICK = [("CKA", [1]), ("CKA", [2, 0]), ("RRA", [2, 0])]
 
 
 @pytest.fixture(params=["plain", "transformed", "known-noise", "batch"])
-def three_outputs(request, data, build, costly_kind, crude_physics, shuffle):
+def three_outputs(request, data, build, costly_kind, shuffle):
     """A model of three different outputs."""
     batch = (2,) if request.param == "batch" else ()
     X, Y = data(batch_shape=batch, num_outputs=2)
@@ -23,7 +24,7 @@ def three_outputs(request, data, build, costly_kind, crude_physics, shuffle):
     if costly_kind != "ZeroMeanGP":
 
         def physics(X):
-            f_p = crude_physics(X)
+            f_p = crude(X)
             return torch.cat([f_p, f_p[..., :1].cos() + 3], dim=-1)
 
         options["physics"] = physics
@@ -51,15 +52,13 @@ def test_the_posterior_is_that_of_the_whole(three_outputs, uniform, same, indice
     ("kind", "indices"),
     [pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow) for case in CASES],
 )
-def test_it_can_be_fitted_again(data, build, kind, crude_physics, uniform, indices):
+def test_it_can_be_fitted_again(data, build, kind, uniform, indices):
     X, Y = data(num_outputs=2)
     # With noise, so that rounding errors do not decide which optimum is reached.
     Y = torch.cat([Y, Y[:, :1].sin() + 3], dim=-1) + 0.1 * uniform(len(X), 3, seed=5)
     options = {}
     if kind != "ZeroMeanGP":
-        options["physics"] = lambda X: torch.cat(
-            [crude_physics(X), crude_physics(X)[..., :1].cos() + 3], dim=-1
-        )
+        options["physics"] = lambda X: torch.cat([crude(X), crude(X)[..., :1].cos() + 3], dim=-1)
     whole = build(kind, X, Y, **options)
     part = whole.subset_output(indices)
     if kind != "ZeroMeanGP":

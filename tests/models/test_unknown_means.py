@@ -146,30 +146,18 @@ class Column(torch.nn.Module):
 class TestForrester:
     """Reading A: f_true = 8 f_p - 20 x; reading B: f_true = 2 f_p - 5 x."""
 
-    def error(self, forrester, seed, factor):
-        X, Y = forrester.data(seed)
-        model = CKA(
-            X,
-            Y * factor,
-            physics=forrester.crude,
-            center="mean",
-            rho_mean="learn",
-            delta_mean="learn",
-        )
-        fit(model, "map")
-        Z = forrester.test_X
-        mean = model.posterior(Z).mean.detach()
-        return (mean - factor * forrester.truth(Z)).square().mean().sqrt().item()
-
     @pytest.mark.parametrize(("factor", "limit"), [(4.0, 0.01), (1.0, 0.003)], ids=["A", "B"])
-    def test_in_brief(self, forrester, factor, limit):
-        errors = [self.error(forrester, seed, factor) for seed in range(3)]
-        assert statistics.mean(errors) <= limit
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize(("factor", "limit"), [(4.0, 0.01), (1.0, 0.003)], ids=["A", "B"])
-    def test_at_length(self, forrester, factor, limit):
-        errors = [self.error(forrester, seed, factor) for seed in range(20)]
+    @pytest.mark.parametrize("seeds", [3, pytest.param(10, marks=pytest.mark.slow)])
+    def test_error(self, forrester, factor, limit, seeds):
+        errors, means = [], {"rho_mean": "learn", "delta_mean": "learn"}
+        for seed in range(seeds):
+            X, Y = forrester.data(seed)
+            model = CKA(X, Y * factor, physics=forrester.crude, center="mean", **means)
+            fit(model, "map")
+            off = model.posterior(forrester.test_X).mean - factor * forrester.truth(
+                forrester.test_X
+            )
+            errors.append(off.square().mean().sqrt().item())
         assert statistics.mean(errors) <= limit
 
 

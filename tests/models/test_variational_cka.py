@@ -23,20 +23,13 @@ from gpadjust.inference.collapsed_bound import CollapsedBound, Observations
 from gpadjust.models.component_noise import ComponentNoise
 from gpadjust.models.terms_gp import arguments_of
 from gpadjust.validation import Structure
+from tests.systems import line, same, wave, waves
 
-LINE = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
-
-
-def wave(X):
-    return torch.sin(6 * X[..., :1])
+LINE = line(2)
 
 
-def waves(X):
-    return torch.cat([wave(X), wave(X).square()], dim=-1)
-
-
-def problem(n, num_outputs=1, seed=0):
-    generator = torch.Generator().manual_seed(seed)
+def problem(n, num_outputs=1):
+    generator = torch.Generator().manual_seed(0)
     X = torch.rand(n, 1, generator=generator, dtype=torch.float64)
     noise = torch.randn(n, num_outputs, generator=generator, dtype=torch.float64)
     return X, 2 * waves(X)[:, :num_outputs] + X + 0.1 * noise
@@ -96,7 +89,7 @@ def test_points_at_all_inputs_make_the_exact_model(shuffle, close, num_outputs, 
     exact.eval()
     bound = take_optimum(model, model.train_inputs[0])
     close(bound, exact.log_evidence()[1] + _jacobian(exact), 1e-4)
-    Z = torch.linspace(-0.2, 1.2, 9, dtype=torch.float64).unsqueeze(-1)
+    Z = line(9, -0.2, 1.2)
     for name in ("posterior", "rho", "delta"):
         ours, theirs = getattr(model, name)(Z), getattr(exact, name)(Z)
         close(ours.mean, theirs.mean, 1e-3)
@@ -122,7 +115,7 @@ def test_all_that_predicts_agrees(close, fitted, rest):
         give_rest(fitted)
         scale = fitted.outcome_transform.stdvs.square()
         close(fitted.predict(LINE).variance, before + 0.3 * scale, 1e-6)
-    Z = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1)
+    Z = line(5)
     mean, variance = fitted.predict(Z)
     posterior = fitted.posterior(Z)
     close(posterior.mean, mean)
@@ -275,8 +268,7 @@ def test_files(tmp_path, noise):
     fit(model, num_screened=0)
     save(model, tmp_path / "model.pt")
     again = load(tmp_path / "model.pt", physics=waves)
-    for ours, theirs in zip(again.predict(LINE, True), model.predict(LINE, True), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=0)
+    same(again.predict(LINE, True), model.predict(LINE, True), rtol=1e-10, atol=0)
     assert again.summary() == model.summary()
     with pytest.raises(ValueError, match="subset"):
         save(model.subset_output([0]), tmp_path / "subset.pt")

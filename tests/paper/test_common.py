@@ -153,7 +153,7 @@ def test_pages_show_the_committed_results(path):
 
 def committed(name):
     """An experiment, and its runs that are committed."""
-    kind = resolve_name(f"paper.{EXPERIMENTS[name][0]}")
+    kind = resolve_name(EXPERIMENTS[name])
     experiment = kind(out=PAPER / "results" / name)
     return experiment, runs_file(experiment).read()
 

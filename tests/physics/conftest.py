@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.systems import normal
+
 torch.set_num_threads(1)
 
 
@@ -51,8 +53,7 @@ def points():
     """Draws standard normal float64 numbers of a shape, the same ones each time."""
 
     def draw(*shape, seed=0):
-        generator = torch.Generator().manual_seed(seed)
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+        return normal(*shape, seed=seed)
 
     return draw
 

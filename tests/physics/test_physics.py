@@ -92,7 +92,7 @@ def test_bad_settings_and_inputs(points):
             ({"inputs": i}, TypeError, re.escape(f"such as [0, 2]; found {i!r}"))
             for i in ([0.5], 1, 0.5, "a")
         ),
-        ({"memo": -1}, ValueError, r"memo must be a number of rows.*found -1"),
+        ({"memo": -1}, ValueError, "memo must be at least 0; found -1"),
         ({"memo": 1.5}, TypeError, r"memo must be a whole number; found 1\.5"),
     ):
         with pytest.raises(error, match=says):

@@ -6,11 +6,13 @@ import re
 import numpy as np
 import pytest
 import torch
+from gpadjust.records.stretches import in_control_steps
 
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
 from gpadjust.records import Record, Records, SmoothingWarning, smooth
-from gpadjust.records.kalman import Link, draw_paths, smooth_chain
+from gpadjust.records.chain import Chain, Known
+from gpadjust.records.kalman import Link, Moments, Smoothed, draw_paths, smooth_chain
 
 STEP, LENGTH = 0.1, 150
 SPEC = StateSpec(["x", "v"], ["force"])
@@ -123,6 +125,14 @@ def test_draws_have_the_moments_and_one_constant(chain):
     paths = np.stack([path.ravel() for path in draws])
     np.testing.assert_allclose(paths.mean(0), mean, atol=0.05)
     np.testing.assert_allclose(np.cov(paths.T), covariance, atol=0.06)
+
+
+def test_progress_is_shown_when_it_is_asked_for(capsys):
+    t = 0.1 * torch.arange(12, dtype=torch.float64)
+    record = Record(t, torch.stack([t.sin(), t.cos()], -1), torch.zeros(12, 1).double())
+    for progress in (False, True):
+        smooth(Records(record, SPEC), spring(), num_starts=2, max_rounds=40, progress=progress)
+        assert ("start 2 of 2" in capsys.readouterr().err) == progress
 
 
 def test_noise_process_noise_parameters_and_states_are_found():
@@ -291,6 +301,22 @@ def test_a_step_that_goes_where_the_physics_fails_is_taken_in_part():
     assert found.physics_parameters.mean[0] == pytest.approx(STIFFNESS, rel=0.05)
 
 
+def test_a_path_that_explains_less_is_taken_in_part_or_not_at_all():
+    record, known = measured(*simulated(0)), Known(*np.full((2, 2), math.nan), {})
+    chain = Chain(spring(), SPEC, in_control_steps([record], SPEC, STEP), known)
+    path, noise = chain.first_path(np.zeros(2)), NOISE.numpy() ** 2
+    before = chain.cost(path, noise, noise)
+    for size, some in ((0.3, True), (1e6, False)):
+        away = size * chain.spread * np.random.default_rng(0).standard_normal(path.states[0].shape)
+        means = np.concatenate([path.states[0] + away, np.zeros((LENGTH, 2))], axis=1)
+        found = Smoothed(Moments(means, np.zeros((LENGTH, 4, 4))), np.zeros((LENGTH - 1, 4, 4)))
+        move = chain.towards(path, [found], noise, noise)
+        assert chain.cost(move.path, noise, noise) <= before + 0.02
+        assert not move.whole
+        assert (move.refused == 0) == (move.path is not path)
+        assert (move.path is path) or some
+
+
 def test_a_physics_that_fails_at_measured_states_is_told():
     truth, actions = simulated(0)
     physics = FunctionPhysics(lambda X: torch.where(X[:, :2] > 0.9, math.nan, X[:, :2]))
@@ -340,7 +366,7 @@ def test_states_that_diverge_from_all_starts_are_told():
         ({"noise": [0.1]}, ValueError, "noise of shape 2"),
         ({"process_noise": [0.1, 0.0]}, ValueError, "process_noise as standard deviations above 0"),
         ({"max_rounds": 0}, ValueError, "max_rounds"),
-        ({"num_starts": 1.5}, ValueError, "num_starts"),
+        ({"num_starts": 1.5}, TypeError, "num_starts"),
         ({"step": 0.15}, ValueError, "whole multiple of the sampling step"),
     ],
 )
@@ -359,7 +385,7 @@ def test_a_physics_of_another_step_or_other_outputs_is_refused():
         smooth(records, lambda X: X[:, :1])
     with pytest.raises(ValueError, match="Expected one physics to follow"):
         smooth(records, [lambda X: X[:, :2], lambda X: X[:, :2]])
-    with pytest.raises(ValueError, match="seed as a whole number"):
+    with pytest.raises(TypeError, match="seed must be a whole number"):
         smooth(records, spring(), noise=NOISE, process_noise=SCATTER).draw(1.5)
 
 

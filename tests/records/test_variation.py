@@ -11,7 +11,7 @@ from gpadjust.dynamics.varying_parameters import VaryingParameters
 from gpadjust.models import PhysicsParameters
 from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
-from gpadjust.records.variation import log_evidence
+from gpadjust.records.smoothing import log_evidence
 
 STEP, FACTOR = 0.1, 1.5
 SPEC = StateSpec(["x", "v"], ["force"])

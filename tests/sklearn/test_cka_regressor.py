@@ -434,5 +434,5 @@ def test_bad_requests(data):
         regressor.predict(Z, return_std=True, return_cov=True)
     with pytest.raises(ValueError, match="X has 2 features, but CKARegressor is expecting 1"):
         regressor.predict(np.hstack([Z, Z]))
-    with pytest.raises(ValueError, match="n_samples as a whole number >= 1, got 0"):
+    with pytest.raises(ValueError, match="n_samples must be at least 1; found 0"):
         regressor.sample_y(Z, 0)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpadjust.states import StateSpec
+from tests.systems import normal, uniform
 
 ARM = StateSpec(
     ["goal", "q", "v"],
@@ -101,8 +102,8 @@ def test_equal_specs_are_equal_and_hashable():
         ({"previous": {"x": "a"}, "angles": ["x"]}, ValueError, "'x' is one .* and 'a' is not"),
         ({"previous": {"x": "a", "v": "a"}}, ValueError, "No state is left to predict"),
         ({"step": "fast"}, TypeError, "step must be a number or None; found 'fast'"),
-        ({"step": 0}, ValueError, "step must be positive and finite; found 0"),
-        ({"step": math.inf}, ValueError, "step must be positive and finite; found inf"),
+        ({"step": 0}, ValueError, "step must be finite and above 0; found 0"),
+        ({"step": math.inf}, ValueError, "step must be finite and above 0; found inf"),
     ],
 )
 def test_bad_declarations_are_refused(options, error, message):
@@ -152,8 +153,7 @@ def test_the_velocity_of_another_state_is_warned_of():
 
 
 def test_noise_in_motion_passes_and_at_rest_is_no_error():
-    generator = torch.Generator().manual_seed(0)
-    noise = 0.01 * torch.randn(2, 25, 3, generator=generator, dtype=torch.float64)
+    noise = 0.01 * normal(2, 25, 3)
     noise[..., 0] = 0
     states, following = swing(25)
     ARM.check_transitions(states + noise[0], following + noise[1])
@@ -224,8 +224,7 @@ def test_what_is_no_previous_state_is_named():
     spec = StateSpec(
         ["y", "y_1", "q", "q_1"], ["u"], angles=ANGLES, previous={"y_1": "y", "q_1": "q"}
     )
-    generator = torch.Generator().manual_seed(0)
-    states = 300 + torch.rand(5, 4, generator=generator, dtype=torch.float64)
+    states = 300 + uniform(5, 4)
     following = spec.complete(states, torch.zeros(1), states[:, [0, 2]] + 0.1)
     following[:, 3] += 2 * math.pi  # the same angle
     following[1, 1] = math.nan  # which was not measured

@@ -16,7 +16,7 @@ from gpadjust.validation import LeaveOneOut, leave_one_out, score
 from gpadjust.validation.plots import (
     plot_adjustment,
     plot_adjustment_pair,
-    plot_calibration,
+    plot_coverage,
     plot_leave_one_out,
     plot_pit,
     plot_prediction,
@@ -166,11 +166,11 @@ def test_a_row_for_each_physics(uniform):
     assert axes[0, 1].get_title() == "sd of $\\rho$ of coarse\nfor $y_{1}$"
 
 
-def test_calibration_and_pit(plane, data):
+def test_coverage_and_pit(plane, data):
     loo = leave_one_out(plane)
     X, Y = data(num_outputs=2)
     for prediction in (loo, loo.score().pit, score(plane.posterior(X, observation_noise=True), Y)):
-        ax = plot_calibration(prediction, output=1)
+        ax = plot_coverage(prediction, output=1)
         assert ax.get_title() == "$y_{2}$"
         values = (
             loo.score().pit
@@ -184,7 +184,7 @@ def test_calibration_and_pit(plane, data):
         bars = plot_pit(prediction, bins=4).patches
         counts = [bar.get_height() for bar in bars]
         assert counts == list(np.histogram(values[:, 0].detach(), bins=4, range=(0, 1))[0])
-    assert plot_calibration(torch.rand(20)).get_title() == ""
+    assert plot_coverage(torch.rand(20)).get_title() == ""
 
 
 def test_leave_one_out(plane):
@@ -216,7 +216,7 @@ def test_points_that_were_not_observed_are_not_drawn(data, build):
     np.testing.assert_allclose(axes[1].lines[-1].get_ydata(), loo.residuals[rest, 1])
     assert np.isfinite(axes[1].get_ylim()).all()
     assert sum(bar.get_height() for bar in plot_pit(loo, output=1).patches) == len(rest)
-    steps = curve(plot_calibration(loo, output=1), "observed").get_ydata()
+    steps = curve(plot_coverage(loo, output=1), "observed").get_ydata()
     np.testing.assert_allclose(np.unique(steps), np.arange(len(rest) + 1) / len(rest))
     (container,) = plot_prediction(model, X, Y, output=1).containers
     np.testing.assert_allclose(container[0].get_xydata()[:, 0], Y[rest, 1])
@@ -237,7 +237,7 @@ def test_an_output_without_observations_is_not_drawn(plane, data):
     for draw in (
         plot_leave_one_out,
         plot_pit,
-        plot_calibration,
+        plot_coverage,
         lambda loo, output: plot_prediction(plane, data()[0], loo.Y, output=output),
     ):
         with pytest.raises(ValueError, match=r"Output 1 has no observed value .* another `output`"):
@@ -263,7 +263,7 @@ def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("true flow", "predicted flow")
     named = replace(loo, output_names=plane.output_names)
     assert plot_leave_one_out(named, output=1)[0].get_xlabel() == "observed flow"
-    assert plot_calibration(named, output=1).get_title() == "flow"
+    assert plot_coverage(named, output=1).get_title() == "flow"
     assert plot_pit(named).get_title() == "force [N]"
     line.input_names, line.output_names = ("time [s]",), ("force [N]",)
     ax = plot_prediction(line, forrester.test_X)
@@ -273,8 +273,10 @@ def test_names_of_columns_are_on_the_axes(line, plane, data, forrester):
 
 RANGES = ("wide", [[0.0], [1.0, 2.0]], object())
 BAD_OPTIONS = [
-    ("num_points", ValueError, "to be a whole number >= 2, got", (1, 2.5, "9", None)),
-    ("output", ValueError, "whole number >= 0, got|no output 2; there are 2", (0.0, None, -1, 2)),
+    ("num_points", ValueError, "must be at least 2; found 1", (1,)),
+    ("num_points", TypeError, "num_points must be a whole number", (2.5, "9", None)),
+    ("output", ValueError, "output must be at least 0|no output 2; there are 2", (-1, 2)),
+    ("output", TypeError, "output must be a whole number", (0.0, None)),
     (
         "bounds",
         ValueError,
@@ -314,7 +316,7 @@ def test_models_that_have_nothing_to_draw(line, data):
         plot_adjustment(ZeroMeanGP(*data()))
     with pytest.raises(ValueError, match="of one input with `plot_adjustment`"):
         plot_adjustment_pair(line)
-    for draw in (plot_calibration, plot_pit, plot_leave_one_out):
+    for draw in (plot_coverage, plot_pit, plot_leave_one_out):
         with pytest.raises(TypeError, match=r"got CKA; pass `leave_one_out\(model\)`"):
             draw(line)
 
@@ -331,18 +333,18 @@ def test_bad_input(line, plane, data, forrester):
         (lambda: plot_prediction(plane, X[:0], Y[:0]), ValueError, "n x d, one point or more"),
         (lambda: plot_prediction(plane, X.numpy(), Y), TypeError, r"got ndarray; .*as_tensor\(X, "),
         (lambda: plot_prediction(plane, X, Y.tolist()), TypeError, "torch tensor, got list"),
-        (lambda: plot_prediction(line, one, level=95), ValueError, "level between 0 and 1"),
+        (lambda: plot_prediction(line, one, level=95), ValueError, "level must be between 0 and 1"),
         (lambda: plot_prediction(line, one, ax=Figure().subplots(2)), ValueError, "1 x 1 axes"),
-        (lambda: plot_leave_one_out(loo, level="95 %"), TypeError, "level to be a number"),
-        (lambda: plot_leave_one_out(loo, output="y1"), ValueError, "number >= 0, got 'y1'"),
+        (lambda: plot_leave_one_out(loo, level="95 %"), TypeError, "level must be a number"),
+        (lambda: plot_leave_one_out(loo, output="y1"), TypeError, "whole number; found 'y1'"),
         (lambda: plot_pit(torch.tensor([0.5, 1.5])), ValueError, "PIT values between 0 and 1"),
-        (lambda: plot_pit(loo, bins=1.5), ValueError, r"bins to be a whole number >= 1, got 1\.5"),
+        (lambda: plot_pit(loo, bins=1.5), TypeError, r"bins must be a whole number; found 1\.5"),
         (
             lambda: plot_pit(loo.score().pit.numpy()),
             TypeError,
             "the values themselves as a torch tensor",
         ),
-        (lambda: plot_calibration(loo, output=2), ValueError, "no output 2; there are 2, from 0"),
+        (lambda: plot_coverage(loo, output=2), ValueError, "no output 2; there are 2, from 0"),
     ):
         with pytest.raises(error, match=says):
             call()

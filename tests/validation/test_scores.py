@@ -46,10 +46,10 @@ def test_coverage_of_overconfident_predictions_is_too_low(uniform):
 
 def test_bad_level(prediction):
     for level in (0.0, 1.0, 95, -0.1, float("nan")):
-        with pytest.raises(ValueError, match="Expected level between 0 and 1, got"):
+        with pytest.raises(ValueError, match="level must be between 0 and 1; found"):
             coverage(*prediction, level=level)
     for level in ("0.9", None, [0.9]):
-        with pytest.raises(TypeError, match=r"Expected level to be a number such as 0\.95, got"):
+        with pytest.raises(TypeError, match=r"level must be a number such as 0\.95; found"):
             coverage(*prediction, level=level)
 
 

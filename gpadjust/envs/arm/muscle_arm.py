@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.envs.argument_checks import checked_options, finite_numbers
+from gpadjust.checks import checked_options, finite_array
 from gpadjust.envs.arm.opensim_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION, build_muscle_arm
 from gpadjust.envs.arm.simulation import ArmSimulation
 from gpadjust.envs.arm.task import MAX_TARGET, START_MEAN, START_STD, angle_error, hand_distance_cm
@@ -107,7 +107,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
                 of the bounds of the observation.
         """
         super().reset(seed=seed)
-        options = checked_options(options, ("state", "target"))
+        options = checked_options("options", options, ("state", "target"))
         # Both are drawn in any case, so that an option does not change the other one.
         angles = self.np_random.normal(START_MEAN, START_STD)
         target = self.np_random.uniform(0, MAX_TARGET, 2)
@@ -142,7 +142,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
         if self.state is None or self._failed:
             why = "after a failed integration" if self._failed else "before the first step"
             raise gym.error.ResetNeeded(f"Call reset {why}.")
-        excitations = finite_numbers(action, (NUM_EXCITED,))
+        excitations = finite_array(action, (NUM_EXCITED,))
         if excitations is None:
             raise ValueError(
                 f"The action must be four finite excitations, of shape (4,); found {action!r}."
@@ -178,7 +178,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
 
 
 def _checked(value: Any, option: str, names: str, high: NDArray[np.float32]) -> NDArray[np.float64]:
-    numbers = finite_numbers(value, high.shape)
+    numbers = finite_array(value, high.shape)
     if numbers is None or (np.abs(numbers) > high).any():
         bounds = ", ".join(f"{bound:.4g}" for bound in high)
         raise ValueError(

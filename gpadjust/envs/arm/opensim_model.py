@@ -8,7 +8,7 @@ from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
-from gpadjust.envs.argument_checks import check_number
+from gpadjust.checks import checked_number
 from gpadjust.envs.arm.torque_arm import ArmEquation
 
 JOINTS = ("shoulder", "elbow")
@@ -94,12 +94,7 @@ def build_muscle_arm(equation: ArmEquation, strength: float) -> Any:
         TypeError: If strength is no number.
         ValueError: If strength is not in (0, 2].
     """
-    check_number(strength, "strength")
-    if not 0 < strength <= MAX_STRENGTH:
-        raise ValueError(
-            f"strength must be in (0, {MAX_STRENGTH:g}], where 1 is a healthy arm's; found "
-            f"{strength}."
-        )
+    checked_number("strength", strength, above=0, most=MAX_STRENGTH)
     opensim = load_opensim()
     model = _skeleton(opensim, equation)
     for joint, (low, high) in zip(JOINTS, LIMITS, strict=True):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.argument_checks import check_number
+from gpadjust.checks import checked_number
 from gpadjust.envs.arm.opensim_model import controls, load_opensim
 from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP
 
@@ -41,9 +41,7 @@ class ArmSimulation:
     """
 
     def __init__(self, build: Callable[[], Any], accuracy: float) -> None:
-        check_number(accuracy, "accuracy")
-        if not 0 < accuracy < 1:
-            raise ValueError(f"accuracy must be in (0, 1), such as 1e-5; found {accuracy}.")
+        checked_number("accuracy", accuracy, above=0, below=1)
         self.build = build
         self.accuracy = accuracy
         self._start_anew()

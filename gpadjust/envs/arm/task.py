@@ -7,10 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from gpadjust.envs.argument_checks import check_count, check_least_columns
+from gpadjust.checks import check_columns, checked_whole
 from gpadjust.envs.arm.torque_arm import REAL_ARM
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import check_columns
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)
@@ -40,7 +39,7 @@ Muscles follow their excitations with a delay, so that the next state depends on
 
 def angle_error(states: Tensor) -> Tensor:
     """The root mean square error of the angles, ``...`` in rad, of states ``... x 6`` or more."""
-    check_least_columns(states, 6, "states")
+    check_columns("states", states, 6, more=True)
     error = states[..., :2] - states[..., 4:6]
     return error.square().mean(-1).sqrt()
 
@@ -72,7 +71,7 @@ def arm_start(n: int) -> Tensor:
     The angles are from :math:`\mathcal{N}((35°, 65°), (5°)^2 I)`, each angle of the targets from
     :math:`\mathcal{U}(0°, 100°)`.
     """
-    check_count(n)
+    checked_whole("n", n, 0)
     angles = torch.tensor(START_MEAN, dtype=torch.float64)
     angles = angles + START_STD * torch.randn(n, 2, dtype=torch.float64)
     targets = MAX_TARGET * torch.rand(n, 2, dtype=torch.float64)
@@ -105,7 +104,7 @@ def hand_position(angles: Tensor) -> Tensor:
         >>> hand_position(torch.tensor([0.0, torch.pi / 2], dtype=torch.float64))
         tensor([0.3090, 0.3330], dtype=torch.float64)
     """
-    check_columns(angles, 2, "angles")
+    check_columns("angles", angles, 2)
     upper, fore = REAL_ARM.lengths
     shoulder, both = angles[..., 0], angles[..., 0] + angles[..., 1]
     across = upper * shoulder.cos() + fore * both.cos()
@@ -125,6 +124,6 @@ def hand_distance_cm(states: Tensor) -> Tensor:
         >>> hand_distance_cm(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi]))
         tensor(66.6000)
     """
-    check_least_columns(states, 6, "states")
+    check_columns("states", states, 6, more=True)
     gap = hand_position(states[..., :2]) - hand_position(states[..., 4:6])
     return 100 * gap.square().sum(-1).sqrt()

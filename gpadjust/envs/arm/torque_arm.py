@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gpadjust.envs.argument_checks import finite_numbers
+from gpadjust.checks import finite_array
 from gpadjust.physics import ODEPhysics
 
 ARM_TIME_STEP = 0.2
@@ -66,7 +66,7 @@ class ArmEquation:
         """Check the parameters."""
         for entry in fields(self):
             given, single = getattr(self, entry.name), entry.name == "damping"
-            numbers = finite_numbers(given, () if single else (2,))
+            numbers = finite_array(given, () if single else (2,))
             if numbers is None:
                 expected = "a finite number" if single else "a pair of finite numbers"
                 raise ValueError(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.envs.argument_checks import checked_options, finite_numbers
+from gpadjust.checks import check_switch, checked_options, finite_array
 from gpadjust.envs.cart_pole.system import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
@@ -79,8 +79,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         time_step: float = TIME_STEP,
     ) -> None:
         super().__init__(render_mode)
-        if not isinstance(encode_angle, bool):
-            raise TypeError(f"encode_angle must be True or False; found {encode_angle!r}.")
+        check_switch("encode_angle", encode_angle)
         if not isinstance(equation, CartPoleEquation):
             raise TypeError(
                 f"equation must be a CartPoleEquation, such as REAL_CART_POLE; found {equation!r}."
@@ -114,9 +113,9 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
             ValueError: If ``options`` has another key, or the state is not four such numbers.
         """
         super().reset(seed=seed)
-        options = checked_options(options, ("state",))
+        options = checked_options("options", options, ("state",))
         if "state" in options:
-            given = finite_numbers(options["state"], (4,))
+            given = finite_array(options["state"], (4,))
             if given is None or (np.abs(given) > MAX_START).any():
                 raise ValueError(
                     "options['state'] must be four finite numbers, x, theta, x_dot and theta_dot, "
@@ -147,7 +146,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         """
         if self.state is None:
             raise gym.error.ResetNeeded("Call reset before the first step.")
-        force = finite_numbers(action, (1,))
+        force = finite_array(action, (1,))
         if force is None:
             raise ValueError(
                 f"The action must be one finite force, of shape (1,); found {action!r}."

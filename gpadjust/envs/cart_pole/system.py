@@ -9,12 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gpadjust.envs.argument_checks import check_count
+from gpadjust.checks import check_columns, checked_number, checked_whole
 from gpadjust.physics import ODEPhysics
-from gpadjust.physics.base import whole_number
-from gpadjust.physics.ode import is_finite
 from gpadjust.states import StateSpec
-from gpadjust.states.state_spec import check_columns
 
 TIME_STEP = 0.1
 SUBSTEP = 0.02  # s, the longest: a single Euler step of 0.1 s errs by 0.3 rad/s
@@ -166,8 +163,7 @@ def equation_physics(
     equation: CartPoleEquation | nn.Module, time_step: float = TIME_STEP, name: str = "cart_pole"
 ) -> ODEPhysics:
     """A time step, in s, of such an equation."""
-    if not (is_finite("time_step", time_step) and time_step > 0):
-        raise ValueError(f"time_step must be a positive number of seconds; found {time_step}.")
+    checked_number("time_step", time_step, above=0)
     substeps = math.ceil(round(time_step / SUBSTEP, 6))
     return ODEPhysics(equation, time_step, state_dim=4, substeps=substeps, name=name)
 
@@ -189,8 +185,7 @@ def random_cart_pole_physics(seed: int, time_step: float = TIME_STEP) -> ODEPhys
         TypeError: If ``seed`` is no whole number.
         ValueError: If it is negative, or ``time_step`` not positive.
     """
-    if whole_number("seed", seed) < 0:
-        raise ValueError(f"seed must not be negative; found {seed}.")
+    checked_whole("seed", seed, 0)
     cart_mass, pole_mass, pole_length = np.random.default_rng(seed).uniform(
         [0.4, 0.5, 0.5], [0.6, 0.7, 0.7]
     )
@@ -214,7 +209,7 @@ def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_leng
     Returns:
         ``...``.
     """
-    check_columns(states, 4, "states")
+    check_columns("states", states, 4)
     x, theta = states[..., 0], states[..., 1]
     across = x - pole_length * theta.sin()
     up = pole_length * (theta.cos() - 1)
@@ -231,6 +226,6 @@ def cart_pole_start(n: int) -> Tensor:
 
     Each is from :math:`\mathcal{N}([0, \pi, 0, 0], 0.2^2 I)`.
     """
-    check_count(n)
+    checked_whole("n", n, 0)
     mean = torch.tensor(START_MEAN, dtype=torch.float64)
     return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Figures of predictions, of their calibration, and of where the physics is wrong or trusted.
+"""Figures of predictions, of their coverage, and of where the physics is wrong or trusted.
 
 Each function draws on the axes that it is given, or on those of a new figure, and returns them;
 show or save the figure with ``ax.figure``. They need matplotlib, ``pip install gpadjust[plot]``.
@@ -11,7 +11,7 @@ from gpadjust.validation.plots.adjustments import (
     plot_trust_pair,
 )
 from gpadjust.validation.plots.predictions import (
-    plot_calibration,
+    plot_coverage,
     plot_leave_one_out,
     plot_pit,
     plot_prediction,
@@ -20,7 +20,7 @@ from gpadjust.validation.plots.predictions import (
 __all__ = [
     "plot_adjustment",
     "plot_adjustment_pair",
-    "plot_calibration",
+    "plot_coverage",
     "plot_leave_one_out",
     "plot_pit",
     "plot_prediction",

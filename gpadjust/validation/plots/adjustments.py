@@ -1,4 +1,4 @@
-"""Plots of rho and delta, and of what predictions rest on."""
+"""Plots of rho and delta, and of the basis of predictions."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     BLUE,
@@ -23,7 +24,6 @@ from gpadjust.validation.plots.drawing import (
     quantile,
     tidy,
     two_inputs,
-    whole,
 )
 from gpadjust.validation.trust import SIDES, Trust
 
@@ -76,7 +76,7 @@ def plot_adjustment(
         (2, 1)
     """
     names = _adjustments(model)
-    num_points = whole(num_points, "num_points", 2)
+    num_points = checked_whole("num_points", num_points, 2)
     quantile(level)  # refused before there is a figure
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     d = train_X.shape[-1]
@@ -142,7 +142,7 @@ def plot_adjustment_pair(
         (2, 2)
     """
     names = _adjustments(model)
-    num_points = whole(num_points, "num_points", 2)
+    num_points = checked_whole("num_points", num_points, 2)
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     i, j = two_inputs(inputs, train_X.shape[-1], "`plot_adjustment`")
     shape = (len(names), 2)
@@ -187,14 +187,14 @@ def _adjustments(model: Any) -> list[str]:
 
 
 def _unadjusted(model: Any, name: str, output: int) -> float:
-    """What the model takes a rho or a delta to be where no data say otherwise."""
+    """The value of a rho or a delta away from data."""
     if hasattr(model, "term_mean"):
         return float(model.term_mean(name, output))
     return 1.0 if name.startswith("rho") else 0.0
 
 
 def _symbol(name: str) -> str:
-    """How ``rho``, ``rho_coarse`` and ``delta`` are written."""
+    """The symbols of ``rho``, ``rho_coarse`` and ``delta``."""
     symbol, _, physics = name.partition("_")
     if symbol not in ("rho", "delta"):
         return name
@@ -241,7 +241,7 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = Non
     The shares of all points are in the legend.
 
     Args:
-        trust: What :func:`~gpadjust.validation.trust` returned.
+        trust: The result of :func:`~gpadjust.validation.trust`.
         output: Which output to draw.
         bins: Number of parts of each input's range.
         axes: Axes to draw on. Default: a new figure.
@@ -264,7 +264,7 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = Non
         (1,)
     """
     side, named = _side_and_names(trust, output)
-    bins = whole(bins, "bins", 1)
+    bins = checked_whole("bins", bins, 1)
     d = trust.X.shape[-1]
     axes = new_axes(1, d)[0] if axes is None else given_axes(axes, (d,))
     for ax, x, name in zip(axes, trust.X.unbind(-1), labels(trust, "input", d), strict=True):
@@ -289,7 +289,7 @@ def plot_trust_pair(
     """Draw over two inputs which predictions rest on physics, data, or neither, as points.
 
     Args:
-        trust: What :func:`~gpadjust.validation.trust` returned.
+        trust: The result of :func:`~gpadjust.validation.trust`.
         inputs: The two inputs, counted from 0.
         output: Which output to draw.
         ax: Where to draw. Default: a new figure.
@@ -323,7 +323,7 @@ def plot_trust_pair(
 
 
 def _side_and_names(trust: Trust, output: int) -> tuple[Tensor, dict[str, str]]:
-    """What each prediction of an output rests on, and what the legend says of the shares."""
+    """The basis of each prediction of an output, and the legend's text of the shares."""
     if not isinstance(trust, Trust):
         raise TypeError(f"Expected a Trust, got {type(trust).__name__}; pass `trust(model)`.")
     side = column(trust.side, output)

@@ -1,4 +1,4 @@
-"""What the figures share: colours, axes, names, bands, and one output of a posterior."""
+"""Parts of all figures: colors, axes, names, bands, and one output of a posterior."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.mathtext import MathTextParser
 from torch import Tensor
 
-from gpadjust.validation.scores import check_level
+from gpadjust.checks import check_level, checked_whole
 
-BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
+BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the color-blind, too
 BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
 DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
 
@@ -42,19 +42,9 @@ def column(values: Tensor, output: int) -> Tensor:
             f"Expected n x m values to draw, got shape {tuple(values.shape)}; plot the elements of "
             "a batch one by one."
         )
-    if whole(output, "output", 0) >= values.shape[-1]:
+    if checked_whole("output", output, 0) >= values.shape[-1]:
         raise ValueError(f"There is no output {output}; there are {values.shape[-1]}, from 0.")
     return values[:, output].detach()
-
-
-def whole(number: Any, name: str, least: int) -> int:
-    """Return a whole number of at least ``least``, or raise a ValueError that names it."""
-    try:
-        if index(number) >= least:
-            return index(number)
-    except TypeError:
-        pass  # refused below
-    raise ValueError(f"Expected {name} to be a whole number >= {least}, got {number!r}.")
 
 
 def two_inputs(inputs: Any, d: int, otherwise: str) -> tuple[int, int]:
@@ -70,7 +60,7 @@ def two_inputs(inputs: Any, d: int, otherwise: str) -> tuple[int, int]:
 
 
 def observed(values: Tensor, output: int) -> Tensor:
-    """Where the ``n`` values of an output are not NaN, which is somewhere."""
+    """The points, of ``n``, at which an output is not NaN; at least one."""
     seen = ~values.isnan()
     if not seen.any():
         raise ValueError(

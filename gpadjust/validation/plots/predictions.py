@@ -1,4 +1,4 @@
-"""Plots of predictions: along an input, of left-out observations, and their calibration."""
+"""Plots of predictions: along an input, of left-out observations, and their coverage."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from scipy.stats import binom
 from torch import Tensor
 
+from gpadjust.checks import checked_whole
 from gpadjust.physics import JoinedPhysics
 from gpadjust.validation.leave_one_out import LeaveOneOut, observations
 from gpadjust.validation.plots.drawing import (
@@ -30,7 +31,6 @@ from gpadjust.validation.plots.drawing import (
     observed,
     quantile,
     tidy,
-    whole,
 )
 from gpadjust.validation.scores import Scores
 
@@ -123,7 +123,7 @@ def plot_leave_one_out(
     Points at which the output was not observed are left out.
 
     Args:
-        loo: What :func:`~gpadjust.validation.leave_one_out` returned, without batch.
+        loo: The result of :func:`~gpadjust.validation.leave_one_out`, without batch.
         output: Which output to draw.
         level: Nominal coverage of the intervals.
         axes: Two axes to draw on. Default: a new figure.
@@ -194,13 +194,13 @@ def _check_inputs(X: Tensor, Y: Tensor | None) -> None:
         )
 
 
-def plot_calibration(
+def plot_coverage(
     prediction: Tensor | LeaveOneOut | Scores, *, output: int = 0, ax: Axes | None = None
 ) -> Axes:
     """Draw the observed coverage of central intervals against the nominal one.
 
     Below the diagonal the intervals are too narrow, above it too wide. The band holds 95 % of the
-    observed coverages of a calibrated prediction with as many points, at each level.
+    observed coverages of predictions whose intervals hold, of as many points, at each level.
 
     Args:
         prediction: PIT values, ``n`` or ``n x m``, or what has them. Those that are NaN, where
@@ -214,7 +214,7 @@ def plot_calibration(
 
     Example:
         >>> import torch
-        >>> plot_calibration(torch.rand(50)).get_ylabel()
+        >>> plot_coverage(torch.rand(50)).get_ylabel()
         'observed coverage'
     """
     pit, title = _pit_and_title(prediction, output)
@@ -225,7 +225,7 @@ def plot_calibration(
     levels = np.linspace(0, 1, 201)
     n = len(pit)
     low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
-    ax.fill_between(levels, low, high, color=GREY, alpha=0.2, lw=0, label="95 % if calibrated")
+    ax.fill_between(levels, low, high, color=GREY, alpha=0.2, lw=0, label="95 % if intervals hold")
     ax.plot([0, 1], [0, 1], color=GREY, lw=1, ls="--")
     reached = np.sort(2 * (pit - 0.5).abs().numpy())
     steps = np.arange(n + 1) / n
@@ -246,9 +246,9 @@ def plot_pit(
     bins: int = 10,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the histogram of PIT values: flat if calibrated, U-shaped if too sure.
+    """Draw the histogram of PIT values: flat if intervals hold, U-shaped if too sure.
 
-    The band holds 95 % of the counts of a bin if calibrated.
+    The band holds 95 % of the counts of a bin if intervals hold.
 
     Args:
         prediction: PIT values, ``n`` or ``n x m``, or what has them. Those that are NaN, where
@@ -258,15 +258,15 @@ def plot_pit(
         ax: Where to draw. Default: a new figure.
 
     Raises:
-        TypeError: As :func:`plot_calibration`.
-        ValueError: As :func:`plot_calibration`, or if ``bins`` is not a positive whole number.
+        TypeError: As :func:`plot_coverage`.
+        ValueError: As :func:`plot_coverage`, or if ``bins`` is not a positive whole number.
 
     Example:
         >>> import torch
         >>> len(plot_pit(torch.rand(50), bins=5).patches)
         5
     """
-    bins = whole(bins, "bins", 1)
+    bins = checked_whole("bins", bins, 1)
     pit, title = _pit_and_title(prediction, output)
     if ax is None:
         ax = new_axes(1, 1)[0, 0]
@@ -276,7 +276,7 @@ def plot_pit(
     low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
     ax.hist(pit.numpy(), bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
     ax.fill_between(
-        [0, 1], low, high, color=GREY, alpha=0.25, lw=0, zorder=3, label="95 % if calibrated"
+        [0, 1], low, high, color=GREY, alpha=0.25, lw=0, zorder=3, label="95 % if intervals hold"
     )
     ax.axhline(n / bins, color=GREY, lw=1, ls="--", zorder=3)
     ax.set(xlabel="probability integral transform", ylabel="count", xlim=(0, 1))

@@ -1,0 +1,250 @@
+"""Checks of the numbers, shapes and options that a user gives, for all rooms.
+
+A function ``check_...`` raises an error or returns nothing; one called ``checked_...`` also returns
+the value in the form that is worked with. The name of the argument comes first. A wrong kind is a
+TypeError, a wrong value or shape a ValueError; both say what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from numbers import Real
+from operator import index
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+
+def checked_whole(name: str, value: Any, least: int | None = None) -> int:
+    """A whole number as an int; not True or False.
+
+    Raises:
+        TypeError: If it is none.
+        ValueError: If it is below ``least``.
+    """
+    try:
+        number = None if isinstance(value, bool) else index(value)
+    except TypeError:
+        number = None
+    if number is None:
+        raise TypeError(f"{name} must be a whole number; found {value!r}.")
+    if least is not None and number < least:
+        raise ValueError(f"{name} must be at least {least}; found {number}.")
+    return number
+
+
+def checked_number(
+    name: str,
+    value: Any,
+    *,
+    least: float | None = None,
+    above: float | None = None,
+    most: float | None = None,
+    below: float | None = None,
+) -> float:
+    """A finite real number as a float.
+
+    Args:
+        name: The argument's name.
+        value: What was given for it.
+        least: The least value that is allowed.
+        above: A value that it must exceed.
+        most: The largest value that is allowed.
+        below: A value that it must not reach.
+
+    Raises:
+        TypeError: If it is no number.
+        ValueError: If it is not finite, or out of range.
+
+    Example:
+        >>> checked_number("discount", 1.5, above=0, most=1)
+        Traceback (most recent call last):
+        ...
+        ValueError: discount must be above 0 and at most 1; found 1.5.
+    """
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number; found {value!r}.")
+    number = float(value)
+    right = (
+        math.isfinite(number)
+        and (least is None or number >= least)
+        and (above is None or number > above)
+        and (most is None or number <= most)
+        and (below is None or number < below)
+    )
+    if not right:
+        limits = {"at least": least, "above": above, "at most": most, "below": below}
+        told = [f"{word} {limit:g}" for word, limit in limits.items() if limit is not None]
+        told = told if most is not None or below is not None else ["finite", *told]
+        raise ValueError(f"{name} must be {' and '.join(told)}; found {value}.")
+    return number
+
+
+def check_level(level: float) -> None:
+    """Raise an error unless a level, such as 0.95, is a number between 0 and 1."""
+    if isinstance(level, bool) or not isinstance(level, int | float | Real):
+        raise TypeError(f"level must be a number such as 0.95; found {level!r}.")
+    if not 0 < level < 1:
+        raise ValueError(f"level must be between 0 and 1; found {level}; 95 % is 0.95.")
+
+
+def check_switch(name: str, value: Any) -> None:
+    """Raise a TypeError unless an option is True or False."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{name} must be True or False; found {value!r}.")
+
+
+def check_choice(name: str, value: Any, known: Sequence[str]) -> None:
+    """Raise a ValueError unless an option is one of these words."""
+    if value not in known:
+        raise ValueError(f"Unknown {name} {value!r}; use {' or '.join(map(repr, known))}.")
+
+
+def checked_options(name: str, options: Any, known: Sequence[str]) -> dict[str, Any]:
+    """Options by name; none for None.
+
+    Raises:
+        TypeError: If they are no dictionary.
+        ValueError: If there is an unknown one.
+    """
+    options = {} if options is None else options
+    names = ", ".join(map(repr, known))
+    if not isinstance(options, dict):
+        raise TypeError(f"{name} must be a dictionary, which may hold {names}; found {options!r}.")
+    for option in options:
+        if option not in known:
+            raise ValueError(
+                f"Unknown {name.removesuffix('s')} {option!r}; the known ones: {names}."
+            )
+    return options
+
+
+def real_array(values: ArrayLike) -> NDArray[np.float64]:
+    """A copy of real numbers as a float64 array; a TypeError if they are anything else.
+
+    NumPy would drop the imaginary part of complex numbers, and take None for NaN and text for
+    numbers.
+    """
+    array = np.array(values)
+    # Objects may be numbers, such as fractions.
+    if array.dtype.kind not in "biufO" or (
+        array.dtype.kind == "O" and None in array.ravel().tolist()
+    ):
+        found = "None" if array.dtype.kind == "O" else array.dtype
+        raise TypeError(f"expected real numbers, found {found}")
+    return array.astype(np.float64, copy=False)
+
+
+def finite_array(values: Any, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
+    """A copy of finite real numbers of a shape; None if the values are something else."""
+    try:
+        numbers = real_array(values)
+    except (TypeError, ValueError):
+        return None
+    return numbers if numbers.shape == shape and np.isfinite(numbers).all() else None
+
+
+def checked_tensor(name: str, values: Any) -> Tensor:
+    """A copy of real numbers as a float64 tensor.
+
+    Raises:
+        TypeError: If they are anything else.
+    """
+    try:
+        if not isinstance(values, Tensor):
+            return torch.from_numpy(real_array(values))
+        if not values.is_complex():
+            return values.detach().to("cpu", torch.float64, copy=True)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise TypeError(f"Expected {name} to be real numbers, got {values!r}.") from error
+    raise TypeError(f"Expected {name} to be real numbers, got {values.dtype}.")
+
+
+def checked_bounds(name: str, bounds: Any, columns: int | None = None) -> Tensor:
+    """Finite bounds ``2 x d``, lower ones and then upper ones, in float64.
+
+    Raises:
+        TypeError: If they are no numbers.
+        ValueError: If they have another shape (``d`` is ``columns``, or at least 1), are not
+            finite, or a lower one is not below its upper one.
+    """
+    bounds = checked_tensor(name, bounds)
+    right = bounds.dim() == 2 and len(bounds) == 2 and bounds.shape[1] > 0
+    if not right or columns not in (None, bounds.shape[1]):
+        raise ValueError(
+            f"Expected {name} of shape 2 x {'d' if columns is None else columns}, the lower ones "
+            f"and then the upper ones, got {tuple(bounds.shape)}."
+        )
+    if not bounds.isfinite().all() or (bounds[0] >= bounds[1]).any():
+        raise ValueError(
+            f"Expected finite {name}, each lower one below its upper one, got {bounds.tolist()}."
+        )
+    return bounds
+
+
+def checked_points(name: str, X: Any, columns: int, bounds: Tensor | None = None) -> Tensor:
+    """Finite points ``n x columns`` in float64, within bounds ``2 x columns`` if there are any.
+
+    Raises:
+        TypeError: If they are no numbers.
+        ValueError: If they have another number of columns, are not finite, or out of bounds.
+    """
+    X = checked_tensor(name, X)
+    if X.dim() != 2 or X.shape[-1] != columns:
+        raise ValueError(
+            f"Expected {name} of shape n x {columns}, a row for each point, got {tuple(X.shape)}."
+        )
+    if not X.isfinite().all():
+        raise ValueError(f"Expected {name} to be finite, got {X.tolist()}.")
+    if bounds is not None and (outside := (X.clamp(bounds[0], bounds[1]) != X).any(-1)).any():
+        raise ValueError(
+            f"Expected {name} within the bounds {bounds.tolist()}, got {X[outside][0].tolist()}."
+        )
+    return X
+
+
+def check_columns(name: str, tensor: Tensor, columns: int, more: bool = False) -> None:
+    """Raise an error unless a tensor is floating-point and ``... x columns`` (or ``more``)."""
+    if not torch.is_tensor(tensor) or not tensor.is_floating_point():
+        found = tensor.dtype if torch.is_tensor(tensor) else type(tensor).__name__
+        raise TypeError(
+            f"Expected {name} as a floating-point tensor, got {found}; convert with "
+            f"`torch.as_tensor({name}, dtype=torch.float64)`."
+        )
+    width = tensor.shape[-1] if tensor.dim() else 0
+    if width < columns or (width > columns and not more):
+        least = " or more" if more else ""
+        raise ValueError(
+            f"Expected {name} of shape ... x {columns}{least}, got {tuple(tensor.shape)}."
+        )
+
+
+def check_finite(name: str, tensor: Tensor) -> None:
+    """Raise a ValueError that names the rows of ``tensor`` (``... x n x k``) with NaN or inf."""
+    _check_rows(name, ~tensor.isfinite().all(-1), "to be finite, found NaN or infinity")
+
+
+def check_observed(name: str, Y: Tensor) -> None:
+    """As :func:`check_finite`, but NaN is a missing value; a row of them is an error."""
+    _check_rows(name, Y.isinf().any(-1), "to be finite, found infinity")
+    expected = "to hold an observation in each row, found nothing but NaN"
+    _check_rows(name, Y.isnan().all(-1), expected)
+
+
+def _check_rows(name: str, bad: Tensor, expected: str) -> None:
+    if bad.any():
+        rows = marked_rows(bad)
+        shown = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
+        raise ValueError(
+            f"Expected {name} {expected} in {len(rows)} of {bad.shape[-1]} rows (row {shown}); "
+            "remove these points."
+        )
+
+
+def marked_rows(marked: Tensor) -> list[int]:
+    """Where in the last dimension something is marked."""
+    return sorted({int(where[-1]) for where in marked.nonzero()})

@@ -1,0 +1,88 @@
+"""Functions, data and models that the tests of several rooms take."""
+
+import torch
+
+
+def uniform(*shape, low=0.0, high=1.0, seed=0):
+    """Draws float64 numbers of a shape, uniform on [low, high], the same ones for a seed."""
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+
+def normal(*shape, seed=0):
+    """Draws standard normal float64 numbers of a shape, the same ones for a seed."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def line(n, low=0.0, high=1.0):
+    """Evenly spaced float64 numbers, ``n x 1``."""
+    return torch.linspace(low, high, n, dtype=torch.float64).unsqueeze(-1)
+
+
+def crude(X):
+    """Two outputs of two inputs, neither of them near zero on [0, 2]^2."""
+    return torch.stack([2 + (3 * X[..., 0]).sin() + X[..., 1], 4 + (2 * X[..., 1]).cos()], dim=-1)
+
+
+def truth(X):
+    """What a model of `crude` is to learn."""
+    bias = torch.stack([X[..., 1].square(), X[..., 0].exp()], dim=-1) / 4
+    return crude(X) * (1.2 + 0.2 * X[..., :1]) + bias
+
+
+def ripple(X):
+    """As many outputs as inputs, none of them near zero."""
+    return 2 + (3 * X).sin()
+
+
+def wave(X):
+    """One output, of the first input."""
+    return torch.sin(6 * X[..., :1])
+
+
+def waves(X):
+    """Two outputs, of the first input."""
+    return torch.cat([wave(X), wave(X).square()], dim=-1)
+
+
+class Sine(torch.nn.Module):
+    """A physics that learns: sin(rate x) + offset, and cos(rate x) if wanted."""
+
+    def __init__(self, rate, offset=0.0, num_outputs=1):
+        super().__init__()
+        self.rate = torch.nn.Parameter(torch.tensor(rate, dtype=torch.float64))
+        self.offset, self.num_outputs = offset, num_outputs
+
+    def forward(self, X):
+        angle = self.rate * X
+        return torch.cat([angle.sin() + self.offset, angle.cos()], -1)[..., : self.num_outputs]
+
+
+def learnable(model):
+    """The values of a model's learnable parameters, by name."""
+    return {name: p.detach() for name, p in model.named_parameters() if p.requires_grad}
+
+
+def around(model, number, spread=0.3, seed=0):
+    """Random samples around the learnable parameters of a model, by name."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(value):
+        away = torch.randn(number, *value.shape, generator=generator, dtype=torch.float64)
+        return value + spread * away
+
+    return {name: draw(value) for name, value in learnable(model).items()}
+
+
+def holding(model, *steps):
+    """The model, which now holds a sample of its hyper-parameters at each step from where it is."""
+    values = learnable(model).items()
+    model.hold_samples({name: torch.stack([p + step for step in steps]) for name, p in values})
+    return model
+
+
+def same(ours, theirs, **tolerance):
+    """Asserts that tensors are close, one by one: moments of two predictions, say."""
+    for one, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, other, **tolerance)
