@@ -8,7 +8,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from pkgutil import resolve_name
@@ -18,8 +17,6 @@ Case = tuple[Any, ...]
 """What is run once: a value of each axis, and a seed."""
 Run = dict[str, Any]
 """A case that was run: its values by name, what identifies the run, and what it found."""
-Task = Case  # goes, like Record, when no chapter needs it
-Record = Run
 Axes = Mapping[str | tuple[str, ...], Mapping[Any, str]]
 
 
@@ -63,8 +60,8 @@ class Experiment:
     only_tables: bool = False
     """run nothing; make tables and figures of the runs that are there"""
     other_versions: Literal["refuse", "keep", "replace"] = "refuse"
-    """what becomes of runs of other versions of the packages, or of other defaults of the library, if
-    more are to be run: nothing is run, they are kept beside the new ones, or they are run again"""
+    """what becomes of runs of other versions of the packages, or of other defaults of the library,
+    if more are to be run: nothing is run, they are kept with the new ones, or they are run again"""
 
     name: ClassVar[str]
     """on the command line, and in the markers of the pages"""
@@ -105,8 +102,6 @@ class Experiment:
         Raises:
             ValueError: If ``only`` has a name that no axis has.
         """
-        if hasattr(self, "tasks"):  # goes when all chapters have axes
-            return [tuple(task) for task in self.tasks()]
         parts = [
             [value if isinstance(name, tuple) else (value,) for value in values]
             for name, values in self.axes.items()
@@ -170,26 +165,7 @@ class Experiment:
 
     def _module(self) -> Any:
         """The experiment's module, imported when it is needed."""
-        if find_spec(f"{type(self).__module__}.{self.name}") is None:  # goes with the old chapters
-            return _Old(type(self).__module__)
         return import_module(f"{type(self).__module__}.{self.name}")
-
-
-class _Old:
-    """The modules of a chapter of the old form; goes when there is none."""
-
-    def __init__(self, folder: str) -> None:
-        self.folder = folder
-
-    def run(self, experiment: Any, *case: Any) -> Any:
-        module = import_module(f"{self.folder}.run")
-        return module.run(experiment, *case, unfinished=experiment.unfinished(*case))
-
-    def __getattr__(self, name: str) -> Any:
-        part = {"draw": "figure"}.get(name, "tables")
-        if find_spec(f"{self.folder}.{part}") is None:
-            raise AttributeError(name)
-        return getattr(import_module(f"{self.folder}.{part}"), name)
 
 
 def title(case: Case) -> str:
