@@ -1,49 +1,67 @@
-"""How well dynamics foresee a new episode, for the log."""
+"""How dynamics learn real episodes, and how well they predicted them before."""
 
 from __future__ import annotations
 
+import math
+import time
 import warnings
 
 import torch
 from torch import Tensor
 
-from gpadjust.control import Task
+from gpadjust.control.recorded_episodes import RecordedEpisodes
+from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
 from gpadjust.dynamics.free_run import typical_change
 from gpadjust.models import TermsModel
 from gpadjust.physics import PhysicsError
-from gpadjust.rl.recorded_episodes import RecordedEpisodes
 from gpadjust.validation.trust import trust
 
 _WINDOWS = 4  # some half second for a model of an episode
 _FAR = ("nlpd", "coverage", "energy")
 
 
-def foresight(
-    task: Task,
-    new: Trajectories,
-    recorded: RecordedEpisodes,
-    horizons: tuple[int, ...],
+def learn_dynamics(
+    task: Task, new: RecordedEpisodes, recorded: RecordedEpisodes, horizons: tuple[int, ...]
 ) -> dict[str, float]:
-    """Scores of the next states, and of trajectories over each horizon, by the names in the log.
+    """Score the dynamics of a task on new episodes, and update them with these.
 
-    Energies are in units of the typical changes in all that is recorded, so that those of different
-    episodes can be compared. PyTorch's generator is left as it is.
+    PyTorch's generator is left as it is by the scores. Scores that are not defined (densities of
+    dynamics without variances, horizons longer than the episodes) are left out.
 
     Args:
-        task: The task, with bounds of the states; its dynamics are scored.
-        new: What they have not learnt from.
-        recorded: All real episodes.
-        horizons: Numbers of steps; none for the scores of next states, and how many of them data
-            override the physics in, alone.
+        task: The task, with bounds of the states.
+        new: Episodes that the dynamics have not learnt.
+        recorded: All episodes; energy scores are in units of their typical changes, so that those
+            of different episodes can be compared.
+        horizons: Numbers of steps over which trajectories are scored; none for scores of single
+            steps alone.
+
+    Returns:
+        ``nlpd`` and ``coverage`` of a step, ``rmse/<state>``; ``overrides``, the share of
+        predictions in which data override the physics; ``nlpd_15``, ``coverage_15`` and
+        ``energy_15`` of a horizon of 15; ``score_seconds``, ``fit_seconds``.
     """
-    dynamics = task.dynamics
+    start, found = time.perf_counter(), {}
+    learnable = new.learnable(task.dynamics)
+    if task.dynamics.is_fitted:
+        before = time.perf_counter()
+        found = _scores(task, learnable, recorded, horizons)
+        found["score_seconds"] = time.perf_counter() - before
+    task.dynamics.update(*learnable)
+    found["fit_seconds"] = time.perf_counter() - start - found.get("score_seconds", 0.0)
+    return {name: value for name, value in found.items() if not math.isnan(value)}
+
+
+def _scores(
+    task: Task, new: Trajectories, recorded: RecordedEpisodes, horizons: tuple[int, ...]
+) -> dict[str, float]:
+    dynamics, spec = task.dynamics, task.dynamics.spec
     score = dynamics.score(*new)
     found = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
-    names = [dynamics.spec.states[i] for i in dynamics.spec.moving]
+    names = [spec.states[i] for i in spec.moving]
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
     found["overrides"] = _overrides(dynamics, new.states, new.actions)
-    found |= {f"{name}_{k}": float("nan") for k in horizons for name in _FAR}
     possible = [k for k in horizons if k <= new.longest]
     if not possible:
         return found
@@ -59,17 +77,17 @@ def foresight(
     except (NotImplementedError, PhysicsError) as error:  # scores are not worth an episode
         warnings.warn(
             f"There are no scores of trajectories, as their particles cannot move: {error} Pass "
-            "options with score_horizons=() to do without.",
+            "score_horizons=() to do without.",
             UserWarning,
             stacklevel=4,
         )
         return found
-    units = typical_change(dynamics.spec, recorded.states, recorded.next_states)
+    units = typical_change(spec, recorded.states, recorded.next_states)
     far = run.score(windows.measured, horizons=possible, units=units)
     for i, horizon in enumerate(possible):
         for name in _FAR:
             values = getattr(far, name)[i]
-            values = values if name == "energy" else values[dynamics.spec.moving]
+            values = values if name == "energy" else values[spec.moving]
             found[f"{name}_{horizon}"] = float(values.mean())
     return found
 

@@ -1,96 +1,76 @@
-"""What a replay buffer tells of the real episodes."""
+"""Real episodes, and what they tell."""
 
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
-import numpy as np
 import torch
-from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 
-from gpadjust.control import Task
+from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, Trajectories
 from gpadjust.physics import PhysicsError
-from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.states import StateSpec
 
-_REACH = 10.0  # how many half ranges of the recorded states particles may be from their middle
+_REACH = 10.0  # half ranges of the recorded states, from their middle to the bounds
 
 
+@dataclass(frozen=True, eq=False)
 class RecordedEpisodes:
-    """The transitions in a replay buffer, as states and actions in the user's units.
-
-    Rows are in the order of time, one environment after the other.
+    """Steps of real episodes, each after the one before it.
 
     Args:
-        buffer: The buffer.
-        policy: Knows the scale of the actions in the buffer.
-        spec: Decodes the observations.
-        newest: How many steps of each environment to take. Default: all.
-
-    Attributes:
+        spec: The entries of states and actions.
         states: ``N x state_dim``.
         actions: ``N x action_dim``.
         next_states: ``N x state_dim``.
         rewards: ``N``.
         terminated: Whether the next state ended the episode, ``N`` booleans.
-        num_ended: How many episodes ended.
+        episode: The number of the episode, ``N`` integers.
+        begins: Whether the step is the first one of its episode, ``N`` booleans.
+        whole: Whether the episode has ended, ``N`` booleans.
     """
 
-    def __init__(
-        self,
-        buffer: MixedReplayBuffer,
-        policy: BasePolicy,
-        spec: StateSpec,
-        newest: int | None = None,
-    ) -> None:
-        first = buffer.pos if buffer.full else 0
-        rows = (first + np.arange(buffer.size())) % buffer.buffer_size
-        rows = rows if newest is None else rows[len(rows) - min(newest, len(rows)) :]
-        happened = ~buffer.failed[rows].T.flatten()
-
-        def column(name: str) -> np.ndarray:
-            values = getattr(buffer, name)[rows].swapaxes(0, 1)
-            return values.reshape(-1, *values.shape[2:])[happened].astype(np.float64)
-
-        self.spec = spec
-        self.states = spec.decode(torch.from_numpy(column("observations")))
-        self.next_states = spec.decode(torch.from_numpy(column("next_observations")))
-        self.actions = torch.from_numpy(policy.unscale_action(column("actions")))
-        self.rewards = torch.from_numpy(column("rewards"))
-        dones = torch.from_numpy(column("dones"))
-        self.terminated = (dones * (1 - torch.from_numpy(column("timeouts")))).bool()
-        self.num_ended = int(dones.sum())
-        ended = buffer.dones[rows].astype(bool).T
-        starts = np.ones_like(ended)
-        starts[:, 1:] = ended[:, :-1]
-        self._episode = torch.from_numpy(starts.flatten().cumsum()[happened])
-        if buffer.full and starts[:, 1:].any():
-            starts[:, 0] = False  # what came before the oldest row is lost
-        self._starts = torch.from_numpy(starts.flatten()[happened])
-        # Those of an episode under way say nothing yet of how far one goes.
-        whole = np.flip(np.maximum.accumulate(np.flip(ended, axis=1), axis=1), axis=1)
-        self._whole = torch.from_numpy(whole.flatten()[happened])
+    spec: StateSpec
+    states: Tensor
+    actions: Tensor
+    next_states: Tensor
+    rewards: Tensor
+    terminated: Tensor
+    episode: Tensor
+    begins: Tensor
+    whole: Tensor
 
     @property
     def num_transitions(self) -> int:
-        """Number of rows."""
+        """Number of steps."""
         return len(self.states)
+
+    @property
+    def trajectories(self) -> Trajectories:
+        """States, actions and next states, of which dynamics learn."""
+        return Trajectories(self.states, self.actions, self.next_states, self.episode)
+
+    def some(self, rows: Any) -> Self:
+        """The steps that an index of rows selects."""
+        names = [field.name for field in fields(self)[1:]]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def draw_starts(self, n: int) -> Tensor:
         """Draw states at which episodes started, ``n x state_dim``, from PyTorch's generator."""
-        starts = self.states[self._starts]
+        starts = self.states[self.begins]
         return starts[torch.randint(len(starts), (n,))]
 
     def bounds(self) -> Tensor | None:
-        """Bounds ``2 x state_dim`` far beyond what was seen in episodes that have ended.
+        """Bounds ``2 x state_dim`` far beyond the states of episodes that have ended.
 
-        There are none of angles, constants and previous values; None if no episode has ended.
+        They are infinite for angles, constants and previous values; None if no episode has ended.
         """
-        if not self._whole.any():
+        if not self.whole.any():
             return None
-        seen = torch.cat([self.states[self._whole], self.next_states[self._whole]])
+        seen = torch.cat([self.states[self.whole], self.next_states[self.whole]])
         low, high = seen.amin(0), seen.amax(0)
         reach = _REACH * (high - low) / 2
         reach[high == low] = torch.inf  # that it has not moved yet tells nothing
@@ -99,8 +79,15 @@ class RecordedEpisodes:
                 reach[i] = torch.inf
         return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
 
+    def complete(self, task: Task, episode_length: int) -> Task:
+        """The task with length, starts and bounds of these episodes where it has none."""
+        found: dict[str, Any] = {"episode_length": episode_length}
+        if self.num_transitions:
+            found |= {"initial_states": self.draw_starts, "state_bounds": self.bounds()}
+        return replace(task, **{k: v for k, v in found.items() if getattr(task, k) is None})
+
     def learnable(self, dynamics: Dynamics) -> Trajectories:
-        """What happened, but for the states at which the physics fails.
+        """All steps but those at which the physics fails.
 
         Raises:
             PhysicsError: If it does not say where, or everywhere.
@@ -121,15 +108,14 @@ class RecordedEpisodes:
                 )
                 works[rows] = False
             else:
-                parts = self.states, self.actions, self.next_states, self._episode
-                return Trajectories(*parts).some(works)
+                return self.trajectories.some(works)
 
     def check(self, task: Task, tolerance: float = 1e-3) -> None:
-        """Compare the functions of a task with what was recorded.
+        """Compare the functions of a task with the recorded rewards and terminations.
 
         Args:
             task: The user's.
-            tolerance: Greatest error of the reward, relative to the largest that was recorded.
+            tolerance: Greatest error of the reward, relative to the largest recorded one.
 
         Raises:
             ValueError: If they differ; it shows the worst transition.
