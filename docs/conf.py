@@ -40,41 +40,16 @@ include_patterns = [
     "docs/**",
     "paper/*.md",
     "paper/*/README.md",
-    "paper/real/data/README.md",
+    "paper/machines/data/README.md",
     "paper/results/*/tables.md",
     "tutorials/*",
 ]
 exclude_patterns = ["docs/_build", "docs/jupyter_execute"]
 default_role = "py:obj"  # single backticks link where they can, and are code elsewhere
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!gpadjust\.).*")]  # links to other libraries need the network
-nitpick_ignore = [  # what signatures name, but users do not call by name
-    ("py:class", "gpadjust.systems.arm_view.ArmView"),
-    ("py:class", "gpadjust.systems.cart_pole_view.CartPoleView"),
-    ("py:class", "gpadjust.systems.rendering.ViewedEnv"),
-    ("py:class", "gpadjust.inference.fitting.FitOptions"),
-    ("py:class", "gpadjust.dynamics.learning.DynamicsFitOptions"),
-    ("py:class", "gpadjust.records.record.Stretch"),
-    ("py:class", "gpadjust.records.smoothing.Estimate"),
-    ("py:class", "gpadjust.records.chain.Known"),
-    ("py:class", "gpadjust.models.local_errors.LocalErrors"),
-    ("py:class", "gpadjust.models.stacked.Part"),
-    ("py:class", "gpadjust.gp.kernels.AnyKernel"),
-    ("py:class", "gpadjust.gp.kernels.Batched"),
-    ("py:class", "gpadjust.gp.kernels.CompositeKernel"),
-    ("py:class", "gpadjust.gp.kernels.Stationary"),
-    ("py:class", "gpadjust.gp.noise.Noise"),
-    ("py:class", "gpadjust.models.exact_conditioning.ExactConditioning"),
-    ("py:class", "gpadjust.models.rra.PaperConditioning"),
-    ("py:class", "gpadjust.models.rra.WeightConditioning"),
-    ("py:class", "gpadjust.models.sparse_conditioning.SparseConditioning"),
-    ("py:class", "gpadjust.models.sampled_functions.TermFeatures"),
-    ("py:class", "gpadjust.models.stacked.StackedFunctions"),
-    ("py:class", "gpadjust.rl.buffer.CompactReplayBuffer"),
-    ("py:class", "gpadjust.rl.checkpoint.Agent"),
-    ("py:class", "gpadjust.rl.episode_loop.EpisodeLoop"),
-    ("py:class", "gpadjust.rl.model_vec_env.ModelStep"),
-    ("py:class", "gpadjust.rl.recorded_episodes.RecordedEpisodes"),
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!gpadjust\.).*"),  # links to other libraries need the network
+    ("py:class", r"gpadjust(\.\w+){3,}"),  # inner classes, which signatures name
 ]
 
 autodoc_default_options = {"members": True, "show-inheritance": True}

@@ -74,12 +74,17 @@ _ROOMS = (
     "dynamics",
     "control",
 )
+# Rooms that are not searched for names; most need an extra.
+_OTHER_ROOMS = ("ax", "envs", "records", "report", "rl", "sklearn")
 
 
 def __getattr__(name: str) -> Any:
-    """A name or a room at its first use: environments need no BoTorch, which takes long."""
-    if name in _ROOMS:
-        return import_module(f"gpadjust.{name}")
+    """Import a name or a room at its first use: environments need no BoTorch, which is slow."""
+    if name in (*_ROOMS, *_OTHER_ROOMS):
+        try:
+            return import_module(f"gpadjust.{name}")
+        except ImportError as error:  # hasattr and help go on
+            raise AttributeError(str(error)) from error
     if name in __all__:
         for room in _ROOMS:
             module = import_module(f"gpadjust.{room}")
@@ -90,4 +95,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_ROOMS})
+    return sorted({*__all__, *_ROOMS, *_OTHER_ROOMS, "__version__"})

@@ -1,4 +1,4 @@
-"""Run one of the paper's experiments, or one of ours; `python -m paper report` fills the READMEs.
+"""Run one of the paper's experiments, or one of ours; `python -m paper report` fills the pages.
 
 Each says its options: `python -m paper forrester --help`.
 """
@@ -8,33 +8,29 @@ from __future__ import annotations
 import sys
 import warnings
 from importlib import import_module
+from pathlib import Path
+from pkgutil import resolve_name
 
-EXPERIMENTS = {
-    "forrester": ("Forrester", "eight models of Forrester's function (figure 1)"),
-    "multifidelity": ("Multifidelity", "eight methods on functions of low and high fidelity"),
-    "calibration": ("Calibration", "do intervals hold? CKA by each method of inference"),
-    "structures": ("Structures", "does the richer model pay? CKA beside what it contains"),
-    "active": ("Active", "error over measurements, by who chooses them"),
-    "cartpole": ("CartPole", "learners that swing up a cart-pole"),
-    "arm": ("Arm", "learners that reach with a muscle arm"),
-    "foresight": ("Foresight", "do dynamics foresee the next trial, and know how well?"),
-    "planning": ("Planning", "cart-poles that are swung up by planning in several models"),
-    "reaching": ("Reaching", "muscle arms that reach after a few trials, by several models"),
-    "parameters": ("Parameters", "intervals of a physics' parameters, by several discrepancies"),
-    "real": ("Real", "learners of real machines, by free runs beside what was measured"),
-    "elsewhere": ("Elsewhere", "free runs on other torques, loads, days and machines"),
-    "tanks": ("Tanks", "cascaded tanks: structures of f_p and GPs, by a free run"),
-    "large": ("Large", "100,000 observations: inducing points, or an exact model of some"),
-    "optimisation": ("Optimisation", "trials of Bayesian optimisation in Ax, with and without f_p"),
-    "misled": ("Misled", "Bayesian optimisation with a physics that misleads, or helps"),
-    "choice": ("Choice", "a physics of no use, and what compare recommends"),
-    "kinks": ("Kinks", "next states of systems with dry friction, impacts, gaps and switches"),
-    "ridges": ("Ridges", "intervals of parameters on a ridge, or of which several values do"),
-    "polynomials": ("Polynomials", "CKA, AR1 and MFK on functions that are nearly polynomials"),
-    "seeds": ("Seeds", "fits of the same data by several seeds, beside long sampling"),
-    "floor": ("Floor", "what the control tasks cost at best"),
+CHAPTERS = {
+    "forrester": ("Forrester",),
+    "pairs": ("Multifidelity", "Polynomials", "Large"),
+    "calibration": ("Calibration", "Seeds"),
+    "structures": ("Structures", "Choice"),
+    "parameters": ("Parameters", "Ridges"),
+    "measuring": ("Active", "Optimisation", "Misled"),
+    "cartpole": ("CartPole", "Planning", "Floor"),
+    "arm": ("Arm", "Reaching"),
+    "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
-_OTHER = {"report": "copy the results that are committed into the READMEs"}
+"""Folders, and the classes of the experiments that they declare."""
+EXPERIMENTS = {
+    kind.lower(): f"paper.{chapter}:{kind}" for chapter, kinds in CHAPTERS.items() for kind in kinds
+}
+"""Classes of the experiments, by their names."""
+_OTHER = {
+    "all": "run what is missing of every experiment, with --out paper/results/NAME, then report",
+    "report": "copy the results that are committed into the pages",
+}
 
 
 def main() -> None:
@@ -42,10 +38,15 @@ def main() -> None:
     name, *arguments = sys.argv[1:] or ["--help"]
     if name in EXPERIMENTS:
         _run(name, arguments)
+    elif name == "all":  # options are those that all experiments have
+        for each in EXPERIMENTS:
+            print(f"\n{each}: {_about(each)}")
+            _run(each, ["--out", f"{Path(__file__).parent}/results/{each}", *arguments])
+        import_module("paper.report").report()
     elif name == "report" and not arguments:
         import_module("paper.report").report()
     else:
-        lines = [f"  {known:<15}{what}" for known, (_, what) in EXPERIMENTS.items()]
+        lines = [f"  {known:<15}{_about(known)}" for known in EXPERIMENTS]
         lines += [f"  {known:<15}{what}" for known, what in _OTHER.items()]
         usage = f"usage: python -m paper experiment [options]\n\n{__doc__}\n" + "\n".join(lines)
         if {"-h", "--help"} & {name, *arguments}:
@@ -54,10 +55,15 @@ def main() -> None:
         raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
 
 
+def _about(name: str) -> str:
+    """The first line of what its class says."""
+    return str(resolve_name(EXPERIMENTS[name]).__doc__).partition("\n")[0]
+
+
 def _run(name: str, arguments: list[str]) -> None:
     import tyro
 
-    kind = getattr(import_module(f"paper.{name}"), EXPERIMENTS[name][0])
+    kind = resolve_name(EXPERIMENTS[name])
     config = [tyro.conf.FlagCreatePairsOff, *([tyro.conf.OmitArgPrefixes] if kind.flat else [])]
     experiment = tyro.cli(kind, prog=f"python -m paper {name}", args=arguments, config=config)
     runner = import_module("paper.common.runner")

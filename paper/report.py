@@ -1,4 +1,4 @@
-"""Copies the committed results into the READMEs, between their markers."""
+"""Copies the committed results into the pages, between their markers."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 from paper.common.tables import filled, fragments
 
 PAPER = Path(__file__).parent
-READMES = (PAPER.parent / "README.md", PAPER / "README.md")
+PAGES = sorted([PAPER.parent / "README.md", *PAPER.glob("*.md"), *PAPER.glob("*/README.md")])
 
 
 def report() -> None:
-    """Write every result into the READMEs."""
+    """Write every result into the pages."""
     found = results(PAPER / "results")
-    for path in READMES:
+    for path in PAGES:
         path.write_text(filled(path.read_text(), found))
 
 

@@ -60,6 +60,18 @@ def test_every_name_is_there_and_brings_nothing_optional():
     assert pickle.loads(pickle.dumps(gpadjust.CKA)) is gpadjust.CKA
 
 
+def test_what_a_user_can_take_is_listed_and_nothing_else(monkeypatch):
+    rooms = {path.parent.name for path in Path(gpadjust.__file__).parent.glob("*/__init__.py")}
+    assert set(dir(gpadjust)) == {*gpadjust.__all__, *rooms, "__version__"}
+    assert gpadjust.report.report
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    for name in ("gpadjust.sklearn", "gpadjust.sklearn.cka_regressor"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.delattr(gpadjust, "sklearn", raising=False)
+    with pytest.raises(AttributeError, match="needs scikit-learn"):
+        gpadjust.sklearn  # noqa: B018
+
+
 def test_other_names_are_not():
     assert not hasattr(gpadjust, "GPModel")
     with pytest.raises(AttributeError, match="'gpadjust' has no attribute 'GPModel'"):

@@ -18,7 +18,7 @@ THUMBNAILS = {"1": 1, "2": 1, "4": 2, "6": 2, "7": 1, "9": 3}  # which picture; 
 CARD = """:::{{grid-item-card}} {number}. {title}
 :link: {stem}
 :link-type: doc
-:img-top: pictures/{number}.png
+:img-top: pictures/{number}_{picture}.png
 :img-alt: A figure of the tutorial {title}
 {text}
 :::"""
@@ -48,7 +48,10 @@ def anchored(name: str, text: str) -> str:
 def gallery(text: str) -> str:
     """The tutorials' README, its table as cards with pictures."""
     rows = re.findall(r"^\| \[(\d+)\. (.+?)\]\((.+?)\.ipynb\) \| (.+?) \|$", text, re.MULTILINE)
-    cards = [CARD.format(number=n, title=t, stem=s, text=text) for n, t, s, text in rows]
+    cards = [
+        CARD.format(number=n, title=t, stem=s, text=text, picture=THUMBNAILS.get(n, 0))
+        for n, t, s, text in rows
+    ]
     grid = "\n".join(["::::{grid} 1 2 2 2", ":gutter: 3", *cards, "::::"])
     tree = "\n".join(["```{toctree}", ":hidden:", *(stem for _, _, stem, _ in rows), "```"])
     table = re.search(r"^\|.*^\|.*?$", text, re.MULTILINE | re.DOTALL)
@@ -56,17 +59,16 @@ def gallery(text: str) -> str:
 
 
 def take_pictures(app: Sphinx) -> None:
-    """Write a picture of each tutorial, for its card and for other pages."""
+    """Write the pictures of the tutorials, for their cards and for other pages."""
     for path in TUTORIALS.glob("*.ipynb"):
-        number = path.stem.partition("_")[0]
         cells = json.loads(path.read_text())["cells"]
         data = [output.get("data", {}) for cell in cells for output in cell.get("outputs", [])]
-        pictures = [each["image/png"] for each in data if "image/png" in each]
-        picture = base64.b64decode("".join(pictures[THUMBNAILS.get(number, 0)]))
-        target = TUTORIALS / "pictures" / f"{number}.png"
-        if not target.exists() or target.read_bytes() != picture:
-            target.parent.mkdir(exist_ok=True)
-            target.write_bytes(picture)
+        for i, each in enumerate(each for each in data if "image/png" in each):
+            picture = base64.b64decode("".join(each["image/png"]))
+            target = TUTORIALS / "pictures" / f"{path.stem.partition('_')[0]}_{i}.png"
+            if not target.exists() or target.read_bytes() != picture:
+                target.parent.mkdir(exist_ok=True)
+                target.write_bytes(picture)
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

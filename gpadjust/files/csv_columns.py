@@ -85,7 +85,7 @@ class CsvColumns:
                 hint = self._other_delimiter() or self._miscounted(line, fields, delimiter)
                 raise ValueError(
                     f"{file}, line {line}: expected {expected}, one for each name, found "
-                    f"{len(fields)}; mend the line, or leave it out.{hint}"
+                    f"{len(fields)}; correct the line, or leave it out.{hint}"
                 )
 
     def __len__(self) -> int:
@@ -158,7 +158,7 @@ class CsvColumns:
         raise ValueError(f"{where}: expected a column {name!r}, found {found}.{meant}{hint}")
 
     def _other_delimiter(self) -> str:
-        """What to do if a single column has names for several."""
+        """Return a hint if a single column has the names of several."""
         marks = [mark for mark in _OTHERS if mark in self.names[0]] if len(self.names) == 1 else []
         if not marks:
             return ""
@@ -184,12 +184,12 @@ class CsvColumns:
     def _refuse(self, line: int, column: int, expected: str, text: str) -> NoReturn:
         raise ValueError(
             f"{self.file}, line {line}, column {column + 1} ({self.names[column]!r}): expected "
-            f"{expected}, found {text!r}; mend the field, or leave the line out."
+            f"{expected}, found {text!r}; correct the field, or leave the line out."
             f"{self._other_decimal(text)}"
         )
 
     def _other_decimal(self, text: str) -> str:
-        """What to do if a field would be a number with the other decimal mark."""
+        """Return a hint if a field would be a number with the other decimal mark."""
         other = "," if self.decimal == "." else "."
         try:
             float(text.replace(other, "."))

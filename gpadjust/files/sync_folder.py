@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def sync_folder(path: Path) -> None:
-    """Wait until the names of the files in a folder are on the disk, where a system can tell.
+    """Wait until the names of the files in a folder are on the disk, where the system supports it.
 
     A file that was written and synchronised is else lost with its name when the power is cut.
     """

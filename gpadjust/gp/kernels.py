@@ -130,7 +130,7 @@ class Stationary(NamedTuple):
         return self.scale.unsqueeze(-1)
 
     def pairs(self, x: Tensor, derivatives: bool = True) -> Pairs:
-        """All pairs of centred inputs ``... x n x d``, and what derivatives are made of."""
+        """All pairs of centered inputs ``... x n x d``, and what derivatives are made of."""
         z, scale = x / self.lengthscale, self.scale[..., None, None]
         if self.profile is RBF:
             return Pairs(_exponents(z, shift=self.scale.log()[..., None, None]).exp_(), None, z)

@@ -14,7 +14,7 @@ from torch.nn import Parameter
 
 
 class Noise(NamedTuple):
-    """What a GPyTorch likelihood says of the noise of observations: the only place that asks.
+    """The noise of observations by a GPyTorch likelihood; only this class asks the likelihood.
 
     Learnt variances are the one of ``GaussianLikelihood``, or those that a likelihood with a method
     ``selection`` (as that of :class:`~gpadjust.AR1`) selects from by the inputs.
@@ -24,7 +24,7 @@ class Noise(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether the noise of each training target was given."""
+        """True if the noise of each training target was given."""
         return isinstance(self.likelihood, FixedNoiseGaussianLikelihood)
 
     @property
@@ -47,7 +47,7 @@ class Noise(NamedTuple):
         return [part.raw_noise for part in parts if isinstance(part, _HomoskedasticNoiseBase)]
 
     def selection(self, inputs: Tensor) -> Tensor | None:
-        """Which learnt variance each of ``n`` inputs has, ``... x n x K``; None for the one."""
+        """Return the share of each variance at ``n`` inputs, ``... x n x K``; None for one."""
         select = getattr(self.likelihood, "selection", None)
         return None if select is None else select(inputs)
 
@@ -70,5 +70,5 @@ class Noise(NamedTuple):
         return noise.sum(-1, keepdim=True) / observed.sum(-1, keepdim=True)
 
     def after(self, **given: Tensor) -> Noise:
-        """That of a model conditioned on further observations."""
+        """Return the noise of the model conditioned on further observations."""
         return Noise(self.likelihood.get_fantasy_likelihood(**given))

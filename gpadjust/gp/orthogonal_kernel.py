@@ -50,7 +50,7 @@ class OrthogonalKernel(CompositeKernel):
 
     @property
     def batch_shape(self) -> Size:
-        """That of the base kernel."""
+        """The batch shape of the base kernel."""
         return self.base_kernel.batch_shape
 
     @batch_shape.setter

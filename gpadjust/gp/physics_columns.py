@@ -51,7 +51,7 @@ class PhysicsInput(InputTransform):
         return appended(self.base, X, self.values(X))
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
-        """As :meth:`transform`, with the base transform's own preprocessing."""
+        """Return :meth:`transform` with the preprocessing of the base transform."""
         return appended(self.base, X, self.values(X), preprocess=True)
 
     def values(self, X: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ class PhysicsInput(InputTransform):
         return values
 
     def at(self, X: Tensor, coordinates: Tensor) -> Tensor:
-        """As :meth:`transform`, at other coordinates, ``... x p``; f_p is NaN where it fails."""
+        """Return :meth:`transform` at coordinates ``... x p``; f_p is NaN where it fails."""
         f_p = self.physics.or_nan(X, self.physics.unknowns.at(coordinates))
         return appended(self.base, X, f_p)
 
@@ -84,7 +84,7 @@ class PhysicsInput(InputTransform):
         return inputs if self.base is None else self.base.untransform(inputs)
 
     def equals(self, other: InputTransform) -> bool:
-        """Whether ``other`` appends the same physics after an equal base transform."""
+        """Return whether ``other`` appends the same physics after an equal base transform."""
         if not isinstance(other, PhysicsInput) or self.physics is not other.physics:
             return False
         ours, theirs = self.base, other.base
@@ -131,7 +131,7 @@ class AppendedPhysics(Batched, gpytorch.Module):
     r"""Reads f_p from a column that :class:`PhysicsInput` appended: the basis of a term.
 
     For output :math:`j` it returns :math:`(f_{p,j}(x) - c_j) / \text{scale}_j`, in the units of the
-    model's targets. The centre c is the offset, or that and a learnt number of spreads.
+    model's targets. The center c is the offset, or that and a learnt number of spreads.
 
     Args:
         num_inputs: Number ``d`` of input columns before the appended ones.
@@ -139,11 +139,11 @@ class AppendedPhysics(Batched, gpytorch.Module):
             ``batch_shape x (m) x 1 x k``.
         offset: ``batch_shape x (m) x 1``, in the user's units, as the next three.
         scale: Its scale.
-        spread: For a centre that is learnt, or None.
-        mean: The term's prior mean, so that a centre that moves leaves that of the whole function.
+        spread: For a center that is learnt, or None.
+        mean: The term's prior mean, so that a center that moves leaves that of the whole function.
     """
 
-    prior_of_learnt = (0.0, 3.0)  # mean and standard deviation of the centre's prior, in spreads
+    prior_of_learnt = (0.0, 3.0)  # mean and standard deviation of the center's prior, in spreads
     select: Tensor
     offset: Tensor
     scale: Tensor
@@ -172,16 +172,16 @@ class AppendedPhysics(Batched, gpytorch.Module):
 
     @property
     def learnt(self) -> Parameter | None:
-        """The centre in spreads, if a fit may move it: the constant that the basis is affine in."""
+        """The center in spreads, if a fit may move it: the constant that the basis is affine in."""
         return self.center if self.learns_center and self.center.requires_grad else None
 
     def slope(self, x: Tensor) -> Tensor:
-        """The derivative of the basis by the centre in spreads, ``... x 1``."""
+        """The derivative of the basis by the center in spreads, ``... x 1``."""
         return -self.spread / self.scale
 
     @property
     def origin(self) -> Tensor:
-        """The centre c, ``batch_shape x (m) x 1``, in the user's units."""
+        """The center c, ``batch_shape x (m) x 1``, in the user's units."""
         return self.offset + self.spread * self._center if self.learns_center else self.offset
 
     @property
@@ -196,7 +196,7 @@ class AppendedPhysics(Batched, gpytorch.Module):
 
     @property
     def moved_mean(self) -> Tensor | float:
-        """What a centre that has moved takes from the prior mean with a term, to be given back."""
+        """Return the change of the prior mean by a center that has moved, to be undone."""
         return self.spread * self._center * self.mean / self.scale if self.learns_center else 0.0
 
     def forward(self, x: Tensor) -> Tensor:

@@ -78,7 +78,7 @@ class Term(Batched):
 
     @property
     def is_known(self) -> bool:
-        """Whether g is a known constant."""
+        """True if g is a known constant."""
         return self.kernel is None and not self.learns_mean
 
     @property

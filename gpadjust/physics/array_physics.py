@@ -1,4 +1,4 @@
-"""A function of NumPy arrays or of tensors, whichever it is, as a Physics."""
+"""A Physics of a function of NumPy arrays or of tensors."""
 
 from __future__ import annotations
 

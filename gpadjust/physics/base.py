@@ -1,4 +1,4 @@
-"""The interface of a physics, and what all of them share."""
+"""The interface of a physics, and the code that all of them share."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class Physics(torch.nn.Module, ABC):
         return Y.reshape(*columns.shape[:-1], m).expand(*shape, m)
 
     def or_nan(self, X: Tensor, parameters: Tensor | None = None) -> Tensor:
-        """As calling it, without gradient, NaN in rows at which the physics fails.
+        """Return the outputs without gradient, NaN in rows at which the physics fails.
 
         Raises:
             PhysicsError: If it does not say where it fails, or fails everywhere before its number
@@ -217,7 +217,7 @@ class Physics(torch.nn.Module, ABC):
         return Y.detach()
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
-        """As :meth:`of_rows`, evaluated whatever is remembered; checked, of the rows' dtype."""
+        """Return :meth:`of_rows` without the memory, checked, in the dtype of the rows."""
         try:
             Y = self.evaluate(*(self._arguments(rows) if self._p else (rows,)))
         except PhysicsError as error:
@@ -237,7 +237,7 @@ class Physics(torch.nn.Module, ABC):
             if bad:
                 raise PhysicsError(
                     f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} "
-                    "row(s), expected finite numbers. Mend it, or keep such inputs out:",
+                    "row(s), expected finite numbers. Correct it, or exclude such inputs:",
                     bad,
                     partial=Y.detach(),
                 )
@@ -249,7 +249,7 @@ class Physics(torch.nn.Module, ABC):
         return (rows[:, :d], self.unknowns.named(rows[:, d:])) if self._p else (rows,)
 
     def forget(self) -> None:
-        """Forget what is remembered of rows, if anything is."""
+        """Empty the memory of evaluated rows, if there is one."""
 
     def extra_repr(self) -> str:
         """The settings that ``repr`` shows."""
@@ -278,7 +278,7 @@ class Physics(torch.nn.Module, ABC):
         return parameters.to(X)
 
     def _where_it_works(self, rows: Tensor) -> Tensor | PhysicsError:
-        """``N x m`` outputs, NaN where the physics fails; its error if there is nothing else."""
+        """Return ``N x m`` outputs, NaN where the physics fails, or its error if all rows fail."""
         working = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
         while True:
             try:
@@ -316,7 +316,7 @@ class Physics(torch.nn.Module, ABC):
         return kept[0], torch.nn.functional.pad(slope, (0, self._p))
 
     def _arguments_hint(self, error: Exception) -> str:
-        """What to do where a function was called with the wrong number of arguments."""
+        """Return a hint for a function that was called with a wrong number of arguments."""
         if not isinstance(error, TypeError) or "positional argument" not in str(error):
             return ""
         if self._p:

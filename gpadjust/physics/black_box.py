@@ -124,14 +124,14 @@ class BlackBoxPhysics(Physics):
             first = next(iter(errors.values()))
             raise PhysicsError(
                 f"Physics {self.name!r} raised {described(first)}, in the first of {len(errors)} "
-                f"failed row(s) of {len(rows)}. Mend it, or keep such inputs out:",
+                f"failed row(s) of {len(rows)}. Correct it, or exclude such inputs:",
                 errors,
                 partial=torch.from_numpy(Y) if outputs else None,
             ) from first
         return Y
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, by the memory and with the gradient asked for."""
+        """Return the outputs of rows from the memory, with the gradient that was chosen."""
         if not torch.is_grad_enabled() or not rows.requires_grad or len(rows) == 0:
             return self._recall(rows.detach())
         if self.gradient is None:
@@ -156,7 +156,7 @@ class BlackBoxPhysics(Physics):
         self._memo = RowMemo(self._memo.capacity)
 
     def _recall(self, rows: Tensor) -> Tensor:
-        """``N x m`` outputs, from the memory as far as it knows them."""
+        """Return ``N x m`` outputs, from the memory where it has them."""
         if not self._memo.capacity or len(rows) == 0:
             return super().of_rows(rows)
         # Values are compared, not versions: `p.data.fill_(...)` leaves a tensor's version as it is.

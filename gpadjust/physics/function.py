@@ -1,4 +1,4 @@
-"""A torch function as physics, several physics side by side, and whatever else passes for one."""
+"""Physics of a torch function, of several physics side by side, and of other callables."""
 
 from __future__ import annotations
 
@@ -120,17 +120,17 @@ class JoinedPhysics(Physics):
         return self._of_parts(lambda part, own: part.of_rows(own), X, *parameters)
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class; checks, memory and gradients are the parts'."""
+        """Return the outputs of rows; checks, memory and gradients are those of the parts."""
         return self.evaluate(*self._arguments(rows))
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
-        """As :meth:`of_rows`, whatever the parts remember."""
+        """Return :meth:`of_rows` without the memory of the parts."""
         return self._of_parts(lambda part, own: part.fresh_rows(own), *self._arguments(rows))
 
     def _of_parts(
         self, ask: Callable[[Physics, Tensor], Tensor], X: Tensor, *parameters: ParameterValues
     ) -> Tensor:
-        """What each part is asked of its rows, side by side."""
+        """Return the results of a function of each part and its rows, side by side."""
         outputs = []
         for name, part in zip(self.names, cast(Iterable[Physics], self.parts), strict=True):
             try:
@@ -152,7 +152,7 @@ class JoinedPhysics(Physics):
         return Y
 
     def forget(self) -> None:
-        """Forget what the parts remember."""
+        """Empty the memory of the parts."""
         for part in cast(Iterable[Physics], self.parts):
             part.forget()
 
@@ -197,15 +197,15 @@ def as_physics(physics: AnyPhysics | Parts) -> Physics:
 
 
 def _in_common(parts: Sequence[Physics]) -> dict[str, Unknown]:
-    """The unknown parameters of some physics; what has the same name is one."""
+    """The unknown parameters of several physics; parameters of one name are one."""
     found: dict[str, Unknown] = {}
     for part in parts:
         for name, unknown in part.unknowns.items():
             if found.setdefault(name, unknown) != unknown:
                 raise ValueError(
-                    f"Several physics have an unknown parameter {name!r}, which is then one, but "
-                    f"say different things of it: {found[name]} and {unknown}. Say the same, or "
-                    "give it another name."
+                    f"Several physics have an unknown parameter {name!r}, which is then one "
+                    f"parameter, but with different priors: {found[name]} and {unknown}. Give one "
+                    "prior, or different names."
                 )
     return found
 

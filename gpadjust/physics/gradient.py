@@ -1,4 +1,4 @@
-"""Gradients of what is computed outside of torch: by differences, and through autograd."""
+"""Gradients of functions outside of torch: by differences, and through autograd."""
 
 from __future__ import annotations
 

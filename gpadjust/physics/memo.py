@@ -104,5 +104,5 @@ class RowMemo:
         self.__dict__.update(state, _lock=RLock())
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RowMemo:
-        """An empty memo of the same capacity: what is copied is about to go its own way."""
+        """Return an empty memo of the same capacity, as a copy of the physics may change."""
         return RowMemo(self.capacity)

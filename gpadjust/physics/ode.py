@@ -153,7 +153,7 @@ class ODEPhysics(Physics):
         return path[-1] - state if self.difference else path[-1]
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, with the gradient in X by differences if that was asked for."""
+        """Return the outputs of rows, with the gradient in X by differences if that was chosen."""
         by_differences = self.gradient == "finite-difference" and torch.is_grad_enabled()
         by_differences = by_differences and rows.requires_grad
         if not by_differences or any(p.requires_grad for p in self.parameters()):

@@ -1,4 +1,4 @@
-"""Row-by-row calls of a NumPy function, in parallel where joblib is told so."""
+"""Row-by-row calls of a NumPy function, in parallel under ``joblib.parallel_config``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unknown parameters of a physics, and what is known of them beforehand."""
+"""Unknown parameters of a physics, and their priors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LARGEST = 8.0  # coordinate, beyond which float64 knows no mass of the normal d
 
 @dataclass(frozen=True)
 class Unknown:
-    r"""A parameter of a physics that is to be learnt, and what is known of it beforehand.
+    r"""An unknown parameter of a physics, and its prior.
 
     Its prior is one of three: :math:`N(\text{guess}, \text{sd}^2)`; a log-normal one, of which
     ``factor`` is one standard deviation (1.5: two thirds to one and a half times the guess are
@@ -136,13 +136,13 @@ class Unknown:
         return (value - self.guess) / (self.sd or 1.0)
 
     def _cdf(self, value: float) -> float:
-        """What the prior without bounds has below a value."""
+        """Return the probability below a value by the prior without bounds."""
         end = torch.tensor(value, dtype=torch.float64)
         return float(_STANDARD.cdf(self._without_bounds(end)))
 
 
 def _share(z: Tensor) -> Tensor:
-    """What the standard normal distribution has below, never nothing or all."""
+    """Return the standard normal probability below ``z``, never 0 or 1."""
     return _STANDARD.cdf(z.clamp(-_LARGEST, _LARGEST))
 
 
@@ -176,11 +176,11 @@ class ParameterValues(Mapping[str, Any]):
         return len(self._names)
 
     def numpy(self) -> ParameterValues:
-        """The same as arrays of NumPy."""
+        """Return the values as NumPy arrays."""
         return ParameterValues(self._names, self.rows.detach().cpu().double().numpy().copy())
 
     def row(self, i: int) -> ParameterValues:
-        """Those of a row, a number each."""
+        """Return the values of a row, a number each."""
         return ParameterValues(self._names, np.asarray(self.rows[i]))
 
 

@@ -7,7 +7,7 @@ class PhysicsWarning(UserWarning):
     It is given when a model of the physics is built, by at least five observations of an output: a
     factor, as of other units; the opposite sign; an offset; inputs, or targets, that were scaled
     beforehand, while f_p reads and returns raw units. What the model learns anyway is not warned
-    of: an offset where the centre or ``delta_mean`` is learnt, a factor where ``rho_mean`` is. Nor
+    of: an offset where the center or ``delta_mean`` is learnt, a factor where ``rho_mean`` is. Nor
     is a physics with unknown or trainable parameters, whose first values are guesses.
 
     Example:

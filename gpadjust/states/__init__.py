@@ -1,4 +1,4 @@
-"""What the entries of a system's state and action are, said once for dynamics and environments."""
+"""Names and kinds of the entries of state and action, for dynamics and systems."""
 
 from gpadjust.states.state_spec import StateSpec
 

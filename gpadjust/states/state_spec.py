@@ -1,4 +1,4 @@
-"""What the entries of a system's state are."""
+"""Names and kinds of the entries of a system's state."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _OFF_CIRCLE = 0.3  # of a sine and cosine that noisy sensors show
 
 @dataclass(frozen=True)
 class StateSpec:
-    r"""What the entries of a system's state and action are, said once.
+    r"""Names and kinds of the entries of a system's state and action.
 
     A *state* is a row of physical quantities; an *observation* is what a policy sees: the state
     with each angle :math:`\theta` replaced, in its place, by :math:`\sin\theta, \cos\theta`.

@@ -27,9 +27,8 @@ from gpadjust.systems.reaching import (
 )
 from gpadjust.systems.torque_arm import REAL_ARM
 from paper.arm import Settings
-from paper.control import Scenario
-from paper.control.learner import System, dynamics
-from paper.control.recorder import Recorder
+from paper.cartpole import Scenario
+from paper.cartpole.control import Recorder, System, dynamics
 
 NUM_LAST_STEPS = 5  # of the second score
 ACCURACY = 1e-5  # the environment's
@@ -48,7 +47,7 @@ def system(scenario: Scenario, settings: Settings) -> System:
         initial_states=memory_start if settings.memory else arm_start,
         episode_length=settings.episode_length,
     )
-    recorder = ArmRecorder(settings, scenario.model is None)
+    recorder = ArmRecorder(settings, scenario.kind == "none")
     return System(gym.wrappers.TimeLimit(env, settings.episode_length), task, recorder)
 
 

@@ -1,22 +1,152 @@
-"""Swinging up a cart-pole: learners with and without physics (the paper's sec. 3.2)."""
+"""The cart-pole: learners with and without physics (the paper's sec. 3.2), planning, and floors."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from paper.control import Control, Scenario
-from paper.control import Settings as ControlSettings
+from paper.common.experiment import Axes, Experiment
+from paper.common.learners import LEARNERS, LITERAL, Learner, labels
 
 if TYPE_CHECKING:
-    from paper.control.learner import System
+    from paper.cartpole.control import System
 
-MODEL_FREE_UPDATES = 100  # per episode, of all episodes; the best of 25, 50, 100, 200
-SUBSET = 4  # seeds of some scenarios
-STALE = 3  # seeds of those without refreshed model data
 NUM_STARTS = 20  # of the evaluation
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlSettings:
+    """What decides the numbers, for all learners, unless one says otherwise.
+
+    SAC's were tuned on the cart-pole with its true dynamics as the model.
+    """
+
+    episodes: int
+    """real episodes of a run"""
+    episode_length: int
+    """steps of an episode"""
+    model_episodes: int = 20
+    """episodes in the model after each of the first real ones"""
+    last_model_episode: int
+    """real episodes after which the model is no longer used"""
+    updates_per_model_step: float = 2
+    """gradient steps for each step in the model"""
+    num_particles: int = 5
+    """model episodes side by side"""
+    refresh_model_data: bool = True
+    """whether each new model predicts the earlier ones' transitions again (the paper does not)"""
+    updates: int | None = None
+    """gradient steps after each episode of a model-free learner; default: as many as the others"""
+    later_updates: int
+    """gradient steps after each episode without a model"""
+    learning_rate: float = 3e-3
+    """of SAC"""
+    gamma: float = 0.95
+    """of SAC"""
+    tau: float = 0.02
+    """of SAC"""
+    batch_size: int = 256
+    """of SAC"""
+    net_arch: tuple[int, ...] = (128, 128)
+    """of SAC"""
+    ent_coef: str = "auto_0.3"
+    """of SAC"""
+    target_entropy: str | float = "auto"
+    """of SAC"""
+    target: str = "difference"
+    """the targets of dynamics: differences of states, or next states ("absolute")"""
+    num_features: int = 128
+    """of RRA"""
+
+    def updates_after(self, episode: int, model_free: bool) -> int:
+        """Gradient steps after a real episode (from 1), without those within the model."""
+        if model_free and self.updates is not None:
+            return self.updates
+        if episode > self.last_model_episode:
+            return self.later_updates
+        return self.episode_length + (self.updates_in_model() if model_free else 0)
+
+    def updates_in_model(self) -> int:
+        """Gradient steps within the model after a real episode."""
+        return round(self.updates_per_model_step * self.model_episodes * self.episode_length)
+
+
+@dataclass(frozen=True)
+class Scenario(Learner):
+    """A learner of a control task; its models are literal, at their most likely hyper-parameters.
+
+    Args:
+        changes: Settings that it has in place of the shared ones.
+        max_runs: The most seeds that it is run with.
+        kind: ``"learnt"``, or ``"physics"`` for f_p alone, ``"truth"`` for the real system,
+            ``"none"`` for a model-free learner.
+    """
+
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    max_runs: int | None = None
+    kind: str = "learnt"
+
+
+def scenario(
+    name: str,
+    label: str = "",
+    changes: Mapping[str, Any] | None = None,
+    max_runs: int | None = None,
+) -> Scenario:
+    """A scenario of a learner of the registry, or of ``"rra-paper"``, RRA as printed."""
+    known = LEARNERS.get(name, LEARNERS["rra"])
+    model = "PaperRRA" if name == "rra-paper" else known.model
+    kind = {"phy": "physics", "oracle": "truth", "mf": "none"}.get(name, "learnt")
+    options = LITERAL if name in ("cka", "rra") else {}
+    return Scenario(
+        label or f"Dyna-{known.label}", known.color, model, options, known.adjusts,
+        changes or {}, max_runs, kind,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Control(Experiment):
+    """Learners of one task."""
+
+    settings: ControlSettings
+
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.dynamics.LearnedDynamics",)
+    known: ClassVar[Mapping[str, Scenario]]
+    """all learners"""
+    rmses: ClassVar[Mapping[str, str]]
+    """the states that models predict, and what they are called in tables, with units"""
+
+    def system(self, name: str, seed: int) -> System:
+        """The real system, what is known of it, and who writes down what happens, for a run."""
+        raise NotImplementedError
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The names of the learners in tables and figures."""
+        return {name: scenario.label for name, scenario in self.known.items()}
+
+    def settings_of(self, name: str) -> Any:
+        """The settings of a learner."""
+        return replace(self.settings, **self.known[name].changes)
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Some learners have few seeds."""
+        return self.seeds[: self.known[kind[0]].max_runs]
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """Settings, all options of the learner in force, and what its dynamics are."""
+        from paper.cartpole.control import described
+
+        return described(self, kind[0])
+
+    def run(self, *case: Any) -> dict[str, Any]:
+        """Learn, or go on with it."""
+        from paper.cartpole.control import run
+
+        return run(self, *case)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,32 +161,31 @@ class Settings(ControlSettings):
     """whether policy and model see sine and cosine of the angle"""
 
 
+# Per episode, of all episodes; the best of 25, 50, 100, 200.
+_FEWER: Mapping[str, Any] = {"updates": 100}
 _PAPER_GP = {"target": "absolute", "encode_angle": False}
 _PAPER_RRA = {"target": "absolute"}
 _STALE = {"refresh_model_data": False}
 SCENARIOS = {
-    "mf": Scenario("model-free"),
-    "mf-best": Scenario("model-free, fewer updates", changes={"updates": MODEL_FREE_UPDATES}),
-    "phy": Scenario("Dyna-Phy", "physics"),
-    "gp": Scenario("Dyna-GP", "ZeroMeanGP"),
-    "gp-paper": Scenario("Dyna-GP, paper", "ZeroMeanGP", _PAPER_GP),
-    "cka": Scenario("Dyna-CKA", "CKA"),
-    "rra": Scenario("Dyna-RRA", "RRA"),
-    "rra-paper": Scenario("Dyna-RRA, paper", "PaperRRA", _PAPER_RRA),
-    "oracle": Scenario("oracle", "truth"),
-    "gp-absolute": Scenario("Dyna-GP, absolute", "ZeroMeanGP", {"target": "absolute"}, SUBSET),
-    "cka-absolute": Scenario("Dyna-CKA, absolute", "CKA", {"target": "absolute"}, SUBSET),
-    "cka-1": Scenario("Dyna-CKA, 1 update a step", "CKA", {"updates_per_model_step": 1}, SUBSET),
-    "cka-4": Scenario("Dyna-CKA, 4 updates a step", "CKA", {"updates_per_model_step": 4}, SUBSET),
-    "cka-stale": Scenario("Dyna-CKA, not refreshed", "CKA", _STALE, STALE),
-    "gp-paper-stale": Scenario(
-        "Dyna-GP, paper, not refreshed", "ZeroMeanGP", {**_PAPER_GP, **_STALE}, STALE
-    ),
-    "rra-paper-stale": Scenario(
-        "Dyna-RRA, paper, not refreshed", "PaperRRA", {**_PAPER_RRA, **_STALE}, STALE
+    "mf": scenario("mf", "model-free"),
+    "mf-best": scenario("mf", "model-free, fewer updates", _FEWER),
+    "phy": scenario("phy", "Dyna-Phy"),
+    "gp": scenario("gp"),
+    "gp-paper": scenario("gp", "Dyna-GP, paper", _PAPER_GP),
+    "cka": scenario("cka"),
+    "rra": scenario("rra"),
+    "rra-paper": scenario("rra-paper", "Dyna-RRA, paper", _PAPER_RRA),
+    "oracle": scenario("oracle", "oracle"),
+    "gp-absolute": scenario("gp", "Dyna-GP, absolute", {"target": "absolute"}, 4),
+    "cka-absolute": scenario("cka", "Dyna-CKA, absolute", {"target": "absolute"}, 4),
+    "cka-1": scenario("cka", "Dyna-CKA, 1 update a step", {"updates_per_model_step": 1}, 4),
+    "cka-4": scenario("cka", "Dyna-CKA, 4 updates a step", {"updates_per_model_step": 4}, 4),
+    "cka-stale": scenario("cka", "Dyna-CKA, not refreshed", _STALE, 3),
+    "gp-paper-stale": scenario("gp", "Dyna-GP, paper, not refreshed", {**_PAPER_GP, **_STALE}, 3),
+    "rra-paper-stale": scenario(
+        "rra-paper", "Dyna-RRA, paper, not refreshed", {**_PAPER_RRA, **_STALE}, 3
     ),
 }
-RMSES = {"x": "x, m", "theta": "theta, rad", "x_dot": "x', m/s", "theta_dot": "theta', rad/s"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,11 +196,190 @@ class CartPole(Control):
     settings: Settings = field(default_factory=Settings)
 
     name: ClassVar[str] = "cartpole"
+    axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
     known: ClassVar[Mapping[str, Scenario]] = SCENARIOS
-    rmses: ClassVar[Mapping[str, str]] = RMSES
+    rmses: ClassVar[Mapping[str, str]] = {
+        "x": "x, m",
+        "theta": "theta, rad",
+        "x_dot": "x', m/s",
+        "theta_dot": "theta', rad/s",
+    }
 
     def system(self, name: str, seed: int) -> System:
         """The cart-pole; all learners of a seed have the same f_p."""
         from paper.cartpole.system import system
 
         return system(self.known[name], self.settings_of(name), seed)
+
+
+FRICTIONS = {"friction": (0.3, 0.005), "strong-friction": (0.6, 0.01)}
+"""Dry friction of the cart in N, and drag of the pole in N m s²/rad², of systems that have some.
+The friction is none that f_p has, whatever its parameters."""
+
+SENSORS = {"x": 0.01, "theta": 0.01, "x_dot": 0.05, "theta_dot": 0.05}
+"""Standard deviations of the noise of sensors, of the system that has some; not filtered."""
+
+MC_PILCO: Mapping[str, Any] = {
+    "trials": 6,
+    "random_trials": 1,
+    "episode_length": 60,
+    "time_step": 0.05,
+    "horizon": 16,
+    "rounds": 2,
+}
+"""The protocol of Amadio et al. 2022, a random trial and five of 3 s; and how it is planned."""
+
+SMALL_NOISE = 0.01
+"""In that protocol, the standard deviation of the noise of all sensors, and of the starts."""
+
+_OF_A_SEARCH = ("updates", "starts", "learning_rate", "guides")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanningSettings:
+    """What decides the numbers; found with the true system and other seeds (100 to 111)."""
+
+    trials: int = 5
+    """real trials of a run, the first of which goes by f_p"""
+    random_trials: int = 0
+    """the first of these, if they have random forces"""
+    episode_length: int = 25
+    """steps of a trial"""
+    time_step: float = 0.1
+    """in s"""
+    horizon: int = 8
+    """steps that are planned ahead at each step"""
+    sequences: int = 128
+    """of these, in each round of the cross-entropy method"""
+    spread: float = 0.15
+    """of these about the earlier plan, in shares of the range of forces"""
+    rounds: int = 1
+    """of these after the first"""
+    elites: int = 12
+    """of these"""
+    first_sequences: int = 128
+    """of the plan when a trial begins, of all its steps"""
+    first_rounds: int = 12
+    """of these"""
+    restarts: int = 3
+    """of these"""
+    correlation: float = 0.5
+    """of deviations of a step and the next"""
+    updates: int = 150
+    """of the policy, after each trial, where one is searched for"""
+    starts: int = 192
+    """of an update"""
+    learning_rate: float = 3e-3
+    """at the start of the updates"""
+    guides: int = 32
+    """planned episodes that the policy imitates at first"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planning(Experiment):
+    """Cart-poles that are swung up by planning, with several models of them."""
+
+    out: Path = Path("results/planning")
+    settings: PlanningSettings = field(default_factory=PlanningSettings)
+
+    name: ClassVar[str] = "planning"
+    axes: ClassVar[Axes] = {
+        "system": {
+            "plain": "as the paper's",
+            "friction": "dry friction and drag",
+            "strong-friction": "strong dry friction and drag",
+            "sensors": "noisy sensors",
+            "mc-pilco": "in MC-PILCO's protocol",
+        },
+        "learner": labels("cka", "phymean", "phy")
+        | {"fitted": "f_p and viscous friction, fitted"}
+        | labels("gp", "rra")
+        | {"search": "CKA, policy search"}
+        | labels("oracle"),
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+        "gpadjust.control.PolicySearch",
+    )
+
+    def check(self) -> None:
+        """Refuse runs without a trial."""
+        if self.settings.trials < 1:
+            raise ValueError(f"--trials: expected at least 1, got {self.settings.trials}")
+
+    def settings_of(self, system: str) -> PlanningSettings:
+        """The settings for a system."""
+        return replace(self.settings, **MC_PILCO) if system == "mc-pilco" else self.settings
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings, and what the system has that f_p lacks."""
+        system, learner = kind
+        settings = asdict(self.settings_of(system))
+        if learner != "search":
+            settings = {k: each for k, each in settings.items() if k not in _OF_A_SEARCH}
+        more: dict[str, Any] = {"friction": FRICTIONS[system]} if system in FRICTIONS else {}
+        more |= {"sensors": SENSORS} if system == "sensors" else {}
+        more |= {"small_noise": SMALL_NOISE} if system == "mc-pilco" else {}
+        return {**settings, **more}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FloorSettings:
+    """What decides the numbers."""
+
+    sequences: int = 1000
+    """of actions, that each round of the cross-entropy method looks at"""
+    rounds: int = 40
+    """of the cross-entropy method"""
+    elites: int = 200
+    """of the cross-entropy method"""
+    restarts: int = 3
+    """of the cross-entropy method, which ends in local optima"""
+    arm_runs: int = 1
+    """of SAC on the true arm"""
+    arm_episodes: int = 1000
+    """of these, far more than the experiment's"""
+    arm_updates: int = 60
+    """gradient steps after each of these episodes"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Floor(Experiment):
+    """The best open loops found for the known cart-pole, and SAC for long on the true arm."""
+
+    runs: int = NUM_STARTS
+    """fixed starts of the cart-pole, each with an open loop of its own"""
+    out: Path = Path("results/floor")
+    settings: FloorSettings = field(default_factory=FloorSettings)
+
+    name: ClassVar[str] = "floor"
+    axes: ClassVar[Axes] = {
+        "system": {
+            "mean-start": "cart-pole, mean start: cost of the best open loop found",
+            "fixed-starts": "cart-pole, fixed starts: cost of the best open loop found for each",
+            "arm": "arm: hand's error in cm, all steps, of SAC for long on the true arm, its best",
+        }
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.control.Planner", "gpadjust.control.CrossEntropy")
+
+    def check(self) -> None:
+        """Refuse more fixed starts than there are."""
+        if self.seeds.start < 0 or self.seeds.stop > NUM_STARTS:
+            raise ValueError(
+                f"There are {NUM_STARTS} fixed starts, of the seeds 0 to {NUM_STARTS - 1}; found "
+                f"the seeds {self.seeds.start} to {self.seeds.stop - 1}."
+            )
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Few searches from the mean start, and few runs of the arm."""
+        few = {"mean-start": 3, "arm": self.settings.arm_runs}
+        return self.seeds[: few.get(kind[0], self.runs)]
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings of the system."""
+        arm = kind[0] == "arm"
+        return {k: v for k, v in asdict(self.settings).items() if k.startswith("arm_") == arm}

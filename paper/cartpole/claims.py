@@ -1,27 +1,42 @@
-"""The paper's claims about this experiment, and our own targets, with the numbers that decide.
+"""Claims of the paper, and our own targets, with the numbers that decide.
 
-"In 6 trials" and "after 12" allow one trial more, "at trial 30" five more or less. Phy's decay is a
-mean of trials 13-25 above that of the trials from the first at 0.5 or below to 12, and no recovery
-a mean of 41-50 above 0.5. Never to learn, and to fail, is to stay above 0.5 on average (RRA's in
-trials 1-25). CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up if the 95 % interval
-of the paired difference of 41-50 reaches down to CKA's.
+"In 6 trials" and "after 12" allow one trial more, "at trial 30" five more or less. Phy's decay is
+a mean of trials 13-25 above that of the trials from the first at 0.5 or below to 12, and no
+recovery a mean of 41-50 above 0.5. Never to learn, and to fail, is to stay above 0.5 on average
+(RRA's in trials 1-25). CKA holds if its mean of 41-50 is at most 0.45. RRA has caught up if the
+95 % interval of the paired difference of 41-50 reaches down to CKA's. P1 to P5 look at the mean
+over runs, which has an interval of its own: P3's is wide, as single runs fail. P4, P6 and P7 are
+judged in our form of the models, in which the paper has none of its learners: sine and cosine of
+the angle, differences of states, a prior at f_p for RRA, refreshed model data.
 
 Targets are judged by the mean over runs; an ± is a standard error. T6 takes the best of three
-settings on the seeds that it reports; all three are said. T4 and T5 are the same for either.
+settings on the seeds that it reports; all three are said. T4 and T5 are the same for either cost.
 """
 
 from __future__ import annotations
 
+from functools import partial
+
+from scipy import stats
+
 from gpadjust.systems.cart_pole import TIME_STEP
 from paper.cartpole import SCENARIOS, Settings
-from paper.common.claims import Claim, Finding, counted, met, reached, reproduced
-from paper.common.curves import Curves
-from paper.control.tables import PARTS, seconds_of_a_run
+from paper.cartpole.control import PARTS, seconds_of_a_run
+from paper.common.verdicts import (
+    Claim,
+    Curves,
+    Finding,
+    all_of,
+    counted,
+    met,
+    reached,
+    reproduced,
+    within,
+)
 
-_SETTINGS = Settings()
-_SECONDS = _SETTINGS.episode_length * TIME_STEP
-_LAST, _SERVES = _SETTINGS.episodes, _SETTINGS.last_model_episode
-_LATE = _SERVES - 4  # the first of the last five episodes in which the model serves
+_SECONDS = Settings().episode_length * TIME_STEP
+LAST, SERVES = Settings().episodes, Settings().last_model_episode
+_LATE = SERVES - 4  # the first of the last five episodes in which the model serves
 
 
 def _model_free(curves: Curves) -> Finding:
@@ -51,7 +66,8 @@ def _cka(curves: Curves) -> Finding:
     late = _mean(curves, "cka", 41, 50)
     held = first is not None and touch is not None and first <= 7 and touch <= 13 and late <= 0.45
     beaten = held and (first or 0) < 6 and (touch or 0) < 12 and late <= 0.4
-    return reproduced(held, beaten), _described(curves, "cka") + _beside(curves, "cka-absolute")
+    measured = _described(curves, "cka") + _beside(curves, "cka-absolute")
+    return reproduced(held, beaten), f"in our form, {measured}"
 
 
 def _rra(curves: Curves) -> Finding:
@@ -62,26 +78,41 @@ def _rra(curves: Curves) -> Finding:
     return reproduced(failed and not gap.low > 0), measured + _beside(curves, "rra")
 
 
+def _best_of_all(curves: Curves) -> Finding:
+    gaps = {name: curves.paired_difference(name, 1, LAST) for name in ("mf", "phy", "gp", "rra")}
+    said = ", ".join(f"{SCENARIOS[name].label} {gap.text()}" for name, gap in gaps.items())
+    verdict = all_of(*(within(gap, low=0) for gap in gaps.values()))
+    return verdict, f"in our form, more than Dyna-CKA over all trials: {said}"
+
+
+def _sooner(curves: Curves) -> Finding:
+    gap = curves.paired_difference("gp", 1, SERVES)
+    each = curves.window("gp", 1, SERVES) - curves.window("cka", 1, SERVES)
+    more = f"more in {(each > 0).sum()} of {len(each)} seeds"
+    p = stats.wilcoxon(each).pvalue
+    said = f"Dyna-GP {gap.text()} over 1-{SERVES}, {more} (Wilcoxon's p {p:.3f})"
+    return within(gap, low=0), f"in our form, {said}"
+
+
 def _soon(curves: Curves) -> Finding:
     first = curves.first_below("cka", 0.5)
-    return met(first is not None and first <= 6), f"{reached(first)}; at 6 {_costs(curves, 6, 6)}"
+    return met(
+        first is not None and first <= 6
+    ), f"{reached(first)}; at 6 {_costs_of(curves, 6, 6)}"
 
 
-def _while_it_serves(curves: Curves) -> Finding:
-    return _at_most(curves, 0.4, 13, 25)
-
-
-def _at_the_end(curves: Curves) -> Finding:
-    return _at_most(curves, 0.4, 41, 50)
+def _at_most(first: int, last: int, curves: Curves) -> Finding:
+    mean = float(curves.window("cka", first, last).mean())
+    return met(mean <= 0.4), _costs_of(curves, first, last)
 
 
 def _cheap(curves: Curves) -> Finding:
     fit, rollout, update = _seconds(curves, "cka")
     measured = (
         f"{(fit + rollout) / update:.2f} of it (fits {fit:.0f} s, model steps {rollout:.0f} s, "
-        f"updates {update:.0f} s); in trials {_LATE}-{_SERVES} {_late(curves, 'cka'):.2f}"
+        f"updates {update:.0f} s); in trials {_LATE}-{SERVES} {_late(curves, 'cka'):.2f}"
     )
-    if curves.seeds("cka-1", _LAST):
+    if curves.seeds("cka-1", LAST):
         few = _seconds(curves, "cka-1")
         measured += (
             f"; with 1 update a step {(few[0] + few[1]) / few[2]:.2f}, in those trials "
@@ -117,19 +148,28 @@ CLAIMS = (
     Claim(
         "P4", "Dyna-CKA reaches 0.5 in 6 trials, touches 0.4 after 12, holds to 50", ("cka",), _cka
     ),
-    Claim(
-        "P5",
-        "Dyna-RRA fails in 1-25 and catches CKA in 26-50",
-        ("rra-paper", "cka"),
-        _rra,
-    ),
+    Claim("P5", "Dyna-RRA fails in 1-25 and catches CKA in 26-50", ("rra-paper", "cka"), _rra),
+    Claim("P6", "Dyna-CKA is the best performer", ("cka", "mf", "phy", "gp", "rra"), _best_of_all),
+    Claim("P7", "CKA makes learning more sample-efficient than GP", ("cka", "gp"), _sooner),
+)
+_T6 = (
+    "with the best number of updates, Dyna-CKA's mean cost stays at most 0.5 from trial 7 "
+    "(PILCO's published figure: about 7 trials, 17.5 s) to 25"
 )
 TARGETS = (
     Claim("T1", "Dyna-CKA's mean cost is at most 0.5 at trial 6 or before", ("cka",), _soon),
     Claim(
-        "T2", "Dyna-CKA's mean cost is at most 0.40 over trials 13-25", ("cka",), _while_it_serves
+        "T2",
+        "Dyna-CKA's mean cost is at most 0.40 over trials 13-25",
+        ("cka",),
+        partial(_at_most, 13, 25),
     ),
-    Claim("T3", "Dyna-CKA's mean cost is at most 0.40 over trials 41-50", ("cka",), _at_the_end),
+    Claim(
+        "T3",
+        "Dyna-CKA's mean cost is at most 0.40 over trials 41-50",
+        ("cka",),
+        partial(_at_most, 41, 50),
+    ),
     Claim(
         "T4", "Dyna-CKA's fits and model steps take no longer than SAC's updates", ("cka",), _cheap
     ),
@@ -139,13 +179,7 @@ TARGETS = (
         ("cka-1",),
         _fast,
     ),
-    Claim(
-        "T6",
-        "with the best number of updates, Dyna-CKA's mean cost stays at most 0.5 from trial 7 "
-        "(PILCO's published figure: about 7 trials, 17.5 s) to 25",
-        ("cka", "cka-1", "cka-4"),
-        _few_episodes,
-    ),
+    Claim("T6", _T6, ("cka", "cka-1", "cka-4"), _few_episodes),
 )
 
 
@@ -160,38 +194,30 @@ def _described(curves: Curves, name: str) -> str:
 
 def _beside(curves: Curves, name: str) -> str:
     runs = len(curves.seeds(name, 50))
-    if not runs:
-        return ""
-    return f"; {SCENARIOS[name].label}, {counted(runs)}: {_described(curves, name)}"
+    return f"; {SCENARIOS[name].label}, {counted(runs)}: {_described(curves, name)}" if runs else ""
 
 
-def _at_most(curves: Curves, threshold: float, first: int, last: int) -> Finding:
-    mean = float(curves.window("cka", first, last).mean())
-    return met(mean <= threshold), _costs(curves, first, last)
-
-
-def _costs(curves: Curves, first: int, last: int) -> str:
+def _costs_of(curves: Curves, first: int, last: int) -> str:
     costs = curves.window("cka", first, last)
     return f"{costs.mean():.3f} ± {costs.sem():.3f}, the worst run {costs.max():.3f}"
 
 
 def _stays_from(curves: Curves, name: str) -> int | None:
     """The first episode from which the mean cost stays at most 0.5 while the model serves."""
-    by_episode = curves.mean(name).loc[:_SERVES]
+    by_episode = curves.mean(name).loc[:SERVES]
     above = by_episode.index[by_episode > 0.5]
     first = int(above[-1]) + 1 if len(above) else 1
-    return first if first <= _SERVES else None
+    return first if first <= SERVES else None
 
 
-def _seconds(curves: Curves, name: str, first: int = 1, last: int = _LAST) -> list[float]:
+def _seconds(curves: Curves, name: str, first: int = 1, last: int = LAST) -> list[float]:
     """Median seconds of a run in fits, model steps and updates."""
-    chosen = curves.records[
-        (curves.records["scenario"] == name) & curves.records["episode"].between(first, last)
-    ]
+    own = curves.of(name)
+    chosen = own[own["episode"].between(first, last)]
     return [float(seconds) for seconds in seconds_of_a_run(chosen, PARTS).loc[name]]
 
 
 def _late(curves: Curves, name: str) -> float:
     """Seconds of fits and model steps over those of updates, in the model's last episodes."""
-    fit, rollout, update = _seconds(curves, name, _LATE, _SERVES)
+    fit, rollout, update = _seconds(curves, name, _LATE, SERVES)
     return (fit + rollout) / update

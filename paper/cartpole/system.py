@@ -24,10 +24,8 @@ from gpadjust.systems.cart_pole import (
     cart_pole_start,
     equation_physics,
 )
-from paper.cartpole import NUM_STARTS, Settings
-from paper.control import Scenario
-from paper.control.learner import System, dynamics
-from paper.control.recorder import Recorder
+from paper.cartpole import NUM_STARTS, Scenario, Settings
+from paper.cartpole.control import Recorder, System, dynamics
 
 
 def system(scenario: Scenario, settings: Settings, seed: int) -> System:
@@ -43,7 +41,7 @@ def system(scenario: Scenario, settings: Settings, seed: int) -> System:
         initial_states=cart_pole_start,
         episode_length=settings.episode_length,
     )
-    return System(env, task, CartPoleRecorder(settings, scenario.model is None, seed))
+    return System(env, task, CartPoleRecorder(settings, scenario.kind == "none", seed))
 
 
 def true_physics() -> ODEPhysics:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
-from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, ClassVar, Literal, NamedTuple
 
-Task = tuple[Any, ...]
-Record = dict[str, Any]
+Case = tuple[Any, ...]
+"""What is run once: a value of each axis, and a seed."""
+Run = dict[str, Any]
+"""A case that was run: its values by name, what identifies the run, and what it found."""
+Axes = Mapping[str | tuple[str, ...], Mapping[Any, str]]
 
 
 class Table(NamedTuple):
@@ -25,22 +31,26 @@ class Table(NamedTuple):
 class Experiment:
     """Runs that do not depend on each other, and what is made of them.
 
-    An experiment is a folder. Its ``__init__.py`` has a subclass with the settings as further
-    fields, and imports nothing slow: the command line is made of it. Beside it lie
+    A chapter is a folder of `paper/`. Its ``__init__.py`` declares its experiments: subclasses with
+    ``axes``, and with settings as further fields; it imports nothing slow, because the command line
+    is made of it. Beside it lies a module with the ``name`` of each experiment, which has
 
-    - ``run.py`` with ``run(experiment, *task, unfinished)``: runs a task with one thread, returns
-      what it found, as JSON has it. ``unfinished`` is a path of the task's own; with a suffix it is
-      the place for what it needs to go on after an interruption, and removes when it ends.
-    - ``tables.py`` with ``tables(records, experiment)``: tables of all runs by name. It may have
-      ``first_look(records)``: a short table of the first few runs, None if they are too few.
-    - if there are figures, ``figure.py`` with ``draw(records, experiment)``: draws them into
-      ``experiment.out`` and returns their files.
+    - ``run(experiment, *case)``: runs a case with one thread; returns what it found, for JSON.
+      A run that can go on after an interruption keeps its state at ``experiment.unfinished(*case)``
+      (a path, to which it adds a suffix) and removes it when it ends.
+    - ``tables(runs, experiment)``: tables of all runs, by name.
+    - ``first_look(runs)``, if wanted: a short table of the first runs, None if they are too few.
+    - ``draw(runs, experiment)``, if there are figures: draws them into ``experiment.out`` and
+      returns their files.
     """
 
     runs: int = 10
-    """number of runs, each with a seed of its own"""
+    """number of runs of each kind, each with a seed of its own"""
     seed: int = 0
     """the first seed"""
+    only: tuple[str, ...] = ()
+    """values of axes (learners, systems, sizes, ...) that are run; all values of an axis of which
+    none is named"""
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     """parallel processes"""
     out: Path = Path("results")
@@ -50,57 +60,131 @@ class Experiment:
     only_tables: bool = False
     """run nothing; make tables and figures of the runs that are there"""
     other_versions: Literal["refuse", "keep", "replace"] = "refuse"
-    """what becomes of runs that other versions of the packages made, if more are to be run: nothing
-    is run, they are kept beside the new ones, or they are run again"""
+    """what becomes of runs of other versions of the packages, or of other defaults of the library,
+    if more are to be run: nothing is run, they are kept with the new ones, or they are run again"""
 
     name: ClassVar[str]
-    """on the command line, and in the markers of the READMEs"""
+    """on the command line, and in the markers of the pages"""
+    axes: ClassVar[Axes]
+    """by the name of each axis, its values and their labels; if values have several parts, the
+    name is a tuple of theirs and each value a tuple"""
     key: ClassVar[tuple[str, ...]]
-    """what the parts of a task are called; the last is its seed"""
+    """the names of the parts of a case: those of the axes, and ``"seed"``"""
+    calls: ClassVar[tuple[str, ...]] = ()
+    """the calls of the library that decide the numbers, such as ``"gpadjust.fit"``: the defaults
+    of their arguments are part of what identifies a run"""
     flat: ClassVar[bool] = True
     """whether options of nested settings have the names of these alone"""
     packages: ClassVar[tuple[str, ...]] = ("gpadjust", "torch", "gpytorch", "botorch", "numpy")
     """whose versions decide the numbers"""
+
+    def __init_subclass__(cls) -> None:
+        if "axes" in cls.__dict__:
+            cls.key = (*_flat(cls.axes), "seed")
 
     @property
     def seeds(self) -> range:
         """The seeds that are asked for."""
         return range(self.seed, self.seed + self.runs)
 
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """The seeds of a kind of cases (values of all axes); none if it is not to be run."""
+        return self.seeds
+
     def check(self) -> None:
         """Raise a ValueError for an option, or an ImportError for a package, that will not do."""
 
-    def tasks(self) -> Sequence[Task]:
-        """What is asked for, in the order in which it is run; ``key`` names the parts of each."""
-        raise NotImplementedError
+    def cases(self) -> list[Case]:
+        """What is asked for, in the order in which it is run.
+
+        Seed by seed with all values of the last axis, so that what is done first can be compared.
+
+        Raises:
+            ValueError: If ``only`` has a name that no axis has.
+        """
+        parts = [
+            [value if isinstance(name, tuple) else (value,) for value in values]
+            for name, values in self.axes.items()
+        ]
+        kinds = [tuple(sum(kind, ())) for kind in product(*parts)]
+        known = [{str(kind[i]) for kind in kinds} for i in range(len(self.key) - 1)]
+        unknown = [name for name in self.only if not any(name in names for names in known)]
+        if unknown:
+            there = "; ".join(
+                f"{name}: {', '.join(dict.fromkeys(str(kind[i]) for kind in kinds))}"
+                for i, name in enumerate(self.key[:-1])
+            )
+            raise ValueError(f"--only: there is no {unknown[0]!r}, but there are, by axis, {there}")
+        wanted = [names & {*self.only} or names for names in known]
+        found = []
+        outer = len(kinds[0]) - len(parts[-1][0])
+        for first in dict.fromkeys(kind[:outer] for kind in kinds):
+            seeds = {
+                kind: self.seeds_of(*kind)
+                for kind in kinds
+                if kind[:outer] == first
+                and all(str(value) in names for value, names in zip(kind, wanted, strict=True))
+            }
+            every = dict.fromkeys(seed for own in seeds.values() for seed in own)
+            found += [(*k, seed) for seed in every for k, own in seeds.items() if seed in own]
+        return found
+
+    def unfinished(self, *case: Any) -> Path:
+        """Where a run keeps what it needs to go on after an interruption: a path of its own."""
+        return self.out / "unfinished" / title(case)
 
     def describe(self, *kind: Any) -> dict[str, Any]:
-        """All that decides the numbers of a task (given without its seed), but for versions."""
-        raise NotImplementedError
+        """The settings that decide the numbers of a kind of cases; all of them, by default."""
+        settings = getattr(self, "settings", None)
+        return {} if settings is None else asdict(settings)
 
-    def run(self, *task: Any, unfinished: Path) -> Record:
-        """Run a task."""
-        found: Record = self._part("run").run(self, *task, unfinished=unfinished)
+    def defaults(self) -> dict[str, dict[str, Any]]:
+        """The defaults of the arguments of ``calls``, as JSON has them."""
+        return {name: defaults_of(resolve_name(name)) for name in self.calls}
+
+    def run(self, *case: Any) -> Run:
+        """Run a case."""
+        found: Run = self._module().run(self, *case)
         return found
 
-    def first_look(self, records: Sequence[Record]) -> str | None:
+    def first_look(self, runs: Sequence[Run]) -> str | None:
         """A short table of the first few runs, if the experiment has one and they are enough."""
-        look = getattr(self._part("tables"), "first_look", None)
-        text: str | None = look(records) if look and records else None
+        look = getattr(self._module(), "first_look", None)
+        text: str | None = look(runs) if look and runs else None
         return text
 
-    def tables(self, records: Sequence[Record]) -> dict[str, Table]:
+    def tables(self, runs: Sequence[Run]) -> dict[str, Table]:
         """The tables of all runs, by name."""
-        found: dict[str, Table] = self._part("tables").tables(records, self)
+        found: dict[str, Table] = self._module().tables(runs, self)
         return found
 
-    def draw(self, records: Sequence[Record]) -> list[Path]:
+    def draw(self, runs: Sequence[Run]) -> list[Path]:
         """Draw the figures, if there are any, and return their files."""
-        if find_spec(f"{type(self).__module__}.figure") is None:
-            return []
-        found: list[Path] = self._part("figure").draw(records, self)
-        return found
+        draw = getattr(self._module(), "draw", None)
+        return draw(runs, self) if draw else []
 
-    def _part(self, name: str) -> Any:
-        """A module of the experiment's folder, imported when it is needed."""
-        return import_module(f"{type(self).__module__}.{name}")
+    def _module(self) -> Any:
+        """The experiment's module, imported when it is needed."""
+        return import_module(f"{type(self).__module__}.{self.name}")
+
+
+def title(case: Case) -> str:
+    """A case as the name of a file."""
+    return "-".join(map(str, case)).replace(" ", "_")
+
+
+def defaults_of(call: Any) -> dict[str, Any]:
+    """The arguments of a call that have a default, as JSON has them; others by their names."""
+    found = {
+        parameter.name: parameter.default
+        for parameter in inspect.signature(call).parameters.values()
+        if parameter.default is not inspect.Parameter.empty
+    }
+    plain: dict[str, Any] = json.loads(
+        json.dumps(found, default=lambda value: getattr(value, "__qualname__", None) or repr(value))
+    )
+    return plain
+
+
+def _flat(axes: Axes) -> list[str]:
+    return [part for name in axes for part in (name if isinstance(name, tuple) else (name,))]

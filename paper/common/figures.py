@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -76,3 +76,80 @@ def one_legend(figure: Figure, axes: Iterable[Axes], ncols: int = 3) -> None:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
     figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=ncols)
+
+
+def curves(
+    path: Path,
+    parts: Mapping[str, pd.DataFrame],
+    value: str,
+    lines: Mapping[str, tuple[str, str]],
+    *,
+    x: str = "episode",
+    by: str = "learner",
+    labels: tuple[str, str],
+    columns: int = 2,
+    size: tuple[float, float] = (4.2, 3.0),
+    share: bool = True,
+    logarithmic: bool = False,
+    finish: Callable[[Axes, str, pd.DataFrame], None] | None = None,
+) -> Path:
+    """Draw median and quartiles of a measure over trials, a panel for each part of the runs.
+
+    Args:
+        path: The file.
+        parts: Runs by the title of their panel, a row for each run and trial.
+        value: The column that is drawn.
+        lines: Label and color by the entries of ``by`` that are drawn.
+        x: The column of the trials.
+        by: The column that tells the lines apart.
+        labels: What stands below and beside all panels.
+        columns: Panels in a row.
+        size: Of a panel, in inches.
+        share: Whether all panels have the same axes.
+        logarithmic: Whether the measure has a logarithmic axis.
+        finish: Adds to a panel, given its axes, its title and its runs.
+
+    Returns:
+        The file.
+    """
+    figure, axes = panels([*parts], columns, size, share=share, width=8.0)
+    for ax, (title, runs) in zip(axes, parts.items(), strict=True):
+        for name, (label, color) in lines.items():
+            own = runs[runs[by] == name]
+            if len(own):
+                draw_quartiles(ax, own, value, by=x, color=color, label=label)
+        if logarithmic:
+            ax.set_yscale("log")
+        ax.grid(axis="y", color="0.9", lw=0.6)
+        ax.set_axisbelow(True)
+        if finish:
+            finish(ax, title, runs)
+    figure.supxlabel(labels[0], fontsize="medium")
+    figure.supylabel(labels[1], fontsize="medium")
+    one_legend(figure, axes, ncols=4)
+    return save(figure, path)
+
+
+def strips(ax: Axes, rows: Mapping[str, Sequence[pd.Series[float]]], colors: Sequence[str]) -> None:
+    """Draw each run of each row as a dot, with its median and quartiles.
+
+    Args:
+        ax: Where.
+        rows: Values of the runs, by the label of the row: one series, or several beside each other.
+        colors: Of the series.
+    """
+    for row, (_, series) in enumerate(rows.items()):
+        if row % 2 == 0:
+            ax.axhspan(row - 0.5, row + 0.5, color="0.95", lw=0, zorder=-1)
+        for i, (values, color) in enumerate(zip(series, colors, strict=False)):
+            y = row + 0.4 * (i - (len(series) - 1) / 2)
+            low, middle, high = values.quantile([0.25, 0.5, 0.75])
+            ax.plot([low, high], [y, y], color=color, lw=7, alpha=0.3, solid_capstyle="butt")
+            ax.plot(values, [y] * len(values), "o", color=color, ms=3.5, mew=0, alpha=0.35)
+            ax.plot(middle, y, "|", color="black", ms=11, mew=1.5)
+    ax.set_yticks(range(len(rows)), rows)
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+    ax.grid(axis="x", color="0.85", lw=0.6)
+    ax.set_axisbelow(True)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
-import platform
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +15,8 @@ import torch
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
-import gpadjust
-from paper.common.commit import commit_of
-from paper.common.experiment import Experiment, Record, Table, Task
-from paper.common.runs_file import RunsFile
+from paper.common.experiment import Case, Experiment, Run, Table, title
+from paper.common.runs import RunsFile, commit_of, differences, rounded, versions
 from paper.common.tables import aligned, as_document, settings_table
 
 
@@ -49,31 +44,28 @@ def main(experiment: Experiment) -> None:
         raise Refused(f"--runs: expected at least 2 (for a spread), got {experiment.runs}")
     if experiment.jobs < 1:
         raise Refused(f"--jobs: expected at least 1 process, got {experiment.jobs}")
-    if experiment.key[-1] != "seed":
-        raise Refused(
-            f"{experiment.name}: the last part of key must be 'seed', got {experiment.key}"
-        )
     file = runs_file(experiment)
     if not experiment.only_tables:
         try:
             experiment.check()
+            experiment.cases()
         except (ImportError, ValueError) as error:
             raise Refused(str(error)) from error
         with _alone(experiment.out):
             run_missing(experiment)
-    records = list(file.read().values())
-    if not records:
+    runs = list(file.read().values())
+    if not runs:
         raise Refused(f"There are no results in {experiment.out}.")
-    tables = tables_of(experiment, records)
+    tables = tables_of(experiment, runs)
     for table in tables.values():
         print(f"\n{table.title}\n\n{aligned(table.text)}")
     (experiment.out / TABLES).write_text(as_document(tables))
-    print(experiment.out / TABLES, *experiment.draw(records), sep="\n")
+    print(experiment.out / TABLES, *experiment.draw(runs), sep="\n")
 
 
-def tables_of(experiment: Experiment, records: Sequence[Record]) -> dict[str, Table]:
-    """Settings and results, by the names of their markers in the READMEs."""
-    found = experiment.tables(records)
+def tables_of(experiment: Experiment, runs: Sequence[Run]) -> dict[str, Table]:
+    """Settings and results, by the names of their markers in the pages."""
+    found = experiment.tables(runs)
     settings = getattr(experiment, "settings", None)
     if settings is not None:
         found["settings"] = Table("Settings", settings_table({"value": asdict(settings)}))
@@ -81,125 +73,103 @@ def tables_of(experiment: Experiment, records: Sequence[Record]) -> dict[str, Ta
 
 
 def run_missing(experiment: Experiment) -> None:
-    """Run the tasks that there is no run of, and add them to the file.
+    """Run the cases that there is no run of, and add them to the file.
 
     Raises:
-        Refused: If the runs that are there were made with other settings; or by other versions,
-            unless ``other_versions`` says what is to become of them.
+        Refused: If the runs that are there were made with other settings; or by other versions or
+            defaults, unless ``other_versions`` says what is to become of them.
     """
     file = runs_file(experiment)
-    done, tasks = file.read(), [tuple(task) for task in experiment.tasks()]
-    kinds = {task[:-1] for task in tasks}
-    for task, record in done.items():
-        if task[:-1] in kinds:
-            check_settings(file.path, task, record["settings"], _described(experiment, task[:-1]))
-    others = {task for task, record in done.items() if _by_others(record, experiment)}
-    missing = [task for task in tasks if task not in done]
+    done, cases = file.read(), experiment.cases()
+    kinds = {case[:-1] for case in cases}
+    for case, run in done.items():
+        if case[:-1] in kinds:
+            check_settings(file.path, case, run, experiment)
+    others = {
+        case: differ
+        for case, run in done.items()
+        if (differ := _by_others(run, experiment, case[:-1] in kinds))
+    }
+    missing = [case for case in cases if case not in done]
     if others and experiment.other_versions == "replace":
-        missing = [task for task in tasks if task not in done or task in others]
+        missing = [case for case in cases if case not in done or case in others]
     elif others and missing and experiment.other_versions == "refuse":
-        task = next(iter(others))
-        differ = _by_others(done[task], experiment)
         raise Refused(
-            f"{file.path} has runs of other versions: {differ}. Pass --other-versions keep to add "
-            "to them, --other-versions replace to run them again, or another --out."
+            f"{file.path} has runs of other versions: {next(iter(others.values()))}. Pass "
+            "--other-versions keep to add to them, --other-versions replace to run them again, or "
+            "another --out."
         )
     elif others:
         print(f"{len(others)} of the runs were made by other versions of the packages.")
     shown = _first_look(experiment, done.values()) if missing else True
-    bar = tqdm(total=len(tasks), initial=len(tasks) - len(missing), unit="run", disable=not missing)
+    bar = tqdm(total=len(cases), initial=len(cases) - len(missing), unit="run", disable=not missing)
     with bar, _backend(experiment.backend) as options:
         away = replace(experiment, out=experiment.out.absolute())
-        calls = [joblib.delayed(run_one)(away, task) for task in missing]
+        calls = [joblib.delayed(run_one)(away, case) for case in missing]
         parallel = joblib.Parallel(n_jobs=experiment.jobs, batch_size=1, **options)
-        for task in parallel(calls):
+        for case in parallel(calls):
             bar.update()
-            bar.set_postfix_str(_title(task))
+            bar.set_postfix_str(title(case))
             shown = shown or _first_look(experiment, file.read().values())
 
 
-def run_one(experiment: Experiment, task: Task) -> Task:
-    """Run a task and add it to the file; return it."""
+def run_one(experiment: Experiment, case: Case) -> Case:
+    """Run a case and add it to the file; return it."""
     torch.set_num_threads(1)
     file = runs_file(experiment)
-    unfinished = experiment.out / "unfinished" / _title(task)
+    unfinished = experiment.unfinished(*case)
     unfinished.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(f"{unfinished}.lock")
     with lock:  # a worker may outlive a call that was killed
-        before = file.read().get(task)
+        before = file.read().get(case)
         if before is None or _by_others(before, experiment):
-            named = dict(zip(experiment.key, task, strict=True))
+            named = dict(zip(experiment.key, case, strict=True))
             made_by = {
-                "settings": _described(experiment, task[:-1]),
+                "settings": _described(experiment, case[:-1]),
+                "defaults": experiment.defaults(),
                 "versions": versions(experiment.packages),
-                "commit": commit_of(_ROOT),  # it does not decide whether a task is run again
+                "commit": commit_of(_ROOT),  # it does not decide whether a case is run again
             }
-            found = experiment.run(*task, unfinished=unfinished)
-            file.append({**named, **made_by, **rounded(found)})
+            file.append({**named, **made_by, **rounded(experiment.run(*case))})
         Path(lock.lock_file).unlink(missing_ok=True)
-    return task
+    return case
 
 
-def _by_others(record: Record, experiment: Experiment) -> str:
-    """In which version of a package that is still used a run differs; empty if in none."""
-    now = versions(experiment.packages)
-    found = {name: was for name, was in record["versions"].items() if name in experiment.packages}
-    return differences(found, {name: now.get(name, "not there") for name in found})
+def check_settings(path: Path, case: Case, run: Run, experiment: Experiment) -> None:
+    """Refuse a run that was made with other settings, and say which.
 
-
-def check_settings(
-    path: Path, task: Task, found: Mapping[str, Any], expected: Mapping[str, Any]
-) -> None:
-    """Refuse a run that was made with other settings, and say which."""
-    differ = differences(found, expected)
+    Settings that only one of them has are not meant: such a run is one of another version.
+    """
+    differ = differences(run["settings"], _described(experiment, case[:-1]), of_both=True)
     if differ:
         raise Refused(
-            f"{path}: {_title(task)} was made with other settings: {differ}. Choose another --out, "
+            f"{path}: {title(case)} was made with other settings: {differ}. Choose another --out, "
             "or the settings of the runs that are there."
         )
 
 
-def differences(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
-    """The first entry that differs, in words; empty if there is none. Python's version may."""
-    for name in {**found, **expected}:
-        was, now = found.get(name, "not there"), expected.get(name, "not there")
-        if isinstance(was, dict) and isinstance(now, dict):
-            inner = differences(was, now)
-            if inner:
-                return f"{name}.{inner}"
-        elif was != now and name != "python":
-            return f"{name} was {was} and is now {now}"
-    return ""
+def _by_others(run: Run, experiment: Experiment, asked: bool = True) -> str:
+    """The first version, default or setting in which a run differs; empty if there is none.
+
+    Of the packages, those count that are still used; of the settings, those of kinds of cases that
+    are asked for.
+    """
+    now = versions(experiment.packages)
+    found = {name: was for name, was in run["versions"].items() if name in experiment.packages}
+    differ = differences(found, {name: now.get(name, "not there") for name in found})
+    if not differ and experiment.calls:
+        if not run.get("defaults"):
+            return "the defaults of the library are not said of them"
+        differ = differences(run["defaults"], experiment.defaults())
+    if differ or not asked:
+        return differ
+    kind = tuple(run[name] for name in experiment.key[:-1])
+    return differences(run["settings"], _described(experiment, kind))
 
 
 @cache
-def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Of Python and of what the numbers come from."""
-    found = {"python": platform.python_version()}
-    for name in packages:
-        with suppress(PackageNotFoundError):
-            found[name] = gpadjust.__version__ if name == "gpadjust" else version(name)
-    return found
-
-
-def rounded(value: Any) -> Any:
-    """Six significant digits of numbers, also in lists and dictionaries; None for nan."""
-    if isinstance(value, float):
-        return None if math.isnan(value) else float(f"{value:.6g}")
-    if isinstance(value, list | tuple):
-        return [rounded(entry) for entry in value]
-    if isinstance(value, dict):
-        return {key: rounded(entry) for key, entry in value.items()}
-    return value
-
-
-def _title(task: Task) -> str:
-    return "-".join(map(str, task)).replace(" ", "_")
-
-
-@cache
-def _described(experiment: Experiment, kind: Task) -> dict[str, Any]:
-    """The settings of a kind of tasks, as JSON has them."""
+def _described(experiment: Experiment, kind: Case) -> dict[str, Any]:
+    """The settings of a kind of cases, as JSON has them."""
     try:
         described: dict[str, Any] = json.loads(json.dumps(experiment.describe(*kind)))
     except TypeError as error:
@@ -209,9 +179,9 @@ def _described(experiment: Experiment, kind: Task) -> dict[str, Any]:
     return described
 
 
-def _first_look(experiment: Experiment, records: Any) -> bool:
+def _first_look(experiment: Experiment, runs: Any) -> bool:
     """Show a short table as soon as there are runs enough; tell whether there were."""
-    text = experiment.first_look(list(records))
+    text = experiment.first_look(list(runs))
     if text:
         tqdm.write(f"\n{aligned(text)}\n")
     return bool(text)

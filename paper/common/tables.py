@@ -1,19 +1,133 @@
-"""Tables in Markdown: for the terminal, for a file, and from there for the READMEs."""
+"""Tables in Markdown: for the terminal, for a file, and from there for the pages."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from paper.common.claims import Judged
-from paper.common.experiment import Table
+from paper.common.experiment import Run, Table
+from paper.common.verdicts import Judged
+
+Cell = Callable[[pd.DataFrame], Any]
+"""What a cell shows of the runs of its row."""
+_IDENTIFYING = ("settings", "defaults", "versions", "commit")
 
 _START, _END = r"<!-- (?!end)(\S+) -->\n", "<!-- end -->"
 _FRAGMENT = re.compile(_START + r"((?:(?!<!-- ).*\n)*?)" + _END)
+
+
+def frame(
+    runs: Sequence[Run], lists: str | Sequence[str] = (), index: str = "episode"
+) -> pd.DataFrame:
+    """Runs as a table, without what identifies them.
+
+    Args:
+        runs: The runs.
+        lists: The entry that has lists by name, such as ``"trials"``; or the entries that are lists
+            themselves. If given, there is a row for each of their elements.
+        index: The column that counts the elements of a run, from 1.
+    """
+    if not lists:
+        return pd.DataFrame([{k: v for k, v in r.items() if k not in _IDENTIFYING} for r in runs])
+    rows = []
+    for run in runs:
+        columns = run[lists] if isinstance(lists, str) else {name: run[name] for name in lists}
+        left = {*_IDENTIFYING, *([lists] if isinstance(lists, str) else lists)}
+        own = {name: value for name, value in run.items() if name not in left}
+        each = zip(*columns.values(), strict=True)
+        rows += [
+            {**own, index: i, **dict(zip(columns, values, strict=True))}
+            for i, values in enumerate(each, 1)
+        ]
+    return pd.DataFrame(rows)
+
+
+def groups(
+    runs: pd.DataFrame,
+    by: str | Sequence[str],
+    labels: Mapping[Any, str] | Callable[..., str] | None = None,
+) -> dict[str, pd.DataFrame]:
+    """The rows of a table: parts of the runs, by their labels.
+
+    Args:
+        runs: All runs.
+        by: The column that tells the parts apart, or several.
+        labels: The labels of values, in the order of the rows: values that have none are left out.
+            Or a function that makes a label (of several columns, it is given several values); the
+            rows then have the order of the runs, as without labels.
+    """
+    parts = {
+        values[0] if isinstance(by, str) else values: part
+        for values, part in runs.groupby([by] if isinstance(by, str) else [*by], sort=False)
+    }
+    if isinstance(labels, Mapping):
+        return {label: parts[value] for value, label in labels.items() if value in parts}
+    label = labels or (lambda *values: ", ".join(map(str, values)))
+    return {label(*([v] if isinstance(by, str) else v)): part for v, part in parts.items()}
+
+
+def of(value: str, how: str | Callable[[Any], float] = "mean", form: str = ".3g") -> Cell:
+    """A cell with a statistic of a column; empty where there is none.
+
+    Args:
+        value: The column.
+        how: The statistic: a name that pandas knows, or a function of the values.
+        form: Of the number.
+    """
+
+    def cell(runs: pd.DataFrame) -> str:
+        if how == "mean":
+            return number(exact_mean(runs[value]), form)
+        # As one group: of values that are all alike pandas then finds a spread of 0.
+        return number(runs.groupby(lambda _: 0)[value].agg(how).get(0), form)
+
+    return cell
+
+
+def exact_mean(values: pd.Series[float]) -> float:
+    """The mean, in whatever order the values are; nan are left out, and the mean of none."""
+    known = values.dropna()
+    return math.fsum(known) / len(known) if len(known) else math.nan
+
+
+def across(runs: pd.DataFrame, by: str, labels: Mapping[Any, str], cell: Cell) -> dict[str, Cell]:
+    """Columns for the values of a column that the runs have, in the order of their labels."""
+
+    def restricted(value: Any) -> Cell:
+        return lambda part: cell(part[part[by] == value])
+
+    found = {*runs[by]}
+    return {label: restricted(value) for value, label in labels.items() if value in found}
+
+
+def table(
+    rows: Mapping[str, pd.DataFrame],
+    columns: Mapping[str, Cell],
+    corner: str = "",
+    *,
+    bold: bool = False,
+) -> str:
+    """A table of runs.
+
+    Args:
+        rows: The runs of each row, by its label, as ``groups`` makes them.
+        columns: What cells show of them, by the heads of columns.
+        corner: The head of the labels.
+        bold: Whether the lowest number of a row is bold, and what looks the same.
+    """
+    found = []
+    for label, runs in rows.items():
+        cells = [str(cell(runs)) for cell in columns.values()]
+        if bold:
+            best = min((cell for cell in cells if cell), key=float, default="")
+            cells = [f"**{cell}**" if cell and cell == best else cell for cell in cells]
+        found.append([label, *cells])
+    return markdown([corner, *columns], found)
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -39,7 +153,7 @@ def _aligned(match: re.Match[str]) -> str:
 
 
 def as_document(tables: Mapping[str, Table]) -> str:
-    """Tables as a file, each between the markers that it has in the READMEs."""
+    """Tables as a file, each between the markers that it has in the pages."""
     parts = [
         f"{table.title}\n\n<!-- {name} -->\n{table.text}\n<!-- end -->"
         for name, table in tables.items()

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
-Reading = Literal["A", "B"]
-
 LOWER, UPPER = -0.6, 1.0
-GRID = torch.linspace(LOWER, UPPER, 40, dtype=torch.float64).unsqueeze(-1)
+POINTS = torch.linspace(LOWER, UPPER, 40, dtype=torch.float64).unsqueeze(-1)
 
 
 def forrester(X: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from importlib import import_module
+from pkgutil import resolve_name
 
 import numpy as np
 import pandas as pd
@@ -10,10 +10,8 @@ import pytest
 from scipy import stats
 
 from paper.__main__ import EXPERIMENTS
-from paper.common.claims import Claim, Judged, all_of, judge, met, reproduced, within
-from paper.common.curves import Curves
-from paper.common.runner import differences, runs_file, tables_of
-from paper.common.statistics import Difference, interquartile_mean
+from paper.common.runner import runs_file, tables_of
+from paper.common.runs import differences
 from paper.common.tables import (
     aligned,
     best_in_bold,
@@ -22,13 +20,25 @@ from paper.common.tables import (
     fragments,
     markdown,
 )
-from paper.report import PAPER, READMES, results
+from paper.common.verdicts import (
+    Claim,
+    Curves,
+    Difference,
+    Judged,
+    all_of,
+    interquartile_mean,
+    judge,
+    met,
+    reproduced,
+    within,
+)
+from paper.report import PAGES, PAPER, results
 
 
 def curves(**runs):
     """Of scenarios whose values are given by seed, each a list over the episodes from 1."""
     rows = [
-        {"scenario": name, "seed": seed, "episode": episode, "cost": value}
+        {"learner": name, "seed": seed, "episode": episode, "cost": value}
         for name, by_seed in runs.items()
         for seed, values in by_seed.items()
         for episode, value in enumerate(values, 1)
@@ -135,15 +145,15 @@ def test_fragments_replace_what_stands_between_their_markers():
         filled("<!-- y -->\nold\n<!-- end -->", {"x": "new"})
 
 
-@pytest.mark.parametrize("path", READMES, ids=["README.md", "paper/README.md"])
-def test_readmes_show_the_committed_results(path):
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.parent.name)
+def test_pages_show_the_committed_results(path):
     text = path.read_text()
     assert filled(text, results(PAPER / "results")) == text
 
 
 def committed(name):
     """An experiment, and its runs that are committed."""
-    kind = getattr(import_module(f"paper.{name}"), EXPERIMENTS[name][0])
+    kind = resolve_name(EXPERIMENTS[name])
     experiment = kind(out=PAPER / "results" / name)
     return experiment, runs_file(experiment).read()
 
@@ -152,10 +162,10 @@ def committed(name):
 def test_committed_runs_have_the_settings_of_today(name):
     """If this fails, a default has changed: run them again, or say in a setting what it was."""
     experiment, runs = committed(name)
-    today = {kind: experiment.describe(*kind) for kind in {task[:-1] for task in runs}}
-    for task, record in runs.items():
-        expected = json.loads(json.dumps(today[task[:-1]]))
-        assert not differences(record["settings"], expected), task
+    today = {kind: experiment.describe(*kind) for kind in {case[:-1] for case in runs}}
+    for case, run in runs.items():
+        expected = json.loads(json.dumps(today[case[:-1]]))
+        assert not differences(run["settings"], expected, of_both=True), case
 
 
 @pytest.mark.slow

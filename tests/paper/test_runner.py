@@ -14,46 +14,42 @@ from cloudpickle import register_pickle_by_value, unregister_pickle_by_value
 from filelock import FileLock
 
 from paper.common import runner
-from paper.common.commit import commit_of
-from paper.common.experiment import Experiment, Table
-from paper.common.runner import Refused, check_settings, main, run_missing, runs_file, versions
-from paper.common.runs_file import RunsFile
+from paper.common.experiment import Axes, Experiment, Table
+from paper.common.runner import Refused, check_settings, main, run_missing, runs_file
+from paper.common.runs import RunsFile, commit_of, versions
 
 ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Toy(Experiment):
-    """Squares; tasks write down that they were run."""
+    """Squares; cases write down that they were run."""
 
     runs: int = 3
     jobs: int = 1
     scale: float = 1.0
 
     name: ClassVar[str] = "toy"
-    key: ClassVar[tuple[str, ...]] = ("kind", "seed")
+    axes: ClassVar[Axes] = {"kind": {"a": "the first", "b": "the second"}}
     packages: ClassVar[tuple[str, ...]] = ("gpadjust", "numpy")
-
-    def tasks(self):
-        return [(kind, seed) for seed in self.seeds for kind in ("a", "b")]
 
     def describe(self, *kind):
         return {"scale": self.scale, "inner": {"kind": kind[0]}}
 
-    def run(self, *task, unfinished):
-        if (self.out / "stop").exists() and task == ("a", 1):
+    def run(self, *case):
+        if (self.out / "stop").exists() and case == ("a", 1):
             raise KeyboardInterrupt
         with open(self.out / "log", "a") as log:
-            log.write(f"{task} {unfinished.name}\n")
-        return {"value": self.scale * task[1] ** 2, "nothing": float("nan")}
+            log.write(f"{case} {self.unfinished(*case).name}\n")
+        return {"value": self.scale * case[1] ** 2, "nothing": float("nan")}
 
-    def first_look(self, records):
-        return "a first look" if len(records) == 2 else None
+    def first_look(self, runs):
+        return "a first look" if len(runs) == 2 else None
 
-    def tables(self, records):
-        return {"runs": Table("Runs", f"{len(records)}")}
+    def tables(self, runs):
+        return {"runs": Table("Runs", f"{len(runs)}")}
 
-    def draw(self, records):
+    def draw(self, runs):
         return []
 
 
@@ -117,8 +113,88 @@ def test_runs_of_other_settings_are_refused(tmp_path):
     main(Toy(out=tmp_path))
     with pytest.raises(Refused, match=r"a-0 was made with other settings: scale was 1\.0 and is "):
         main(Toy(out=tmp_path, scale=2.0))
-    with pytest.raises(Refused, match=r"inner\.kind was a and is now not there"):
-        check_settings(tmp_path, ("a", 0), {"inner": {"kind": "a"}}, {"inner": {}})
+    other = {"settings": {"inner": {"kind": "b", "more": 1}}}
+    with pytest.raises(Refused, match=r"inner\.kind was b and is now a"):
+        check_settings(tmp_path, ("a", 0), other, Toy(out=tmp_path))
+
+
+@dataclass(frozen=True, kw_only=True)
+class More(Toy):
+    """With a setting that it did not have."""
+
+    def describe(self, *kind):
+        return super().describe(*kind) | {"sort": "new"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calling(Toy):
+    """With a call of a library."""
+
+    calls: ClassVar[tuple[str, ...]] = ("json.dumps",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Less(Toy):
+    """Without a setting that it had."""
+
+    def describe(self, *kind):
+        return {"scale": self.scale}
+
+
+def test_runs_that_lack_a_setting_or_the_defaults_are_of_another_version(tmp_path):
+    """Also if a default of the library changes; nothing is said as long as nothing is to be run."""
+    main(Toy(out=tmp_path, runs=2))
+    for kind, said in (
+        (Less, r"inner was .* and is now not there\. Pass --other-versions"),
+        (More, r"sort was not there and is now new\. Pass --other-versions"),
+        (Calling, "the defaults of the library are not said"),
+    ):
+        main(kind(out=tmp_path, runs=2))
+        with pytest.raises(Refused, match=said):
+            main(kind(out=tmp_path, runs=3))
+    calling = Calling(out=tmp_path, runs=3, other_versions="replace")
+    main(calling)
+    assert len(calls(tmp_path)) == 4 + 6
+    file = runs_file(calling)
+    assert file.read()["a", 0]["defaults"]["json.dumps"]["skipkeys"] is False
+    file.path.write_text(file.path.read_text().replace('"skipkeys":false', '"skipkeys":true'))
+    with pytest.raises(Refused, match=r"json\.dumps\.skipkeys was True and is now False"):
+        main(Calling(out=tmp_path, runs=4))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairs(Experiment):
+    """Three kinds of pairs by two learners, of which one has fewer seeds."""
+
+    axes: ClassVar[Axes] = {
+        ("name", "n"): {("x", 1): "x, 1", ("x", 2): "x, 2", ("y", 1): "y, 1"},
+        "learner": {"cka": "CKA", "gp": "GP"},
+    }
+
+    def seeds_of(self, *kind):
+        return self.seeds[:1] if kind[2] == "gp" else self.seeds
+
+
+def test_cases_follow_from_the_axes():
+    assert Pairs.key == ("name", "n", "learner", "seed")
+    cases = Pairs(runs=2, seed=5).cases()
+    assert cases[:4] == [
+        ("x", 1, "cka", 5),
+        ("x", 1, "gp", 5),
+        ("x", 1, "cka", 6),
+        ("x", 2, "cka", 5),
+    ]
+    assert len(cases) == 9
+    assert Pairs(runs=1, only=("y", "gp")).cases() == [("y", 1, "gp", 0)]
+    assert Pairs(runs=1, only=("1", "gp")).cases() == [("x", 1, "gp", 0), ("y", 1, "gp", 0)]
+    with pytest.raises(ValueError, match=r"there is no 'z', but .* name: x, y; n: 1, 2; learner"):
+        Pairs(only=("z",)).cases()
+
+
+def test_unknown_values_are_refused_before_anything_is_run(tmp_path):
+    with pytest.raises(Refused, match="--only: there is no 'c'"):
+        main(Toy(out=tmp_path, only=("c",)))
+    assert not list(tmp_path.iterdir())
 
 
 def test_runs_of_other_versions_are_refused_kept_or_run_again(tmp_path, monkeypatch, capsys):
@@ -255,7 +331,7 @@ def test_a_full_disk_loses_only_what_is_being_written(tmp_path, monkeypatch):
 def test_a_killed_process_leaves_whole_runs(tmp_path):
     code = (
         "import os, sys\nfrom pathlib import Path\n"
-        "from paper.common.runs_file import RunsFile\n"
+        "from paper.common.runs import RunsFile\n"
         "file = RunsFile(Path(sys.argv[1]), ('seed',))\n"
         "for seed in range(200):\n    file.append({'seed': seed, 'x': [0.5] * 1000})\n"
         "    if seed == 20:\n        os.kill(os.getpid(), 9)\n"

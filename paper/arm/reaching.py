@@ -1,0 +1,282 @@
+"""An arm that reaches after a few trials, by gradients through what is known of it."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.noise import NormalActionNoise
+from torch import Tensor
+
+from gpadjust.control import PolicySearch, PolicySearchAgent, Task, mlp_policy
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.inference import SamplingWarning
+from gpadjust.physics import ODEPhysics
+from gpadjust.states import StateSpec
+from gpadjust.systems import MuscleArmEnv, RememberAction
+from gpadjust.systems.reaching import (
+    ARM_MEMORY_SPEC,
+    ARM_SPEC,
+    arm_reward,
+    arm_start,
+    arm_targets,
+    hand_position,
+)
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, torque_arm
+from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
+from paper.arm import Settings as ArmSettings
+from paper.arm.arm import BOUND, draw_arm
+from paper.arm.system import memory_start, reach, score
+from paper.cartpole.planning import Sensors, trials_table
+from paper.common.experiment import Run, Table
+from paper.common.figures import curves as draw_curves
+from paper.common.figures import panels, save
+from paper.common.learners import LEARNERS
+from paper.common.tables import claims_table, frame, groups, of, table
+from paper.common.verdicts import Claim, Curves, Finding, judge, met
+from paper.machines.networks import NetworkDynamics
+
+MAPPED = (1, 3, 9)
+"""Trials after which the errors at each target are kept."""
+
+_GAINS = {"strength": (16.0, 8.0)}  # the torques that f_p believes in, where not the usual ones
+_SD = {
+    "theta_s": SENSORS["angles"],
+    "theta_e": SENSORS["angles"],
+    "theta_s_dot": SENSORS["velocities"],
+    "theta_e_dot": SENSORS["velocities"],
+}
+_SYSTEMS, _LABELS = Reaching.axes["system"], Reaching.axes["learner"]
+
+
+def run(experiment: Reaching, system: str, learner: str, seed: int) -> Run:
+    """Make the trials; return the hand's errors after each, and times."""
+    warnings.simplefilter("ignore", SamplingWarning)
+    warnings.filterwarnings("ignore", message="A step of the last real episode")
+    warnings.filterwarnings("ignore", message=".* of the episodes of the policy left the bounds")
+    settings, trials = experiment.settings, experiment.trials(system, learner)
+    agent = make_agent(experiment, system, learner, seed)
+    rows, maps = [], {}
+    for trial in range(1, trials + 1):
+        if trial > settings.noisy_trials:
+            agent.action_noise = None
+        before, start = dict(agent.wall_time), time.process_time()
+        agent.learn(settings.episode_length)
+        spent = time.process_time() - start
+        errors = evaluate(agent, system, settings, seed)
+        rows.append(
+            {
+                **{name: float(np.sqrt(np.square(e).mean())) for name, e in errors.items()},
+                **{f"{p}_seconds": agent.wall_time[p] - before[p] for p in ("update", "fit")},
+                "cpu_seconds": spent,
+            }
+        )
+        if trial in MAPPED:
+            maps[f"{trial}"] = errors["all_steps"].tolist()
+    return {"trials": {name: [row[name] for row in rows] for name in rows[0]}, "maps": maps}
+
+
+def evaluate(agent: Any, system: str, settings: ReachingSettings, seed: int) -> dict[str, Any]:
+    """The hand's error at each target, in cm: root mean squares over all and the last steps."""
+    arm = ArmSettings(
+        strength=settings.strength,
+        memory=system == "memory",
+        episode_length=settings.episode_length,
+    )
+    policy = NoisyPolicy(agent, settings, seed) if system == "sensors" else agent
+    found: dict[str, Any] = score(reach(policy, arm))
+    return found
+
+
+class NoisyPolicy:
+    """A policy that sees the state by noisy sensors.
+
+    Args:
+        policy: The policy, with Stable-Baselines3's ``predict``.
+        settings: Of the arm.
+        seed: Of the noise.
+    """
+
+    def __init__(self, policy: Any, settings: ReachingSettings, seed: int) -> None:
+        self.policy = policy
+        self.sensors = Sensors(MuscleArmEnv(strength=settings.strength), ARM_SPEC, _SD)
+        self.random = np.random.default_rng(seed)
+
+    def predict(self, observation: NDArray[np.float32], *, deterministic: bool) -> Any:
+        """Actions for a batch of observations."""
+        seen = self.sensors.noisy(observation, self.random)
+        return self.policy.predict(seen, deterministic=deterministic)
+
+
+def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> PolicySearchAgent:
+    """The agent of a run, at its start."""
+    settings = experiment.settings
+    task = Task(
+        dynamics(settings, system, learner),
+        arm_reward,
+        initial_states=memory_start if system == "memory" else arm_start,
+        episode_length=settings.episode_length,
+        state_bounds=bounds(spec_of(system)),
+    )
+    search = PolicySearch(
+        updates=settings.updates,
+        num_starts=settings.starts,
+        num_functions=None,
+        learning_rate=settings.learning_rate,
+    )
+    # Of actions scaled to [-1, 1], as Stable-Baselines3 has it.
+    sd = 2 * settings.noise * np.ones(4)
+    return PolicySearchAgent(
+        environment(system, settings),
+        task,
+        partial(mlp_policy, first_actions=[settings.first_action] * 4),
+        search,
+        reward_tolerance=None,
+        score_horizons=(),
+        action_noise=NormalActionNoise(np.zeros(4), sd),
+        seed=seed,
+    )
+
+
+def environment(system: str, settings: ReachingSettings) -> gym.Env[Any, Any]:
+    """The real arm."""
+    env: gym.Env[Any, Any] = MuscleArmEnv(strength=settings.strength)
+    if system == "memory":
+        env = RememberAction(env)
+    env = Sensors(env, ARM_SPEC, _SD) if system == "sensors" else env
+    return gym.wrappers.TimeLimit(env, settings.episode_length)
+
+
+def spec_of(system: str) -> StateSpec:
+    """The entries of its states."""
+    return ARM_MEMORY_SPEC if system == "memory" else ARM_SPEC
+
+
+def bounds(spec: StateSpec) -> Tensor:
+    """Those of the states, ``2 x state_dim``; of targets and actions there are none."""
+    limits = torch.tensor([[-np.inf], [np.inf]], dtype=torch.float64).repeat(1, spec.state_dim)
+    for columns, name in ((slice(0, 2), "angles"), (slice(2, 4), "velocities")):
+        limits[:, columns] = torch.tensor(BOUNDS[name]).double().unsqueeze(-1)
+    return limits
+
+
+def dynamics(settings: ReachingSettings, system: str, learner: str) -> Dynamics:
+    """What the policy is trained in, at its start."""
+    spec = spec_of(system)
+    equation = torque_arm(_GAINS[system]) if system in _GAINS else torque_arm()
+    physics = ODEPhysics(
+        equation,
+        step=ARM_TIME_STEP,
+        state_dim=4,
+        substeps=settings.substeps,
+        name="torque_arm",
+        gradient="finite-difference",
+    )
+    if learner in ("phy", "fitted"):
+        return PhysicsDynamics(spec, physics)
+    if learner == "ensemble":
+        options: dict[str, Any] = {"number": 6, "folds": False, "hidden": 64, "steps": 800}
+        return NetworkDynamics(spec, physics, **options, rate=3e-3, decay=1e-2, seed=None)
+    known = LEARNERS[learner]
+    return LearnedDynamics(spec, physics if known.adjusts else None, model=known.make)
+
+
+def tables(runs: Sequence[Run], experiment: Reaching) -> dict[str, Table]:
+    """All tables, by name."""
+    trials, last, found = frame(_trials(runs), "trials"), experiment.settings.trials, {}
+    for system, label in _SYSTEMS.items():
+        own = trials[trials["system"] == system]
+        shown = [trial for trial in (1, 2, 3, 4, 6, 10) if trial <= own["episode"].max()]
+        for measure, steps in (("all_steps", "all steps"), ("last_five", "last five steps")):
+            if len(own):
+                title = f"The hand's error in cm, {steps}, arm {label}"
+                text = trials_table(own, measure, _LABELS, shown, (3, last), (1, last), ".1f")
+                found[f"{system}_{measure}"] = Table(title, text)
+    plain = Curves(trials[trials["system"] == "plain"], "all_steps")
+    judged = {"all steps": judge(TARGETS, plain, last)}
+    found["targets"] = Table("Targets", claims_table("target", judged))
+    seconds = {
+        "update_seconds": "policy search, s",
+        "fit_seconds": "fit, s",
+        "cpu_seconds": "CPU, s",
+    }
+    columns = {what: of(column, "median", ".1f") for column, what in seconds.items()}
+    later = groups(trials[trials["episode"] > 1], "learner", _LABELS)
+    text = table(later, columns, "median of the trials after the first, all arms")
+    found["seconds"] = Table("Seconds of a trial", text)
+    return found
+
+
+def _trials(runs: Sequence[Run]) -> list[Run]:
+    return [{name: value for name, value in each.items() if name != "maps"} for each in runs]
+
+
+def _after(most: float, trial: int, curves: Curves) -> Finding:
+    errors = curves.window("cka", trial, trial)
+    measured = f"{errors.mean():.1f} cm of {len(errors)} runs, the worst {errors.max():.1f}"
+    return met(errors.mean() <= most), measured
+
+
+def _never_above(curves: Curves) -> Finding:
+    own = curves.of("cka")
+    late = own[own["episode"] >= 3]["all_steps"]
+    return met(late.max() <= 8), f"{late.max():.1f} cm"
+
+
+TARGETS = (
+    Claim("T1", "mean at most 8 cm after trial 1", ("cka",), partial(_after, 8, 1)),
+    Claim("T2", "mean at most 6.5 cm after trial 2", ("cka",), partial(_after, 6.5, 2)),
+    Claim("T3", "mean at most 5.5 cm after trial 4", ("cka",), partial(_after, 5.5, 4)),
+    Claim("T4", "mean at most 4.5 cm after trial 10", ("cka",), partial(_after, 4.5, 10)),
+    Claim("T5", "no run above 8 cm after trial 3 or a later one", ("cka",), _never_above),
+)
+
+
+def draw(runs: Sequence[Run], experiment: Reaching) -> list[Path]:
+    """Draw the error over the trials, a panel for each arm, and maps of CKA's on the plain one."""
+    trials = frame(_trials(runs), "trials")
+    floor = {"color": "0.5", "lw": 1, "ls": "--", "label": "true arm, 1,000 trials of SAC"}
+
+    def finish(ax: Any, title: str, own: pd.DataFrame) -> None:
+        ax.axhline(BOUND, **floor)
+        ax.set_ylim(0, 40)
+
+    colors = {name: known.color for name, known in LEARNERS.items()} | {"ensemble": "tab:green"}
+    found = [
+        draw_curves(
+            experiment.out / "curves.png",
+            groups(trials, "system", _SYSTEMS),
+            "all_steps",
+            {name: (label, colors[name]) for name, label in _LABELS.items()},
+            labels=("trial", "hand's error, cm, median and quartiles"),
+            finish=finish,
+        )
+    ]
+    own = [each for each in runs if (each["system"], each["learner"]) == ("plain", "cka")]
+    return [*found, _maps(own, experiment)] if own else found
+
+
+def _maps(runs: Sequence[Run], experiment: Reaching) -> Path:
+    """The error at each target after some trials, the mean over the runs of CKA."""
+    shown = [trial for trial in MAPPED if any(f"{trial}" in each["maps"] for each in runs)]
+    figure, axes = panels([f"after trial {trial}" for trial in shown], 3, (2.9, 2.3))
+    targets = 100 * hand_position(arm_targets()).numpy()
+    for trial, ax in zip(shown, axes, strict=True):
+        maps = [each["maps"][f"{trial}"] for each in runs if f"{trial}" in each["maps"]]
+        draw_arm(ax)
+        color = {"c": np.mean(maps, axis=0), "cmap": "viridis_r", "vmin": 0, "vmax": 30}
+        dots = ax.scatter(targets[:, 0], targets[:, 1], s=18, zorder=2, **color)
+        ax.set_aspect("equal")
+    figure.supxlabel("along the upper arm at 0°, cm", fontsize="medium")
+    figure.supylabel("across, cm", fontsize="medium")
+    figure.colorbar(dots, ax=axes, label="RMSE, cm", shrink=0.9, extend="max")
+    return save(figure, experiment.out / "map.png")

@@ -1,0 +1,366 @@
+"""Learners of a control task: one resumable run, its records, and the tables of all."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from torch import Tensor
+
+from gpadjust.control import EpisodeCheckpoint, Task, resume
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.physics import Physics
+from gpadjust.rl import Dyna, DynaCallback, DynaOptions, DynaSAC
+from gpadjust.states import StateSpec
+from paper.cartpole import Control, ControlSettings, Scenario
+from paper.common.experiment import Run
+from paper.common.runner import Refused
+from paper.common.runs import differences, versions
+from paper.common.tables import markdown, number, numbers
+from paper.common.verdicts import Curves, interquartile_mean
+
+_SAID = ("task", "options", "seed", "verbose", "tensorboard_log", "_init_setup_model")
+PARTS = ("fit", "rollout", "update")
+
+
+class System(NamedTuple):
+    """What a run is about.
+
+    Args:
+        env: The real system; an environment that can be pickled.
+        task: What is known of it.
+        recorder: Writes down what happens.
+    """
+
+    env: gym.Env[Any, Any]
+    task: Task
+    recorder: Recorder
+
+
+def dynamics(
+    scenario: Scenario, settings: ControlSettings, spec: StateSpec, physics: Physics, truth: Physics
+) -> Dynamics:
+    """The model of a learner; a model-free one does not use it."""
+    if scenario.kind != "learnt":
+        return PhysicsDynamics(spec, truth if scenario.kind == "truth" else physics)
+    options = {"num_features": settings.num_features} if "RRA" in str(scenario.model) else {}
+    target: Any = settings.target
+    return LearnedDynamics(
+        spec,
+        physics if scenario.adjusts else None,
+        model=partial(scenario.make, **options),
+        target=target,
+        fit_options={"method": "map"},
+    )
+
+
+def make_agent(experiment: Control, name: str, seed: int) -> DynaSAC:
+    """A learner, at its start."""
+    system = experiment.system(name, seed)
+    options, arguments = _options(experiment, name), _arguments(experiment, name)
+    return DynaSAC("MlpPolicy", system.env, system.task, options, **arguments, seed=seed)
+
+
+def described(experiment: Control, name: str) -> dict[str, Any]:
+    """Settings, all options of the learner in force, and what its dynamics are."""
+    system, settings = experiment.system(name, 0), asdict(experiment.settings_of(name))
+    learner = {**_defaults(SAC), **_defaults(Dyna), **_arguments(experiment, name)}
+    options = asdict(_options(experiment, name))
+    found = {
+        **settings,
+        "learner": {key: learner[key] for key in learner if key not in {*settings, *_SAID}},
+        "options": {key: options[key] for key in options if key not in settings},
+        "task": system.task.describe(),
+    }
+    if experiment.known[name].kind == "none":
+        del found["task"]
+    plain: dict[str, Any] = json.loads(json.dumps(found, default=repr))
+    return plain
+
+
+def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallback] = ()) -> Run:
+    """Learn, or go on with it.
+
+    Raises:
+        Refused: If an unfinished run is of other settings or versions.
+    """
+    checkpoint = Path(f"{experiment.unfinished(name, seed)}.ckpt")
+    settings, system = experiment.settings_of(name), experiment.system(name, seed)
+    now = {"settings": described(experiment, name), "versions": versions(experiment.packages)}
+    if checkpoint.exists():
+        agent: Any = resume(checkpoint, system.env, system.task)
+        differ = differences(agent.notes["made"], now)
+        if differ:
+            raise Refused(
+                f"{checkpoint} is of an unfinished run of others: {differ}. Remove it to begin "
+                "that run again, choose another --out, or go on as it was begun."
+            )
+    else:
+        agent = make_agent(experiment, name, seed)
+        agent.notes["made"] = now
+    agent.learn(
+        settings.episodes * settings.episode_length - agent.num_timesteps,
+        callback=[system.recorder, *callbacks, EpisodeCheckpoint(checkpoint)],
+        log_interval=settings.episodes + 1,  # nothing is shown
+        reset_num_timesteps=False,
+    )
+    found = system.recorder.found()
+    for path in (checkpoint, Path(f"{checkpoint}.lock")):
+        path.unlink(missing_ok=True)
+    return found
+
+
+def _options(experiment: Control, name: str) -> DynaOptions:
+    settings: ControlSettings = experiment.settings_of(name)
+    model_free = experiment.known[name].kind == "none"
+    return DynaOptions(
+        model_episodes=settings.model_episodes,
+        updates_per_model_step=settings.updates_per_model_step,
+        last_model_episode=0 if model_free else settings.last_model_episode,
+        refresh_model_data=settings.refresh_model_data,
+        num_particles=settings.num_particles,
+        score_horizons=(),
+    )
+
+
+def _arguments(experiment: Control, name: str) -> dict[str, Any]:
+    """The arguments of SAC that the settings decide."""
+    settings: ControlSettings = experiment.settings_of(name)
+    named = ("learning_rate", "gamma", "tau", "batch_size", "ent_coef", "target_entropy")
+    policy = {"net_arch": list(settings.net_arch), "optimizer_kwargs": {"fused": True}}
+    return {
+        **{key: getattr(settings, key) for key in named},
+        "policy_kwargs": policy,
+        "device": "cpu",
+    }
+
+
+def _defaults(kind: Any) -> dict[str, Any]:
+    """The arguments of a learner that have a default."""
+    parameters = inspect.signature(kind.__init__).parameters.values()
+    return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
+
+
+class Recorder(DynaCallback):
+    """Records each episode, and sets the number of updates that follows it.
+
+    A record is begun when the episode ends, and finished after the updates, before the next one.
+    Records are notes of the agent, so that checkpoints hold them: one belongs after this callback
+    in the list. Seconds of the parts are of wall time, ``"cpu_seconds"`` what this process took for
+    all of it, on its one core. An experiment says in a subclass what it writes down of an episode,
+    and of the policy after it.
+
+    Args:
+        settings: Of the learner.
+        model_free: Whether it has no model.
+    """
+
+    model: DynaSAC
+
+    def __init__(self, settings: ControlSettings, model_free: bool) -> None:
+        super().__init__()
+        self.settings: Any = settings
+        self.model_free = model_free
+        self._record: dict[str, Any] | None = None
+        self._begun = 0.0  # of this process's time
+
+    def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
+        """What is recorded of an episode's transitions."""
+        return {}
+
+    def of_policy(self, episode: int) -> dict[str, Any]:
+        """What is recorded of the policy after the updates that follow an episode (from 1)."""
+        return {}
+
+    def found(self) -> dict[str, Any]:
+        """The records of a run, a list for each column."""
+        return {"episodes": {name: [r[name] for r in self.records] for name in self.records[0]}}
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """Those of the finished episodes."""
+        records: list[dict[str, Any]] = self.model.notes.setdefault("episodes", [])
+        return records
+
+    def on_model_fit(self, metrics: dict[str, float]) -> None:
+        """How well the model foresaw the episode; rmse for each state, once it can predict."""
+        if self._record is not None and "nlpd" in metrics:
+            errors = [value for name, value in metrics.items() if name.startswith("rmse/")]
+            self._record |= {name: metrics[name] for name in ("nlpd", "coverage")}
+            self._record["rmse"] = errors
+
+    def _on_rollout_start(self) -> None:
+        self._finish()
+        self._begun = time.process_time()
+        episode = len(self.records) + 1
+        self.model.gradient_steps = self.settings.updates_after(episode, self.model_free)
+
+    def _on_rollout_end(self) -> None:
+        steps = self.num_timesteps - sum(past["steps"] for past in self.records)
+        episode = self.model.recorded_episodes(newest=steps)
+        own = self.of_episode(episode.states, episode.actions, episode.next_states)
+        self._record = {"steps": steps, **own, **dict.fromkeys(("nlpd", "coverage", "rmse"))}
+
+    def _on_training_end(self) -> None:
+        self._finish()
+
+    def _finish(self) -> None:
+        """Complete the record of the episode whose updates are done, if there is one."""
+        if self._record is None:
+            return
+        agent, log = self.model, self.records
+        has_model = not self.model_free and len(log) < self.settings.last_model_episode
+        left = agent.logger.name_to_value.get("model/left_bounds", 0) if has_model else 0
+        record = {
+            **self._record,
+            **self.of_policy(len(log) + 1),
+            "left_bounds": int(left),
+            "updates": agent._n_updates - sum(past["updates"] for past in log),
+        }
+        for part, seconds in agent.wall_time.items():
+            record[f"{part}_seconds"] = seconds - sum(past[f"{part}_seconds"] for past in log)
+        record["cpu_seconds"] = time.process_time() - self._begun
+        log.append(record)
+        self._record = None
+
+
+def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
+    """A row for each scenario, seed and element of an entry that has lists by name.
+
+    Of ``"episodes"`` there is a column for the error of each state; episodes count from 1.
+    """
+    errors = [f"rmse_{state}" for state in experiment.rmses]
+    frames = []
+    for name in experiment.known:
+        for each in sorted(
+            (r for r in runs if r["scenario"] == name), key=lambda r: int(r["seed"])
+        ):
+            own = pd.DataFrame(each[entry])
+            if "rmse" in own:
+                of_states = [found or [np.nan] * len(errors) for found in own.pop("rmse")]
+                own[errors] = np.array(of_states, dtype=float)
+                own = own.astype({"nlpd": float, "coverage": float})
+            if "episode" not in own:
+                own.insert(0, "episode", np.arange(len(own)) + 1)
+            own.insert(0, "scenario", name)
+            own.insert(1, "seed", each["seed"])
+            frames.append(own)
+    return pd.concat(frames, ignore_index=True)
+
+
+def updates_table(experiment: Control) -> str:
+    """How many gradient steps each scenario makes after an episode."""
+    until = experiment.settings.last_model_episode
+    starts = [1, until + 1] if until < experiment.settings.episodes else [1]
+    rows = []
+    for name, scenario in experiment.known.items():
+        settings, cells = experiment.settings_of(name), []
+        for episode in starts:
+            model_free = scenario.kind == "none"
+            real = settings.updates_after(episode, model_free)
+            in_model = not model_free and episode <= until
+            cells.append(f"{real} + {settings.updates_in_model()}" if in_model else f"{real}")
+        rows.append([f"`{name}`", scenario.label, *cells, f"{scenario.max_runs or 'all'}"])
+    headings = [f"updates, trials 1-{until}", f"{until + 1}-"][: len(starts)]
+    return markdown(["`--only`", "", *headings, "seeds"], rows)
+
+
+def summary(
+    curves: Curves,
+    labels: Mapping[str, str],
+    columns: Mapping[str, Callable[[str], Any]],
+    *,
+    end: tuple[int, int],
+    windows: Sequence[tuple[int, int]],
+    thresholds: Sequence[float],
+    digits: int,
+    texts: Mapping[str, Callable[[str], str]] | None = None,
+) -> str:
+    """A row for each learner.
+
+    Args:
+        curves: Of the measure.
+        labels: Of the learners.
+        columns: By their heading, what gives a number of a learner.
+        end: The episodes that the interquartile mean is of.
+        windows: Episodes over which the learners are compared with the reference.
+        thresholds: Whose first episodes are shown.
+        digits: After the point.
+        texts: Further columns, as they are shown.
+    """
+    texts = texts or {}
+    form, other = f".{digits}f", labels[curves.reference]
+    rows = []
+    for name in curves.names:
+        row = [labels[name], f"{len(curves.seeds(name))}"]
+        row += [number(value(name), form) for value in columns.values()]
+        middle, low, high = interquartile_mean(curves.window(name, *end))
+        row.append(number(middle, form))
+        if not np.isnan(low):
+            row[-1] += f" ({low:{form}}, {high:{form}})"
+        row += [curves.paired_difference(name, *window).text(form) for window in windows]
+        firsts = [curves.first_below(name, threshold) for threshold in thresholds]
+        row += ["never" if first is None else f"{first}" for first in firsts]
+        rows.append([*row, *(text(name) for text in texts.values())])
+    said = f"{end[0]}-{end[1]}" if end[0] < end[1] else f"{end[0]}"
+    header = ["", "runs", *columns, f"IQM of {said} (95 %)"]
+    header += [f"{first}-{last}, less {other}'s" for first, last in windows]
+    header += [f"first at {threshold:g}" for threshold in thresholds]
+    return markdown([*header, *texts], rows)
+
+
+def short_summary(
+    curves: Curves, labels: Mapping[str, str], columns: Mapping[str, Callable[[str], float]],
+    heading: str, level: float, unit: str, digits: int,
+) -> str:  # fmt: skip
+    """A row for each of some learners: a few numbers, and when a level is reached first."""
+    rows = []
+    for name, label in labels.items():
+        if name in curves.names:
+            first = curves.first_below(name, level)
+            cells = [number(value(name), f".{digits}f") for value in columns.values()]
+            rows.append([label, *cells, "never" if first is None else f"trial {first}"])
+    return markdown([heading, *columns, f"first at {level:g}{unit}"], rows)
+
+
+def seconds_of_a_run(rows: pd.DataFrame, parts: Sequence[str]) -> pd.DataFrame:
+    """Medians over the runs of the seconds in each part that there is: a row for each scenario."""
+    columns = [f"{part}_seconds" for part in parts if f"{part}_seconds" in rows]
+    by_run = rows.groupby(["scenario", "seed"], sort=False)[columns].sum()
+    return by_run.groupby("scenario", sort=False).median()
+
+
+def cost_of_a_run(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Seconds of a run in each part, its updates, and the particles that it lost.
+
+    ``cpu_seconds`` are of the whole run on its core, the others of wall time: medians over the
+    runs, as a run may have been suspended. Updates and particles are means.
+    """
+    total = sum(episodes[f"{part}_seconds"] for part in PARTS)
+    table = seconds_of_a_run(episodes.assign(total_seconds=total), (*PARTS, "total", "cpu"))
+    by_run = episodes.groupby(["scenario", "seed"], sort=False)[["updates", "left_bounds"]].sum()
+    table[["updates", "left_bounds"]] = by_run.groupby("scenario", sort=False).mean()
+    return table
+
+
+def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
+    """How well the models foresaw episodes, from the second: the first that a learnt one can."""
+    errors = [f"rmse_{state}" for state in experiment.rmses]
+    scored = episodes[episodes["episode"] > 1].groupby("scenario", sort=False)
+    table = scored[["nlpd", *errors]].median()
+    table.insert(1, "coverage", scored["coverage"].mean())
+    table["lost"] = cost_of_a_run(episodes)["left_bounds"]
+    table = table[table[errors[0]].notna()].rename(index=experiment.labels)
+    headings = [f"RMSE of {what}" for what in experiment.rmses.values()]
+    return numbers(table, ["", "NLPD", "coverage of 95 %", *headings, "particles lost"], ".2g")

@@ -1,0 +1,406 @@
+"""Trials of a cart-pole, each planned in what is known of it by then."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpadjust.control import (
+    CrossEntropy,
+    MPCAgent,
+    Planner,
+    PolicySearch,
+    PolicySearchAgent,
+    Task,
+)
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.inference import SamplingWarning
+from gpadjust.states import StateSpec
+from gpadjust.systems import CartPoleEquation, CartPoleSwingUpEnv, cart_pole
+from gpadjust.systems.cart_pole import (
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    START_MEAN,
+    cart_pole_reward,
+    cart_pole_start,
+    equation_physics,
+)
+from paper.cartpole import (
+    FRICTIONS,
+    SENSORS,
+    SMALL_NOISE,
+    CartPole,
+    Planning,
+    PlanningSettings,
+)
+from paper.common.experiment import Run, Table
+from paper.common.figures import curves as draw_curves
+from paper.common.learners import LEARNERS
+from paper.common.runner import runs_file
+from paper.common.tables import claims_table, frame, groups, markdown, number, of, table
+from paper.common.verdicts import Claim, Curves, Finding, judge, met
+
+_BOUND = 50.0  # of all entries of the state, in m, rad and s, where a policy is searched for
+_LEARNERS, _SYSTEMS = Planning.axes["learner"], Planning.axes["system"]
+
+
+def run(experiment: Planning, system: str, learner: str, seed: int) -> Run:
+    """Make the trials; return cost and times of each."""
+    warnings.simplefilter("ignore", SamplingWarning)
+    warnings.filterwarnings("ignore", message="A step of the last real episode")
+    settings = experiment.settings_of(system)
+    agent = make_agent(experiment, system, learner, seed)
+    rows: list[dict[str, Any]] = []
+    for _ in range(settings.trials):
+        before, start = dict(agent.wall_time), time.process_time()
+        agent.learn(settings.episode_length)
+        costs = -agent.recorded_episodes(newest=settings.episode_length).rewards
+        late = np.stack(agent.env.episodes[len(rows)])[-round(1 / settings.time_step) :]
+        seconds = {name: agent.wall_time[name] - before[name] for name in ("plan", "fit")}
+        rows.append(
+            {
+                "cost": costs.mean().item(),
+                "last_cost": costs[-5:].mean().item(),
+                "last_offset": np.abs(late[:, 0]).max().item(),
+                "last_lean": np.abs(np.degrees(wrapped(late[:, 1]))).max().item(),
+                **{f"{name}_seconds": spent for name, spent in seconds.items()},
+                "cpu_seconds": time.process_time() - start,
+            }
+        )
+    return {"trials": {name: [row[name] for row in rows] for name in rows[0]}}
+
+
+def make_agent(
+    experiment: Planning, system: str, learner: str, seed: int
+) -> MPCAgent | PolicySearchAgent:
+    """The agent of a run, at its start."""
+    settings = experiment.settings_of(system)
+    env, length = environment(system, settings), settings.episode_length
+    each_step, first = planners(settings)
+    task = Task(
+        dynamics(settings, system, learner, seed),
+        mc_pilco_reward if system == "mc-pilco" else cart_pole_reward,
+        initial_states=cart_pole_start,
+        episode_length=length,
+        state_bounds=torch.tensor([[-_BOUND] * 4, [_BOUND] * 4]) if learner == "search" else None,
+    )
+    common: dict[str, Any] = {
+        "reward_tolerance": None,
+        "score_horizons": (),
+        "random_steps": settings.random_trials * length,
+        "seed": seed,
+    }
+    if learner != "search":
+        return MPCAgent(env, task, each_step, first=first, **common)
+    search = PolicySearch(
+        updates=settings.updates,
+        num_starts=settings.starts,
+        num_functions=None,
+        learning_rate=settings.learning_rate,
+        guide=first,
+        num_guides=settings.guides,
+    )
+    return PolicySearchAgent(env, task, search=search, **common)
+
+
+def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:
+    """The planner of each step, and that of a trial that begins."""
+    elites, correlation = settings.elites, settings.correlation
+    each_step = Planner(
+        search=CrossEntropy(settings.rounds, num_elites=elites, correlation=correlation),
+        horizon=settings.horizon,
+        num_random=settings.sequences,
+        spread=settings.spread,
+    )
+    first = Planner(
+        search=CrossEntropy(settings.first_rounds, num_elites=elites, correlation=correlation),
+        num_random=settings.first_sequences,
+        restarts=settings.restarts,
+    )
+    return each_step, first
+
+
+def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -> Dynamics:
+    """What is planned in, at its start."""
+    time_step = settings.time_step
+    if learner == "oracle":
+        return PhysicsDynamics(CART_POLE_SPEC, equation_physics(equation(system), time_step))
+    physics = cart_pole(seed, time_step=time_step).physics
+    if learner in ("phy", "fitted"):
+        return PhysicsDynamics(CART_POLE_SPEC, physics)
+    known = LEARNERS["cka" if learner == "search" else learner]
+    return LearnedDynamics(CART_POLE_SPEC, physics if known.adjusts else None, model=known.make)
+
+
+def wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles in [-pi, pi)."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
+class Sensors(gym.ObservationWrapper[Any, Any, Any]):
+    """Observations with noise, by the environment's generator; the reward is of the true state.
+
+    Args:
+        env: The environment.
+        spec: What the entries of its states are.
+        sd: Standard deviations of the noise by the name of the entry; of others there is none.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], spec: StateSpec, sd: Mapping[str, float]) -> None:
+        super().__init__(env)
+        self.spec = spec
+        self.columns = [i for i, name in enumerate(spec.states) if name in sd]
+        self.sd = np.array([sd[spec.states[i]] for i in self.columns])
+
+    def observation(self, observation: Any) -> Any:
+        """Add the noise to the state."""
+        return self.noisy(observation, self.unwrapped.np_random)
+
+    def noisy(self, observation: NDArray[Any], random: np.random.Generator) -> NDArray[np.float32]:
+        """Observations ``... x observation_dim`` as the sensors have them."""
+        state = self.spec.decode(torch.from_numpy(observation.astype(np.float64)))
+        noise = self.sd * random.normal(size=(*state.shape[:-1], len(self.sd)))
+        state[..., self.columns] += torch.from_numpy(noise)
+        return self.spec.observe(state).numpy().astype(np.float32)
+
+
+class Still(gym.Wrapper[Any, Any, Any, Any]):
+    """Episodes of the cart-pole that start nearly still."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Start from about the hanging pole at rest."""
+        self.env.reset(seed=seed)
+        start = self.unwrapped.np_random.normal(START_MEAN, SMALL_NOISE)
+        return self.env.reset(options={"state": start})
+
+
+class Watched(gym.Wrapper[Any, Any, Any, Any]):
+    """Keeps the true states of an episode.
+
+    Attributes:
+        episodes: Those of each episode, ``T x 4``, the newest last.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.episodes: list[list[NDArray[np.float64]]] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begin an episode."""
+        self.episodes.append([])
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        """Make a step."""
+        result = self.env.step(action)
+        unwrapped: Any = self.unwrapped
+        self.episodes[-1].append(unwrapped.state)
+        return result
+
+
+def equation(system: str) -> CartPoleEquation:
+    """The equation of motion of a system."""
+    if system not in FRICTIONS:
+        return REAL_CART_POLE
+    dry, drag = FRICTIONS[system]
+    return replace(REAL_CART_POLE, dry=dry, drag=drag)
+
+
+def environment(system: str, settings: PlanningSettings) -> Watched:
+    """The real system."""
+    env: gym.Env[Any, Any] = CartPoleSwingUpEnv(
+        equation=equation(system), time_step=settings.time_step
+    )
+    if system == "sensors":
+        env = Sensors(env, CART_POLE_SPEC, SENSORS)
+    elif system == "mc-pilco":
+        small = dict.fromkeys(CART_POLE_SPEC.states, SMALL_NOISE)
+        env = Sensors(Still(env), CART_POLE_SPEC, small)
+    return Watched(gym.wrappers.TimeLimit(env, settings.episode_length))
+
+
+def mc_pilco_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """The reward of that protocol, of transitions ``N x ...``: how far pole and cart are off.
+
+    That of the others is of the tip alone, under which the cart may swing.
+    """
+    x, theta = next_states[:, 0], next_states[:, 1]
+    lean = torch.atan2(theta.sin(), theta.cos())
+    return torch.expm1(-(lean / 3).square() - x.square())
+
+
+def tables(runs: Sequence[Run], experiment: Planning) -> dict[str, Table]:
+    """All tables, by name."""
+    trials, last = frame(runs, "trials"), experiment.settings.trials
+    by_system = {system: trials[trials["system"] == system] for system in _SYSTEMS}
+    found, judged = {}, []
+    for system, own in by_system.items():
+        judged += judge(TARGETS.get(str(system), ()), Curves(own, "cost"), last)
+        if len(own):
+            text = _successes(own) if system == "mc-pilco" else _costs(own, last)
+            if system == "plain":
+                text = f"{text}\n{_of_dyna(experiment, last)}".rstrip()
+            found[str(system)] = Table(f"Cart-pole {_SYSTEMS[system]}", text)
+    found["short"] = Table("Mean cost of planned trials", _short(trials, last))
+    found["targets"] = Table("Targets", claims_table("target", {"planned": judged}))
+    seconds = {"plan_seconds": "plans, s", "fit_seconds": "fit, s", "cpu_seconds": "CPU, s"}
+    columns = {what: of(column, "median", ".1f") for column, what in seconds.items()}
+    text = table(groups(trials, "learner", _LEARNERS), columns, "median of a trial")
+    found["seconds"] = Table("Seconds of a trial", text)
+    return found
+
+
+def _short(trials: pd.DataFrame, last: int) -> str:
+    """Each learner beside CKA, by the seeds that both have."""
+    systems = groups(trials[trials["system"] != "mc-pilco"], "system", _SYSTEMS)
+    rows = []
+    for learner, label in _LEARNERS.items():
+        cells = []
+        for own in systems.values():
+            curves = Curves(own, "cost")
+            if learner == "cka":
+                cost = number(curves.window("cka", 2, last).mean(), ".2f")
+                cells.append(f"{cost} ({len(curves.seeds('cka'))} runs)")
+            else:
+                gap = curves.paired_difference(learner, 2, last)
+                cells.append(f"{gap.text('.2f')} ({gap.n})" if gap.n else "")
+        if any(cells):
+            rows.append([label if learner == "cka" else f"{label}, less CKA's", *cells])
+    return markdown(["mean cost of trials 2-5", *systems], rows)
+
+
+def _of_dyna(experiment: Planning, last: int) -> str:
+    """Rows of the learners of the cart-pole's own experiment that have a model, if it was run."""
+    other = CartPole(out=experiment.out.parent / CartPole.name)
+    runs, rows = runs_file(other).read().values(), []
+    for name in ("cka", "phy", "gp"):
+        costs = np.array([r["episodes"]["cost"] for r in runs if r["scenario"] == name])
+        if len(costs):
+            cells = [number(each, ".3f") for each in costs[:, :last].mean(0)]
+            worst = number(costs[:, 2:last].max(), ".3f")
+            rows.append([f"DynaSAC, {_LEARNERS[name]}", f"{len(costs)}", *cells, worst, ""])
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def succeeded(trials: pd.DataFrame) -> pd.Series[bool]:
+    """Whether pole and cart stay within 10 degrees and 0.1 m of the goal in the last second."""
+    return (trials["last_lean"] <= 10) & (trials["last_offset"] <= 0.1)
+
+
+def _successes(own: pd.DataFrame) -> str:
+    """Of how many runs each trial succeeds; the first one is random."""
+    own = own.assign(success=succeeded(own), episode=own["episode"] - 1)
+    own = own[own["episode"] >= 1]
+    columns: dict[str, Any] = {"runs": lambda part: part["seed"].nunique()}
+    for trial in range(1, own["episode"].max() + 1):
+        columns[f"trial {trial}"] = partial(_successes_at, trial)
+    columns["mean cost of these"] = of("cost", form=".3f")
+    return table(groups(own, "learner", _LEARNERS), columns)
+
+
+def _successes_at(trial: int, part: pd.DataFrame) -> int:
+    return int(part.loc[part["episode"] == trial, "success"].sum())
+
+
+def _costs(own: pd.DataFrame, last: int) -> str:
+    return trials_table(own, "cost", _LEARNERS, range(1, last + 1), (3, 5), (2, last), ".3f")
+
+
+def trials_table(
+    own: pd.DataFrame, measure: str, labels: Mapping[Any, str], shown: Sequence[int],
+    late: tuple[int, int], compared: tuple[int, int], form: str,
+) -> str:  # fmt: skip
+    """Means of some trials, the worst of later ones, differences from CKA by the same seeds."""
+    curves = Curves(own, measure)
+
+    def gap(part: pd.DataFrame) -> str:
+        if "cka" not in curves.names:
+            return ""
+        return curves.paired_difference(part["learner"].iloc[0], *compared).text(form)
+
+    def mean_at(trial: int, part: pd.DataFrame) -> str:
+        return number(curves.mean_at(part["learner"].iloc[0], trial), form)
+
+    columns: dict[str, Any] = {"runs": lambda part: part["seed"].nunique()}
+    columns |= {f"trial {i}": partial(mean_at, i) for i in shown}
+    columns["worst of {}-{}".format(*late)] = lambda part: number(
+        part.loc[part["episode"].between(*late), measure].max(), form
+    )
+    return table(groups(own, "learner", labels), {**columns, "less CKA's": gap})
+
+
+def _first(most: float, trial: int, curves: Curves) -> Finding:
+    costs = curves.window("cka", trial, trial)
+    return met(costs.mean() <= most), f"{costs.mean():.3f}, the worst run {costs.max():.3f}"
+
+
+def _never_above(curves: Curves) -> Finding:
+    own = curves.of("cka")
+    late = own[own["episode"].between(3, 5)]["cost"]
+    return met(late.max() <= 0.35), f"{late.max():.3f}, mean {late.mean():.3f}"
+
+
+def _all_stand(trial: int, curves: Curves) -> Finding:
+    """Whether all runs succeed in a trial after the random one."""
+    own = curves.of("cka")
+    good = succeeded(own[own["episode"] == trial + 1])
+    later = succeeded(own[own["episode"] > 1])
+    text = f"{good.sum()} of {len(good)}; in all five trials {later.sum()} of {len(later)}"
+    return met(bool(good.all())), text
+
+
+TARGETS = {
+    "plain": (
+        Claim("T1", "mean cost at most 0.40 in trial 1, in f_p", ("cka",), partial(_first, 0.4, 1)),
+        Claim("T2", "mean cost at most 0.36 in trial 2", ("cka",), partial(_first, 0.36, 2)),
+        Claim("T3", "mean cost at most 0.29 in trial 3", ("cka",), partial(_first, 0.29, 3)),
+        Claim("T4", "no run above 0.35 in trials 3 to 5", ("cka",), _never_above),
+    ),
+    "mc-pilco": (
+        Claim(
+            "T5",
+            "in MC-PILCO's protocol all runs succeed in trial 2 (theirs by trial 4 or 5)",
+            ("cka",),
+            partial(_all_stand, 2),
+        ),
+    ),
+}
+
+
+def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
+    """Draw the cost of the trials, models over each other, a panel for each system."""
+    trials = frame(runs, "trials")
+
+    def title(system: str, own: pd.DataFrame) -> str:
+        seeds = own.groupby("learner")["seed"].nunique()
+        few, many = seeds.min(), seeds.max()
+        return f"{system} ({few if few == many else f'{few} to {many}'} runs)"
+
+    parts = {title(label, own): own for label, own in groups(trials, "system", _SYSTEMS).items()}
+    lines = {
+        name: (label, "tab:cyan" if name == "search" else LEARNERS[name].color)
+        for name, label in _LEARNERS.items()
+    }
+    return [
+        draw_curves(
+            experiment.out / "planning.png",
+            parts,
+            "cost",
+            lines,
+            labels=("trial", "cost, median and quartiles"),
+            share=False,
+            finish=lambda ax, _, own: ax.set_xticks(range(1, own["episode"].max() + 1)),
+        )
+    ]

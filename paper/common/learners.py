@@ -1,0 +1,73 @@
+"""Every learner of the chapters: its label, its color, and how its model is made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial, wraps
+from pkgutil import resolve_name
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Learner:
+    """A learner.
+
+    Args:
+        label: Its name in tables and figures.
+        color: Its color in figures.
+        model: A class of :mod:`gpadjust.models`; None of a learner whose model a chapter makes.
+        options: Of that class.
+        adjusts: Whether the model is given f_p.
+    """
+
+    label: str
+    color: str
+    model: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    adjusts: bool = True
+
+    @property
+    def make(self) -> Callable[..., Any]:
+        """Its model factory, of inputs, targets and ``physics``; imports the library."""
+        if self.model is None:
+            raise ValueError(f"{self.label}: the chapter makes its model")
+        kind = resolve_name(f"gpadjust.models:{self.model}")
+        if self.adjusts:
+            return partial(kind, **self.options) if self.options else kind
+
+        @wraps(kind)
+        def without_physics(X: Any, Y: Any, physics: Any = None, **options: Any) -> Any:
+            return kind(X, Y, **{**self.options, **options})
+
+        return without_physics
+
+
+LITERAL: Mapping[str, Any] = {"center": 0.0}
+"""Of the model as it is printed in the paper: rho is about 0, not about 1."""
+
+LEARNERS = {
+    # With f_p and data.
+    "cka": Learner("CKA", "navy", "CKA"),
+    "literal": Learner("CKA, center 0", "tab:blue", "CKA", LITERAL),
+    "rra": Learner("RRA", "tab:green", "RRA"),
+    "phymean": Learner("physics mean", "tab:purple", "PhysicsMeanGP"),
+    "bias": Learner("GP-bias", "tab:pink", "BiasGP"),
+    "scale": Learner("GP-scale", "tab:olive", "ScaleGP"),
+    "ar1": Learner("AR1", "tab:brown", "AR1"),
+    "fitted": Learner("f_p, parameters fitted", "tab:brown"),
+    "calibrated": Learner("calibrated f_p", "tab:brown", "CalibratedPhysics"),
+    "compare": Learner("recommended by compare", "tab:cyan"),
+    # Without data, or without f_p.
+    "phy": Learner("f_p alone", "tab:orange"),
+    "gp": Learner("GP", "tab:red", "ZeroMeanGP", adjusts=False),
+    "mf": Learner("model-free", "0.55"),
+    "oracle": Learner("the true system", "black"),
+}
+"""By the names that runs give them; where the runs of a chapter name one otherwise, its axis says
+which is meant."""
+
+
+def labels(*names: str, **more: str) -> dict[str, str]:
+    """The values of an axis of learners: names of ``LEARNERS`` with their labels, then others."""
+    return {name: LEARNERS[name].label for name in names} | more

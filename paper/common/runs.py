@@ -1,0 +1,163 @@
+"""Finished runs in one file, a line of JSON each, and what identifies them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+import gpadjust
+from paper.common.experiment import Case, Run
+
+
+class RunsFile:
+    """A file to which runs are added, by any number of processes, and from which none is lost.
+
+    A line counts once its end is written. A process that dies while it writes leaves a torn line,
+    which no one reads and the next to write removes; one that cannot write (a full disk) takes
+    back what it has written and raises an error. Of a case that is there twice the last counts.
+
+    Args:
+        path: The file; it is made with the first run.
+        key: The entries that name a case.
+    """
+
+    def __init__(self, path: Path, key: Sequence[str]) -> None:
+        self.path = path
+        self.key = tuple(key)
+
+    def append(self, run: Run) -> None:
+        """Write a run, and wait until it is on the disk.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        line = json.dumps(run, separators=(",", ":")).encode() + b"\n"
+        locks = self.path.parent / "unfinished"
+        locks.mkdir(parents=True, exist_ok=True)
+        with FileLock(locks / "append.lock"), open(self.path, "ab", buffering=0) as file:
+            end = self._whole()
+            file.truncate(end)
+            try:
+                while line:  # a full disk takes some of it
+                    line = line[file.write(line) :]
+                os.fsync(file.fileno())
+            except OSError as error:
+                file.truncate(end)
+                raise OSError(
+                    error.errno, f"{error.strerror}; the run is not written, all before it are"
+                ) from error
+
+    def read(self) -> dict[Case, Run]:
+        """All runs, by case; nothing is changed.
+
+        Raises:
+            ValueError: If a line that is whole is none of a run.
+        """
+        if not self.path.exists():
+            return {}
+        found = {}
+        lines = self.path.read_bytes()[: self._whole()].splitlines()
+        for number, line in enumerate(lines, start=1):
+            try:
+                run = json.loads(line)
+                case = tuple(run[name] for name in self.key)
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(
+                    f"Expected a run in each line of {self.path}, found {line[:40]!r} in line "
+                    f"{number}. Remove that line, or name another folder."
+                ) from error
+            found[case] = run
+        return found
+
+    def _whole(self) -> int:
+        """The length of the file without a torn last line."""
+        return self.path.read_bytes().rfind(b"\n") + 1
+
+
+def differences(
+    found: Mapping[str, Any], expected: Mapping[str, Any], *, of_both: bool = False
+) -> str:
+    """The first entry that differs, in words; empty if there is none. Python's version may.
+
+    Args:
+        found: Of a run.
+        expected: As it would be now.
+        of_both: Whether only entries that both have count.
+    """
+    for name in [n for n in found if n in expected] if of_both else {**found, **expected}:
+        was, now = found.get(name, "not there"), expected.get(name, "not there")
+        if isinstance(was, dict) and isinstance(now, dict):
+            inner = differences(was, now, of_both=of_both)
+            if inner:
+                return f"{name}.{inner}"
+        elif was != now and name != "python":
+            return f"{name} was {was} and is now {now}"
+    return ""
+
+
+@cache
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Of Python and of what the numbers come from."""
+    found = {"python": platform.python_version()}
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            found[name] = gpadjust.__version__ if name == "gpadjust" else version(name)
+    return found
+
+
+def rounded(value: Any) -> Any:
+    """Six significant digits of numbers, also in lists and dictionaries; None for nan."""
+    if isinstance(value, float):
+        return None if math.isnan(value) else float(f"{value:.6g}")
+    if isinstance(value, list | tuple):
+        return [rounded(entry) for entry in value]
+    if isinstance(value, dict):
+        return {key: rounded(entry) for key, entry in value.items()}
+    return value
+
+
+@cache
+def commit_of(root: Path) -> str | None:
+    """The hash of a repository's current commit, read once per process.
+
+    A ``"+"`` follows it if tracked files differ from it. Those in ``paper/results`` do not count,
+    which runs themselves change.
+
+    Args:
+        root: The root of the repository.
+
+    Returns:
+        None if it is none (as in an unpacked archive), has no commit yet, or git does not answer.
+    """
+    found = _git(root, "rev-parse", "HEAD", "--show-prefix")
+    if found is None:
+        return None
+    head, _, prefix = found.partition("\n")
+    if prefix.strip():  # of a repository in which ours is but a folder
+        return None
+    changed = _git(
+        root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!paper/results"
+    )
+    return head + "+" if changed else head
+
+
+def _git(root: Path, *command: str) -> str | None:
+    """The output of a git command; None if it fails or git is not installed."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), *command], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout

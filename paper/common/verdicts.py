@@ -1,0 +1,312 @@
+"""Verdicts on claims and targets, and the numbers behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy import stats
+
+Verdict = Literal[
+    "reproduced",
+    "not reproduced",
+    "beaten",
+    "inconclusive",
+    "undetermined",
+    "met",
+    "missed",
+    "not run",
+]
+Finding = tuple[Verdict, str]
+FEWEST = 2  # runs that a verdict is given of
+_FEWEST_RESAMPLED = 4  # runs that a bootstrap interval is given of
+_RESAMPLES = 5000
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The mean of paired differences, with what it may be.
+
+    Args:
+        mean: The mean.
+        error: Its standard error; nan of fewer than two.
+        n: Of how many differences it is.
+    """
+
+    mean: float
+    error: float
+    n: int
+
+    @classmethod
+    def of(cls, values: ArrayLike) -> Difference:
+        """Of some differences; nan are left out."""
+        found = np.asarray(values, dtype=float)
+        found = found[~np.isnan(found)]
+        mean = float(found.mean()) if len(found) else np.nan
+        return cls(mean, float(stats.sem(found)) if len(found) > 1 else np.nan, len(found))
+
+    def __truediv__(self, scale: float) -> Difference:
+        return Difference(self.mean / scale, self.error / abs(scale), self.n)
+
+    @property
+    def half_width(self) -> float:
+        """Of the 95 % interval of Student's t, to either side of the mean; nan of fewer than 2."""
+        return float(stats.t.ppf(0.975, self.n - 1)) * self.error if self.n > 1 else np.nan
+
+    @property
+    def low(self) -> float:
+        """The lower end of the 95 % interval."""
+        return self.mean - self.half_width
+
+    @property
+    def high(self) -> float:
+        """The upper end of the 95 % interval."""
+        return self.mean + self.half_width
+
+    def text(self, form: str = ".3f") -> str:
+        """In words, with the standard error unless it is nan, as it is of a single run."""
+        if np.isnan(self.mean):
+            return ""
+        return f"{self.mean:+{form}}" + ("" if np.isnan(self.error) else f" ± {self.error:{form}}")
+
+    def ratio(self, form: str = ".2f") -> str:
+        """Of differences of logarithms: the geometric mean of ratios, and its 95 % interval."""
+        if np.isnan(self.mean):
+            return ""
+        middle, low, high = np.exp([self.mean, self.low, self.high])
+        return f"{middle:{form}}" + ("" if np.isnan(low) else f" [{low:{form}}, {high:{form}}]")
+
+
+def paired(
+    runs: pd.DataFrame,
+    value: str,
+    by: str,
+    name: Any,
+    reference: Any,
+    on: Sequence[str] = ("seed",),
+    *,
+    ratio: bool = False,
+) -> Difference:
+    """How much more a value is for one entry of a column than for another, pair by pair.
+
+    Args:
+        runs: A row for each run.
+        value: The column of the value.
+        by: The column that tells the two apart, such as ``"learner"``.
+        name: One of its entries.
+        reference: The other.
+        on: The columns that runs of a pair share.
+        ratio: Whether logarithms are compared, so that it is one of ratios.
+
+    Returns:
+        nan if there is no pair.
+    """
+    wide = runs.pivot_table(index=[*on], columns=by, values=value)
+    if not {name, reference} <= {*wide}:
+        return Difference.of([])
+    wide = np.log(wide) if ratio else wide
+    return Difference.of(wide[name] - wide[reference])
+
+
+def interquartile_mean(values: ArrayLike) -> tuple[float, float, float]:
+    """The mean of the middle half of some runs, and its 95 % bootstrap interval.
+
+    Of fewer than four runs an interval says nothing, and is nan.
+    """
+    scores = np.asarray(values, dtype=float)
+    if not len(scores):
+        return np.nan, np.nan, np.nan
+    middle = float(stats.trim_mean(scores, 0.25))
+    if len(scores) < _FEWEST_RESAMPLED:
+        return middle, np.nan, np.nan
+    low, high = bootstrap([scores], lambda x, axis: stats.trim_mean(x, 0.25, axis=axis))
+    return middle, low, high
+
+
+def bootstrap(
+    samples: Sequence[ArrayLike], statistic: Callable[..., Any], paired: bool = False
+) -> tuple[float, float]:
+    """The 95 % percentile interval of a statistic, from a generator of its own."""
+    found = stats.bootstrap(
+        [np.asarray(sample, dtype=float) for sample in samples],
+        statistic,
+        paired=paired,
+        n_resamples=_RESAMPLES,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+@dataclass(frozen=True)
+class Curves:
+    """A measure over the episodes, of several learners with several seeds.
+
+    Args:
+        runs: A row for each learner, ``seed`` and ``episode``, as ``tables.frame`` makes.
+        measure: The column that is looked at.
+        reference: The learner that others are compared with, seed by seed.
+        by: The column of the learners.
+    """
+
+    runs: pd.DataFrame
+    measure: str
+    reference: str = "cka"
+    by: str = "learner"
+
+    @property
+    def names(self) -> list[str]:
+        """The learners that there are, in order."""
+        return list(self.runs[self.by].unique())
+
+    def of(self, name: str) -> pd.DataFrame:
+        """The rows of a learner."""
+        return self.runs[self.runs[self.by] == name]
+
+    def seeds(self, name: str, last: int = 0) -> set[int]:
+        """The seeds of a learner; with a last episode, of the runs that reached it."""
+        own = self.of(name)
+        return set(own[own["episode"] >= last]["seed"])
+
+    def restricted(self, seeds: set[int]) -> Curves:
+        """Those of some seeds only."""
+        return replace(self, runs=self.runs[self.runs["seed"].isin(seeds)])
+
+    def mean(self, name: str) -> pd.Series[float]:
+        """The mean over the runs, by episode."""
+        return self.of(name).groupby("episode")[self.measure].mean()
+
+    def spread(self, name: str) -> pd.Series[float]:
+        """The standard deviation over the runs, by episode."""
+        return self.of(name).groupby("episode")[self.measure].std()
+
+    def mean_at(self, name: str, episode: int) -> float:
+        """The mean over the runs at an episode; nan if none got there."""
+        return float(self.mean(name).get(episode, np.nan))
+
+    def first_below(self, name: str, threshold: float) -> int | None:
+        """The first episode at which the mean over the runs is not above a threshold."""
+        mean = self.mean(name)
+        below = mean.index[mean <= threshold]
+        return int(below[0]) if len(below) else None
+
+    def window(self, name: str, first: int, last: int) -> pd.Series[float]:
+        """The mean over some episodes, by seed."""
+        own = self.of(name)
+        return own[own["episode"].between(first, last)].groupby("seed")[self.measure].mean()
+
+    def paired_difference(
+        self, name: str, first: int, last: int, reference: str | None = None
+    ) -> Difference:
+        """How much more a learner has than another with the same seeds, over some episodes.
+
+        It is nan for the reference itself, and where no seed is shared.
+        """
+        other = self.reference if reference is None else reference
+        if name == other:
+            return Difference.of([])
+        return Difference.of(self.window(name, first, last) - self.window(other, first, last))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A claim, its verdict, and the numbers behind it."""
+
+    id: str
+    claim: str
+    verdict: Verdict
+    measured: str
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of the paper, or a target of our own, about curves.
+
+    Args:
+        id: The paper's, or ours.
+        text: What it says.
+        needed: The learners that it is about.
+        decide: Gives verdict and numbers, from curves of the seeds with which all of ``needed``
+            were run to their end; other learners may lack some of these.
+        fewest: Runs without which there is no verdict.
+    """
+
+    id: str
+    text: str
+    needed: tuple[str, ...]
+    decide: Callable[[Curves], Finding]
+    fewest: int = FEWEST
+
+
+def judge(claims: Sequence[Claim], curves: Curves, last: int) -> list[Judged]:
+    """All claims, each by the seeds that all its learners have; one that lacks them is not judged.
+
+    Args:
+        claims: What is judged.
+        curves: Of all runs.
+        last: The episode that a run must have reached.
+    """
+    found = []
+    for claim in claims:
+        runs = {name: curves.seeds(name, last) for name in claim.needed}
+        shared = set.intersection(*runs.values())
+        if len(shared) < claim.fewest:
+            least = min(runs, key=lambda name: len(runs[name]))
+            lacking = f"no results of {least}" if not runs[least] else f"too few runs of {least}"
+            found.append(Judged(claim.id, claim.text, "not run", lacking))
+            continue
+        verdict, measured = claim.decide(curves.restricted(shared))
+        measured = f"{counted(len(shared))}: {measured}"
+        found.append(Judged(claim.id, claim.text, verdict, measured))
+    return found
+
+
+def reproduced(held: bool, beaten: bool = False) -> Verdict:
+    """The verdict on a claim of the paper."""
+    if not held:
+        return "not reproduced"
+    return "beaten" if beaten else "reproduced"
+
+
+def within(difference: Difference, low: float = -np.inf, high: float = np.inf) -> Verdict:
+    """Whether a difference is between two bounds.
+
+    Inconclusive if a bound is in its 95 % interval; of one run, or of runs that are all alike, what
+    it is decides.
+    """
+    half = np.nan_to_num(difference.half_width)
+    least, most = difference.mean - half, difference.mean + half
+    if low <= least and most <= high:
+        return "reproduced"
+    return "not reproduced" if most < low or high < least else "inconclusive"
+
+
+def all_of(*verdicts: Verdict) -> Verdict:
+    """The verdict on a claim of several parts: the worst of theirs."""
+    order: tuple[Verdict, ...] = (
+        "not reproduced",
+        "inconclusive",
+        "undetermined",
+        "reproduced",
+        "beaten",
+    )
+    return min(verdicts, key=order.index)
+
+
+def met(held: bool) -> Verdict:
+    """The verdict on a target of our own."""
+    return "met" if held else "missed"
+
+
+def counted(runs: int) -> str:
+    """A number of runs, in words."""
+    return f"{runs} run{'' if runs == 1 else 's'}"
+
+
+def reached(episode: int | None) -> str:
+    """When a threshold was reached, in words."""
+    return "never" if episode is None else f"at trial {episode}"

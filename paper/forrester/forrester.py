@@ -1,0 +1,379 @@
+"""The paper's models and one more, by two protocols; the paper's claims, and its figure 1.
+
+"Slightly" is within 20 %, "about 30 %" 20 to 40 %, "about 50 %" 40 to 60 %; beyond, in the claim's
+favor, a claim is beaten. Differences are paired by data set and relative to the mean of what they
+are compared with; a claim is inconclusive if its bound lies in their 95 % interval (of Student's t;
+of spreads by the bootstrap). Best is who is not above the lowest mean by more than this interval.
+F7 is undetermined under the paper's protocol if the closed form, with the lengthscales and ridges
+of the grid, gives both verdicts: the paper does not say which it took.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from botorch.models import SingleTaskGP
+from gpytorch.kernels import RBFKernel, ScaleKernel
+from gpytorch.mlls import ExactMarginalLogLikelihood
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from torch import Tensor
+
+from gpadjust import RRA, fit
+from gpadjust.models import PaperRRA
+from gpadjust.validation import coverage, crps, nlpd, rmse
+from paper.common.experiment import Run, Table
+from paper.common.figures import save, strips
+from paper.common.learners import LEARNERS, LITERAL
+from paper.common.tables import across, claims_table, frame, groups, markdown, of, table
+from paper.common.verdicts import Difference, Judged, Verdict, all_of, bootstrap, reproduced, within
+from paper.forrester import GRID, PROTOCOLS, READINGS, Forrester, Settings
+from paper.forrester.problem import CRUDE, LOWER, POINTS, UPPER, observations, truth
+
+LEARNT = "CKA, learnt means"  # not in the paper
+MODELS = {
+    "Zero-mean GP": "gp",
+    "Phy-mean GP": "phymean",
+    "GP-bias": "bias",
+    "GP-scale": "scale",
+    "AR1": "ar1",
+    "CKA": "literal",
+    "RRA": "rra",
+    LEARNT: "literal",
+}
+"""By the paper's names, those of the registry."""
+NAMES = [name for name in MODELS if name != LEARNT]
+FIRST_LOOK = 3  # data sets
+_SCORES = {"nlpd": nlpd, "crps": crps, "coverage": coverage}
+_ABOUT_HALF = (0.4, 0.6)  # below the physics mean
+
+
+@cache
+def _prepare(settings: Settings) -> None:
+    """Set a process up: one fit that is not timed."""
+    trained("CKA", "gpadjust", "B", *observations(0, settings.observations), settings)
+
+
+def run(experiment: Forrester, reading: str, protocol: str, seed: int) -> Run:
+    """Train all models of a protocol on a data set.
+
+    Returns:
+        For each model, and for f_p, its name, its scores and the seconds that it took.
+    """
+    settings = experiment.settings
+    _prepare(settings)
+    X, Y = observations(seed, settings.observations)
+    y = truth(POINTS)
+    rows: list[dict[str, Any]] = [
+        {"model": "f_p", "rmse": rmse(CRUDE[reading](POINTS), y).item()}
+        | dict.fromkeys([*_SCORES, "seconds"])
+    ]
+    for name, model, seconds in _models(reading, protocol, X, Y, settings):
+        with torch.no_grad():
+            posterior = model.posterior(POINTS, observation_noise=True)
+            mean, variance = posterior.mean, posterior.variance
+        scores = {score: call(mean, variance, y).item() for score, call in _SCORES.items()}
+        error = rmse(mean, y).item()
+        rows.append({"model": name, "rmse": error, **scores, "seconds": seconds})
+    return {column: [row[column] for row in rows] for column in rows[0]}
+
+
+def _models(
+    reading: str, protocol: str, X: Tensor, Y: Tensor, settings: Settings
+) -> Iterator[tuple[str, SingleTaskGP, float]]:
+    """Each model of a protocol, its name first, and the seconds that it took."""
+    if protocol == GRID:
+        for lengthscale in settings.lengthscales:
+            for ridge in settings.ridges:
+                model = closed_form(reading, X, Y, lengthscale, ridge)
+                yield f"{lengthscale:g}, {ridge:g}", model, 0.0
+        return
+    for name in MODELS:
+        start = time.perf_counter()
+        model = trained(name, protocol, reading, X, Y, settings)
+        yield name, model, time.perf_counter() - start
+
+
+def closed_form(reading: str, X: Tensor, Y: Tensor, lengthscale: float, ridge: float) -> PaperRRA:
+    """RRA as printed, with nothing learnt."""
+    model = PaperRRA(X, Y, torch.full_like(Y, ridge), physics=CRUDE[reading])
+    for term in model.terms:
+        kernel: Any = term.kernel
+        kernel.base_kernel.lengthscale = lengthscale
+    return model.eval()
+
+
+def trained(
+    name: str, protocol: str, reading: str, X: Tensor, Y: Tensor, settings: Settings
+) -> SingleTaskGP:
+    """Build one of the models and train it by a protocol."""
+    options: dict[str, Any] = {"low_X": POINTS} if name == "AR1" else {}
+    options |= LITERAL if name == "RRA" else {}
+    options |= {"rho_mean": "learn", "delta_mean": "learn"} if name == LEARNT else {}
+    make: Any = LEARNERS[MODELS[name]].make
+    if protocol == "paper":
+        options |= _plain(name, Y, settings.noise)
+        make = PaperRRA if name == "RRA" else make
+    with warnings.catch_warnings():
+        # f_p crosses zero, and GP-scale is here to show what that does to it.
+        warnings.filterwarnings("ignore", message=".*nearly zero.*")
+        model = make(X, Y, physics=CRUDE[reading], **options)
+        if protocol == "gpadjust":
+            fit(model, "map")
+            return model
+        if name == "RRA":
+            for term in model.terms:
+                term.kernel.base_kernel.lengthscale = RBFKernel().lengthscale.detach().double()
+        _adam(model, settings)
+    return model
+
+
+def _plain(name: str, Y: Tensor, noise: float) -> dict[str, Any]:
+    """Options that make a model as plain GPyTorch does: its initial values, y as it is."""
+    options: dict[str, Any] = {"train_Yvar": torch.full_like(Y, noise)}
+    if name == "RRA":
+        return options
+    both = ("rho_covar_module", "delta_covar_module")
+    kernels = {"AR1": ("low_covar_module", "delta_covar_module"), "CKA": both, LEARNT: both}
+    of_kernels = {key: ScaleKernel(RBFKernel()) for key in kernels.get(name, ("covar_module",))}
+    return options | {"outcome_transform": None} | of_kernels
+
+
+def _adam(model: SingleTaskGP, settings: Settings) -> None:
+    """Maximize the marginal likelihood by a fixed number of steps."""
+    mll = ExactMarginalLogLikelihood(model.likelihood, model).train()
+    optimizer = torch.optim.Adam(
+        [p for p in model.parameters() if p.requires_grad], lr=settings.rate
+    )
+    for _ in range(settings.steps):
+        optimizer.zero_grad()
+        loss = -mll(model(*model.train_inputs), model.train_targets, *model.train_inputs)
+        loss.backward()
+        optimizer.step()
+    model.eval()
+
+
+def load(runs: Sequence[Run]) -> pd.DataFrame:
+    """The scores: a row for each reading, protocol, seed and model."""
+    columns = ("rmse", *_SCORES, "seconds")
+    return frame(runs, ("model", *columns)).astype(dict.fromkeys(columns, float))
+
+
+def first_look(runs: Sequence[Run]) -> str | None:
+    """The errors on the first data sets."""
+    found = load(runs)
+    found = found[(found["reading"] == "B") & (found["protocol"] != GRID)]
+    sets = found.groupby("protocol")["seed"].nunique()
+    if len(sets) < 2 or sets.min() < FIRST_LOOK:
+        return None
+    return f"The first {sets.min()} data sets, reading B\n\n" + errors(found)
+
+
+def tables(runs: Sequence[Run], experiment: Forrester) -> dict[str, Table]:
+    """All tables, by name."""
+    scored = load(runs)
+    by_reading = {reading: scored[scored["reading"] == reading] for reading in READINGS}
+    grid = scored[scored["protocol"] == GRID]
+    found = {"rmse": Table("Reading B, mean / median RMSE", errors(by_reading["B"]))}
+    columns = {
+        "RMSE mean": of("rmse"),
+        "sd": of("rmse", "std"),
+        "median": of("rmse", "median"),
+        "NLPD": of("nlpd"),
+        "CRPS": of("crps"),
+        "coverage": of("coverage"),
+        "fit, s": of("seconds", "median"),
+    }
+    for reading, part in by_reading.items():
+        for protocol in PROTOCOLS:
+            title = f"Reading {reading} of the crude function, protocol {protocol}"
+            own = part[part["protocol"] == protocol]
+            found[f"{reading}:{protocol}"] = Table(title, table(groups(own, "model"), columns))
+    for reading, part in by_reading.items():
+        judged = {
+            f"protocol {p}": judge(
+                part[part["protocol"] == p], grid if (reading, p) == ("B", "paper") else None
+            )
+            for p in PROTOCOLS
+        }
+        title = f"Claims, on reading {reading}"
+        found[f"claims-{reading}"] = Table(title, claims_table("claim", judged))
+    title = "The closed form of RRA, reading B: mean RMSE less that of Phy-mean GP"
+    found["grid"] = Table(title, _grid(_wide(by_reading["B"], "paper"), grid))
+    return found
+
+
+def errors(runs: pd.DataFrame) -> str:
+    """Mean and median errors of one reading, a column for each protocol."""
+
+    def both(part: pd.DataFrame) -> str:
+        return f"{part['rmse'].mean():.3g} / {part['rmse'].median():.3g}"
+
+    known = runs[runs["protocol"].isin([*PROTOCOLS])]
+    columns = across(known, "protocol", PROTOCOLS, both)
+    return table(groups(known, "model"), columns, "mean / median RMSE")
+
+
+def judge(runs: pd.DataFrame, grid: pd.DataFrame | None = None) -> list[Judged]:
+    """Judge the claims on the runs of one reading and protocol.
+
+    Args:
+        runs: Of all models.
+        grid: Of the closed form, if it is to be judged whether F7 is determined.
+    """
+    rmse = runs.pivot(index="seed", columns="model", values="rmse")
+    mean, sd = rmse.mean(), rmse.std()
+
+    def change(model: str, reference: str = "Phy-mean GP") -> Difference:
+        return Difference.of(rmse[model] - rmse[reference]) / mean[reference]
+
+    def below(found: Difference, least: float, most: float) -> Verdict:
+        verdict = within(found, high=-least)
+        return "beaten" if verdict == "reproduced" and found.mean < -most else verdict
+
+    def wider(model: str, reference: str) -> Verdict:
+        if sd[model] == 0 or sd[reference] == 0 or len(rmse) < 4:
+            return reproduced(sd[model] > sd[reference])
+        low, high = bootstrap(
+            [rmse[model], rmse[reference]],
+            lambda x, y, axis: np.std(x, axis=axis, ddof=1) - np.std(y, axis=axis, ddof=1),
+            paired=True,
+        )
+        return "reproduced" if low > 0 else "not reproduced" if high < 0 else "inconclusive"
+
+    gap = (rmse["GP-bias"] - rmse["Phy-mean GP"]).abs().max()
+    best = mean[NAMES].idxmin()
+    among_best = best == "RRA" or Difference.of(rmse["RRA"] - rmse[best]).low <= 0
+    f7 = below(change("RRA"), *_ABOUT_HALF) if among_best else "not reproduced"
+    f7_text = f"{change('RRA').text('.1%')}; the best is {best}"
+    if best != "RRA" and among_best:
+        f7_text += ", within the interval of their difference"
+    if grid is not None and len(grid):
+        changes = [part.mean for part in _closed_form(rmse, grid).values()]
+        f7_text += f"; the closed form gives {min(changes):+.0%} to {max(changes):+.0%} on the grid"
+        if min(changes) <= -_ABOUT_HALF[0] <= max(changes):
+            f7 = "undetermined"
+    zero, scaled = change("Zero-mean GP", "f_p"), change("GP-scale", "Zero-mean GP")
+    spread = f"sd {sd['GP-scale']:.3g} against {sd['Zero-mean GP']:.3g}"
+    return [
+        Judged(
+            "F1",
+            "zero-mean GP slightly below f_p",
+            below(zero, 0, 0.2),
+            f"{zero.text('.1%')} of f_p's RMSE",
+        ),
+        Judged(
+            "F2",
+            "GP-scale slightly below zero-mean GP, with the larger spread",
+            all_of(below(scaled, 0, 0.2), wider("GP-scale", "Zero-mean GP")),
+            f"{scaled.text('.1%')}, {spread}",
+        ),
+        Judged(
+            "F3",
+            "Phy-mean GP and GP-bias are the same model",
+            reproduced(bool(gap <= 1e-9)),
+            f"RMSEs differ by {gap:.1g} at most",
+        ),
+        Judged(
+            "F4",
+            "Phy-mean GP and AR1 below GP-scale",
+            all_of(*(within(change(m, "GP-scale"), high=0) for m in ("Phy-mean GP", "AR1"))),
+            f"{mean['Phy-mean GP']:.3g} and {mean['AR1']:.3g} against {mean['GP-scale']:.3g}",
+        ),
+        Judged(
+            "F5",
+            "AR1 has the largest spread of Phy-mean GP, GP-bias and AR1",
+            wider("AR1", "Phy-mean GP"),
+            f"sd {sd['AR1']:.3g} against {sd['Phy-mean GP']:.3g}",
+        ),
+        Judged(
+            "F6",
+            "CKA about 30 % below Phy-mean GP",
+            below(change("CKA"), 0.2, 0.4),
+            change("CKA").text(".1%"),
+        ),
+        Judged("F7", "RRA about 50 % below Phy-mean GP, the best", f7, f7_text),
+    ]
+
+
+def _wide(runs: pd.DataFrame, protocol: str) -> pd.DataFrame:
+    """The errors of a protocol: a row for each seed, a column for each model."""
+    chosen = runs[runs["protocol"] == protocol]
+    return chosen.pivot(index="seed", columns="model", values="rmse")
+
+
+def _closed_form(rmse: pd.DataFrame, grid: pd.DataFrame) -> dict[str, Difference]:
+    """The change of each cell of the grid from the physics mean."""
+    cells = _wide(grid, GRID).drop(columns="f_p")
+    reference = rmse["Phy-mean GP"]
+    return {str(cell): Difference.of(cells[cell] - reference) / reference.mean() for cell in cells}
+
+
+def _grid(rmse: pd.DataFrame, grid: pd.DataFrame) -> str:
+    """A row for each lengthscale, a column for each ridge."""
+    if grid.empty:
+        return "No results yet."
+    found = _closed_form(rmse, grid)
+    names = [cell.split(", ") for cell in grid["model"].unique() if cell != "f_p"]
+    ridges = list(dict.fromkeys(ridge for _, ridge in names))
+    rows = [
+        [lengthscale, *(found[f"{lengthscale}, {ridge}"].text(".0%") for ridge in ridges)]
+        for lengthscale in dict.fromkeys(lengthscale for lengthscale, _ in names)
+    ]
+    return markdown(["lengthscale", *(f"ridge {ridge}" for ridge in ridges)], rows)
+
+
+def draw(runs: Sequence[Run], experiment: Forrester) -> list[Path]:
+    """Draw the paper's figure for each protocol, of reading B: six fits, and all errors."""
+    scored, found = load(runs), []
+    for protocol in PROTOCOLS:
+        figure = Figure(figsize=(13, 6), layout="constrained")
+        axes: dict[str, Axes] = figure.subplot_mosaic(
+            [["a", "b", "c", "g"], ["d", "e", "f", "g"]], width_ratios=[1, 1, 1, 1.2]
+        )
+        names = [name for name in NAMES if name != "GP-bias"]
+        for letter, name in zip("abcdef", names, strict=True):
+            _fit_panel(axes[letter], name, protocol, experiment.settings)
+            axes[letter].set_title(f"({letter}) {name}", loc="left")
+            axes[letter].set(xlabel="x" * (letter in "def"), ylabel="y" * (letter in "ad"))
+        figure.legend(*axes["a"].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+        own = scored[(scored["protocol"] == protocol) & (scored["reading"] == "B")]
+        rows = {name: [part["rmse"]] for name, part in groups(own, "model").items()}
+        strips(axes["g"], rows, ["tab:blue"])
+        axes["g"].set_xscale("log")
+        axes["g"].xaxis.set_minor_formatter(NullFormatter())
+        axes["g"].set_xlabel("RMSE; each run, median and quartiles")
+        axes["g"].set_title(f"(g) {own['seed'].nunique()} runs", loc="left")
+        found.append(save(figure, experiment.out / f"forrester_{protocol}.png"))
+    return found
+
+
+def _fit_panel(ax: Axes, name: str, protocol: str, settings: Settings, seed: int = 3) -> None:
+    """Draw one model of the data set of a seed."""
+    x = torch.linspace(LOWER, UPPER, 200, dtype=torch.float64).unsqueeze(-1)
+    X, Y = observations(seed, settings.observations)
+    model = trained(name, protocol, "B", X, Y, settings)
+    with torch.no_grad():
+        posterior = model.posterior(x, observation_noise=True)
+        mean, sd = posterior.mean.squeeze(-1), posterior.variance.sqrt().squeeze(-1)
+    ax.fill_between(
+        x.squeeze(-1), mean - 2 * sd, mean + 2 * sd, color="navy", alpha=0.15, lw=0, label="2 sd"
+    )
+    if isinstance(model, RRA):
+        torch.manual_seed(seed)
+        functions = model.sample_functions(20)(x).squeeze(-1)
+        ax.plot(x.squeeze(-1), functions.mT, color="navy", lw=0.4, alpha=0.6)
+    ax.plot(x, CRUDE["B"](x), color="black", ls="--", lw=1, label="f_p")
+    ax.plot(x.squeeze(-1), mean, color="tab:blue", lw=3.5, label="mean")
+    ax.plot(x, truth(x), color="black", lw=1, label="truth")
+    ax.plot(X, Y, "o", color="red", ms=4, label="data")
+    ax.set_ylim(-9, 9)

@@ -1,0 +1,75 @@
+"""What a learner makes of a machine's transitions."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.models import PhysicsParameters, orthogonal_rbf
+from gpadjust.records import Records, smooth
+from paper.machines import REAL_LEARNERS, UNTAUGHT
+from paper.machines.networks import NetworkDynamics
+from paper.machines.pendulums import Machine
+
+
+class Learnt(NamedTuple):
+    """The result of a learner.
+
+    Args:
+        dynamics: The dynamics.
+        noise: Standard deviations of what is measured, ``state_dim``, if they learnt from states
+            that were estimated: the noise that they learnt is then process noise.
+        parameters: The posterior of f_p's parameters, if they were learnt.
+        variation: How parameters vary in a run, if states were estimated.
+    """
+
+    dynamics: Dynamics
+    noise: Tensor | None = None
+    parameters: PhysicsParameters | None = None
+    variation: Tensor | None = None
+
+
+def learnt(name: str, machine: Machine, data: Any, seed: int) -> Learnt:
+    """Learn from transitions of a machine, or from records of stretches.
+
+    Args:
+        name: Of ``REAL_LEARNERS``.
+        machine: The machine.
+        data: ``Trajectories``; ``Records`` for all their transitions, or states along them.
+        seed: Of networks, and of the draw of the states.
+    """
+    known = REAL_LEARNERS[name]
+    found: Any = None
+    if known.states == "smoothed":
+        found = smooth(data, machine.physics())
+        data = found.draw(seed)
+    data = data.trajectories() if isinstance(data, Records) else data
+    dynamics = _dynamics(name, machine, data, seed)
+    if name not in UNTAUGHT:
+        dynamics.update(*data)
+    if found is not None:
+        return Learnt(dynamics, found.noise, found.physics_parameters, found.variation)
+    if isinstance(dynamics, LearnedDynamics) and dynamics.model.has_unknowns:
+        return Learnt(dynamics, parameters=dynamics.model.physics_parameters)
+    return Learnt(dynamics)
+
+
+def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:
+    known, physics = REAL_LEARNERS[name], None
+    if known.physics == "fitted":
+        fitted = PhysicsDynamics(machine.spec, machine.physics())
+        if known.model is None:
+            return fitted
+        fitted.update(*data)
+        physics = fitted.physics
+    elif known.physics != "none":
+        physics = machine.physics(known.physics)
+    if known.model is None:
+        return PhysicsDynamics(machine.spec, physics)
+    if known.model == "network":
+        return NetworkDynamics(machine.spec, physics, seed=seed)
+    options = {"covar_module": orthogonal_rbf} if "orthogonal" in name else {}
+    return LearnedDynamics(machine.spec, physics, model=partial(known.make, **options))

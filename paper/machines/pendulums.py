@@ -1,0 +1,211 @@
+"""The pendulums: an equation of motion each, and parameters that were published."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.physics import ODEPhysics, Unknown
+from gpadjust.states import StateSpec
+
+STEP = 0.05  # s, of control
+SUBSTEPS = 10  # at 4 its RK4 comes near its limit: friction that sets in is stiff
+_GRAVITY = 9.81
+_GEAR = 6.0
+_SLIDES = 0.05  # rad/s, at which Coulomb friction is three quarters of its value
+_MASS = 0.68  # kg, of the pendulum that is learnt from
+
+FRICTION = {
+    "viscous": Unknown(0.01, factor=5.0, unit="N m s"),
+    "coulomb": Unknown(0.1, factor=3.0, unit="N m"),
+}
+"""What is known beforehand of friction in drives of this size."""
+
+Parameters = Mapping[str, float]
+Rates = Callable[[Tensor, Tensor, Mapping[str, Any]], Tensor]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine, and what was published of it.
+
+    Args:
+        spec: What states and actions are; the scores are of the last angle first of all.
+        rates: The equation of motion: the time derivatives ``N x state_dim`` of states
+            ``N x state_dim`` under actions ``N x action_dim``, with parameters by name, each
+            ``N`` or a number.
+        known: Parameters by what is known: ``"crude"``, as someone has them who knows the machine a
+            little, and ``"identified"``, by experiments.
+    """
+
+    spec: StateSpec
+    rates: Rates
+    known: Mapping[str, Parameters]
+
+    @property
+    def unknowns(self) -> dict[str, Unknown]:
+        """Its parameters with what someone knows beforehand who has the crude ones.
+
+        Masses and inertias are known within a factor of 1.5 or so, of friction the order of
+        magnitude only.
+        """
+        return {
+            name: FRICTION.get(name.rpartition("_")[0] or name, Unknown(value or 1.0, factor=1.5))
+            for name, value in self.known["crude"].items()
+        }
+
+    def physics(self, parameters: str | Parameters = "unknown") -> ODEPhysics:
+        """A control step by unknown parameters, by those that are known so, or by these."""
+        options: dict[str, Any] = {
+            "step": STEP,
+            "state_dim": self.spec.state_dim,
+            "substeps": SUBSTEPS,
+            "name": self.rates.__name__,
+        }
+        if parameters == "unknown":
+            return ODEPhysics(self.rates, unknowns=self.unknowns, **options)
+        given = self.known[parameters] if isinstance(parameters, str) else parameters
+        values = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in given.items()}
+        return ODEPhysics(lambda state, action: self.rates(state, action, values), **options)
+
+
+def _friction(rate: Tensor, viscous: Any, coulomb: Any) -> Tensor:
+    return viscous * rate + coulomb * (rate / _SLIDES).tanh()
+
+
+def double_pendulum(
+    state: Tensor, action: Tensor, p: Mapping[str, Any], length: float = 0.3
+) -> Tensor:
+    """Two links with geared drives, by the nine sums of masses that can be told apart.
+
+    ``inertia_1`` is :math:`I_1 + m_2 l_1^2`, ``inertia_2`` :math:`I_2`, ``moment_1``
+    :math:`m_1 r_1 + m_2 l_1` and ``moment_2`` :math:`m_2 r_2`, with inertias about the joints, and
+    ``rotor`` the inertia of a rotor. ``length`` is :math:`l_1` in m. Source: the makers'
+    ``docs/text/dynamics.rst``, but for the form of the friction.
+    """
+    q1, q2, dq1, dq2 = state.unbind(-1)
+    coupling = length * p["moment_2"]
+    across = p["inertia_2"] + coupling * q2.cos()
+    whole = p["inertia_1"] + coupling * q2.cos() + across + (_GEAR**2 + 1) * p["rotor"]
+    across = across - _GEAR * p["rotor"]
+    fore = p["inertia_2"] + _GEAR**2 * p["rotor"]
+    swing = coupling * q2.sin()
+    both = _GRAVITY * p["moment_2"] * (q1 + q2).sin()
+    torque_1 = action[:, 0] + swing * (2 * dq1 + dq2) * dq2 - both
+    torque_1 = torque_1 - _GRAVITY * p["moment_1"] * q1.sin()
+    torque_1 = torque_1 - _friction(dq1, p["viscous_1"], p["coulomb_1"])
+    torque_2 = action[:, 1] - swing * dq1.square() - both
+    torque_2 = torque_2 - _friction(dq2, p["viscous_2"], p["coulomb_2"])
+    size = whole * fore - across.square()
+    ddq1 = (fore * torque_1 - across * torque_2) / size
+    ddq2 = (whole * torque_2 - across * torque_1) / size
+    return torch.stack([dq1, dq2, ddq1, ddq2], dim=-1)
+
+
+def design_c(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
+    """The double pendulum of designs C.0 and C.1, with links of 0.2 and 0.3 m."""
+    return double_pendulum(state, action, p, 0.2)
+
+
+def pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
+    """A rigid body on a drive: its inertia about the joint, ``moment`` :math:`m l`, friction."""
+    q, dq = state.unbind(-1)
+    torque = action[:, 0] - _GRAVITY * p["moment"] * q.sin()
+    torque = torque - _friction(dq, p["viscous"], p["coulomb"])
+    return torch.stack([dq, torque / p["inertia"]], dim=-1)
+
+
+def loaded_pendulum(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
+    """The pendulum with its mass as a second action; inertia and moment are proportional to it."""
+    share = action[:, 1] / _MASS
+    return pendulum(
+        state, action, {**p, "inertia": p["inertia"] * share, "moment": p["moment"] * share}
+    )
+
+
+def sums_of_masses(
+    first: tuple[float, float, float],
+    second: tuple[float, float, float],
+    length: float,
+    rotor: float,
+    friction: Parameters | None = None,
+) -> Parameters:
+    """The parameters of a double pendulum from mass, inertia and center of mass of its links."""
+    (mass_1, inertia_1, center_1), (mass_2, inertia_2, center_2) = first, second
+    frictions = ("viscous_1", "coulomb_1", "viscous_2", "coulomb_2")
+    return {
+        "inertia_1": inertia_1 + mass_2 * length**2,
+        "inertia_2": inertia_2,
+        "moment_1": mass_1 * center_1 + mass_2 * length,
+        "moment_2": mass_2 * center_2,
+        "rotor": rotor,
+        **(friction or dict.fromkeys(frictions, 0.0)),
+    }
+
+
+# The makers' model 2.0 of design A.0; their Coulomb friction, c arctan(100 q'), is c pi / 2 where
+# it slides. The crude one has masses and inertias of the first link 15 % too small, of the second
+# 15 % too large, and no friction.
+DOUBLE_PENDULUM = Machine(
+    StateSpec(["q1", "q2", "dq1", "dq2"], ["u1", "u2"], angles=["q1", "q2"]),
+    double_pendulum,
+    {
+        "crude": sums_of_masses(
+            (0.85 * 0.5594, 0.85 * 0.05347, 0.3),
+            (1.15 * 0.6043, 1.15 * 0.02392, 0.1838),
+            0.3,
+            7.66e-5,
+        ),
+        "identified": sums_of_masses(
+            (0.5594, 0.05347, 0.3),
+            (0.6043, 0.02392, 0.1838),
+            0.3,
+            7.66e-5,
+            {
+                "viscous_1": 0.001,
+                "coulomb_1": 0.093 * math.pi / 2,
+                "viscous_2": 0.001,
+                "coulomb_2": 0.078 * math.pi / 2,
+            },
+        ),
+    },
+)
+
+# The makers' model 1.0 of design C.1, links 15 % off, and no friction.
+DESIGN_C = Machine(
+    DOUBLE_PENDULUM.spec,
+    design_c,
+    {
+        "crude": sums_of_masses(
+            (0.85 * 0.5235, 0.85 * 0.03189, 0.2),
+            (1.15 * 0.6256, 1.15 * 0.05087, 0.2557),
+            0.2,
+            6.29e-5,
+        )
+    },
+)
+
+PENDULUM = Machine(
+    StateSpec(["q", "dq"], ["u"], angles=["q"]),
+    pendulum,
+    {
+        # The makers' file: 0.6755 kg at 0.5 m.
+        "crude": {
+            "inertia": 0.6755 * 0.5**2,
+            "moment": 0.6755 * 0.5,
+            "viscous": 0.1,
+            "coulomb": 0.0,
+        },
+        # By free runs of these records, as the makers' identified values are off by a factor of 3.
+        "identified": {"inertia": 0.19, "moment": 0.372, "viscous": 0.01, "coulomb": 0.15},
+    },
+)
+
+LOADED = Machine(
+    StateSpec(["q", "dq"], ["u", "load"], angles=["q"]), loaded_pendulum, PENDULUM.known
+)

@@ -1,0 +1,318 @@
+"""Laws with unknown parameters, and cases of them: inputs, observations, and the true values.
+
+Cases of textbook problems have a system that is not always the law: the line is Plumlee's (2017),
+the decay that of Bayarri et al. (2007), with numbers that vary. The others are of a right law, the
+parameters of which observations tell apart badly, or which folds; they are drawn from their priors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from gpadjust.physics import FunctionPhysics, ParameterValues, Unknown
+
+Values = NDArray[np.float64]
+GRAVITY = 9.81
+Law = Callable[[Tensor, ParameterValues], Tensor]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A law with unknown parameters, and what is observed of it.
+
+    Attributes:
+        law: The physics, of one output.
+        unknowns: Its parameters.
+        box: Least and largest inputs, ``d`` each.
+        number: Of observations.
+        noise: Its standard deviation.
+    """
+
+    law: Law
+    unknowns: Mapping[str, Unknown]
+    box: tuple[tuple[float, ...], tuple[float, ...]]
+    number: int
+    noise: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """Observations of a law whose parameters were drawn from their prior.
+
+    Attributes:
+        X: Inputs, ``n x d``.
+        Y: Observations, ``n x 1``.
+        physics: The law.
+        true: Its parameters, ``p``.
+        noise: The standard deviation of the noise.
+    """
+
+    X: Tensor
+    Y: Tensor
+    physics: FunctionPhysics
+    true: Tensor
+    noise: float
+
+
+def case(name: str, seed: int) -> Case:
+    """The case of a problem that a seed draws."""
+    problem = PROBLEMS[name]
+    generator = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(problem.box, dtype=torch.float64)
+    engine = SobolEngine(len(low), scramble=True, seed=seed)
+    X = low + engine.draw(problem.number, dtype=torch.float64) * (high - low)
+    physics = FunctionPhysics(problem.law, unknowns=problem.unknowns, name=name)
+    z = torch.randn(len(problem.unknowns), generator=generator, dtype=torch.float64)
+    true = physics.unknowns.at(z)
+    noise = torch.randn(len(X), 1, generator=generator, dtype=torch.float64)
+    return Case(X, physics(X, true) + problem.noise * noise, physics, true, problem.noise)
+
+
+def _beam(X: Tensor, p: ParameterValues) -> Tensor:
+    """Deflection of a cantilever in a joint that gives, by load and length."""
+    load, length = X.T
+    return 10 * load * (length**3 / (3 * p.EI) + length**2 / p.kr)
+
+
+def _reaction(X: Tensor, p: ParameterValues) -> Tensor:
+    """Conversion after an hour by temperature in K, with a rate by Arrhenius."""
+    return 1 - (-(p.logA - p.E / (8.314e-3 * X[:, 0])).exp()).exp()
+
+
+def _creep(X: Tensor, p: ParameterValues) -> Tensor:
+    """Strain of a spring beside a dashpot under a constant load, before it comes to rest."""
+    return (1 - (-X[:, 0] * p.E / p.eta).exp()) / p.E
+
+
+def _inhibited(X: Tensor, p: ParameterValues) -> Tensor:
+    """Rate of an enzyme by its substrate and an inhibitor."""
+    substrate, inhibitor = X.T
+    return p.V * substrate / (p.K * (1 + inhibitor / p.Ki) + substrate)
+
+
+def _spectrum(X: Tensor, p: ParameterValues) -> Tensor:
+    """Three peaks."""
+    peaks = ((p[f"a{i}"], p[f"c{i}"], p[f"w{i}"]) for i in (1, 2, 3))
+    return sum((a * (-0.5 * ((X[:, 0] - c) / w).square()).exp() for a, c, w in peaks), 0 * X[:, 0])
+
+
+def _pendulum(X: Tensor, p: ParameterValues) -> Tensor:
+    """Angle by time, of a swing of either sign and phase."""
+    return p.swing * (3 * X[:, 0] + p.phase).sin()
+
+
+def _square(X: Tensor, p: ParameterValues) -> Tensor:
+    """A lens that is out of focus either way, by aperture."""
+    return (p.focus - 1).square() * X[:, 0] + p.rest
+
+
+def _alias(X: Tensor, p: ParameterValues) -> Tensor:
+    """An oscillation that is observed too seldom."""
+    return p.size * (p.rate * X[:, 0]).cos()
+
+
+def _spectral(factor: float) -> dict[str, Unknown]:
+    middles = {f"c{i}": Unknown(c, sd=0.04) for i, c in ((1, 0.25), (2, 0.5), (3, 0.75))}
+    heights = {f"a{i}": Unknown(1.0, factor=factor) for i in (1, 2, 3)}
+    return {**heights, **middles, **{f"w{i}": Unknown(0.1, factor=1.3) for i in (1, 2, 3)}}
+
+
+PROBLEMS = {
+    "beam": Problem(
+        _beam,
+        {"EI": Unknown(10.0, factor=1.5), "kr": Unknown(30.0, factor=1.5)},
+        ((0.2, 0.8), (1.0, 1.0)),
+        14,
+        0.01,
+    ),
+    "reaction": Problem(
+        _reaction,
+        {"logA": Unknown(22.0, sd=2.0), "E": Unknown(63.0, sd=6.0)},
+        ((325.0,), (345.0,)),
+        12,
+        0.01,
+    ),
+    "creep": Problem(
+        _creep,
+        {"E": Unknown(2.0, factor=1.8), "eta": Unknown(2.0, factor=1.6)},
+        ((0.05,), (1.0,)),
+        13,
+        0.01,
+    ),
+    "inhibitor": Problem(
+        _inhibited,
+        {
+            "V": Unknown(3.0, factor=1.6),
+            "K": Unknown(2.0, factor=1.6),
+            "Ki": Unknown(1.0, factor=2.0),
+        },
+        ((0.1, 0.0), (1.5, 1.0)),
+        14,
+        0.02,
+    ),
+    "spectrum": Problem(_spectrum, _spectral(1.5), ((0.0,), (1.0,)), 40, 0.05),
+    "pendulum": Problem(
+        _pendulum,
+        {"swing": Unknown(0.3, sd=1.0), "phase": Unknown(0.2, bounds=(-math.pi, math.pi))},
+        ((0.0,), (2.0,)),
+        12,
+        0.1,
+    ),
+    "focus": Problem(
+        _square,
+        {"focus": Unknown(1.3, sd=1.0), "rest": Unknown(0.0, sd=1.0)},
+        ((0.0,), (2.0,)),
+        12,
+        0.1,
+    ),
+    "radar": Problem(
+        _alias,
+        {"size": Unknown(1.0, sd=0.3), "rate": Unknown(20.0, sd=12.0)},
+        ((0.0,), (3.0,)),
+        12,
+        0.4,
+    ),
+    "alias": Problem(
+        _alias,
+        {"size": Unknown(1.0, sd=0.3), "rate": Unknown(6.0, sd=4.0)},
+        ((0.0,), (3.0,)),
+        12,
+        0.2,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class TextbookCase:
+    """A case of a problem.
+
+    Args:
+        law: The physics, of one input and one output.
+        unknowns: Its unknown parameters.
+        X: Inputs, ``n x 1``.
+        system: What the system does there, ``n x 1``, and what is observed but for noise.
+        noise: The standard deviation of that.
+        true: The parameters that the system has, in so far as it has any.
+        seed: Of the noise.
+    """
+
+    law: Callable[[Tensor, ParameterValues], Tensor]
+    unknowns: Mapping[str, Unknown]
+    X: Tensor
+    system: Tensor
+    noise: float
+    true: Mapping[str, float]
+    seed: int
+
+    @property
+    def physics(self) -> FunctionPhysics:
+        """The physics."""
+        return FunctionPhysics(self.law, unknowns=self.unknowns, name="law")
+
+    @property
+    def observations(self) -> Tensor:
+        """What is observed, ``n x 1``."""
+        generator = torch.Generator().manual_seed(1000 + self.seed)
+        noise = torch.randn(self.system.shape, generator=generator, dtype=torch.float64)
+        return self.system + self.noise * noise
+
+    @property
+    def best(self) -> dict[str, float]:
+        """The parameters with which the physics describes the system best, by least squares."""
+        physics, names = self.physics, [*self.unknowns]
+
+        def errors(values: Values) -> Values:
+            found = physics(self.X, torch.from_numpy(values))
+            error: Values = (found - self.system).flatten().numpy()
+            return error
+
+        start = physics.unknowns.guess.numpy()
+        found = least_squares(errors, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        return dict(zip(names, found.x.tolist(), strict=True))
+
+
+def textbook_case(problem: str, seed: int) -> TextbookCase:
+    """The case of a problem that a seed draws."""
+    return _TEXTBOOK[problem](np.random.default_rng(seed), seed)
+
+
+def _right(draw: np.random.Generator, seed: int) -> TextbookCase:
+    size, rate = draw.normal(5, 1), math.exp(draw.normal(0, 0.3))
+    unknowns = {"size": Unknown(5.0, sd=1.0), "rate": Unknown(1.0, factor=math.exp(0.3))}
+    X = _grid(0.1, 3, 15)
+    true = {"size": size, "rate": rate}
+    return TextbookCase(
+        lambda X, p: p.size * (1 - (-p.rate * X[:, 0]).exp()),
+        unknowns,
+        X,
+        size * (1 - (-rate * X).exp()),
+        0.1,
+        true,
+        seed,
+    )
+
+
+def _smooth(draw: np.random.Generator, seed: int) -> TextbookCase:
+    slope, frequency = draw.uniform(2, 5), draw.uniform(4, 7)
+    X = _grid(0.02, 1, 17)
+    system = slope * X + X * (frequency * X).sin()
+    return TextbookCase(
+        lambda X, p: p.slope * X[:, 0], {"slope": Unknown(3.0, sd=2.0)}, X, system, 0.02, {}, seed
+    )
+
+
+def _confounded(draw: np.random.Generator, seed: int) -> TextbookCase:
+    rate, rest = draw.uniform(1.2, 2.2), draw.uniform(0.5, 2)
+    X = _grid(0.1, 3, 20)
+    system = 3.5 * (-rate * X).exp() + rest
+    true = {"rate": rate}
+    return TextbookCase(
+        lambda X, p: 5 * (-p.rate * X[:, 0]).exp(),
+        {"rate": Unknown(1.0, factor=2.0)},
+        X,
+        system,
+        0.1,
+        true,
+        seed,
+    )
+
+
+def _ball(draw: np.random.Generator, seed: int) -> TextbookCase:
+    height, drag = draw.uniform(40, 60), draw.uniform(0.002, 0.02)  # m, 1/m
+    X = _grid(0.05, 2, 20)
+    fallen = (math.sqrt(GRAVITY * drag) * X).cosh().log() / drag
+    unknowns = {
+        "gravity": Unknown(9.0, sd=2.0, unit="m/s²"),
+        "height": Unknown(50.0, sd=20.0, unit="m"),
+    }
+    true = {"gravity": GRAVITY, "height": height}
+    return TextbookCase(
+        lambda X, p: p.height - 0.5 * p.gravity * X[:, 0].square(),
+        unknowns,
+        X,
+        height - fallen,
+        0.05,
+        true,
+        seed,
+    )
+
+
+def _grid(low: float, high: float, n: int) -> Tensor:
+    return torch.linspace(low, high, n, dtype=torch.float64).unsqueeze(-1)
+
+
+_TEXTBOOK: dict[str, Callable[[np.random.Generator, int], TextbookCase]] = {
+    "right": _right,
+    "smooth": _smooth,
+    "confounded": _confounded,
+    "ball": _ball,
+}

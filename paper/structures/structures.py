@@ -1,0 +1,260 @@
+"""What CKA loses to the models that it contains, and RRA to CKA, by the library's defaults."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+from botorch.exceptions.warnings import OptimizationWarning
+from torch import Tensor
+
+from gpadjust import fit
+from gpadjust.dynamics import LearnedDynamics
+from gpadjust.inference import SampleResult, SamplingWarning
+from gpadjust.models import TermsGP
+from paper.calibration import PUMP, label
+from paper.calibration.calibration import Data, of_pair, pump, scored
+from paper.common.experiment import Run, Table
+from paper.common.learners import LEARNERS
+from paper.common.tables import Cell, claims_table, frame, table
+from paper.common.verdicts import Judged, met
+from paper.structures import CELLS, GROUPS, MODELS, Structures
+from paper.structures.systems import System, system
+
+MOST_RMSE = 1.1  # in those of the better of physics mean and GP
+MOST_NLPD = 0.15  # nats above the better of them
+CELLS_HELD = 0.9  # the share in which CKA is to hold both
+MOST_RRA = 1.15  # of RRA's RMSE in CKA's, in the mean
+_CONTAINED = ["phy", "gp"]
+_CELL = ["problem", "size", "noise"]
+_Fitted = TypeVar("_Fitted")
+
+
+def run(
+    experiment: Structures, problem: str, size: int, noise: float, model: str, seed: int
+) -> Run:
+    """Fit one model to one data set; return scores, those of each output in a list."""
+    _prepare(model)
+    settings = experiment.settings
+    if GROUPS[problem] != "functions":
+        return _of_system(system(problem, size, settings.num_transitions, seed), model)
+    if problem == PUMP[0]:
+        return _of_function(pump(settings.num_pump, seed), model, seed)
+    return _of_function(of_pair(problem, size, noise, settings.num_test, seed), model, seed)
+
+
+def _make(name: str) -> Callable[..., TermsGP]:
+    return LEARNERS["phymean" if name == "phy" else name].make
+
+
+def _of_function(data: Data, name: str, seed: int) -> Run:
+    """Scores of each output, as those of calibration."""
+    (model, sizes), found = _timed(lambda: _fitted(data, name))
+    scores = scored(model, data, seed)
+    parts = (scores[score] for score in ("nrmse", "nlpd", "coverage"))
+    return {"N": len(data.X), **_scores(*parts), "effective_size": sizes, **found}
+
+
+def _fitted(data: Data, name: str) -> tuple[TermsGP, list[float]]:
+    model = _make(name)(data.X, data.Y, physics=data.physics)
+    return model, _sizes(fit(model))
+
+
+def _of_system(data: System, name: str) -> Run:
+    """Scores of each state's change in one step, as the mean and variance of dynamics tell it."""
+
+    def learnt() -> LearnedDynamics:
+        physics = None if name == "gp" else data.physics
+        dynamics = LearnedDynamics(data.spec, physics, model=_make(name))
+        dynamics.update(*data.train)
+        return dynamics
+
+    dynamics, found = _timed(learnt)
+    scores = dynamics.score(*data.test)
+    change = data.spec.change(data.test.states, data.test.next_states)[:, data.spec.moving]
+    sd = change.std(0)
+    return {
+        "N": len(data.train.states),
+        **_scores(scores.rmse / sd, scores.nlpd - sd.log(), scores.coverage),
+        "effective_size": _sizes(dynamics.fit_result),
+        **found,
+    }
+
+
+def _scores(nrmse: Tensor, nlpd: Tensor, coverage: Tensor) -> Run:
+    """Over the outputs, and of each."""
+    each = {"nrmse": nrmse.tolist(), "nlpd": nlpd.tolist(), "coverage": coverage.tolist()}
+    return {
+        "nrmse": nrmse.log().mean().exp().item(),
+        "nlpd": nlpd.mean().item(),
+        "coverage": coverage.mean().item(),
+        "each": each,
+    }
+
+
+def _sizes(result: Any) -> list[float]:
+    """The effective sample size of the draws of each output."""
+    return result.effective_size.reshape(-1).tolist() if isinstance(result, SampleResult) else []
+
+
+def _timed(fitted: Callable[[], _Fitted]) -> tuple[_Fitted, Run]:
+    """What a fit returns; its seconds, and whether it said that its draws are few."""
+    start = time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = fitted()
+    seconds = time.perf_counter() - start
+    for each in caught:
+        if not issubclass(each.category, OptimizationWarning | SamplingWarning):
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    warned = any(issubclass(each.category, SamplingWarning) for each in caught)
+    return result, {"seconds": seconds, "warned": warned}
+
+
+@cache
+def _prepare(name: str) -> None:
+    """Set a process up: one fit that is not timed."""
+    _fitted(of_pair("forrester", 5, 0.0, 10, 4), name)
+
+
+def cells(runs: Sequence[Run]) -> pd.DataFrame:
+    """A row for each cell that all models have run in.
+
+    Columns ``"label"``, ``"group"``, ``"seeds"``, their number, and ``"best"``, the better one's
+    RMSE of physics mean and GP; then ``(score, model)`` of ``"nrmse"``, the median over the seeds
+    in units of that, ``"nlpd"``, the mean less the better one's, ``"coverage"`` and ``"warned"``,
+    means, and ``"seconds"``, a median.
+    """
+    scored = frame(runs)
+    by_cell = scored.groupby([*_CELL, "model"], sort=False)
+    middle = by_cell[["nrmse", "seconds"]].median().unstack()
+    mean = by_cell[["nlpd", "coverage", "warned"]].mean().unstack()
+    found = pd.concat([middle, mean], axis=1).dropna()
+    order = dict.fromkeys([*CELLS, *found.index])  # beside the known ones those of smaller trials
+    found = found.loc[[cell for cell in order if cell in found.index]]
+    best = found["nrmse"][_CONTAINED].min(axis=1)
+    least = found["nlpd"][_CONTAINED].min(axis=1)
+    for model in MODELS:
+        found["nrmse", model] /= best
+        found["nlpd", model] -= least
+    sizes = scored.groupby(_CELL, sort=False).agg(N=("N", "first"), seeds=("seed", "nunique"))
+    sizes = sizes.reindex(found.index)
+    found["seeds"], found["best"] = sizes["seeds"], best
+    found["group"] = [GROUPS[name] for name, *_ in found.index]
+    found["label"] = [
+        label(name, n, noise) for (name, _, noise), n in zip(found.index, sizes["N"], strict=True)
+    ]
+    return found
+
+
+def tables(runs: Sequence[Run], experiment: Structures) -> dict[str, Table]:
+    """All tables, by name."""
+    found = cells(runs)
+    beside = "that of the better of physics mean and GP"
+    return {
+        "targets": Table("Targets", claims_table("target", {"": verdicts(found)})),
+        "summary": Table("CKA beside the better of physics mean and GP", summary(found)),
+        "nrmse": Table(f"Median RMSE / {beside}", _by_model(found, "nrmse", ".2f", MOST_RMSE)),
+        "nlpd": Table(
+            f"Mean NLPD less {beside}, nats", _by_model(found, "nlpd", "+.2f", MOST_NLPD)
+        ),
+        "coverage": Table("Mean coverage of 95 %", _by_model(found, "coverage", ".2f")),
+        "seconds": Table("Median seconds of a fit", _by_model(found, "seconds", ".2g")),
+    }
+
+
+def _by_group(found: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    return {name: found[found["group"] == name] for name in dict.fromkeys(found["group"])}
+
+
+def verdicts(found: pd.DataFrame) -> list[Judged]:
+    """Whether CKA loses to what it contains, and RRA to CKA."""
+    rmse, nlpd = found["nrmse", "cka"], found["nlpd", "cka"]
+    held = (rmse <= MOST_RMSE) & (nlpd <= MOST_NLPD)
+    rest = zip(found["label"][~held], rmse[~held], nlpd[~held], strict=True)
+    beyond = "; ".join(f"{name}: RMSE {e:.2f}, NLPD {d:+.2f}" for name, e, d in rest)
+    groups = {"": found, **_by_group(found)}
+    ahead = {name: (_ratio(part), part["nlpd", "cka"].mean()) for name, part in groups.items()}
+    rra = {name: _ratio(part, "rra", "cka") for name, part in groups.items()}
+    return [
+        Judged(
+            "S1",
+            f"CKA's RMSE at most {MOST_RMSE} times, and its NLPD at most {MOST_NLPD} nats above, "
+            f"that of the better of physics mean and GP in at least {CELLS_HELD:.0%} of the cells",
+            met(held.mean() >= CELLS_HELD),
+            f"in {held.sum()} of {len(held)} ({held.mean():.0%})"
+            + (f"; not in {beyond}" if beyond else ""),
+        ),
+        Judged(
+            "S2",
+            "CKA is ahead of the better of them in the mean",
+            met(ahead[""][0] < 1 and ahead[""][1] < 0),
+            "; ".join(
+                f"{name}: " * bool(name) + f"RMSE {error:.2f} times, NLPD {density:+.2f}"
+                for name, (error, density) in ahead.items()
+            ),
+        ),
+        Judged(
+            "S3",
+            f"RRA's RMSE at most {MOST_RRA} times CKA's in the mean",
+            met(rra[""] <= MOST_RRA),
+            "; ".join(f"{name}: " * bool(name) + f"{ratio:.2f}" for name, ratio in rra.items()),
+        ),
+    ]
+
+
+def _ratio(part: pd.DataFrame, model: str = "cka", other: str | None = None) -> float:
+    """The geometric mean of RMSEs, in units of the better one of physics mean and GP, or other."""
+    of = part["nrmse", model] / (1 if other is None else part["nrmse", other])
+    return float(np.exp(np.log(of).mean()))
+
+
+def summary(found: pd.DataFrame) -> str:
+    """In how many cells CKA holds both limits, and the means, by group."""
+
+    def close(part: pd.DataFrame) -> Any:
+        return part["nrmse", "cka"] <= MOST_RMSE
+
+    def sure(part: pd.DataFrame) -> Any:
+        return part["nlpd", "cka"] <= MOST_NLPD
+
+    def both(part: pd.DataFrame) -> str:
+        held = close(part) & sure(part)
+        return f"{held.sum()} of {len(part)} ({held.mean():.0%})"
+
+    def rmse(model: str) -> Cell:
+        return lambda part: f"{_ratio(part, model):.2f}"
+
+    def nlpd(model: str) -> Cell:
+        return lambda part: f"{part['nlpd', model].mean():+.2f}"
+
+    columns: dict[str, Cell] = {
+        "CKA holds both limits": both,
+        f"RMSE to {MOST_RMSE}": lambda part: close(part).sum(),
+        f"NLPD to +{MOST_NLPD}": lambda part: sure(part).sum(),
+        **{f"RMSE, {label}": rmse(model) for model, label in MODELS.items()},
+        **{f"NLPD, {label}": nlpd(model) for model, label in MODELS.items()},
+        "CKA: 95 % hold": lambda part: f"{part['coverage', 'cka'].mean():.3f}",
+        "RMSE, RRA / CKA": lambda part: f"{_ratio(part, 'rra', 'cka'):.2f}",
+    }
+    return table(_by_group(found) | {"all": found}, columns, "cells")
+
+
+def _by_model(found: pd.DataFrame, column: str, form: str, most: float | None = None) -> str:
+    """A row for each cell; what of CKA is beyond the limit is bold."""
+
+    def cell(model: str) -> Cell:
+        def text(row: pd.DataFrame) -> str:
+            value = row[column, model].iloc[0]
+            is_beyond = model == "cka" and most is not None and value > most
+            return f"**{value:{form}}**" if is_beyond else f"{value:{form}}"
+
+        return text
+
+    rows = {name: found.iloc[[i]] for i, name in enumerate(found["label"])}
+    return table(rows, {label: cell(model) for model, label in MODELS.items()})
