@@ -189,7 +189,7 @@ def compare(
     structure with too many unknown constants for the points is left out of models and tables,
     unless there is no other.
 
-    Beneath each table is ``"physics alone"``, f_p as it is, whose noise is told by the other
+    Beneath each table is ``"physics alone"``, f_p as it is, whose noise is estimated from the other
     observations: no candidate, but what an adjustment has to be better than. The text begins with
     the errors of the physics alone, adjusted, and of the data alone
     (:meth:`Comparison.errors`).
