@@ -106,11 +106,11 @@ class PhysicsDynamics(Dynamics):
         return step
 
     def describe(self) -> dict[str, str]:
-        """What these dynamics are, each setting as a text."""
+        """Each setting of these dynamics as a text."""
         return fingerprint(type(self), self.spec)
 
     def state_dict(self) -> dict[str, Any]:
-        """What these dynamics are, and what the physics said of the first transitions."""
+        """The settings, and what the physics returned for the first transitions."""
         probes = None if self._probes is None else [tensor.clone() for tensor in self._probes]
         return {"fingerprint": self.describe(), "probes": probes}
 
