@@ -169,13 +169,6 @@ class PhysicsDynamics(Dynamics):
         return step
 
     def describe(self) -> dict[str, str]:
-<<<<<<< HEAD
-        """Each setting of these dynamics as a text."""
-        return fingerprint(type(self), self.spec)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The settings, and what the physics returned for the first transitions."""
-=======
         """What these dynamics are, each setting as a text."""
         unknowns = {name: repr(u) for name, u in self.physics.unknowns.items()}
         return fingerprint(type(self), self.spec, **({"unknowns": unknowns} if unknowns else {}))
@@ -185,7 +178,6 @@ class PhysicsDynamics(Dynamics):
 
         That is at the guesses of unknown parameters.
         """
->>>>>>> 1a88ae4ebf6c24708418bee4625b3a2d49bf5a8f
         probes = None if self._probes is None else [tensor.clone() for tensor in self._probes]
         fitted = None if self._fitted is None else self._fitted.state_dict()
         return {"fingerprint": self.describe(), "probes": probes, "fitted": fitted}
