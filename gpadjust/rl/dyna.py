@@ -30,7 +30,6 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.vec_env import VecEnv
 
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
-from gpadjust.control.agent import check_spaces
 from gpadjust.control.checkpoint import RandomState, TaskAgent, packed, unpacked
 from gpadjust.control.recorded_episodes import learn_dynamics
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
@@ -436,7 +435,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         if self.task is not None:
-            check_spaces(self.task, self.observation_space, self.action_space)
+            self.task.check_spaces(self.observation_space, self.action_space)
         self.replay_buffer_kwargs |= {
             "real_fraction": self.options.real_fraction,
             "model_buffer_size": self.options.model_buffer_size,
