@@ -18,8 +18,19 @@ from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
-    *("checks", "physics", "states", "files", "envs", "gp", "models", "inference"),
-    *("validation", "report", "sklearn", "ax", "active", "dynamics", "records", "control", "rl"),
+    *("checks", "physics", "states", "files", "gp", "models", "inference"),
+    *(
+        "validation",
+        "report",
+        "sklearn",
+        "ax",
+        "active",
+        "dynamics",
+        "records",
+        "control",
+        "systems",
+    ),
+    "rl",
 ]
 
 
@@ -120,14 +131,12 @@ def test_a_report_passes_few_files(tmp_path, monkeypatch):
 @pytest.fixture
 def swing_up():
     """The cart-pole, and a task whose dynamics learn in moments."""
-    import gymnasium
+    from gpadjust.systems import cart_pole
 
-    from gpadjust.control import Task
-    from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-
+    system = cart_pole()
     quick = {"method": "map", "num_starts": 1, "num_screened": 0}
-    dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0), fit_options=quick)
-    return gymnasium.make("gpadjust/CartPoleSwingUp-v0"), Task(dynamics, cart_pole_reward)
+    dynamics = LearnedDynamics(system.spec, system.physics, fit_options=quick)
+    return system.make(), system.task(dynamics)
 
 
 @pytest.mark.filterwarnings("ignore:A step of the last real episode")

@@ -589,15 +589,10 @@ class DynaSAC(Dyna, SAC):
     ``SAC``, bit for bit.
 
     Example:
-        >>> import gymnasium
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
         >>> from gpadjust.rl import DynaOptions, DynaSAC
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
-        >>> task = Task(dynamics, cart_pole_reward)
-        >>> agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), seed=0)
+        >>> from gpadjust.systems import cart_pole
+        >>> system, options = cart_pole(), DynaOptions(model_episodes=2)
+        >>> agent = DynaSAC("MlpPolicy", system.make(), system.task(), options, seed=0)
         >>> agent.learn(total_timesteps=25).num_episodes
         1
     """
@@ -610,19 +605,13 @@ class DynaTD3(Dyna, TD3):
     system nor the model. Particles have noise of their own.
 
     Example:
-        >>> import gymnasium
         >>> import numpy as np
         >>> from stable_baselines3.common.noise import NormalActionNoise
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import PhysicsDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
         >>> from gpadjust.rl import DynaOptions, DynaTD3
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
-        >>> task = Task(dynamics, cart_pole_reward)
-        >>> noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
-        >>> options = DynaOptions(model_episodes=2)
-        >>> agent = DynaTD3("MlpPolicy", env, task, options, action_noise=noise, seed=0)
+        >>> from gpadjust.systems import cart_pole
+        >>> system, options = cart_pole(), DynaOptions(model_episodes=2)
+        >>> noise = {"action_noise": NormalActionNoise(np.zeros(1), 0.2 * np.ones(1)), "seed": 0}
+        >>> agent = DynaTD3("MlpPolicy", system.make(), system.task(), options, **noise)
         >>> agent.learn(total_timesteps=25).num_episodes
         1
     """

@@ -13,12 +13,9 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.envs import (
-    CART_POLE_SPEC,
-    cart_pole_reward,
-    random_cart_pole_physics,
-)
 from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
+from gpadjust.systems import cart_pole as swing_up
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
 from tests.rl.conftest import model_rows
 
 
@@ -236,7 +233,7 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
 def test_cart_pole(cart_pole):
     dynamics = LearnedDynamics(
         CART_POLE_SPEC,
-        random_cart_pole_physics(0),
+        swing_up(0).physics,
         fit_options={"num_screened": 8, "num_starts": 1, "num_samples": 3, "num_draws": 16},
     )
     agent = DynaSAC(
