@@ -60,7 +60,7 @@ def saved(model, path):
 
 BUILDS = {
     "CKA": lambda X, Y: CKA(X, Y, physics=relu, center="mean", delta_mean="learn"),
-    "learnt centre": lambda X, Y: CKA(X, Y, physics=relu, center="learn"),
+    "learnt center": lambda X, Y: CKA(X, Y, physics=relu, center="learn"),
     "several": lambda X, Y: CKA(X, Y, 0.01, physics={"a": relu, "b": silu}),
     "RRA": lambda X, Y: RRA(X, Y, physics=relu, num_features=16, seed=3),
     "physics mean": lambda X, Y: PhysicsMeanGP(X, Y, physics=relu, rho_mean=0.9),
@@ -195,7 +195,7 @@ def test_known_noise_of_later_observations(uniform, path):
 
 def test_a_stacked_model_comes_back(uniform, path):
     X, Y, Z = problem(uniform)
-    models = {name: BUILDS[name](X, Y) for name in ("learnt centre", "zero mean")}
+    models = {name: BUILDS[name](X, Y) for name in ("learnt center", "zero mean")}
     stacked = StackedGP(models, torch.tensor([[0.5, 0.25], [0.5, 0.75]]).double())
     save(stacked, path)
     again = load(path)

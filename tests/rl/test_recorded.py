@@ -1,0 +1,135 @@
+"""What a buffer tells of the real episodes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from gpadjust.control import Task
+from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.rl import MixedReplayBuffer
+
+SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
+ACTIONS = spaces.Box(-4, 4, (1,))
+
+
+@pytest.fixture
+def recorded():
+    """Records steps 0, 1, ... of episodes of so many steps; `x` is the step, plus 100 per env."""
+
+    def record(num_steps, episode_length=3, n_envs=1, capacity=100, newest=None, terminal=False):
+        buffer = MixedReplayBuffer(
+            capacity * n_envs, spaces.Box(-np.inf, np.inf, (3,)), ACTIONS, "cpu", n_envs
+        )
+        for t in range(num_steps):
+            x = t + 100.0 * np.arange(n_envs)
+            obs, following = observe(x), observe(x + 0.5)
+            done = (t + 1) % episode_length == 0
+            infos = [{"TimeLimit.truncated": done and not terminal}] * n_envs
+            buffer.add(obs, following, np.full((n_envs, 1), 0.25), -x, np.full(n_envs, done), infos)
+        keep = None
+        if newest is not None:
+            keep = np.zeros((capacity, n_envs), dtype=bool)
+            keep[buffer.pos - 1 - np.arange(min(newest, buffer.size()))] = True
+        return buffer.recorded(SPEC, lambda scaled: 4 * scaled, keep)
+
+    return record
+
+
+def observe(x):
+    return np.stack([x, np.sin(x), np.cos(x)], axis=-1)
+
+
+def reward(states, actions, next_states):
+    return -states[:, 0]
+
+
+def task(reward=reward, terminated=None):
+    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :2])
+    return Task(dynamics, reward, terminated=terminated)
+
+
+def test_rows_are_states_and_actions_in_the_users_units(recorded):
+    episodes = recorded(4)
+    expected = torch.arange(4.0).double()
+    assert episodes.states.dtype == episodes.actions.dtype == torch.float64
+    assert torch.equal(episodes.states[:, 0], expected)
+    angle = torch.atan2(expected.sin(), expected.cos())
+    assert torch.allclose(episodes.states[:, 1], angle, atol=1e-6)
+    assert torch.equal(episodes.next_states[:, 0], expected + 0.5)
+    assert torch.equal(episodes.actions, torch.ones(4, 1).double())
+    assert torch.equal(episodes.rewards, -expected)
+
+
+def test_environments_follow_one_another(recorded):
+    assert recorded(2, n_envs=2).states[:, 0].tolist() == [0, 1, 100, 101]
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_full_buffer_is_read_from_its_oldest_row(recorded, n_envs):
+    episodes = recorded(8, n_envs=n_envs, capacity=5)
+    assert episodes.num_transitions == 5 * n_envs
+    assert episodes.states[:5, 0].tolist() == [3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize(("newest", "expected"), [(2, [6, 7]), (0, []), (99, [3, 4, 5, 6, 7])])
+def test_the_newest_rows_alone(recorded, newest, expected):
+    episodes = recorded(8, capacity=5, newest=newest)
+    assert episodes.states[:, 0].tolist() == expected
+
+
+def starts_of(episodes):
+    return sorted(set(episodes.draw_starts(200)[:, 0].tolist()))
+
+
+def test_starts_are_those_of_episodes(recorded):
+    episodes = recorded(8, n_envs=2)
+    assert starts_of(episodes) == [0, 3, 6, 100, 103, 106]
+    assert episodes.draw_starts(5).shape == (5, 2)
+
+
+def test_the_oldest_row_of_a_full_buffer_may_be_no_start(recorded):
+    assert starts_of(recorded(8, capacity=4)) == [6]  # the rows are 4, 5, 6, 7
+
+
+def test_without_a_start_in_the_buffer_the_oldest_row_serves(recorded):
+    assert starts_of(recorded(8, capacity=4, episode_length=20)) == [4]
+
+
+def test_bounds_are_far_beyond_what_was_seen(recorded):
+    assert recorded(2).bounds() is None  # nobody knows yet how far an episode goes
+    low, high = recorded(4).bounds()
+    assert low[0] == pytest.approx(1.25 - 12.5)  # of the first three rows, a whole episode
+    assert high[0] == pytest.approx(1.25 + 12.5)
+    assert (low[1], high[1]) == (-math.inf, math.inf)
+
+
+def test_the_environments_functions_pass(recorded):
+    recorded(6).check(task())
+    recorded(6, terminal=True).check(task(terminated=lambda states: (states[:, 0] % 3) > 2))
+
+
+def test_a_wrong_reward_is_shown_by_its_worst_transition(recorded):
+    def wrong(states, actions, next_states):
+        return torch.where(states[:, 0] == 2, 5.0, -states[:, 0])
+
+    with pytest.raises(ValueError, match=r"transition 2 gave -2, but the function says 5") as error:
+        recorded(4).check(task(wrong))
+    assert "actions[2] = [1.0]" in str(error.value)
+
+
+def test_a_reward_of_another_shape_is_refused(recorded):
+    with pytest.raises(ValueError, match=r"reward must return one value per row, shape \(4,\)"):
+        recorded(4).check(task(lambda states, actions, next_states: states))
+
+
+def test_terminations_that_were_not_told_are_refused(recorded):
+    with pytest.raises(ValueError, match=r"transition 2 .*terminated=True, but none was given"):
+        recorded(4, terminal=True).check(task())
+
+
+def test_wrong_terminations_are_refused(recorded):
+    with pytest.raises(ValueError, match=r"transition 1 .*terminated=False, but the function says"):
+        recorded(4).check(task(terminated=lambda states: states[:, 0] == 1.5))
