@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, torque_arm
 
 from gpadjust.control.checkpoint import RandomState
-from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, torque_arm
 from gpadjust.physics import ODEPhysics
 from paper.arm import Arm, Reaching, ReachingSettings, Settings
 from paper.arm import system as arm_system
