@@ -9,6 +9,7 @@ from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, torque_arm
 
 from gpadjust.control.checkpoint import RandomState
 from gpadjust.physics import ODEPhysics
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, torque_arm
 from paper.arm import Arm, Reaching, ReachingSettings, Settings
 from paper.arm import system as arm_system
 from paper.arm.arm import load_maps

@@ -6,11 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from gpadjust.envs import REAL_CART_POLE
-from gpadjust.envs.cart_pole.system import START_MEAN, equation_physics
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gpadjust.control.checkpoint import RandomState
+from gpadjust.systems.cart_pole import REAL_CART_POLE, START_MEAN, equation_physics
 from paper.arm import Arm
 from paper.arm import Settings as ArmSettings
 from paper.arm import system as arm_system
