@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, torque_arm
 
 from gpadjust.control.checkpoint import RandomState
 from gpadjust.physics import ODEPhysics
