@@ -1,25 +1,34 @@
-"""Tasks, and planning in dynamics models; Stable-Baselines3 is not needed."""
+"""Tasks, planning and policy search in dynamics models, and agents that control by them."""
 
+from gpadjust.control.agent import Agent, Callback, print_progress
+from gpadjust.control.agents import MPCAgent, PolicySearchAgent
+from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
 from gpadjust.control.mpc import MPC, Planned
-from gpadjust.control.objectives import Objective, Return
 from gpadjust.control.planner import Plan, Planner
-from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy, rbf_policy
+from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
-from gpadjust.control.rollouts import Rollout, Rollouts
+from gpadjust.control.recorded_episodes import RecordedEpisodes
+from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
 from gpadjust.control.task import InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
     "MPC",
+    "Agent",
     "BoundedPolicy",
+    "Callback",
     "CrossEntropy",
+    "EpisodeCheckpoint",
     "InitialStates",
+    "MPCAgent",
     "Objective",
     "PathIntegral",
     "Plan",
     "Planned",
     "Planner",
     "PolicySearch",
+    "PolicySearchAgent",
+    "RecordedEpisodes",
     "Return",
     "Reward",
     "Rollout",
@@ -32,5 +41,6 @@ __all__ = [
     "imitate",
     "linear_policy",
     "mlp_policy",
-    "rbf_policy",
+    "print_progress",
+    "resume",
 ]

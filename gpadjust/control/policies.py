@@ -110,30 +110,6 @@ def linear_policy(
     return mlp_policy(spec, action_bounds, (), first_actions=first_actions)
 
 
-def rbf_policy(
-    spec: StateSpec,
-    action_bounds: ArrayLike,
-    num_centres: int = 50,
-    first_actions: Sequence[float] | None = None,
-) -> BoundedPolicy:
-    """A sum of bells, as PILCO has it (Deisenroth and Rasmussen 2011).
-
-    Args:
-        spec: What the entries of states and actions are.
-        action_bounds: ``2 x action_dim``.
-        num_centres: Number of bells.
-        first_actions: As of :func:`mlp_policy`.
-
-    Raises:
-        ValueError: As :func:`mlp_policy`.
-    """
-    last = nn.Linear(num_centres, spec.action_dim, dtype=torch.float64)
-    with torch.no_grad():
-        last.bias.copy_(_before_tanh(first_actions, action_bounds, spec.action_dim))
-    body = nn.Sequential(_Bells(spec.observation_dim, num_centres), last)
-    return BoundedPolicy(body, spec, action_bounds)
-
-
 def _before_tanh(actions: Sequence[float] | None, action_bounds: ArrayLike, dim: int) -> Tensor:
     """What the tanh of a policy makes these actions of, ``action_dim``; 0 for None."""
     low, high = checked_bounds("action_bounds", action_bounds, dim)
@@ -147,17 +123,3 @@ def _before_tanh(actions: Sequence[float] | None, action_bounds: ArrayLike, dim:
         )
     share = (2 * given - low - high) / (high - low)
     return share.clamp(-_NEAR, _NEAR).atanh()
-
-
-class _Bells(nn.Module):
-    """Bells of what is seen, ``N x num_centres``."""
-
-    def __init__(self, num_inputs: int, num_centres: int) -> None:
-        super().__init__()
-        self.centres = nn.Parameter(torch.randn(num_centres, num_inputs, dtype=torch.float64))
-        self.log_widths = nn.Parameter(torch.zeros(num_inputs, dtype=torch.float64))
-
-    def forward(self, seen: Tensor) -> Tensor:
-        """Heights at ``N x num_inputs``."""
-        gap = (seen.unsqueeze(-2) - self.centres) / self.log_widths.exp()
-        return (-gap.square().sum(-1) / 2).exp()

@@ -101,7 +101,7 @@ class Task:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)
 
-    def rehearse(self, states: Tensor, actions: Tensor) -> None:
+    def try_functions(self, states: Tensor, actions: Tensor) -> None:
         """Call physics and functions once, to find what is wrong with them before it costs data.
 
         Args:

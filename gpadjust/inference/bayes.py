@@ -252,7 +252,9 @@ def _with_parameters(
     named = _named(parameters, vectors) | model.input_transform.remember(coordinates)
     _hold(model, held, settled)
     calibrated.calibration.direct(model, coordinates[rows])
-    warn_of_parameters(calibrated)
+    calibration, near = calibrated.calibration, calibrated.near
+    told = calibrated.information.precision.sum(-3)
+    warn_of_parameters(calibration.unknowns.names, told, near.point)
     return _result(size, is_good, named, parameters, hint=hint)
 
 

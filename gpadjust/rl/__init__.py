@@ -8,16 +8,10 @@ except ImportError as error:
     ) from error
 
 from gpadjust.rl.actor_policy import actor_policy
-from gpadjust.rl.agents import DynaSAC, DynaTD3
 from gpadjust.rl.buffer import MixedReplayBuffer
-from gpadjust.rl.callbacks import DynaCallback
-from gpadjust.rl.checkpoint import EpisodeCheckpoint, resume, save_checkpoint
-from gpadjust.rl.dyna import Dyna
-from gpadjust.rl.model_learner import ModelLearner
+from gpadjust.rl.dyna import Dyna, DynaCallback, DynaSAC, DynaTD3
 from gpadjust.rl.model_vec_env import ModelVecEnv
-from gpadjust.rl.mpc_agent import MPCAgent
-from gpadjust.rl.options import DynaOptions, ModelOptions
-from gpadjust.rl.policy_search_agent import PolicySearchAgent
+from gpadjust.rl.options import DynaOptions
 
 __all__ = [
     "Dyna",
@@ -25,14 +19,7 @@ __all__ = [
     "DynaOptions",
     "DynaSAC",
     "DynaTD3",
-    "EpisodeCheckpoint",
-    "MPCAgent",
     "MixedReplayBuffer",
-    "ModelLearner",
-    "ModelOptions",
     "ModelVecEnv",
-    "PolicySearchAgent",
     "actor_policy",
-    "resume",
-    "save_checkpoint",
 ]

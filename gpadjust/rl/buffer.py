@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+
+from gpadjust.control import RecordedEpisodes
+from gpadjust.states import StateSpec
 
 
 class CompactReplayBuffer(ReplayBuffer):
@@ -119,9 +122,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
     Attributes:
         model_buffer: The model's transitions.
         failed: Which places repeat another transition, ``buffer_size x n_envs`` booleans.
+        learnt: Which places the dynamics have learnt, ``buffer_size x n_envs`` booleans.
         mix: Whether batches hold model transitions.
-        num_new: Steps that were added since this was last set to zero, by whom reads them.
-        num_ended: Episodes that ended since then.
         real_fraction: Share of real samples in a batch.
 
     Raises:
@@ -129,7 +131,7 @@ class MixedReplayBuffer(CompactReplayBuffer):
             asked for.
     """
 
-    rows = (*CompactReplayBuffer.rows, "failed")
+    rows = (*CompactReplayBuffer.rows, "failed", "learnt")
 
     def __init__(
         self,
@@ -163,8 +165,8 @@ class MixedReplayBuffer(CompactReplayBuffer):
         )
         self.real_fraction = real_fraction
         self.mix = True
-        self.num_new = self.num_ended = 0
         self.failed = np.zeros((self.buffer_size, n_envs), dtype=bool)
+        self.learnt = np.zeros_like(self.failed)
         self.model_buffer = CompactReplayBuffer(
             buffer_size if model_buffer_size is None else model_buffer_size,
             observation_space,
@@ -189,9 +191,7 @@ class MixedReplayBuffer(CompactReplayBuffer):
             return
         pos = self.pos
         super().add(obs, next_obs, action, reward, done, infos)
-        self.num_new += 1
-        self.num_ended += int((done.astype(bool) & ~failed).sum())
-        self.failed[pos] = failed
+        self.failed[pos], self.learnt[pos] = failed, False
         for i in failed.nonzero()[0]:
             # Its place in the row is taken by a transition that is sampled once more.
             row, env = (pos - 1, i) if self.size() > 1 else (pos, int(failed.argmin()))
@@ -209,7 +209,6 @@ class MixedReplayBuffer(CompactReplayBuffer):
         if not self.size():
             return
         ended = environments & (self.dones[self.pos - 1] == 0)
-        self.num_ended += int(ended.sum())
         self.dones[self.pos - 1][ended] = self.timeouts[self.pos - 1][ended] = 1
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
@@ -238,5 +237,49 @@ class MixedReplayBuffer(CompactReplayBuffer):
         """Empty both buffers."""
         super().reset()
         self.model_buffer.reset()
-        self.failed[:] = False
-        self.num_new = self.num_ended = 0
+        self.failed[:] = self.learnt[:] = False
+
+    def recorded(
+        self,
+        spec: StateSpec,
+        unscale_action: Callable[[np.ndarray], np.ndarray],
+        keep: np.ndarray | None = None,
+    ) -> RecordedEpisodes:
+        """The real steps in the user's units, one environment after the other.
+
+        Args:
+            spec: The entries of states and actions.
+            unscale_action: The inverse of the scale of the actions in the buffer.
+            keep: Which places to take, ``buffer_size x n_envs`` booleans. Default: all.
+        """
+        first = self.pos if self.full else 0
+        rows = (first + np.arange(self.size())) % self.buffer_size
+        happened = ~self.failed if keep is None else keep & ~self.failed
+
+        def column(values: np.ndarray) -> torch.Tensor:
+            """The values of what happened, in the order of time."""
+            values, chosen = values.swapaxes(0, 1), happened[rows].T.flatten()
+            return torch.from_numpy(values.reshape(-1, *values.shape[2:])[chosen])
+
+        def numbers(name: str) -> torch.Tensor:
+            return column(getattr(self, name)[rows].astype(np.float64))
+
+        ended = self.dones[rows].astype(bool)
+        begins = np.ones_like(ended)
+        begins[1:] = ended[:-1]
+        episode = begins.cumsum(0) + np.arange(self.n_envs) * (len(rows) + 1)
+        if self.full and begins[1:].any():
+            begins[0] = False  # what came before the oldest row is lost
+        # Those of an episode under way say nothing yet of how far one goes.
+        whole = np.flip(np.maximum.accumulate(np.flip(ended, axis=0), axis=0), axis=0)
+        return RecordedEpisodes(
+            spec,
+            spec.decode(numbers("observations")),
+            torch.from_numpy(unscale_action(numbers("actions").numpy())),
+            spec.decode(numbers("next_observations")),
+            numbers("rewards"),
+            (numbers("dones") * (1 - numbers("timeouts"))).bool(),
+            column(episode),
+            column(begins),
+            column(whole),
+        )

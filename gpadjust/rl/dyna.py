@@ -3,24 +3,48 @@
 from __future__ import annotations
 
 import io
+import json
 import warnings
+from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    RolloutReturn,
+    TensorDict,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+from stable_baselines3.common.vec_env import VecEnv
 
-from gpadjust.control import Task
-from gpadjust.rl.buffer import MixedReplayBuffer
-from gpadjust.rl.model_learner import ModelLearner
+from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
+from gpadjust.control.agent import check_spaces
+from gpadjust.control.checkpoint import RandomState, TaskAgent, packed, unpacked
+from gpadjust.control.recorded_episodes import learn_dynamics
+from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
+from gpadjust.rl.checkpoint import (
+    CheckpointCallback,
+    described,
+    environment_state,
+    restore_environment,
+)
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
 
-class Dyna(ModelLearner):
+class Dyna(TaskAgent, OffPolicyAlgorithm):
     r"""What an off-policy learner needs to learn from real episodes and from those in a model.
 
     After each real episode it updates on what it has, as the learner does; teaches the real
@@ -60,6 +84,7 @@ class Dyna(ModelLearner):
 
     Attributes:
         num_episodes: Real episodes that have ended and were learnt from.
+        task: The task; to change a part of it, set another one.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"update"``.
         notes: What you want to keep with the agent, in plain values; saved and resumed with it.
 
@@ -72,7 +97,9 @@ class Dyna(ModelLearner):
         AssertionError: By Stable-Baselines3, if the actions are no box.
     """
 
-    options_class = DynaOptions
+    replay_buffer: MixedReplayBuffer
+    observation_space: spaces.Box
+    action_space: spaces.Box
 
     def __init__(
         self,
@@ -110,10 +137,17 @@ class Dyna(ModelLearner):
                 f"{name} is an option of the model: pass DynaOptions({name}={kwargs[name]!r}) as "
                 "options."
             )
-        self.owed_updates = 0.0
+        self.task = task
+        self.options: Any = DynaOptions() if options is None else options
+        self.num_episodes = 0
+        self.owed_updates = 0.0  # of steps in the model
+        self.wall_time = dict.fromkeys(("fit", "rollout", "update"), 0.0)
+        self.notes: dict[str, Any] = {}
+        self.model_hooks: list[DynaCallback] = []
+        self._unread_dynamics: dict[str, Any] = {}  # of an agent that was loaded without a task
+        if kwargs.get("_init_setup_model", True):
+            self.ready_task()
         super().__init__(
-            task,
-            DynaOptions() if options is None else options,
             policy,
             env,
             buffer_size=buffer_size,
@@ -126,15 +160,49 @@ class Dyna(ModelLearner):
 
     # One iteration
 
-    def _update(self, gradient_steps: int, batch_size: int) -> None:
-        """The learner's own updates, on what there is."""
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update on what there is, learn the model, train in it; SB3 calls this."""
+        if not self.replay_buffer.size():
+            return  # all steps failed
         serves = self.options.uses_model(self.num_episodes)
-        self.replay_buffer.mix = self.options.keep_model_data or serves
-        super()._update(gradient_steps, batch_size)
+        new, num_ended = self._new_episodes()
+        if serves and new is not None and self.options.reward_tolerance is not None:
+            new.check(self.ready_task(), self.options.reward_tolerance)
+        self.replay_buffer.mix = serves
+        with self.timed("update"):
+            super().train(gradient_steps, batch_size)
+        if new is None:
+            return
+        metrics = self._learn_dynamics(new) if serves else {}
+        self.logger.record("model/real_reward", float(new.rewards.mean()))
+        self.replay_buffer.learnt[: self.replay_buffer.size()] = True
+        self.num_episodes += num_ended
+        if serves:
+            for hook in self.model_hooks:
+                hook.on_model_fit(metrics)
+            self._train_in_model(self.options.model_episodes * num_ended, batch_size)
+            total = sum(self.wall_time.values())
+            for name, seconds in self.wall_time.items():
+                self.logger.record(f"model/share_{name}", seconds / total)
 
-    def _improve(self, num_ended: int, batch_size: int) -> None:
-        """Train in the model."""
-        self._train_in_model(self.options.model_episodes * num_ended, batch_size)
+    def _new_episodes(self) -> tuple[RecordedEpisodes | None, int]:
+        """The real steps that the dynamics have not learnt, if an episode has ended; how many."""
+        buffer, is_fitted = self.replay_buffer, self.ready_task().dynamics.is_fitted
+        num_ended = int((buffer.dones.astype(bool) & ~buffer.failed & ~buffer.learnt).sum())
+        if not num_ended:
+            return None, 0
+        new = self._recorded(~buffer.learnt if is_fitted else None)
+        least = 1 if is_fitted else 2  # a first fit needs two
+        return (new if new.num_transitions >= least else None), num_ended
+
+    def _learn_dynamics(self, new: RecordedEpisodes) -> dict[str, float]:
+        """Score the dynamics on new episodes, and let them learn these; return what is logged."""
+        with self.timed("fit"):
+            horizons = self.options.score_horizons
+            metrics = learn_dynamics(self.model_task(), new, self.recorded_episodes(), horizons)
+        for name, value in metrics.items():
+            self.logger.record(f"model/{name}", value)
+        return metrics
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
         """Run model episodes, side by side, with updates at each step."""
@@ -192,7 +260,127 @@ class Dyna(ModelLearner):
         self.owed_updates -= updates
         if updates:
             with self.timed("update"):
-                super()._update(updates, batch_size)
+                super().train(updates, batch_size)
+
+    # Real episodes
+
+    def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
+        """As in SB3; callbacks may be or hold an :class:`~gpadjust.control.EpisodeCheckpoint`."""
+        several = isinstance(callback, list)
+        given = callback if several else [callback]
+        checkpoints = [each for each in given if isinstance(each, EpisodeCheckpoint)]
+        if checkpoints and self.use_sde:
+            raise ValueError(
+                "EpisodeCheckpoint cannot resume generalised state-dependent exploration exactly; "
+                f"use {type(self).__name__} with use_sde=False."
+            )
+        known = [CheckpointCallback(each) if each in checkpoints else each for each in given]
+        with ExitStack() as held:
+            for each in checkpoints:
+                held.enter_context(each.locked())
+            return super().learn(total_timesteps, known if several else known[0], *args, **kwargs)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As in SB3; if it ends within an episode, the next `learn` resets the environments."""
+        try:
+            result = super().collect_rollouts(*args, **kwargs)
+        except BaseException:
+            self._last_obs = None
+            raise
+        if not result.continue_training:  # a callback stopped it at a step, which SB3 did not store
+            self._last_obs = None
+        return result
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: Any = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+    ) -> tuple[int, BaseCallback]:
+        """Refuse to spend a real episode on an agent that could not learn from it."""
+        task = self.ready_task()
+        if self.env is None:
+            raise ValueError(
+                f"There is no environment to learn in; pass env to {type(self).__name__}.load, or "
+                "use set_env()."
+            )
+        assert isinstance(self.train_freq, TrainFreq), "converted when the agent was made"
+        if self.n_envs > 1 and self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+            raise ValueError(
+                f"With {self.n_envs} environments Stable-Baselines3 cannot train by episodes; pass "
+                f"a number of steps as train_freq, such as ({self.episode_length()}, 'step')."
+            )
+        if self.replay_buffer.buffer_size < self.episode_length():
+            raise ValueError(
+                f"buffer_size must hold an episode of {self.episode_length()} steps, for the "
+                "dynamics to learn it; found room for "
+                f"{self.replay_buffer.buffer_size} of each environment."
+            )
+        if reset_num_timesteps or self._last_obs is None:  # SB3 ends the episodes under way
+            self.replay_buffer.end_episodes(np.ones(self.n_envs, dtype=bool))
+        if self._unread_dynamics:
+            task.dynamics.load_state_dict(self._unread_dynamics)
+            self._unread_dynamics = {}
+        self.model_hooks = []  # callbacks that have some add themselves
+        noise = deepcopy(self.action_noise)  # which SB3 resets
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+        before = RandomState.capture()
+        seen = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        assert isinstance(seen, np.ndarray), "observations are boxes"
+        observations = torch.from_numpy(seen.astype(np.float64))
+        task.dynamics.spec.check_observations(observations)
+        # Of a single state much would look right that is not.
+        twice = task.dynamics.spec.decode(observations).repeat(2, 1)
+        middle = torch.from_numpy((self.action_space.low + self.action_space.high) / 2).double()
+        task.try_functions(twice, middle.expand(len(twice), -1))
+        before.restore()
+        if self._random_state is not None:  # a run that goes on
+            self._random_state.restore()
+            self._random_state, self.action_noise = None, noise
+        return result
+
+    def ready_task(self) -> Task:
+        """The task, if the agent can learn with it.
+
+        Raises:
+            ValueError: If it is missing.
+            TypeError: If task or options are of another kind.
+        """
+        name = type(self).__name__
+        if self.task is None:
+            raise ValueError(
+                f"{name} needs a task to learn; found None. Pass task=Task(dynamics, reward, ...) "
+                f"to {name} or, as it is not saved, to {name}.load. Without it the agent can only "
+                "predict."
+            )
+        if not isinstance(self.task, Task):
+            raise TypeError(f"task must be a Task(dynamics, reward, ...); found {self.task!r}.")
+        if not isinstance(self.options, DynaOptions):
+            raise TypeError(f"options must be DynaOptions(...); found {self.options!r}.")
+        return self.task
+
+    def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
+        """The real steps in the buffer; or the newest of each environment only."""
+        keep = None
+        if newest is not None:
+            keep = np.zeros((self.replay_buffer.buffer_size, self.n_envs), dtype=bool)
+            last = self.replay_buffer.pos - 1 - np.arange(min(newest, self.replay_buffer.size()))
+            keep[last] = True
+        return self._recorded(keep)
+
+    def _recorded(self, keep: np.ndarray | None = None) -> RecordedEpisodes:
+        spec = self.ready_task().dynamics.spec
+        return self.replay_buffer.recorded(spec, self.policy.unscale_action, keep)
+
+    def env_attribute(self, name: str) -> Any:
+        """An attribute of the first environment."""
+        if self.env is None:
+            raise ValueError(
+                "Nobody says how long an episode is; give the task an episode_length, or the agent "
+                "an environment: load(..., env=env)."
+            )
+        return self.env.get_attr(name)[0]
 
     # The model
 
@@ -247,11 +435,60 @@ class Dyna(ModelLearner):
         return vectorised
 
     def _setup_model(self) -> None:
+        if self.task is not None:
+            check_spaces(self.task, self.observation_space, self.action_space)
         self.replay_buffer_kwargs |= {
             "real_fraction": self.options.real_fraction,
             "model_buffer_size": self.options.model_buffer_size,
         }
         super()._setup_model()
+
+    # Saving
+
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """As in SB3, with the state of the dynamics."""
+        learnt = self._unread_dynamics
+        if self.task is not None and not learnt:
+            learnt = self.task.dynamics.state_dict()
+        return {**super().get_parameters(), "dynamics": learnt}
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | TensorDict,
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """As in SB3; without a task, the state of the dynamics is kept for the next ``save``.
+
+        Raises:
+            ValueError: As in SB3, if something is missing, unless ``exact_match`` is False.
+            RuntimeError: If the state is of other dynamics, or of another physics.
+        """
+        if isinstance(load_path_or_dict, dict):
+            parameters: dict[str, Any] = dict(load_path_or_dict)
+        else:
+            parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+        if exact_match and "dynamics" not in parameters:
+            raise ValueError(
+                "Expected parameters with the state of the dynamics, 'dynamics'; found "
+                f"{sorted(parameters)}. Pass exact_match=False to take the networks alone."
+            )
+        state = _on_cpu(parameters.pop("dynamics", None))
+        if state is None or self.task is None:
+            super().set_parameters(parameters, exact_match, device)
+            self._unread_dynamics = self._unread_dynamics if state is None else state
+            return
+        before = self.task.dynamics.state_dict()
+        self.task.dynamics.load_state_dict(state)
+        try:
+            super().set_parameters(parameters, exact_match, device)
+        except BaseException:
+            self.task.dynamics.load_state_dict(before)
+            raise
+
+    def _excluded_save_params(self) -> list[str]:
+        own = ["task", "model_hooks", "_random_state", "_unread_dynamics"]
+        return [*super()._excluded_save_params(), *own]
 
     def load_replay_buffer(
         self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
@@ -259,3 +496,134 @@ class Dyna(ModelLearner):
         """As in SB3, for both buffers; the file is a pickle: open only one that you trust."""
         super().load_replay_buffer(path, truncate_last_traj)
         self.replay_buffer.model_buffer.device = self.device
+
+    # Checkpoints
+
+    @classmethod
+    def wrapped(cls, env: GymEnv) -> VecEnv:
+        """The user's environment in the wrappers of Stable-Baselines3."""
+        return cls._wrap_env(env, verbose=0)
+
+    @classmethod
+    def described(cls, env: VecEnv) -> dict[str, Any]:
+        """Number, wrappers and spaces of the environments."""
+        return described(env)
+
+    def saved_parts(self) -> dict[str, bytes]:
+        """SB3's file of the agent, both buffers, and the environments."""
+        saved = io.BytesIO()
+        self.save(saved)
+        buffers = {name: packed(part.filled()) for name, part in self._buffers().items()}
+        return {
+            "agent.zip": saved.getvalue(),
+            "action_space.json": json.dumps(self._action_generator.state).encode(),
+            "environment.pkl": environment_state(self.env),
+            **buffers,
+        }
+
+    @classmethod
+    def from_parts(cls, parts: dict[str, bytes], env: VecEnv, task: Task) -> Self:
+        """The agent that :meth:`saved_parts` saved."""
+        agent = cls.load(io.BytesIO(parts["agent.zip"]), env=env, task=task, force_reset=False)
+        for name, buffer in agent._buffers().items():
+            buffer.fill(unpacked(parts[name]))
+        agent._action_generator.state = json.loads(parts["action_space.json"])
+        if not restore_environment(env, parts["environment.pkl"]):
+            agent._last_obs = None  # the environment is reset
+        return agent
+
+    def _buffers(self) -> dict[str, CompactReplayBuffer]:
+        buffer = self.replay_buffer
+        return {"replay_buffer.npz": buffer, "model_buffer.npz": buffer.model_buffer}
+
+    @property
+    def _action_generator(self) -> Any:
+        """What draws the first actions, with ``learning_starts``."""
+        return self.action_space.np_random.bit_generator
+
+
+def _on_cpu(state: Any) -> Any:
+    """A state of dynamics, which SB3 loads to the device of the networks, where they compute."""
+    if isinstance(state, dict):
+        return {name: _on_cpu(part) for name, part in state.items()}
+    return state.cpu() if torch.is_tensor(state) else state
+
+
+class DynaCallback(BaseCallback):
+    """A Stable-Baselines3 callback with two more hooks, for :class:`Dyna` agents.
+
+    Subclasses that override ``_init_callback`` must call that of this class.
+    """
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, Dyna):
+            raise TypeError(
+                f"{type(self).__name__} is for Dyna agents, such as DynaSAC; found "
+                f"{type(self.model).__name__}."
+            )
+        self.model.model_hooks.append(self)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def on_model_fit(self, metrics: dict[str, float]) -> None:
+        """Called after the dynamics were fitted.
+
+        Args:
+            metrics: ``"fit_seconds"``; and of the newest real transitions, predicted before they
+                were learnt, as soon as the dynamics can predict: ``"nlpd"`` and ``"coverage"``,
+                averaged over the states, and ``"rmse/<state>"`` of each.
+        """
+
+    def on_model_episodes(self, returns: np.ndarray) -> None:
+        """Called after some model episodes that ran side by side.
+
+        Args:
+            returns: The sum of rewards of each.
+        """
+
+
+class DynaSAC(Dyna, SAC):
+    """Soft actor-critic that also trains inside a dynamics model, see :class:`Dyna`.
+
+    One whose model never serves (``DynaOptions(last_model_episode=0)``) is Stable-Baselines3's
+    ``SAC``, bit for bit.
+
+    Example:
+        >>> import gymnasium
+        >>> from gpadjust.control import Task
+        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.rl import DynaOptions, DynaSAC
+        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> task = Task(dynamics, cart_pole_reward)
+        >>> agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), seed=0)
+        >>> agent.learn(total_timesteps=25).num_episodes
+        1
+    """
+
+
+class DynaTD3(Dyna, TD3):
+    """TD3 that also trains inside a dynamics model, see :class:`Dyna`.
+
+    Its policy is deterministic: pass ``action_noise``, without which it explores neither the real
+    system nor the model. Particles have noise of their own.
+
+    Example:
+        >>> import gymnasium
+        >>> import numpy as np
+        >>> from stable_baselines3.common.noise import NormalActionNoise
+        >>> from gpadjust.control import Task
+        >>> from gpadjust.dynamics import PhysicsDynamics
+        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.rl import DynaOptions, DynaTD3
+        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> task = Task(dynamics, cart_pole_reward)
+        >>> noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
+        >>> options = DynaOptions(model_episodes=2)
+        >>> agent = DynaTD3("MlpPolicy", env, task, options, action_noise=noise, seed=0)
+        >>> agent.learn(total_timesteps=25).num_episodes
+        1
+    """

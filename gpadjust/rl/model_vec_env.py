@@ -14,10 +14,10 @@ from torch import Tensor
 
 from gpadjust.checks import check_choice
 from gpadjust.control import Step, Task
+from gpadjust.control.agent import check_spaces
 from gpadjust.dynamics import TransitionFunctions
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import CompactReplayBuffer
-from gpadjust.states import StateSpec
 
 _CHUNK = 2000  # transitions at once, for the sake of memory
 
@@ -89,7 +89,7 @@ class ModelVecEnv(VecEnv):
         worst_reward: float = np.inf,
     ) -> None:
         spec = task.dynamics.spec
-        check_spaces(spec, observation_space, action_space)
+        check_spaces(task, observation_space, action_space)
         if not task.dynamics.is_fitted:
             raise RuntimeError(
                 f"{type(task.dynamics).__name__} has not learnt from transitions yet; call "
@@ -110,6 +110,7 @@ class ModelVecEnv(VecEnv):
         self._states = torch.empty(num_envs, spec.state_dim, dtype=torch.float64)
         self._steps = torch.zeros(num_envs, dtype=torch.long)
         self._functions: TransitionFunctions | None = None
+        self._is_followed = True  # whether particles have followed them already
 
     @property
     def episode_length(self) -> int:
@@ -121,7 +122,8 @@ class ModelVecEnv(VecEnv):
         """Start all episodes; observations ``num_envs x observation_dim``."""
         self._states = self._draw_initial(self.num_envs)
         self._steps.zero_()
-        self._draw_functions()
+        if self._is_followed:
+            self._draw_functions()
         return self._observe(self._states)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -150,6 +152,7 @@ class ModelVecEnv(VecEnv):
     def transition(self, actions: np.ndarray) -> ModelStep:
         """Step all particles, without a new start for those whose episode ended."""
         moves = torch.as_tensor(actions, dtype=torch.float64)
+        self._is_followed = True
         step = self._step(self._states, moves)
         self._states = step.next_states
         self._steps += 1
@@ -210,6 +213,7 @@ class ModelVecEnv(VecEnv):
     def _draw_functions(self) -> None:
         if self.sampling == "trajectory":
             self._functions = self.task.dynamics.sample_functions(self.num_envs)
+            self._is_followed = False
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states of ``N`` rows, which follow the functions in blocks, if there are any."""
@@ -268,20 +272,3 @@ class ModelVecEnv(VecEnv):
     def _observe(self, states: Tensor) -> np.ndarray:
         seen: np.ndarray = self.task.dynamics.spec.observe(states).numpy()
         return seen.astype(self.observation_space.dtype)
-
-
-def check_spaces(
-    spec: StateSpec, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
-) -> None:
-    """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
-    for name, space, size in (
-        ("observation", observation_space, spec.observation_dim),
-        ("action", action_space, spec.action_dim),
-    ):
-        if not isinstance(space, spaces.Box) or space.shape != (size,):
-            raise ValueError(
-                f"The spec of the dynamics says that the {name} has {size} entries, so a Box of "
-                f"shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, of "
-                f"which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
-                f"{tuple(spec.actions)}."
-            )

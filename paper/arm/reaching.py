@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import Tensor
 
-from gpadjust.control import PolicySearch, Task
+from gpadjust.control import PolicySearch, PolicySearchAgent, Task, mlp_policy
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.envs import (
     ARM_MEMORY_SPEC,
@@ -32,7 +32,6 @@ from gpadjust.envs import (
 from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, torque_arm
 from gpadjust.inference import SamplingWarning
 from gpadjust.physics import ODEPhysics
-from gpadjust.rl import ModelOptions, PolicySearchAgent
 from gpadjust.states import StateSpec
 from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
 from paper.arm import Settings as ArmSettings
@@ -72,7 +71,7 @@ def run(experiment: Reaching, system: str, learner: str, seed: int) -> Run:
         if trial > settings.noisy_trials:
             agent.action_noise = None
         before, start = dict(agent.wall_time), time.process_time()
-        agent.learn(settings.episode_length, reset_num_timesteps=False)
+        agent.learn(settings.episode_length)
         spent = time.process_time() - start
         errors = evaluate(agent, system, settings, seed)
         rows.append(
@@ -138,15 +137,14 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
     # Of actions scaled to [-1, 1], as Stable-Baselines3 has it.
     sd = 2 * settings.noise * np.ones(4)
     return PolicySearchAgent(
-        "mlp",
         environment(system, settings),
         task,
+        partial(mlp_policy, first_actions=[settings.first_action] * 4),
         search,
-        ModelOptions(reward_tolerance=None, score_horizons=()),
+        reward_tolerance=None,
+        score_horizons=(),
         action_noise=NormalActionNoise(np.zeros(4), sd),
-        policy_kwargs={"first_actions": [settings.first_action] * 4},
         seed=seed,
-        device="cpu",
     )
 
 

@@ -18,10 +18,10 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
-from gpadjust.control import Task
+from gpadjust.control import EpisodeCheckpoint, Task, resume
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
-from gpadjust.rl import Dyna, DynaCallback, DynaOptions, DynaSAC, EpisodeCheckpoint, resume
+from gpadjust.rl import Dyna, DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, ControlSettings, Scenario
 from paper.common.experiment import Run

@@ -17,7 +17,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.control import CrossEntropy, Planner, PolicySearch, Task
+from gpadjust.control import (
+    CrossEntropy,
+    MPCAgent,
+    Planner,
+    PolicySearch,
+    PolicySearchAgent,
+    Task,
+)
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.envs import (
     CART_POLE_SPEC,
@@ -29,7 +36,6 @@ from gpadjust.envs import (
 )
 from gpadjust.envs.cart_pole.system import START_MEAN, CartPoleEquation, equation_physics
 from gpadjust.inference import SamplingWarning
-from gpadjust.rl import ModelOptions, MPCAgent, PolicySearchAgent
 from gpadjust.states import StateSpec
 from paper.cartpole import (
     FRICTIONS,
@@ -57,14 +63,12 @@ def run(experiment: Planning, system: str, learner: str, seed: int) -> Run:
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     settings = experiment.settings_of(system)
     agent = make_agent(experiment, system, learner, seed)
-    real: Any = agent.get_env()
     rows: list[dict[str, Any]] = []
     for _ in range(settings.trials):
         before, start = dict(agent.wall_time), time.process_time()
-        agent.learn(settings.episode_length, reset_num_timesteps=False)
+        agent.learn(settings.episode_length)
         costs = -agent.recorded_episodes(newest=settings.episode_length).rewards
-        (seen,) = real.get_attr("episodes")
-        late = np.stack(seen[len(rows)])[-round(1 / settings.time_step) :]
+        late = np.stack(agent.env.episodes[len(rows)])[-round(1 / settings.time_step) :]
         seconds = {name: agent.wall_time[name] - before[name] for name in ("plan", "fit")}
         rows.append(
             {
@@ -94,10 +98,10 @@ def make_agent(
         state_bounds=torch.tensor([[-_BOUND] * 4, [_BOUND] * 4]) if learner == "search" else None,
     )
     common: dict[str, Any] = {
-        "options": ModelOptions(reward_tolerance=None, score_horizons=()),
+        "reward_tolerance": None,
+        "score_horizons": (),
         "random_steps": settings.random_trials * length,
         "seed": seed,
-        "device": "cpu",
     }
     if learner != "search":
         return MPCAgent(env, task, each_step, first=first, **common)
@@ -109,7 +113,7 @@ def make_agent(
         guide=first,
         num_guides=settings.guides,
     )
-    return PolicySearchAgent("mlp", env, task, search, **common)
+    return PolicySearchAgent(env, task, search=search, **common)
 
 
 def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:

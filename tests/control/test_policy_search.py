@@ -13,7 +13,6 @@ from gpadjust.control import (
     imitate,
     linear_policy,
     mlp_policy,
-    rbf_policy,
 )
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.physics import BlackBoxPhysics, PhysicsError
@@ -49,7 +48,7 @@ def learnt():
     return dynamics
 
 
-@pytest.mark.parametrize("make", [mlp_policy, linear_policy, rbf_policy])
+@pytest.mark.parametrize("make", [mlp_policy, linear_policy])
 def test_policies_keep_to_the_bounds(make):
     torch.manual_seed(0)
     policy = make(SPEC, BOUNDS)
@@ -60,7 +59,7 @@ def test_policies_keep_to_the_bounds(make):
     assert actions.max() <= 2
 
 
-@pytest.mark.parametrize("make", [mlp_policy, linear_policy, rbf_policy])
+@pytest.mark.parametrize("make", [mlp_policy, linear_policy])
 def test_policies_begin_where_they_are_told_to(make):
     states = torch.zeros(1, 1, dtype=torch.float64)
     policy = make(SPEC, BOUNDS, first_actions=[-0.8])

@@ -6,28 +6,28 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from paper.arm.tables import load_evaluations, load_maps
+from paper.cartpole.tables import holds_from
+from paper.control.learner import described, make_agent, run
+from paper.control.tables import load_episodes
+from paper.floor import Floor
+from paper.floor import Settings as FloorSettings
 from stable_baselines3.common.callbacks import BaseCallback
 
-from gpadjust.rl.random_state import RandomState
+from gpadjust.control.checkpoint import RandomState
 from paper.arm import Arm
 from paper.arm import Settings as ArmSettings
 from paper.arm import system as arm_system
 from paper.arm.claims import claims as arm_claims
 from paper.arm.claims import distance_from_start
 from paper.arm.system import hundred, reach, score
-from paper.arm.tables import load_evaluations, load_maps
 from paper.cartpole import CartPole
 from paper.cartpole import Settings as CartPoleSettings
 from paper.cartpole.claims import CLAIMS, TARGETS
 from paper.cartpole.system import evaluate, fixed_starts
-from paper.cartpole.tables import holds_from
 from paper.common.claims import judge
 from paper.common.curves import Curves
 from paper.common.runner import Refused, main, rounded, run_missing, runs_file
-from paper.control.learner import described, make_agent, run
-from paper.control.tables import load_episodes
-from paper.floor import Floor
-from paper.floor import Settings as FloorSettings
 
 SHORT = {
     "episodes": 3,
@@ -105,7 +105,6 @@ def test_a_fingerprint_holds_what_the_settings_do_not_say():
     assert found["options"]["real_fraction"] == pytest.approx(1 / 11)
     assert found["learner"]["buffer_size"] == 100_000
     assert found["task"]["dynamics.model"] == "CKA"
-    assert described(CartPole(), "mf")["options"]["keep_model_data"] is False
     assert "task" not in described(CartPole(), "mf")
 
 

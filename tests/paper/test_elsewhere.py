@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-
-from paper.common.runner import rounded
 from paper.elsewhere import HORIZONS, TRAININGS, Elsewhere, Settings
 from paper.elsewhere.systems import SYSTEMS, design_c, loaded_pendulum
 from paper.elsewhere.tables import tables
 from paper.real.machines import PENDULUM
+
+from paper.common.runner import rounded
 
 TINY = Settings(n=20, windows=2)
 

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from paper.foresight import METHODS, NOISES, Foresight, Settings
+from paper.foresight.run import measured
 
 from gpadjust.dynamics import Trajectories
 from gpadjust.envs import CART_POLE_SPEC
 from paper.common.runner import rounded
-from paper.foresight import METHODS, NOISES, Foresight, Settings
-from paper.foresight.run import measured
 
 TINY = Settings(
     trials=3,

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-
-from paper.common.runner import main
 from paper.kinks import DATA, KINKS, SMOOTH, Kinks, Settings
 from paper.kinks.run import _drawn
 from paper.kinks.systems import SYSTEMS
 from paper.kinks.tables import tables
+
+from paper.common.runner import main
 
 
 @pytest.mark.parametrize("name", [*KINKS, *SMOOTH])

@@ -3,10 +3,6 @@
 import numpy as np
 import pytest
 import torch
-
-from gpadjust.envs import REAL_CART_POLE, random_cart_pole_physics
-from gpadjust.envs.cart_pole.system import START_MEAN, equation_physics
-from paper.common.runner import rounded
 from paper.planning import LEARNERS, SMALL_NOISE, SYSTEMS, Planning, Settings
 from paper.planning.figure import COLORS
 from paper.planning.run import dynamics
@@ -17,6 +13,10 @@ from paper.planning.systems import (
     equation,
     mc_pilco_reward,
 )
+
+from gpadjust.envs import REAL_CART_POLE, random_cart_pole_physics
+from gpadjust.envs.cart_pole.system import START_MEAN, equation_physics
+from paper.common.runner import rounded
 
 TINY = Settings(
     trials=2,

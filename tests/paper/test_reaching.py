@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-
-from gpadjust.envs.arm.torque_arm import torque_arm
-from paper.common.runner import rounded
 from paper.reaching import LEARNERS, SYSTEMS, Reaching, Settings
 from paper.reaching.ensemble import ResidualEnsemble
 from paper.reaching.run import dynamics
 from paper.reaching.systems import FittedArm, LearntArm, as_physics, spec_of
+
+from gpadjust.envs.arm.torque_arm import torque_arm
+from paper.common.runner import rounded
 
 TINY = Settings(trials=1, long_trials=1, updates=2, starts=3)
 

@@ -2,10 +2,6 @@
 
 import pytest
 import torch
-from torch.testing import assert_close
-
-from gpadjust.dynamics import PhysicsDynamics
-from paper.common.runner import rounded
 from paper.real import HORIZONS, LARGEST, LEARNERS, SYSTEMS, UNTAUGHT, Real, Settings
 from paper.real.figure import COLORS
 from paper.real.learners import MAKERS
@@ -15,6 +11,10 @@ from paper.real.networks import NetworkDynamics
 from paper.real.systems import DATA, system
 from paper.real.tables import load
 from paper.real.targets import CALIBRATED, OURS
+from torch.testing import assert_close
+
+from gpadjust.dynamics import PhysicsDynamics
+from paper.common.runner import rounded
 
 TINY = Settings(sizes=(12,), windows=2, drawn=12)
 MACHINES = {"double": DOUBLE_PENDULUM, "single": PENDULUM}

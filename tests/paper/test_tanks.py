@@ -2,14 +2,14 @@
 
 import pytest
 import torch
-from torch.testing import assert_close
-
-from paper.common.runner import rounded, runs_file
 from paper.tanks import CANDIDATES, GPS, LEARNERS, NARX, STRUCTURES, TENTH, Settings, Tanks
 from paper.tanks.figure import COLORS
 from paper.tanks.run import Start, blocks, follow, without
 from paper.tanks.systems import FIXED, UNKNOWNS, measured, narx_spec, physics, rates
 from paper.tanks.tables import label_of
+from torch.testing import assert_close
+
+from paper.common.runner import rounded, runs_file
 
 TINY = Settings(samples=64, head=40, blocks=2, starts=1, rounds=3, tenths=6, narx=30, sizes=(12,))
 VALUES = {**{name: known.guess for name, known in UNKNOWNS.items()}, "power": 0.5}

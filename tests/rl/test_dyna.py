@@ -118,11 +118,8 @@ def test_episodes_that_terminate_in_the_model_end_there(point_agent, point_env):
     np.testing.assert_array_equal(over, (rows.dones * (1 - rows.timeouts))[:n, 0].astype(bool))
 
 
-@pytest.mark.parametrize("keep", [False, True])
-def test_after_last_model_episode_batches_hold_model_rows_only_if_kept(point_agent, keep):
-    agent = point_agent(
-        last_model_episode=2, keep_model_data=keep, real_fraction=0.0, updates_per_model_step=1
-    )
+def test_after_last_model_episode_batches_hold_no_model_rows(point_agent):
+    agent = point_agent(last_model_episode=2, real_fraction=0.0, updates_per_model_step=1)
     mixed = []
     sample = agent.replay_buffer.sample
 
@@ -132,7 +129,7 @@ def test_after_last_model_episode_batches_hold_model_rows_only_if_kept(point_age
 
     agent.replay_buffer.sample = watch
     agent.learn(20)
-    assert mixed == [True] * 2 * (5 + 10) + [keep] * 2 * 5
+    assert mixed == [True] * 2 * (5 + 10) + [False] * 2 * 5
     assert model_rows(agent) == 2 * 2 * 5
 
 
@@ -492,20 +489,6 @@ def test_what_the_dynamics_learnt_outlives_an_agent_without_them(
     assert dynamics.num_transitions == agent.task.dynamics.num_transitions
 
 
-def test_a_termination_that_was_given_is_asked_for_again(
-    point_agent, point_env, point_task, tmp_path
-):
-    def over(states):
-        return states[:, 0] > 9
-
-    path = tmp_path / "agent.zip"
-    point_agent(terminated=over).learn(5).save(path)
-    with pytest.raises(ValueError, match=r"made with a task that has terminated"):
-        DynaSAC.load(path, env=point_env(), task=point_task()).learn(5)
-    loaded = DynaSAC.load(path, env=point_env(), task=point_task(terminated=over))
-    assert loaded.learn(5).num_episodes == 2
-
-
 def test_dynamics_of_another_kind_are_not_loaded(saved, point_task):
     _, path = saved
     other = LearnedDynamics(StateSpec(["x"], ["v"]), model=ZeroMeanGP)
@@ -766,8 +749,9 @@ def test_a_step_that_failed_is_no_data(point_agent, point_env, learnt_dynamics, 
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
     follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
-    starts = 1 + follows.logical_not().nonzero().flatten()
-    assert recorded.num_ended == len(starts) + int(recorded.num_transitions > int(starts[-1]) + 4)
+    starts = [0, *(1 + follows.logical_not().nonzero().flatten()).tolist()]
+    assert recorded.begins.nonzero().flatten().tolist() == starts
+    assert (recorded.episode.diff() > 0).nonzero().flatten().add(1).tolist() == starts[1:]
     assert dynamics.num_transitions <= recorded.num_transitions
 
 
@@ -977,7 +961,7 @@ def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(
     point_agent, point_dynamics
 ):
     agent = point_agent(dynamics=Stiff(point_dynamics.spec), score_horizons=(1, 5))
-    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass options"):
+    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass score_horizons"):
         logged = logged_of(agent, 1)
     assert "model/coverage" in logged
     assert "model/energy_1" not in logged
@@ -999,8 +983,8 @@ def test_horizons_that_are_no_numbers_of_steps(horizons):
         ({"n_steps": 3}, "no n-step returns; found n_steps=3"),
         ({"replay_buffer_class": dict}, "must be MixedReplayBuffer .*found dict"),
         ({"optimize_memory_usage": True}, "optimize_memory_usage"),
-        ({"real_fraction": 2}, r"real_fraction must be at least 0 and at most 1; found 2"),
-        ({"updates_per_model_step": float("inf")}, "must be finite and at least 0; found inf"),
+        ({"real_fraction": 2}, "real_fraction must be .*; found 2"),
+        ({"updates_per_model_step": float("inf")}, "updates_per_model_step must be .*; found inf"),
         ({"state_bounds": torch.ones(2, 4)}, r"state_bounds must be of shape 2 x 1"),
         (
             {"state_bounds": torch.tensor([[1.0], [-1.0]])},
@@ -1010,11 +994,11 @@ def test_horizons_that_are_no_numbers_of_steps(horizons):
         ({"model_episodes": -1}, "model_episodes must be at least 0; found -1"),
         (
             {"updates_per_model_step": -0.5},
-            "updates_per_model_step must be finite and at least 0; found -0.5",
+            "updates_per_model_step must be .*; found -0.5",
         ),
         (
             {"updates_per_model_step": float("nan")},
-            "updates_per_model_step must be finite and at least 0; found nan",
+            "updates_per_model_step must be .*; found nan",
         ),
         ({"last_model_episode": -1}, "last_model_episode must be at least 0; found -1"),
         ({"episode_length": 0}, "episode_length must be at least 1; found 0"),
@@ -1033,7 +1017,7 @@ def test_bad_arguments_are_refused(point_agent, options, message):
     [
         ({"dynamics": "cka"}, "dynamics must be an object of a Dynamics; found 'cka'"),
         ({"reward": None}, "reward must be a function .*found None"),
-        ({"keep_model_data": 1}, "keep_model_data must be True or False; found 1"),
+        ({"refresh_model_data": 1}, "refresh_model_data must be True or False; found 1"),
         ({"episode_length": 2.5}, "episode_length must be a whole number; found 2.5"),
         ({"reward": 1.0}, "reward must be a function; found 1.0"),
         ({"reward": lambda states: states}, r"reward is called with 3 .*found reward\(states\)"),

@@ -10,18 +10,9 @@ from gymnasium import spaces
 from gpadjust.control import Task
 from gpadjust.dynamics import PhysicsDynamics, StateSpec
 from gpadjust.rl import MixedReplayBuffer
-from gpadjust.rl.recorded_episodes import RecordedEpisodes
 
 SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
 ACTIONS = spaces.Box(-4, 4, (1,))
-
-
-class Policy:
-    """Knows the scale of actions."""
-
-    @staticmethod
-    def unscale_action(action):
-        return 4 * action
 
 
 @pytest.fixture
@@ -38,7 +29,11 @@ def recorded():
             done = (t + 1) % episode_length == 0
             infos = [{"TimeLimit.truncated": done and not terminal}] * n_envs
             buffer.add(obs, following, np.full((n_envs, 1), 0.25), -x, np.full(n_envs, done), infos)
-        return RecordedEpisodes(buffer, Policy(), SPEC, newest)
+        keep = None
+        if newest is not None:
+            keep = np.zeros((capacity, n_envs), dtype=bool)
+            keep[buffer.pos - 1 - np.arange(min(newest, buffer.size()))] = True
+        return buffer.recorded(SPEC, lambda scaled: 4 * scaled, keep)
 
     return record
 

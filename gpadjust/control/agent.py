@@ -1,0 +1,492 @@
+"""The loop of an agent: play an episode, learn the dynamics, improve."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple, Self
+
+import cloudpickle
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpadjust.checks import checked_number, checked_whole
+from gpadjust.control.checkpoint import (
+    EpisodeCheckpoint,
+    RandomState,
+    TaskAgent,
+    layer_names,
+    packed,
+    pickled_environment,
+    unpacked,
+)
+from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
+from gpadjust.control.search import random_sequences
+from gpadjust.control.task import Task
+from gpadjust.dynamics.free_run import checked_horizons
+
+_MAX_HOLD = 5  # steps of a random action
+
+Callback = Callable[["Agent", str, dict[str, float]], Any]
+"""What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
+
+
+class _Step(NamedTuple):
+    """A real step, as the environment has it; its action in the scale of [-1, 1]."""
+
+    episode: int
+    observation: NDArray[Any]
+    action: NDArray[Any]
+    following: NDArray[Any]
+    reward: float
+    terminated: bool
+
+
+class Agent(TaskAgent):
+    """A controller that learns from real episodes: :meth:`learn` plays, learns and improves.
+
+    A subclass says how it acts (:meth:`predict`) and what it improves in a model (:meth:`improve`).
+    Before there are data, the model is the physics; without one, or with several, the first
+    episode's actions are random.
+
+    An error on the way (a wrong reward, a physics that fails, a fit that does not converge) loses
+    nothing: the episodes are kept, and the dynamics learn them after the next one. Mend what is
+    wrong, set ``agent.task`` to a task with other functions or dynamics, for example, and call
+    ``learn`` again; dynamics that know nothing learn all episodes. Transitions at which the physics
+    fails are not learnt, with a warning. A step that did not happen, which an environment tells by
+    a true ``info["step_failed"]``, is not kept and ends its episode.
+
+    Callbacks are called with the agent, the name of an event, and a dictionary of numbers:
+
+    - ``"episode"``: an episode begins;
+    - ``"plan"``: its first action is chosen, with what the agent says of it (:meth:`promise`);
+    - ``"step"``: a real step was made, with its ``reward``;
+    - ``"fit"``: the dynamics have learnt, with the scores of the new steps before that
+      (``nlpd``, ``coverage``, ``rmse/x``, ``coverage_15``, ...), ``real_reward`` of a step and
+      ``promised_reward``;
+    - ``"update"``, ``"search"``: as a subclass has them;
+    - ``"done"``: all steps are made.
+
+    To end a run early, raise an error of your own: nothing is lost.
+
+    Args:
+        env: The real environment, of Gymnasium, with a box of observations, as the spec of the
+            dynamics has them, and a box of actions.
+        task: What is known of the system; rewards and terminations are compared with those of
+            each real episode.
+        action_noise: Called at each step for what is added to the action, ``action_dim`` numbers in
+            halves of its range, such as Stable-Baselines3's ``NormalActionNoise``.
+        random_steps: Episodes that begin before so many real steps have random actions, held for
+            up to five steps. Default: the first one is that of the physics.
+        reward_tolerance: How far the known rewards may be from the recorded ones, relative to the
+            largest of an episode; None to check neither rewards nor terminations, as noisy sensors
+            may need.
+        score_horizons: Numbers of steps over which each new episode is predicted before it is
+            learnt, open loop along its actions. Some half a second, and with a physics that is
+            costly its evaluation at 39 particles of 4 windows a step; () does without.
+        seed: Seed of the global generators and the environment. Default: none.
+
+    Attributes:
+        task: The task; set another one to change a part of it.
+        model: The task in the newest model, by which it acts; None as long as actions are random.
+        num_timesteps: Real steps.
+        num_episodes: Real episodes that the dynamics have learnt.
+        promised_reward: The reward of a step that the model had promised of the newest episodes
+            that were learnt, or None, as of random actions.
+        wall_time: Seconds spent on ``"plan"`` (the actions), ``"fit"`` and ``"update"``.
+        notes: What you want to keep with the agent, in plain values; saved and resumed with it.
+
+    Raises:
+        TypeError: If something is of another kind.
+        ValueError: If observations or actions are not boxes of the spec's entries, or a number is
+            out of range; when learning starts, if the task's functions do not return what they
+            should; after a real episode, if its rewards or terminations are not those of the task.
+    """
+
+    not_saved: ClassVar[tuple[str, ...]] = (
+        *("_task", "env", "model", "_steps", "_callbacks", "_random_state"),
+    )
+    """Attributes that are not in checkpoints; a subclass adds those that hold a task."""
+
+    model: Task | None
+
+    def __init__(
+        self,
+        env: Any,
+        task: Task,
+        *,
+        action_noise: Callable[[], NDArray[Any]] | None = None,
+        random_steps: int = 0,
+        reward_tolerance: float | None = 1e-3,
+        score_horizons: Sequence[int] = (1, 5, 15),
+        seed: int | None = None,
+    ) -> None:
+        checked_whole("random_steps", random_steps, 0)
+        if reward_tolerance is not None:
+            checked_number("reward_tolerance", reward_tolerance, least=0)
+        self.task = task
+        self.env = env
+        check_spaces(task, env.observation_space, env.action_space)
+        self.action_noise = action_noise
+        self.random_steps = random_steps
+        self.reward_tolerance = reward_tolerance
+        self.score_horizons = () if score_horizons == () else checked_horizons(score_horizons)
+        self.num_timesteps = 0
+        self.num_episodes = 0
+        self.promised_reward: float | None = None
+        self.wall_time = dict.fromkeys(("plan", "fit", "update"), 0.0)
+        self.notes: dict[str, Any] = {}
+        self._steps: list[_Step] = []
+        self._promises: list[float | None] = []  # one for each episode
+        self._start: NDArray[Any] | None = None  # where the next episode begins, after a reset
+        self._env_seed = seed  # of the first reset
+        self._callbacks: list[Callback] = []
+        if seed is not None:
+            RandomState.seed(seed)
+
+    # What a subclass says
+
+    @abstractmethod
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], Any]:
+        """Choose actions, as policies of Stable-Baselines3 do, for its ``evaluate_policy``.
+
+        Args:
+            observation: ``observation_dim`` of the spec, or ``n x observation_dim``.
+            state: What the last call returned as state; None at the start.
+            episode_start: Which episodes begin, ``n``.
+            deterministic: Whether the same actions are chosen at the same observation and state.
+
+        Returns:
+            Actions, ``action_dim`` or ``n x action_dim``, and the state for the next call.
+        """
+
+    def improve(self, task: Task) -> bool:
+        """Improve in the newest model; return whether the agent can act by now."""
+        return True
+
+    def promise(self, state: Any) -> dict[str, float]:
+        """Say of an episode that begins what the model promises, such as its ``promised_reward``.
+
+        Args:
+            state: What :meth:`predict` returned with its first action.
+        """
+        return {}
+
+    # The loop
+
+    def learn(
+        self, total_timesteps: int, callback: Callback | Sequence[Callback] | None = None
+    ) -> Self:
+        """Play so many further real steps, in whole episodes, and learn from each.
+
+        Args:
+            total_timesteps: Number of steps; the episode under way is played to its end.
+            callback: One or more callbacks, such as :class:`EpisodeCheckpoint` or
+                :func:`print_progress`.
+        """
+        given = [] if callback is None else [callback] if callable(callback) else [*callback]
+        end = self.num_timesteps + total_timesteps
+        with ExitStack() as held:
+            for each in given:
+                if isinstance(each, EpisodeCheckpoint):
+                    held.enter_context(each.locked())
+            self._callbacks = given
+            self._begin()
+            while self.num_timesteps < end:
+                self.tell("episode")
+                self._play()
+                if self._learn_dynamics():
+                    self._improve()
+            self.tell("done")
+        return self
+
+    def _play(self) -> None:
+        """Play a real episode, and keep its steps."""
+        observation, self._start = self._reset(), None
+        episode, begins, state = len(self._promises), True, None
+        self._promises.append(None)
+        random = self._random_actions() if self.model is None else None
+        getattr(self.action_noise, "reset", lambda: None)()
+        while True:
+            if random is not None:
+                action = self._scaled(next(random))
+            else:
+                with self.timed("plan"):
+                    choice, state = self.predict(observation, state, np.array([begins]))
+                action = self._scaled(choice, noisy=True)
+                if begins:
+                    said = self.promise(state)
+                    self._promises[episode] = said.get("promised_reward")
+                    self.tell("plan", said)
+            following, reward, terminated, truncated, info = self.env.step(self._unscaled(action))
+            self.num_timesteps += 1
+            failed = bool(info.get("step_failed"))
+            if not failed:
+                row = (observation, action, following, float(reward), bool(terminated))
+                self._steps.append(_Step(episode, *row))
+            self.tell("step", {"reward": float(reward)})
+            if failed or terminated or truncated:
+                return
+            observation, begins = following, False
+
+    def _learn_dynamics(self) -> bool:
+        """Let the dynamics learn the episodes that they have not; return whether there were any."""
+        recorded, is_fitted = self.recorded_episodes(), self.task.dynamics.is_fitted
+        new = recorded.some(recorded.episode >= (self.num_episodes if is_fitted else 0))
+        if new.num_transitions < (1 if is_fitted else 2):  # a first fit needs two
+            return False
+        if self.reward_tolerance is not None:
+            new.check(self.task, self.reward_tolerance)
+        with self.timed("fit"):
+            task = recorded.complete(self.task, self.episode_length())
+            values = learn_dynamics(task, new, recorded, self.score_horizons)
+        self.model = None  # it is not the newest any more
+        promises, self.num_episodes = self._promises[self.num_episodes :], len(self._promises)
+        kept = [each for each in promises if each is not None]
+        # Of actions that were random nothing was promised.
+        self.promised_reward = sum(kept) / len(kept) if kept and kept == promises else None
+        values["real_reward"] = float(new.rewards.mean())
+        if self.promised_reward is not None:
+            values["promised_reward"] = self.promised_reward
+            self._compare(values, recorded.rewards)
+        self.tell("fit", values)
+        return True
+
+    def _improve(self) -> None:
+        """Improve in what is known, if that is something and actions are not to be random."""
+        if self.num_timesteps < self.random_steps:
+            return
+        task = self.known_task()
+        if task is None:
+            return
+        with self.timed("update"):
+            can_act = self.improve(task)
+        if can_act:
+            self.model = task
+
+    def tell(self, event: str, values: dict[str, float] | None = None) -> None:
+        """Call the callbacks."""
+        for each in self._callbacks:
+            each(self, event, values or {})
+
+    # What it knows
+
+    @property
+    def task(self) -> Task:
+        """The task; where it is set, the next ``learn`` improves in it first."""
+        return self._task
+
+    @task.setter
+    def task(self, task: Task) -> None:
+        if not isinstance(task, Task):
+            raise TypeError(
+                f"{type(self).__name__} needs a task to learn, as Task(dynamics, reward, ...); "
+                f"found {task!r}."
+            )
+        self._task = task
+        self.model = None
+
+    def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
+        """The real steps; or the newest of them only."""
+        spec, steps = self.task.dynamics.spec, self._steps
+        steps = steps if newest is None else steps[len(steps) - min(newest, len(steps)) :]
+        shapes = [(), (spec.observation_dim,), (spec.action_dim,), (spec.observation_dim,), (), ()]
+        columns = zip(*steps, strict=True) if steps else [()] * len(shapes)
+        episode, seen, actions, following, rewards, terminated = (
+            torch.from_numpy(np.array(column, dtype=np.float64).reshape(len(steps), *shape))
+            for column, shape in zip(columns, shapes, strict=True)
+        )
+        episode = episode.long()
+        return RecordedEpisodes(
+            spec,
+            spec.decode(seen),
+            torch.from_numpy(self._unscaled(actions.numpy())),
+            spec.decode(following),
+            rewards,
+            terminated.bool(),
+            episode,
+            begins=torch.cat([torch.tensor([True]), episode.diff() > 0])[: len(steps)],
+            whole=torch.ones(len(steps), dtype=torch.bool),
+        )
+
+    def env_attribute(self, name: str) -> Any:
+        """An attribute of the environment or of one that it wraps."""
+        return self.env.get_wrapper_attr(name)
+
+    def known_task(self) -> Task | None:
+        """``model_task`` in the newest model, or in the physics; None if nothing is known yet."""
+        task = self.model_task()
+        dynamics = task.dynamics.before_data()
+        return None if dynamics is None else replace(task, dynamics=dynamics)
+
+    def action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the actions, ``2 x action_dim``."""
+        space = self.env.action_space
+        return torch.from_numpy(np.stack([space.low, space.high]).astype(np.float64))
+
+    def __repr__(self) -> str:
+        """What acts where, in which dynamics, and after how many episodes."""
+        return (
+            f"{type(self).__name__}({layer_names(self.env)[-1]}, "
+            f"{type(self.task.dynamics).__name__}, {self.num_episodes} episodes learnt, "
+            f"{self.num_timesteps} steps)"
+        )
+
+    # The parts of the loop
+
+    def _begin(self) -> None:
+        """Find what is wrong before it costs a real step, and improve if that was not done yet."""
+        if self._random_state is not None:  # a run that goes on
+            self._random_state.restore()
+            self._random_state = None
+        spec = self.task.dynamics.spec
+        seen = torch.from_numpy(np.asarray(self._reset(), dtype=np.float64)).unsqueeze(0)
+        before = RandomState.capture()
+        spec.check_observations(seen)
+        # Of a single state much would look right that is not.
+        twice = spec.decode(seen).repeat(2, 1)
+        self.episode_length()
+        self.task.try_functions(twice, self.action_bounds().mean(0).expand(2, -1))
+        before.restore()
+        if self.model is None:
+            self._improve()
+
+    def _reset(self) -> NDArray[Any]:
+        """The observation at which the next episode begins."""
+        if self._start is None:
+            seed, self._env_seed = self._env_seed, None
+            self._start = self.env.reset(seed=seed)[0]
+        return self._start
+
+    def _random_actions(self) -> Iterator[NDArray[Any]]:
+        """Random actions, held for some steps, for the episode and, if it is longer, beyond."""
+        num_steps, bounds = self.episode_length(), self.action_bounds()
+        while True:
+            for action in random_sequences(1, num_steps, bounds, _MAX_HOLD)[0]:
+                yield action.numpy().astype(self.env.action_space.dtype)
+            num_steps = 1
+
+    def _scaled(self, action: NDArray[Any], noisy: bool = False) -> NDArray[Any]:
+        """An action in the scale of [-1, 1], in which noise is added and steps are kept.
+
+        This is how Stable-Baselines3 rounds: agents of both are the same, bit for bit.
+        """
+        low, high = self.env.action_space.low, self.env.action_space.high
+        scaled = 2.0 * ((action - low) / (high - low)) - 1.0
+        if noisy and self.action_noise is not None:
+            scaled = scaled + self.action_noise()
+        return np.clip(scaled, -1.0, 1.0).astype(low.dtype)
+
+    def _unscaled(self, scaled: NDArray[Any]) -> NDArray[Any]:
+        low, high = self.env.action_space.low, self.env.action_space.high
+        return np.asarray(low + (0.5 * (scaled + 1.0) * (high - low)))
+
+    def _compare(self, values: dict[str, float], recorded: Tensor) -> None:
+        """Warn if a real step gave less than promised by a quarter of the range of all rewards.
+
+        The warning also says if data had overridden the physics in most of the predictions. (That
+        alone is no fault: where a model has learnt without noise that its physics is a little off,
+        they do so nearly everywhere.)
+        """
+        real, promised = values["real_reward"], values["promised_reward"]
+        span = max(float(recorded.max()), promised) - float(recorded.min())
+        if promised - real <= span / 4:
+            return
+        overrides = values.get("overrides", 0.0)
+        blame = (
+            f"In {overrides:.0%} of its predictions data had overridden the physics; "
+            "gpadjust.validation.trust tells where. "
+        )
+        warnings.warn(
+            f"A step of the last real episode gave a reward of {real:.3g} on average, where "
+            f"the model promised {promised:.3g}: do not trust what is done in it yet. "
+            f"{blame if overrides > 0.5 else ''}More episodes, a careful objective "
+            "(Return(quantile=0.2), with num_functions=16), or a better physics may help.",
+            UserWarning,
+            stacklevel=4,
+        )
+
+    # Checkpoints
+
+    def save(self, path: Any) -> None:
+        """Write a checkpoint, from which :func:`resume` makes the agent."""
+        EpisodeCheckpoint(path).write(self)
+
+    @classmethod
+    def described(cls, env: Any) -> dict[str, Any]:
+        """The environment's wrappers and spaces, as texts."""
+        return {
+            "wrappers": " of ".join(layer_names(env)),
+            "observation_space": str(env.observation_space),
+            "action_space": str(env.action_space),
+        }
+
+    def saved_parts(self) -> dict[str, bytes]:
+        """Settings and counts, the real steps, what the dynamics learnt, and the environment."""
+        state = {name: part for name, part in vars(self).items() if name not in self.not_saved}
+        learnt = io.BytesIO()
+        torch.save(self.task.dynamics.state_dict(), learnt)
+        columns = zip(*self._steps, strict=True) if self._steps else []
+        steps = dict(zip(_Step._fields, map(np.array, columns), strict=False))
+        env = pickled_environment(self.env)
+        if env is None:
+            state["_start"] = None  # it will be reset
+        return {
+            "agent.pkl": cloudpickle.dumps((state, self.model is not None)),
+            "steps.npz": packed(steps),
+            "dynamics.pt": learnt.getvalue(),
+            "environment.pkl": env or b"",
+        }
+
+    @classmethod
+    def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
+        """The agent that :meth:`saved_parts` saved."""
+        columns = unpacked(parts["steps.npz"])
+        task.dynamics.load_state_dict(torch.load(io.BytesIO(parts["dynamics.pt"])))
+        agent = cls.__new__(cls)
+        state, acted = cloudpickle.loads(parts["agent.pkl"])
+        vars(agent).update(state)
+        agent.task, agent._callbacks = task, []
+        agent.env = cloudpickle.loads(parts["environment.pkl"]) if parts["environment.pkl"] else env
+        rows = zip(*(columns[name] for name in _Step._fields), strict=True) if columns else []
+        agent._steps = [
+            _Step(int(number), seen, action, following, float(reward), bool(terminated))
+            for number, seen, action, following, reward, terminated in rows
+        ]
+        agent.model = agent.known_task() if acted else None
+        return agent
+
+
+def print_progress(agent: Agent, event: str, values: dict[str, float]) -> None:
+    """A callback that prints a line for each plan, fit and search."""
+    if event in ("plan", "fit", "update", "search"):
+        numbers = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+        print(f"{agent.num_timesteps} steps, {event}: {numbers}")
+
+
+def check_spaces(task: Task, observation_space: Any, action_space: Any) -> None:
+    """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
+    spec = task.dynamics.spec
+    for name, space, size in (
+        ("observation", observation_space, spec.observation_dim),
+        ("action", action_space, spec.action_dim),
+    ):
+        if not hasattr(space, "high") or space.shape != (size,):
+            raise ValueError(
+                f"The spec of the dynamics says that the {name} has {size} entries, so a Box of "
+                f"shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, of "
+                f"which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
+                f"{tuple(spec.actions)}."
+            )

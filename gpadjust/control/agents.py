@@ -1,0 +1,243 @@
+"""The agents of the library: one plans each step, one improves a policy."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpadjust.control.agent import Agent
+from gpadjust.control.mpc import MPC, PlanState, check_planner
+from gpadjust.control.planner import Planner
+from gpadjust.control.policies import BoundedPolicy, mlp_policy
+from gpadjust.control.policy_search import PolicySearch
+from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.search import random_sequences
+from gpadjust.control.task import Task
+from gpadjust.states import StateSpec
+
+_EPISODES, _MAX_HOLD = 128, 5  # of random actions, by which the policy's inputs are scaled
+
+
+class MPCAgent(Agent):
+    """Model predictive control in dynamics that learn from each real episode.
+
+    There is no policy to be trained: real steps are those of :class:`MPC`, which plans them in the
+    newest model. Before the first episode it plans in the physics.
+
+    Args:
+        env: As of :class:`Agent`.
+        task: As of :class:`Agent`.
+        each_step: Plans at each step but the first, see :class:`MPC`.
+        first: Plans when an episode begins, see :class:`MPC`.
+        tolerance: How much a plan may disappoint, see :class:`MPC`.
+        options: Further arguments of :class:`Agent`.
+
+    Raises:
+        TypeError: As :class:`Agent`, or if a planner is none.
+        ValueError: As :class:`Agent`.
+
+    Example:
+        >>> import gymnasium
+        >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner, Task
+        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+        >>> task = Task(
+        ...     LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward
+        ... )
+        >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
+        >>> agent = MPCAgent(env, task, quick, first=quick, seed=0)
+        >>> agent.learn(total_timesteps=2 * 25)
+        MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps)
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        task: Task,
+        each_step: Planner | None = None,
+        *,
+        first: Planner | None = None,
+        tolerance: float | None = 0.25,
+        **options: Any,
+    ) -> None:
+        for name, planner in (("each_step", each_step), ("first", first)):
+            if planner is not None:
+                check_planner(name, planner)
+        self.each_step = each_step
+        self.first = first
+        self.tolerance = tolerance
+        super().__init__(env, task, **options)
+
+    @property
+    def mpc(self) -> MPC:
+        """The policy in the newest model, or the physics.
+
+        Raises:
+            RuntimeError: If there is neither a physics nor a real episode to plan with.
+        """
+        task = self.known_task() if self.model is None else self.model
+        if task is None:
+            raise RuntimeError(
+                f"{type(self).__name__} knows nothing of the system yet; call `learn`, or give the "
+                "dynamics a physics."
+            )
+        how: dict[str, Any] = {"first": self.first, "tolerance": self.tolerance}
+        return MPC(task, self.action_bounds(), self.each_step, **how)
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: PlanState | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], PlanState]:
+        """Plan actions; see :meth:`MPC.predict`.
+
+        Raises:
+            RuntimeError: If there is neither a physics nor a real episode to plan with.
+        """
+        return self.mpc.predict(observation, state, episode_start, deterministic)
+
+    def promise(self, state: PlanState) -> dict[str, float]:
+        """What the plan of an episode promises of a step, if it is of the whole episode."""
+        (plan,) = state
+        if plan.left_bounds > 0.1:
+            warnings.warn(
+                f"The best plan of an episode leaves the bounds of the states in "
+                f"{plan.left_bounds:.0%} of the functions that it was followed through, so it "
+                "is not to be trusted there. Penalise such states in the reward, widen "
+                "state_bounds of the task, or search longer (MPCAgent(first=...)).",
+                UserWarning,
+                stacklevel=2,
+            )
+        whole = len(plan.promised) >= self.episode_length()
+        return {"left_bounds": plan.left_bounds} | (
+            {"promised_reward": plan.reward} if whole else {}
+        )
+
+
+class PolicySearchAgent(Agent):
+    """Policy search in dynamics that learn from each real episode.
+
+    The policy is trained in the physics before the first real episode, and after each one in the
+    newest model, by :class:`PolicySearch`, from where it was. If the task does not say where
+    episodes start, the first episode's actions are random. Beside the events of :class:`Agent`
+    there are ``"update"``, ten times in a search, with its number and value, and ``"search"``, with
+    ``reward`` of a step, ``left_bounds`` and ``seconds``.
+
+    Args:
+        env: As of :class:`Agent`.
+        task: What is known of the system, in PyTorch's functions, as gradients flow through them.
+        policy: Makes the policy of a spec and the bounds of the actions: :func:`mlp_policy`,
+            :func:`linear_policy`, or a function of yours, such as
+            ``functools.partial(mlp_policy, net_arch=(32,))``.
+        search: How the policy is improved.
+        options: Further arguments of :class:`Agent`.
+
+    Attributes:
+        policy: The policy.
+
+    Raises:
+        TypeError: As :class:`Agent`, or if policy or search are of another kind.
+        ValueError: As :class:`Agent`.
+
+    Example:
+        >>> import gymnasium
+        >>> import torch
+        >>> from gpadjust.control import PolicySearch, PolicySearchAgent, Task, linear_policy
+        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.envs import cart_pole_start
+        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> bounds = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
+        >>> task = Task(
+        ...     dynamics, cart_pole_reward, initial_states=cart_pole_start, state_bounds=bounds
+        ... )
+        >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
+        >>> PolicySearchAgent(env, task, linear_policy, search, seed=0).learn(total_timesteps=25)
+        PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps)
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        task: Task,
+        policy: Callable[[StateSpec, Tensor], BoundedPolicy] = mlp_policy,
+        search: PolicySearch | None = None,
+        **options: Any,
+    ) -> None:
+        self.search = PolicySearch() if search is None else search
+        if not isinstance(self.search, PolicySearch):
+            raise TypeError(f"search must be a PolicySearch(...); found {search!r}.")
+        super().__init__(env, task, **options)
+        made = policy(task.dynamics.spec, self.action_bounds()) if callable(policy) else policy
+        if not isinstance(made, BoundedPolicy):
+            raise TypeError(
+                "policy must make a BoundedPolicy of a spec and bounds, as mlp_policy does; found "
+                f"{made!r}."
+            )
+        self.policy = made
+        self.is_trained = False
+        self._reward = math.nan  # of a step, as the last search foresaw it
+
+    def improve(self, task: Task) -> bool:
+        """Improve the policy, if it is known where episodes start."""
+        if task.initial_states is None:
+            return False
+        if not self.is_trained:
+            self.policy.look_at(self._random_states(task))
+        guided, tenth = not self.is_trained, max(1, self.search.updates // 10)
+
+        def progress(update: int, value: float) -> None:
+            if update % tenth == 0 or update == self.search.updates:
+                self.tell("update", {"number": update, "value": value})
+
+        result = self.search.improve(self.policy, task, guided=guided, progress=progress)
+        self.is_trained, self._reward = True, result.reward
+        left = result.left_bounds
+        found = {"reward": result.reward, "left_bounds": left, "seconds": result.seconds}
+        self.tell("search", found)
+        if left > 0.1:
+            warnings.warn(
+                f"{left:.0%} of the episodes of the policy left the bounds of the states in the "
+                "model, so it is not to be trusted there. Penalise such states in the reward, "
+                "widen state_bounds of the task, or take more updates.",
+                UserWarning,
+                stacklevel=2,
+            )
+        return True
+
+    def promise(self, state: Any) -> dict[str, float]:
+        """The reward of a step that the last search found in the model."""
+        return {"promised_reward": self._reward}
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Any]:
+        """The policy's actions, always the same at an observation; see :meth:`Agent.predict`."""
+        with torch.no_grad():
+            actions = self.policy.act(torch.as_tensor(np.asarray(observation)).double())
+        return actions.numpy().astype(np.float32), state
+
+    def _random_states(self, task: Task) -> Tensor:
+        """States ``N x state_dim`` of episodes of random actions in a model."""
+        length = self.episode_length()
+        steps = random_sequences(_EPISODES, length, self.action_bounds(), _MAX_HOLD).unbind(1)
+        taken = iter(steps)
+        with torch.no_grad():
+            starts = task.draw_initial_states(_EPISODES)
+            rollout = Rollouts(task, None).act(starts, lambda states: next(taken), length)
+        return torch.cat([starts, rollout.next_states[rollout.made]])

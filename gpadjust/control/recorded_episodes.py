@@ -1,0 +1,237 @@
+"""Real episodes: what they tell, and how dynamics learn them."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from gpadjust.control.task import Task
+from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
+from gpadjust.dynamics.free_run import typical_change
+from gpadjust.models import TermsModel
+from gpadjust.physics import PhysicsError
+from gpadjust.states import StateSpec
+from gpadjust.validation.trust import trust
+
+_REACH = 10.0  # half ranges of the recorded states, from their middle to the bounds
+_WINDOWS = 4  # of which trajectories are scored: some half second for a model of an episode
+_FAR = ("nlpd", "coverage", "energy")
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedEpisodes:
+    """Steps of real episodes, each after the one before it.
+
+    Args:
+        spec: The entries of states and actions.
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+        next_states: ``N x state_dim``.
+        rewards: ``N``.
+        terminated: Whether the next state ended the episode, ``N`` booleans.
+        episode: The number of the episode, ``N`` integers.
+        begins: Whether the step is the first one of its episode, ``N`` booleans.
+        whole: Whether the episode has ended, ``N`` booleans.
+    """
+
+    spec: StateSpec
+    states: Tensor
+    actions: Tensor
+    next_states: Tensor
+    rewards: Tensor
+    terminated: Tensor
+    episode: Tensor
+    begins: Tensor
+    whole: Tensor
+
+    @property
+    def num_transitions(self) -> int:
+        """Number of steps."""
+        return len(self.states)
+
+    @property
+    def trajectories(self) -> Trajectories:
+        """States, actions and next states, of which dynamics learn."""
+        return Trajectories(self.states, self.actions, self.next_states, self.episode)
+
+    def some(self, rows: Any) -> Self:
+        """The steps that an index of rows selects."""
+        names = [field.name for field in fields(self)[1:]]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def draw_starts(self, n: int) -> Tensor:
+        """Draw states at which episodes started, ``n x state_dim``, from PyTorch's generator."""
+        starts = self.states[self.begins]
+        return starts[torch.randint(len(starts), (n,))]
+
+    def bounds(self) -> Tensor | None:
+        """Bounds ``2 x state_dim`` far beyond the states of episodes that have ended.
+
+        They are infinite for angles, constants and previous values; None if no episode has ended.
+        """
+        if not self.whole.any():
+            return None
+        seen = torch.cat([self.states[self.whole], self.next_states[self.whole]])
+        low, high = seen.amin(0), seen.amax(0)
+        reach = _REACH * (high - low) / 2
+        reach[high == low] = torch.inf  # that it has not moved yet tells nothing
+        for i, name in enumerate(self.spec.states):
+            if name in (*self.spec.angles, *self.spec.exogenous, *self.spec.previous):
+                reach[i] = torch.inf
+        return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
+
+    def complete(self, task: Task, episode_length: int) -> Task:
+        """The task with length, starts and bounds of these episodes where it has none."""
+        found: dict[str, Any] = {"episode_length": episode_length}
+        if self.num_transitions:
+            found |= {"initial_states": self.draw_starts, "state_bounds": self.bounds()}
+        return replace(task, **{k: v for k, v in found.items() if getattr(task, k) is None})
+
+    def learnable(self, dynamics: Dynamics) -> Trajectories:
+        """All steps but those at which the physics fails.
+
+        Raises:
+            PhysicsError: If it does not say where, or everywhere.
+        """
+        works = torch.ones(self.num_transitions, dtype=torch.bool)
+        while True:
+            try:
+                dynamics.try_physics(self.states[works], self.actions[works])
+            except PhysicsError as error:
+                rows = works.nonzero().flatten()[list(error.rows)]
+                if not len(rows) or len(rows) == works.sum():
+                    raise
+                warnings.warn(
+                    f"The physics fails at {len(rows)} of {len(works)} new transitions, which the "
+                    f"dynamics do not learn: {error}",
+                    UserWarning,
+                    stacklevel=4,
+                )
+                works[rows] = False
+            else:
+                return self.trajectories.some(works)
+
+    def check(self, task: Task, tolerance: float = 1e-3) -> None:
+        """Compare the functions of a task with the recorded rewards and terminations.
+
+        Args:
+            task: The user's.
+            tolerance: Greatest error of the reward, relative to the largest recorded one.
+
+        Raises:
+            ValueError: If they differ; it shows the worst transition.
+        """
+        rewards = task.rewards(self.states, self.actions, self.next_states).double()
+        error = (rewards - self.rewards).abs()
+        if (error > tolerance * self.rewards.abs().max().clamp_min(1e-6)).any():
+            i = int(error.argmax())
+            raise ValueError(
+                "reward(states, actions, next_states) is not the environment's: transition "
+                f"{i} gave {self.rewards[i]:.6g}, but the function says {rewards[i]:.6g}; "
+                f"{self._row(i)}. Correct the function, or the spec of the state (its order, and "
+                "which entries are angles, seen as sine and then cosine). If rewards or "
+                "observations are noisy, raise reward_tolerance; None checks nothing."
+            )
+        says = task.terminations(self.next_states)
+        wrong = says != self.terminated
+        if wrong.any():
+            i = int(wrong.nonzero()[0])
+            given = (
+                "the function says" if task.terminated is not None else "none was given, that is"
+            )
+            raise ValueError(
+                f"terminated(states) is not the environment's: transition {i} was recorded with "
+                f"terminated={bool(self.terminated[i])}, but {given} {bool(says[i])}; "
+                f"{self._row(i)}. Pass the termination that the environment has."
+            )
+
+    def _row(self, i: int) -> str:
+        parts = ("states", "actions", "next_states")
+        return ", ".join(f"{part}[{i}] = {getattr(self, part)[i].tolist()}" for part in parts)
+
+
+def learn_dynamics(
+    task: Task, new: RecordedEpisodes, recorded: RecordedEpisodes, horizons: tuple[int, ...]
+) -> dict[str, float]:
+    """Score the dynamics of a task on new episodes, and update them with these.
+
+    PyTorch's generator is left as it is by the scores. Scores that are not defined (densities of
+    dynamics without variances, horizons longer than the episodes) are left out.
+
+    Args:
+        task: The task, with bounds of the states.
+        new: Episodes that the dynamics have not learnt.
+        recorded: All episodes; energy scores are in units of their typical changes, so that those
+            of different episodes can be compared.
+        horizons: Numbers of steps over which trajectories are scored; none for scores of single
+            steps alone.
+
+    Returns:
+        ``nlpd`` and ``coverage`` of a step, ``rmse/<state>``; ``overrides``, the share of
+        predictions in which data override the physics; ``nlpd_15``, ``coverage_15`` and
+        ``energy_15`` of a horizon of 15; ``score_seconds``, ``fit_seconds``.
+    """
+    start, found = time.perf_counter(), {}
+    learnable = new.learnable(task.dynamics)
+    if task.dynamics.is_fitted:
+        before = time.perf_counter()
+        found = _scores(task, learnable, recorded, horizons)
+        found["score_seconds"] = time.perf_counter() - before
+    task.dynamics.update(*learnable)
+    found["fit_seconds"] = time.perf_counter() - start - found.get("score_seconds", 0.0)
+    return {name: value for name, value in found.items() if not math.isnan(value)}
+
+
+def _scores(
+    task: Task, new: Trajectories, recorded: RecordedEpisodes, horizons: tuple[int, ...]
+) -> dict[str, float]:
+    dynamics, spec = task.dynamics, task.dynamics.spec
+    score = dynamics.score(*new)
+    found = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
+    names = [spec.states[i] for i in spec.moving]
+    found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
+    found["overrides"] = _overrides(dynamics, new.states, new.actions)
+    possible = [k for k in horizons if k <= new.longest]
+    if not possible:
+        return found
+    windows = new.windows(possible[-1], stride=1)
+    last = len(windows.actions) - 1
+    windows = windows.some(torch.linspace(0, last, min(last + 1, _WINDOWS)).round().long())
+    try:
+        run = dynamics.free_run(
+            windows.initial_states,
+            windows.actions,
+            state_bounds=task.widened(new.states).state_bounds,
+        )
+    except (NotImplementedError, PhysicsError) as error:  # scores are not worth an episode
+        warnings.warn(
+            f"There are no scores of trajectories, as their particles cannot move: {error} Pass "
+            "score_horizons=() to do without.",
+            UserWarning,
+            stacklevel=4,
+        )
+        return found
+    units = typical_change(spec, recorded.states, recorded.next_states)
+    far = run.score(windows.measured, horizons=possible, units=units)
+    for i, horizon in enumerate(possible):
+        for name in _FAR:
+            values = getattr(far, name)[i]
+            values = values if name == "energy" else values[spec.moving]
+            found[f"{name}_{horizon}"] = float(values.mean())
+    return found
+
+
+def _overrides(dynamics: Dynamics, states: Tensor, actions: Tensor) -> float:
+    """The share of predictions in which data override the physics; nan without one."""
+    if not isinstance(dynamics, LearnedDynamics):
+        return float("nan")
+    model = dynamics.model
+    if not isinstance(model, TermsModel) or not model.rho_names:
+        return float("nan")
+    return float(trust(model, dynamics.targets.inputs(states, actions)).data.mean())

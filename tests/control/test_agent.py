@@ -1,0 +1,400 @@
+"""Agents: they play an episode, learn the dynamics, and improve."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.wrappers import TransformObservation
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import NormalActionNoise
+
+from gpadjust.control import (
+    MPC,
+    Agent,
+    MPCAgent,
+    PolicySearchAgent,
+    Task,
+    linear_policy,
+    print_progress,
+)
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
+from gpadjust.envs import (
+    CART_POLE_SPEC,
+    CartPoleSwingUpEnv,
+    cart_pole_reward,
+    random_cart_pole_physics,
+)
+from gpadjust.models import ZeroMeanGP
+from gpadjust.physics import PhysicsError
+from tests.control.conftest import PLAN
+
+pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
+WHOLE = replace(PLAN, horizon=None)
+
+
+class Log(list):
+    """A callback that keeps the numbers of some events."""
+
+    def __init__(self, event):
+        super().__init__()
+        self.event = event
+
+    def __call__(self, agent, event, values):
+        if event == self.event:
+            self.append(values)
+
+
+# The loop
+
+
+def test_it_learns_the_system_and_brings_the_point_home(make_agent, kind, point_env):
+    agent = make_agent(kind).learn(15)
+    assert agent.num_episodes == 3
+    assert agent.task.dynamics.num_transitions == agent.num_timesteps == 15
+    mean, _ = evaluate_policy(agent, point_env(), n_eval_episodes=2, warn=False)
+    assert mean > -1.0  # to stay costs some 5
+
+
+def test_the_first_episode_goes_by_the_physics(make_agent, kind):
+    """Of the point's real cost the physics, a fifth too weak, saves most."""
+    agent = make_agent(kind).learn(5)
+    assert agent.recorded_episodes().rewards.sum() > -1.5
+
+
+def test_without_a_physics_the_first_episode_is_random(make_agent, kind, point_dynamics):
+    fit = {"method": "map", "num_starts": 1, "num_screened": 0}
+    blind = LearnedDynamics(point_dynamics.spec, model=ZeroMeanGP, fit_options=fit)
+    agent = make_agent(kind, dynamics=blind)
+    knows_nothing = pytest.raises(RuntimeError, match="knows nothing")
+    with knows_nothing if kind is MPCAgent else nullcontext():
+        agent.predict(np.ones(1, dtype=np.float32))
+    assert agent.learn(5).recorded_episodes().actions.unique().numel() > 1
+    assert agent.promised_reward is None
+    assert agent.model is not None
+    assert agent.learn(5).recorded_episodes().num_transitions == 10
+
+
+def test_the_first_episodes_can_be_random(make_agent, kind):
+    """Two episodes of five steps begin before the sixth step; the third is brought home."""
+    agent = make_agent(kind, random_steps=6).learn(15)
+    rewards = agent.recorded_episodes().rewards.reshape(3, 5).sum(1)
+    assert rewards[:2].max() < -2 < rewards[2]
+    for wrong, error in ((-1, ValueError), (1.5, TypeError)):
+        with pytest.raises(error, match="random_steps must be"):
+            make_agent(kind, random_steps=wrong)
+
+
+def test_episodes_are_played_to_their_end_and_numbered(make_agent, kind):
+    agent = make_agent(kind).learn(7)
+    episodes = agent.recorded_episodes()
+    assert episodes.episode.tolist() == 5 * [0] + 5 * [1]
+    assert episodes.begins.nonzero().flatten().tolist() == [0, 5]
+    assert torch.equal(episodes.states[1:5], episodes.next_states[:4])
+    newest = agent.recorded_episodes(newest=3)
+    assert torch.equal(newest.states, episodes.states[7:])
+
+
+class Farthest(Agent):
+    """A user's own: it takes the action from which the model moves farthest to the left."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        task, choices = self.model, torch.linspace(-2, 2, 9).double().unsqueeze(-1)
+        states = task.dynamics.spec.decode(torch.as_tensor(observation).double().reshape(1, -1))
+        found = task.dynamics.predict(states.expand(9, -1), choices).mean[:, 0]
+        return choices[found.argmin()].numpy(), state
+
+
+def test_an_agent_of_ones_own_needs_predict_alone(make_agent, tmp_path, point_env, point_task):
+    given = {"score_horizons": (), "seed": 0}
+    agent = Farthest(point_env(), make_agent(MPCAgent).task, **given).learn(10)
+    assert (agent.recorded_episodes().actions == -2).all()
+    assert agent.num_episodes == 2
+
+
+def test_callbacks_are_told_what_happens(make_agent, kind):
+    events = []
+    make_agent(kind).learn(10, lambda agent, event, values: events.append(event))
+    search = ["update"] * 12 + ["search"] if kind is PolicySearchAgent else []
+    episode = ["episode", "plan", *["step"] * 5, "fit", *search]
+    assert events == [*search, *episode, *episode, "done"]
+
+
+def test_progress_is_printed(make_agent, kind, capsys):
+    make_agent(kind).learn(5, [print_progress])
+    said = capsys.readouterr().out
+    assert "5 steps, fit: fit_seconds" in said
+    assert ("0 steps, update: number 12, value" in said) == (kind is PolicySearchAgent)
+
+
+def test_its_representation_says_what_it_is(make_agent, kind):
+    said = repr(make_agent(kind).learn(5))
+    assert said == f"{kind.__name__}(Point, LearnedDynamics, 1 episodes learnt, 5 steps)"
+
+
+def test_scores_of_each_new_episode_are_told(make_agent):
+    log = Log("fit")
+    make_agent(MPCAgent, score_horizons=(4, 2)).learn(10, log)
+    assert {*log[0]} == {"fit_seconds", "real_reward"}
+    known = {"nlpd", "coverage", "rmse/x", "overrides", "energy_2", "coverage_4"}
+    assert known <= {*log[1]}
+    assert all(np.isfinite([*each.values()]).all() for each in log)
+
+
+def test_noise_explores(make_agent):
+    noise = NormalActionNoise(np.zeros(1), 0.5 * np.ones(1))
+    plain, noisy = (make_agent(MPCAgent, action_noise=each).learn(5) for each in (None, noise))
+    assert not torch.equal(plain.recorded_episodes().actions, noisy.recorded_episodes().actions)
+    assert noisy.recorded_episodes().actions.abs().max() <= 2
+
+
+# Promises
+
+
+@pytest.mark.parametrize("first", [PLAN, WHOLE])
+def test_the_promise_is_of_the_episode_that_was_learnt(make_agent, first):
+    """Plans of a part of the episode promise nothing of it."""
+    promises = []
+    agent = make_agent(MPCAgent, first=first)
+    for _ in range(2):
+        plans, fits = Log("plan"), Log("fit")
+        agent.learn(5, [plans, fits])
+        promises.append(agent.promised_reward)
+        assert promises[-1] == plans[0].get("promised_reward") == fits[0].get("promised_reward")
+    assert (promises == [None, None]) == (first is PLAN)
+
+
+def test_a_searched_policy_promises_what_its_last_search_found(make_agent):
+    searches = Log("search")
+    agent = make_agent(PolicySearchAgent).learn(10, searches)
+    assert agent.promised_reward == searches[1]["reward"] != searches[2]["reward"]
+
+
+def test_promises_that_are_not_kept_are_told(make_agent, point_dynamics):
+    """The physics says that any action helps, but the system goes the other way."""
+    wrong = PhysicsDynamics(point_dynamics.spec, lambda X: X[:, :1] - 0.9 * X[:, 1:])
+    with pytest.warns(UserWarning, match="where the model promised .* do not trust"):
+        make_agent(PolicySearchAgent, dynamics=wrong).learn(5)
+
+
+def test_a_promise_that_data_made_against_the_physics_is_told(make_agent, crude_dynamics):
+    """After an episode the model knows that the point moves some ten times as far."""
+
+    class Boasts(PolicySearchAgent):
+        def promise(self, state):
+            return {"promised_reward": 10.0 * self.num_episodes}
+
+    known, log = crude_dynamics(lambda X: X[:, :1] + 0.05 * X[:, 1:]), Log("fit")
+    agent = make_agent(PolicySearchAgent, dynamics=known).learn(5)
+    agent.__class__ = Boasts
+    with pytest.warns(UserWarning, match="In 100% of its predictions data had overridden the phys"):
+        agent.learn(5, log)
+    assert log[0]["overrides"] == 1
+
+
+def test_promises_are_of_the_steps_that_are_made(make_agent):
+    """Each step costs 1 until the point is home, which ends the episode; no warning is given."""
+    agent = make_agent(
+        MPCAgent,
+        reward=lambda states, actions, next_states: -torch.ones(len(states)).double(),
+        reward_tolerance=None,
+        first=WHOLE,
+    )
+    agent.task = replace(agent.task, terminated=lambda states: states[:, 0].abs() < 0.5)
+    assert agent.learn(5).promised_reward == pytest.approx(-1)
+
+
+def test_plans_that_leave_the_bounds_are_told(make_agent, crude_dynamics):
+    bounds, log = torch.tensor([[-2.0], [2.0]], dtype=torch.float64), Log("plan")
+    away = crude_dynamics(lambda X: X[:, :1] + 3.0)
+    agent = make_agent(MPCAgent, dynamics=away, state_bounds=bounds)
+    with pytest.warns(UserWarning, match="leaves the bounds of the states in 100% of the fun"):
+        agent.learn(2, log)
+    assert log[0]["left_bounds"] == 1
+
+
+def test_policies_that_leave_the_bounds_are_told(make_agent):
+    bounds = torch.tensor([[0.99], [1.01]], dtype=torch.float64)
+    starts = {"initial_states": lambda n: torch.ones(n, 1).double()}
+    agent = make_agent(PolicySearchAgent, state_bounds=bounds, **starts)
+    with pytest.warns(UserWarning, match="left the bounds of the states in the model"):
+        agent.learn(5)
+
+
+# Errors lose nothing
+
+
+def test_an_error_loses_no_episode(make_agent, kind, point_reward):
+    agent = make_agent(kind, reward=lambda s, a, n: -3 * n[:, 0].square())
+    with pytest.raises(ValueError, match="is not the environment's"):
+        agent.learn(5)
+    agent.task = replace(agent.task, reward=point_reward)
+    assert agent.learn(5).task.dynamics.num_transitions == 10
+    assert agent.num_episodes == 2
+
+
+class Falls(gymnasium.Wrapper):
+    """A robot that has to be set up again after its eighth step."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 8:
+            raise OSError("the robot fell")
+        return super().step(action)
+
+
+def test_an_environment_that_fails_within_an_episode(make_agent, point_env):
+    agent = make_agent(MPCAgent, Falls(point_env()))
+    with pytest.raises(OSError, match="fell"):
+        agent.learn(10)
+    recorded = agent.learn(5).recorded_episodes()
+    assert agent.task.dynamics.num_transitions == recorded.num_transitions == 5 + 2 + 5
+    assert recorded.begins.nonzero().flatten().tolist() == [0, 5, 7]
+
+
+def test_a_step_that_failed_is_no_data_and_ends_its_episode(make_agent, point_env):
+    class Jams(gymnasium.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            self.steps += 1
+            failed = self.steps in (1, 8)
+            return *super().step(action)[:4], {"step_failed": failed}
+
+    recorded = make_agent(MPCAgent, Jams(point_env())).learn(13).recorded_episodes()
+    assert recorded.episode.tolist() == 5 * [1] + [2] + 5 * [3]
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+
+
+def test_a_callback_that_raises_lets_nothing_be_learnt_twice(make_agent, kind):
+    class Full:
+        def __call__(self, agent, event, values):
+            if event == "fit":
+                raise OSError("full")
+
+    agent = make_agent(kind)
+    with pytest.raises(OSError, match="full"):
+        agent.learn(5, Full())
+    assert agent.learn(5).task.dynamics.num_transitions == 10
+    assert agent.model is not None
+
+
+def test_a_physics_that_fails_for_a_while_loses_no_transition(make_agent, crude_dynamics):
+    broken = []
+
+    def physics(X):
+        if broken:
+            raise PhysicsError("the simulator's licence has expired")
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    def breaks(agent, event, values):
+        broken.extend([True] * (event == "step" and agent.num_timesteps == 10))
+
+    agent = make_agent(MPCAgent, dynamics=crude_dynamics(physics)).learn(5)
+    with pytest.raises(PhysicsError, match="licence"):
+        agent.learn(5, breaks)
+    broken.clear()
+    assert agent.task.dynamics.num_transitions == 5
+    assert agent.learn(5).task.dynamics.num_transitions == 15
+
+
+def test_other_dynamics_learn_all_that_there_is(make_agent, learnt_dynamics):
+    agent = make_agent(MPCAgent).learn(10)
+    agent.task = replace(agent.task, dynamics=learnt_dynamics())
+    assert agent.learn(5).task.dynamics.num_transitions == 15
+
+
+def test_observations_in_another_order_cost_no_episode():
+    order = [0, 3, 1, 2, 4]
+    env = CartPoleSwingUpEnv()
+    shuffled = TransformObservation(env, lambda seen: seen[order], env.observation_space)
+    dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+    task = Task(dynamics, cart_pole_reward, episode_length=25)
+    agent = MPCAgent(shuffled, task, PLAN, first=PLAN, seed=0)
+    with pytest.raises(ValueError, match="sine and cosine of the angle 'theta'"):
+        agent.learn(25)
+    assert agent.num_timesteps == 0
+
+
+def test_an_unknown_time_limit_is_refused(make_agent, point_env):
+    with pytest.raises(ValueError, match=r"no time limit .*give the task an episode_length"):
+        make_agent(MPCAgent, point_env().unwrapped, episode_length=None).learn(5)
+    assert make_agent(MPCAgent, episode_length=None).learn(5).num_episodes == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "error", "message"),
+    [
+        (PolicySearchAgent, {"search": 3}, TypeError, r"PolicySearch\(...\); found 3"),
+        (PolicySearchAgent, {"policy": "mlp"}, TypeError, "make a BoundedPolicy .* found 'mlp'"),
+        (PolicySearchAgent, {"policy": lambda *_: 3}, TypeError, "BoundedPolicy .* found 3"),
+        (MPCAgent, {"first": 3}, TypeError, r"first must be a Planner\(...\); found 3"),
+        (MPCAgent, {"reward_tolerance": "no"}, TypeError, "reward_tolerance must be a number"),
+        (MPCAgent, {"score_horizons": (0,)}, ValueError, "horizon"),
+        (MPCAgent, {"learning_rate": 1.0}, TypeError, "learning_rate"),
+    ],
+)
+def test_bad_arguments_are_refused(make_agent, kind, given, error, message):
+    with pytest.raises(error, match=message):
+        make_agent(kind, **given)
+
+
+@pytest.mark.parametrize("task", [None, 3])
+def test_without_a_task_there_is_no_agent(point_env, task):
+    with pytest.raises(TypeError, match="MPCAgent needs a task to learn"):
+        MPCAgent(point_env(), task)
+
+
+def test_other_spaces_are_refused(make_agent, point_env):
+    for name, space in (
+        ("observation_space", gymnasium.spaces.Box(-1, 1, (2,))),
+        ("action_space", gymnasium.spaces.Discrete(2)),
+    ):
+        env = point_env()
+        setattr(env, name, space)
+        with pytest.raises(ValueError, match=f"the {name.partition('_')[0]} has 1 entries"):
+            make_agent(MPCAgent, env)
+
+
+# One kind of agent
+
+
+def test_changed_options_of_the_planner_serve_at_once(make_agent):
+    agent = make_agent(MPCAgent).learn(5)
+    agent.tolerance = None
+    assert isinstance(agent.mpc, MPC)
+    assert agent.mpc.tolerance is None
+
+
+def test_what_is_recorded_is_read_once_an_episode(make_agent, monkeypatch):
+    """To plan a step does not go through all that was recorded before it."""
+    read = []
+    whole = MPCAgent.recorded_episodes
+    monkeypatch.setattr(
+        MPCAgent, "recorded_episodes", lambda self, *given: read.append(1) or whole(self, *given)
+    )
+    agent = make_agent(MPCAgent).learn(10)
+    assert len(read) <= 5  # before the first, and two of each
+    for _ in range(3):
+        agent.predict(np.array([0.5]))
+    assert len(read) <= 5
+
+
+def test_a_policy_is_made_as_told(make_agent):
+    agent = make_agent(PolicySearchAgent, policy=partial(linear_policy, first_actions=[1.5]))
+    assert agent.policy(torch.zeros(1, 1).double()).item() == pytest.approx(1.5, abs=0.05)
+
+
+@pytest.mark.slow
+def test_the_cart_pole_swings_up_in_two_trials():
+    env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+    f_p = random_cart_pole_physics(3)
+    task = Task(LearnedDynamics(CART_POLE_SPEC, f_p), cart_pole_reward)
+    agent = MPCAgent(env, task, seed=3).learn(50)
+    assert agent.recorded_episodes(newest=25).rewards.mean() > -0.45

@@ -1,0 +1,398 @@
+"""Runs of agents that are interrupted, and go on as if they had not been; files of checkpoints."""
+
+import io
+import os
+import pickle
+import random
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+import zipfile
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from filelock import FileLock
+
+from gpadjust.control import EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
+from gpadjust.control.checkpoint import RandomState
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
+from tests.point import assert_equal
+
+pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
+TOTAL = 15  # three episodes of the point
+
+
+class PowerCut(Exception):  # noqa: N818
+    pass
+
+
+def cut_at(step):
+    """A callback that interrupts the run."""
+
+    def callback(agent, event, values):
+        if event == "step" and agent.num_timesteps == step:
+            raise PowerCut
+
+    return callback
+
+
+def scramble():
+    """Draws from all generators, as other code between two runs may."""
+    torch.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002
+    random.seed(99)
+
+
+def numbers(agent):
+    """All that an agent has learnt, and what its generators draw next."""
+    episodes = agent.recorded_episodes()
+    return {
+        "episodes": [episodes.states, episodes.actions, episodes.rewards, episodes.episode],
+        "dynamics": agent.task.dynamics.state_dict(),
+        "policy": agent.policy.state_dict() if isinstance(agent, PolicySearchAgent) else None,
+        "counts": [agent.num_timesteps, agent.num_episodes, agent.promised_reward, agent.notes],
+        "random": RandomState.capture().as_arrays(),
+    }
+
+
+@pytest.fixture
+def again(make_agent, point_env):
+    """Makes environment and task of a run once more."""
+    return lambda kind=MPCAgent, **given: (point_env(), make_agent(kind, **given).task)
+
+
+@pytest.mark.parametrize("steps", [(7,), pytest.param((3, 11, 12), marks=pytest.mark.slow)])
+def test_an_interrupted_run_ends_as_another(make_agent, kind, steps, again, tmp_path):
+    path = tmp_path / "run.ckpt"
+    whole = numbers(make_agent(kind).learn(TOTAL))
+    agent = make_agent(kind)
+    for step in steps:
+        with pytest.raises(PowerCut):
+            agent.learn(TOTAL - agent.num_timesteps, [EpisodeCheckpoint(path), cut_at(step)])
+        given = again(kind)
+        scramble()
+        agent = resume(path, *given)
+        assert type(agent) is kind
+        assert agent.num_timesteps == step // 5 * 5
+        scramble()
+    agent.learn(TOTAL - agent.num_timesteps, EpisodeCheckpoint(path))
+    assert_equal(numbers(agent), whole)
+    given = again(kind)
+    last = numbers(resume(path, *given))
+    for part in ("episodes", "dynamics", "policy", "counts"):
+        assert_equal(last[part], whole[part])
+
+
+def test_checkpoints_come_every_so_many_episodes(make_agent, tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(
+        EpisodeCheckpoint, "_write", lambda self, agent: saved.append(agent.num_timesteps)
+    )
+    make_agent(MPCAgent).learn(25, EpisodeCheckpoint(tmp_path / "run.ckpt", every=2))
+    assert saved == [0, 10, 20, 25]
+    with pytest.raises(ValueError, match="every must be at least 1; found 0"):
+        EpisodeCheckpoint(tmp_path / "run.ckpt", every=0)
+
+
+SCRIPT = """
+    import hashlib, sys
+    from pathlib import Path
+
+    import gymnasium, torch
+
+    torch.set_num_threads(1)
+    from gpadjust.control import CrossEntropy, EpisodeCheckpoint, MPCAgent, Planner, Task, resume
+    from gpadjust.dynamics import LearnedDynamics
+    from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+
+    path = Path(sys.argv[1])
+    env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
+    task = Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward)
+    if path.exists():
+        agent = resume(path, env, task)
+    else:
+        plan = Planner(search=CrossEntropy(1), horizon=4, num_random=16)
+        agent = MPCAgent(env, task, plan, first=plan, score_horizons=(), seed=0)
+    tells = lambda agent, event, values: event == "episode" and print("written", flush=True)
+    agent.learn(100 - agent.num_timesteps, [EpisodeCheckpoint(path), tells])
+    print(hashlib.sha256(agent.recorded_episodes().states.numpy().tobytes()).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_at_random_moments(tmp_path):
+    script = tmp_path / "run.py"
+    script.write_text(textwrap.dedent(SCRIPT))
+
+    def start(name):
+        command = [sys.executable, str(script), str(tmp_path / name)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+
+    def learnt(process):
+        return process.communicate()[0].splitlines()[-1]
+
+    whole = learnt(start("whole.ckpt"))
+    moments = random.Random(0)
+    for _ in range(3):
+        process = start("run.ckpt")
+        assert process.stdout.readline() == "written\n"
+        time.sleep(moments.uniform(0.0, 0.4))
+        process.kill()
+        process.communicate()
+    assert learnt(start("run.ckpt")) == whole
+
+
+# Files
+
+
+def test_a_failure_while_writing_leaves_the_old_file_and_no_litter(
+    make_agent, tmp_path, monkeypatch
+):
+    path = tmp_path / "run.ckpt"
+    agent = make_agent(MPCAgent).learn(5)
+    agent.save(path)
+    before = path.read_bytes()
+
+    def full_disk(*_):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        agent.save(path)
+    assert path.read_bytes() == before
+    assert {*tmp_path.iterdir()} == {path, path.with_name("run.ckpt.lock")}
+
+
+def test_what_a_killed_writer_left_does_not_pile_up(make_agent, tmp_path, monkeypatch):
+    path = tmp_path / "run.ckpt"
+    agent = make_agent(MPCAgent).learn(5)
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", lambda *_: None)  # it dies before
+        agent.save(path)
+        agent.save(path)
+    assert len([*tmp_path.iterdir()]) == 2  # with the lock
+    agent.save(path)
+    assert {*tmp_path.iterdir()} == {path, path.with_name("run.ckpt.lock")}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="folders cannot be synchronised there")
+def test_the_name_of_a_checkpoint_is_on_the_disk(make_agent, tmp_path, monkeypatch):
+    """After the file itself, its folder is synchronised, or a power cut could lose the new name."""
+    synced, agent = [], make_agent(MPCAgent).learn(5)
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
+    agent.save(tmp_path / "run.ckpt")
+    assert synced == [(tmp_path / "run.ckpt").stat().st_ino, tmp_path.stat().st_ino]
+
+
+class OwnAgent(MPCAgent):
+    """An agent that the library does not know."""
+
+
+def test_an_agent_of_ones_own_is_resumed_by_its_name(make_agent, again, tmp_path):
+    path = tmp_path / "new" / "run.ckpt"  # the folder is made
+    make_agent(OwnAgent, each_step=None, first=None).save(path)
+    assert type(resume(path, *again())) is OwnAgent
+
+
+def test_other_files_are_refused(make_agent, again, tmp_path):
+    whole, cut, other = (tmp_path / name for name in ("whole", "cut", "other"))
+    make_agent(MPCAgent).learn(5).save(whole)
+    cut.write_bytes(whole.read_bytes()[:-2000])
+    other.write_bytes(pickle.dumps([1]))
+    flipped = bytearray(whole.read_bytes())
+    flipped[len(flipped) // 2] ^= 0xFF
+    (tmp_path / "flipped").write_bytes(flipped)
+    with zipfile.ZipFile(whole) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    for missing in parts:
+        with zipfile.ZipFile(tmp_path / missing, "w") as archive:
+            for name in {*parts} - {missing}:
+                archive.writestr(name, parts[name])
+    for path in (cut, other, tmp_path / "flipped", *(tmp_path / name for name in parts)):
+        with pytest.raises(ValueError, match=f"{path.name} is not a checkpoint of"):
+            resume(path, *again())
+    with pytest.raises(FileNotFoundError):
+        resume(tmp_path / "none", *again())
+
+
+def test_an_environment_that_cannot_be_pickled_is_reset(make_agent, point_env, again, tmp_path):
+    def robot():
+        env = point_env()
+        env.unwrapped.lock = threading.Lock()
+        return env
+
+    path = tmp_path / "run.ckpt"
+    with (
+        pytest.warns(UserWarning, match="environment cannot be saved .*pickle"),
+        pytest.raises(PowerCut),
+    ):
+        make_agent(MPCAgent, robot()).learn(TOTAL, [EpisodeCheckpoint(path), cut_at(13)])
+    agent = resume(path, robot(), again()[1])
+    assert agent.num_timesteps == 10
+    assert agent.learn(5).recorded_episodes().num_transitions == TOTAL
+
+
+class Shouting(gymnasium.Wrapper):
+    """Another wrapper."""
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
+    make_agent, again, tmp_path, monkeypatch
+):
+    path = tmp_path / "run.ckpt"
+    make_agent(MPCAgent).learn(5).save(path)
+
+    def unpickled(*_, **__):
+        raise AssertionError("unpickled")
+
+    for name in ("pickle.load", "pickle.loads", "cloudpickle.load", "cloudpickle.loads"):
+        monkeypatch.setattr(name, unpickled)
+    env, task = again()
+    wide = again()[0]
+    wide.action_space = gymnasium.spaces.Box(-3, 3, (1,))
+    own = "of another environment: "
+    for given, message in [
+        ((Shouting(env), task), f"{own}wrappers is .*TimeLimit of Point .*, Shouting of"),
+        ((wide, task), rf"{own}action_space is Box\(-2"),
+        ((env, task, PolicySearchAgent), "algorithm is MPCAgent .*, PolicySearchAgent here"),
+        ((env, again(episode_length=9)[1]), "of another task: episode_length is 5 .*, 9 here"),
+        ((env, again(initial_states=None)[1]), "initial_states is True .*, False here"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            resume(path, *given)
+    with pytest.raises(TypeError, match="task must be a Task"):
+        resume(path, env, task.dynamics)
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_another_physics_is_refused(make_agent, point_dynamics, again, learns, tmp_path):
+    kind = LearnedDynamics if learns else PhysicsDynamics
+
+    def known(slope):
+        return {"dynamics": kind(point_dynamics.spec, lambda X: X[:, :1] + slope * X[:, 1:])}
+
+    make_agent(MPCAgent, **known(0.4)).learn(5).save(tmp_path / "run.ckpt")
+    with pytest.raises(RuntimeError, match="physics"):
+        resume(tmp_path / "run.ckpt", *again(**known(0.41)))
+
+
+@pytest.mark.parametrize("part", ["steps.npz", "random.npz", "dynamics.pt"])
+def test_numbers_are_read_without_pickle(make_agent, again, tmp_path, part):
+    """A planted pickle in the place of arrays does not run."""
+    path = tmp_path / "run.ckpt"
+    make_agent(MPCAgent).learn(5).save(path)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    planted = io.BytesIO()
+    if part.endswith(".npz"):
+        np.savez(planted, episode=np.array([Planted()], dtype=object))
+    else:
+        torch.save(Planted(), planted)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**parts, part: planted.getvalue()}.items():
+            archive.writestr(name, content)
+    with pytest.raises((ValueError, pickle.UnpicklingError), match=r"allow_pickle=False|weights"):
+        resume(path, *again())
+    assert not Planted.ran
+
+
+class Planted:
+    ran = False
+
+    def __reduce__(self):
+        return setattr, (Planted, "ran", True)
+
+
+OTHER = """
+    import sys
+
+    from filelock import FileLock
+
+    lock = FileLock(sys.argv[1] + ".lock").acquire()
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_two_processes_do_not_write_one_file(make_agent, tmp_path):
+    path = tmp_path / "run.ckpt"
+    command = [sys.executable, "-c", textwrap.dedent(OTHER), str(path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as other:
+        assert other.stdout.readline() == "locked\n"
+        agent = make_agent(MPCAgent)
+        for write in (lambda: agent.learn(5, EpisodeCheckpoint(path)), lambda: agent.save(path)):
+            with pytest.raises(RuntimeError, match=r"Another run writes .*run.ckpt"):
+                write()
+        assert agent.num_timesteps == 0
+        other.kill()  # which releases it
+    agent.learn(5, EpisodeCheckpoint(path))
+    assert path.exists()
+
+
+def test_a_lock_is_released_after_an_error_and_held_by_one_run(make_agent, tmp_path):
+    path = tmp_path / "run.ckpt"
+    checkpoint = EpisodeCheckpoint(path)
+    with pytest.raises(PowerCut):
+        make_agent(MPCAgent).learn(10, [checkpoint, cut_at(3)])
+    lock = FileLock(f"{path}.lock")
+    lock.acquire(blocking=False)
+    lock.release()
+    other = make_agent(MPCAgent, seed=1)
+
+    def writes_too(agent, event, values):
+        with pytest.raises(RuntimeError, match="Another run writes"):
+            other.save(path)
+
+    make_agent(MPCAgent).learn(5, [checkpoint, writes_too])
+    lock.acquire(blocking=False)
+    lock.release()
+
+
+def test_a_refused_call_does_not_spend_the_generators(make_agent, again, tmp_path):
+    path = tmp_path / "run.ckpt"
+    whole = numbers(make_agent(MPCAgent).learn(TOTAL))
+    with pytest.raises(PowerCut):
+        make_agent(MPCAgent).learn(TOTAL, [EpisodeCheckpoint(path), cut_at(13)])
+    agent = resume(path, *again())
+    with FileLock(f"{path}.lock"), pytest.raises(RuntimeError, match="Another run writes"):
+        agent.learn(5, EpisodeCheckpoint(path))
+    scramble()
+    assert_equal(numbers(agent.learn(5, EpisodeCheckpoint(path))), whole)
+
+
+def test_what_was_resumed_is_saved_again_as_it_was(make_agent, again, tmp_path):
+    first, second = tmp_path / "first.ckpt", tmp_path / "second.ckpt"
+    agent = make_agent(MPCAgent)
+    agent.notes["costs"] = [1.0]
+    agent.learn(5).save(first)
+    expected = numbers(agent.learn(5))
+    given = again()
+    scramble()
+    resume(first, *given).save(second)
+    given = again()
+    assert_equal(numbers(resume(second, *given).learn(5)), expected)
+    assert expected["counts"][-1] == {"costs": [1.0]}
+
+
+def test_it_is_for_agents_with_a_model():
+    with pytest.raises(TypeError, match="for learners with a model"):
+        EpisodeCheckpoint("run.ckpt")({}, {})
+
+
+def draw():
+    return random.random(), np.random.random(), torch.rand(1).item()  # noqa: NPY002
+
+
+def test_draws_are_repeated_after_restoring():
+    state = pickle.loads(pickle.dumps(RandomState.capture()))
+    first, second = draw(), draw()
+    assert first != second
+    state.restore()
+    assert (draw(), draw()) == (first, second)

@@ -1,0 +1,119 @@
+"""A point on a line, and what learns to move it in moments; its fixtures are imported by rooms."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+
+POINT_SPEC = StateSpec(["x"], ["v"])
+QUICK = {"num_starts": 1, "num_screened": 0}
+FEW_SAMPLES = {**QUICK, "num_samples": 3, "num_draws": 16}
+
+
+class Point(gymnasium.Env):
+    """A point on a line, moved by half the action and some noise; beyond `end` it is over."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+
+    def __init__(self, end=None, max_action=2.0):
+        self.end = end
+        self.action_space = gymnasium.spaces.Box(-max_action, max_action, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(0.5, 1.5, 1).astype(np.float32)
+        return self.x, {}
+
+    def step(self, action):
+        noise = 0.02 * self.np_random.normal(size=1)
+        self.x = (self.x + 0.5 * action + noise).astype(np.float32)
+        over = self.end is not None and bool(self.x[0] > self.end)
+        return self.x, -(float(self.x[0]) ** 2), over, False, {}
+
+
+@pytest.fixture
+def point_env():
+    """Makes the point's environment, of 5 steps: `point_env(end=None)`."""
+
+    def make(episode_length=5, **options):
+        return gymnasium.wrappers.TimeLimit(Point(**options), episode_length)
+
+    return make
+
+
+@pytest.fixture
+def point_dynamics():
+    """The point, as it is."""
+    return PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+
+
+@pytest.fixture
+def crude_dynamics(point_dynamics):
+    """Makes dynamics that learn the point from a physics, by a quick search."""
+    quick = {"method": "map", **QUICK}
+    return lambda physics: LearnedDynamics(point_dynamics.spec, physics, fit_options=quick)
+
+
+@pytest.fixture
+def learnt_dynamics(crude_dynamics):
+    """Makes dynamics that learn the point from a physics that errs."""
+    return lambda: crude_dynamics(lambda X: X[:, :1] + 0.4 * X[:, 1:])
+
+
+@pytest.fixture
+def sampled_dynamics(point_dynamics):
+    """As `learnt_dynamics`, by full Bayes, with few samples."""
+    return lambda: LearnedDynamics(
+        point_dynamics.spec, lambda X: X[:, :1] + 0.4 * X[:, 1:], fit_options=FEW_SAMPLES
+    )
+
+
+@pytest.fixture
+def point_reward():
+    return lambda states, actions, next_states: -next_states[:, 0].square()
+
+
+@pytest.fixture
+def point_task(point_dynamics, point_reward):
+    """Makes the point's task; every part can be given."""
+
+    def make(**parts):
+        known = {"dynamics": point_dynamics, "reward": point_reward, "episode_length": 5}
+        return Task(**{**known, **parts})
+
+    return make
+
+
+def near_one(n):
+    """Starts of the point."""
+    return 0.5 + torch.rand(n, 1, dtype=torch.float64)
+
+
+def flat(name, value, found):
+    """All numbers of nested values, by name."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            flat(f"{name}/{key}", part, found)
+    elif isinstance(value, (list, tuple)):
+        for key, part in enumerate(value):
+            flat(f"{name}/{key}", part, found)
+    elif isinstance(value, (torch.Tensor, np.ndarray)):
+        found[name] = torch.as_tensor(value).detach().clone()
+    else:
+        found[name] = value
+
+
+def assert_equal(one, other):
+    """Asserts that the numbers of two nested values are the same, bit by bit."""
+    found, expected = {}, {}
+    flat("", one, found)
+    flat("", other, expected)
+    assert found.keys() == expected.keys()
+    for name, value in found.items():
+        if torch.is_tensor(value):
+            assert torch.equal(value, expected[name]), name
+        else:
+            assert value == expected[name], name
