@@ -18,8 +18,19 @@ from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
-    *("checks", "physics", "states", "files", "envs", "gp", "models", "inference"),
-    *("validation", "report", "sklearn", "ax", "active", "dynamics", "records", "control", "rl"),
+    *("checks", "physics", "states", "files", "gp", "models", "inference"),
+    *(
+        "validation",
+        "report",
+        "sklearn",
+        "ax",
+        "active",
+        "dynamics",
+        "records",
+        "control",
+        "systems",
+    ),
+    "rl",
 ]
 
 

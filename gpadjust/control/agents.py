@@ -47,10 +47,11 @@ class MPCAgent(Agent):
         >>> import gymnasium
         >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner, Task
         >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
         >>> task = Task(
-        ...     LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward
+        ...     LearnedDynamics(CART_POLE_SPEC, cart_pole().physics), cart_pole_reward
         ... )
         >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(env, task, quick, first=quick, seed=0)
@@ -154,10 +155,11 @@ class PolicySearchAgent(Agent):
         >>> import torch
         >>> from gpadjust.control import PolicySearch, PolicySearchAgent, Task, linear_policy
         >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
-        >>> from gpadjust.envs import cart_pole_start
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+        >>> from gpadjust.systems.cart_pole import cart_pole_start
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole().physics)
         >>> bounds = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
         >>> task = Task(
         ...     dynamics, cart_pole_reward, initial_states=cart_pole_start, state_bounds=bounds

@@ -593,10 +593,11 @@ class DynaSAC(Dyna, SAC):
         >>> import gymnasium
         >>> from gpadjust.control import Task
         >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> from gpadjust.rl import DynaOptions, DynaSAC
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole().physics)
         >>> task = Task(dynamics, cart_pole_reward)
         >>> agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), seed=0)
         >>> agent.learn(total_timesteps=25).num_episodes
@@ -616,10 +617,11 @@ class DynaTD3(Dyna, TD3):
         >>> from stable_baselines3.common.noise import NormalActionNoise
         >>> from gpadjust.control import Task
         >>> from gpadjust.dynamics import PhysicsDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> from gpadjust.rl import DynaOptions, DynaTD3
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, cart_pole().physics)
         >>> task = Task(dynamics, cart_pole_reward)
         >>> noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
         >>> options = DynaOptions(model_episodes=2)

@@ -7,8 +7,8 @@ from paper.planning.systems import FittedPhysics
 
 from gpadjust import CKA, CalibratedPhysics, ODEPhysics, PhysicsMeanGP, Unknown
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.envs import CART_POLE_SPEC, CartPoleSwingUpEnv
-from gpadjust.envs.cart_pole.system import CartPoleEquation
+from gpadjust.systems import CartPoleSwingUpEnv
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, CartPoleEquation
 
 UNKNOWNS = {
     "cart_mass": Unknown(0.6, factor=1.5, unit="kg"),

@@ -122,7 +122,7 @@ FAULTS = (
         "The parameters of a physics that learns stay where they were.",
     ),
     Fault(
-        "gpadjust/envs/remember_action.py",
+        "gpadjust/systems/wrappers.py",
         "taken = np.clip(action, self._taken.low, self._taken.high)",
         "taken = action",
         "The action that is remembered is not the one that was taken.",

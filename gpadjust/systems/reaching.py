@@ -1,0 +1,130 @@
+"""Reaching with the planar arm: its states, reward, starts and targets."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import check_columns, checked_whole
+from gpadjust.states import StateSpec
+from gpadjust.systems.torque_arm import REAL_ARM
+
+START_MEAN = (math.radians(35), math.radians(65))
+START_STD = math.radians(5)
+MAX_TARGET = math.radians(100)
+
+ARM_SPEC = StateSpec(
+    ["theta_s", "theta_e", "theta_s_dot", "theta_e_dot", "target_s", "target_e"],
+    actions=["a1", "a2", "a3", "a4"],
+    exogenous=["target_s", "target_e"],
+)
+"""The state of the reaching arm, in rad and s; the targets, which stay, are for the policy only.
+
+Angles are not encoded: joint limits keep them from going round.
+"""
+
+ARM_MEMORY_SPEC = StateSpec(
+    [*ARM_SPEC.states, "a1_last", "a2_last", "a3_last", "a4_last"],
+    actions=ARM_SPEC.actions,
+    exogenous=ARM_SPEC.exogenous,
+    previous={f"{name}_last": name for name in ARM_SPEC.actions},
+)
+"""The state of the reaching arm with the previous action, of ``RememberAction(MuscleArmEnv())``.
+
+Muscles follow their excitations with a delay, so that the next state depends on the previous ones.
+"""
+
+
+def angle_error(states: Tensor) -> Tensor:
+    """The root mean square error of the angles, ``...`` in rad, of states ``... x 6`` or more."""
+    check_columns("states", states, 6, more=True)
+    error = states[..., :2] - states[..., 4:6]
+    return error.square().mean(-1).sqrt()
+
+
+def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    r"""The reward of transitions: minus the root mean square error of the angles, in rad.
+
+    .. math:: r = -\sqrt{\big((\theta_s - \theta_s^*)^2 + (\theta_e - \theta_e^*)^2\big) / 2}
+
+    Args:
+        states: ``... x 6``; not used.
+        actions: ``... x 4``; not used.
+        next_states: ``... x 6`` (or more, which is not used), the states that were reached.
+
+    Returns:
+        ``...``.
+
+    Example:
+        >>> reached = torch.tensor([0.3, 1.4, 0.0, 0.0, 0.0, 1.0])
+        >>> arm_reward(torch.zeros(6), torch.zeros(4), reached)
+        tensor(-0.3536)
+    """
+    return -angle_error(next_states)
+
+
+def arm_start(n: int, spec: StateSpec = ARM_SPEC) -> Tensor:
+    r"""Draw ``n x 6`` start states, at rest, and targets from PyTorch's generator.
+
+    The angles are from :math:`\mathcal{N}((35°, 65°), (5°)^2 I)`, each angle of the targets from
+    :math:`\mathcal{U}(0°, 100°)`. Previous actions of a spec that has them are zero.
+    """
+    checked_whole("n", n, 0)
+    angles = torch.tensor(START_MEAN, dtype=torch.float64)
+    angles = angles + START_STD * torch.randn(n, 2, dtype=torch.float64)
+    targets = MAX_TARGET * torch.rand(n, 2, dtype=torch.float64)
+    before = angles.new_zeros(n, len(spec.previous))
+    return torch.cat([angles, torch.zeros_like(angles), targets, before], dim=-1)
+
+
+def arm_targets() -> Tensor:
+    """The ``121 x 2`` targets, in rad, at which policies are compared: 0, 10, ..., 100° each.
+
+    Example:
+        >>> arm_targets()[[0, 1, 120]].rad2deg().round()
+        tensor([[  0.,   0.],
+                [  0.,  10.],
+                [100., 100.]], dtype=torch.float64)
+    """
+    grid = torch.arange(0, 101, 10, dtype=torch.float64).deg2rad()
+    return torch.cartesian_prod(grid, grid)
+
+
+def hand_position(angles: Tensor) -> Tensor:
+    """Where the hand is, seen from the shoulder.
+
+    Args:
+        angles: ``... x 2``, of shoulder and elbow, in rad.
+
+    Returns:
+        ``... x 2``, in m, the upper arm along the first axis at 0°.
+
+    Example:
+        >>> hand_position(torch.tensor([0.0, torch.pi / 2], dtype=torch.float64))
+        tensor([0.3090, 0.3330], dtype=torch.float64)
+    """
+    check_columns("angles", angles, 2)
+    upper, fore = REAL_ARM.lengths
+    shoulder, both = angles[..., 0], angles[..., 0] + angles[..., 1]
+    across = upper * shoulder.cos() + fore * both.cos()
+    return torch.stack([across, upper * shoulder.sin() + fore * both.sin()], dim=-1)
+
+
+def hand_distance_cm(states: Tensor) -> Tensor:
+    """How far the hand is from where it would be at the target angles, in cm.
+
+    Args:
+        states: ``... x 6``.
+
+    Returns:
+        ``...``. The score of episodes is the root mean square of it over steps and targets.
+
+    Example:
+        >>> hand_distance_cm(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi]))
+        tensor(66.6000)
+    """
+    check_columns("states", states, 6, more=True)
+    gap = hand_position(states[..., :2]) - hand_position(states[..., 4:6])
+    return 100 * gap.square().sum(-1).sqrt()

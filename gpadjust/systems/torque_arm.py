@@ -1,0 +1,192 @@
+"""A planar arm of two links: its equation of motion and its physics, driven by torques."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import finite_array
+from gpadjust.physics import ODEPhysics, Unknown
+
+ARM_TIME_STEP = 0.2
+SUBSTEPS = 40  # of 5 ms: the damping of the light forearm makes the equation stiff
+
+
+@dataclass(frozen=True)
+class ArmEquation:
+    r"""The equation of motion of a planar arm of two links, driven by torques at its joints.
+
+    The plane is level, so there is no gravity. With the angles :math:`q = (\theta_s, \theta_e)` of
+    shoulder and elbow (the elbow's relative to the upper arm; both grow with flexion), the masses
+    :math:`m_i`, lengths :math:`l_i`, distances :math:`c_i` of the centres of mass from the proximal
+    joints and moments of inertia :math:`I_i` about those centres,
+
+    .. math::
+        M(q)\, \ddot{q} &= \tau - d\, \dot{q} - b \sin\theta_e
+            \begin{pmatrix} -2 \dot\theta_s \dot\theta_e - \dot\theta_e^2 \\ \dot\theta_s^2
+            \end{pmatrix}, \qquad
+        M = \begin{pmatrix} I_1 + m_1 c_1^2 + m_2 l_1^2 + j + 2 b \cos\theta_e
+            & j + b \cos\theta_e \\ j + b \cos\theta_e & j \end{pmatrix}, \\
+        j &= I_2 + m_2 c_2^2, \qquad b = m_2 l_1 c_2, \qquad
+        \tau = \begin{pmatrix} g_s (a_3 - a_4) \\ g_e (a_1 - a_2) \end{pmatrix}
+
+    (Spong, Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, sec. 7.3). The actions
+    are those of the muscle arm: flexor and extensor of the elbow, then of the shoulder.
+
+    Args:
+        masses: The masses of upper arm and forearm with hand, in kg.
+        lengths: Their lengths, in m.
+        centres: The distances of their centres of mass from shoulder and elbow, in m.
+        inertias: Their moments of inertia about the centres of mass, in kg m².
+        damping: The damping :math:`d` of each joint, in N m s/rad.
+        gains: The torques :math:`(g_s, g_e)` of a full action, in N m.
+
+    Raises:
+        ValueError: If one of them is not finite, a mass, length or inertia is not positive, or
+            another one is negative; or if a pair is none.
+
+    Example:
+        >>> equation = ArmEquation(gains=(8.0, 4.0))
+        >>> rest = torch.zeros(1, 4, dtype=torch.float64)
+        >>> equation(rest, torch.tensor([[0.0, 0.0, 1.0, 0.0]], dtype=torch.float64))
+        tensor([[   0.0000,    0.0000,   84.8011, -193.4000]], dtype=torch.float64)
+    """
+
+    masses: tuple[float, float] = (1.82, 1.43)
+    lengths: tuple[float, float] = (0.309, 0.333)
+    centres: tuple[float, float] = (0.135, 0.165)
+    inertias: tuple[float, float] = (0.018, 0.018)
+    damping: float = 0.5
+    gains: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        for entry in fields(self):
+            given, single = getattr(self, entry.name), entry.name == "damping"
+            numbers = finite_array(given, () if single else (2,))
+            if numbers is None:
+                expected = "a finite number" if single else "a pair of finite numbers"
+                raise ValueError(
+                    f"{entry.name} must be {expected}, of the two links or joints; found {given!r}."
+                )
+            positive = entry.name in ("masses", "lengths", "inertias")
+            if not (numbers > 0 if positive else numbers >= 0).all():
+                least = "positive" if positive else "not negative"
+                raise ValueError(f"{entry.name} must be finite and {least}; found {given!r}.")
+            # Hashable, also when given as a list.
+            value = float(numbers) if single else tuple(numbers.tolist())
+            object.__setattr__(self, entry.name, value)
+
+    def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
+        """The time derivative of the state.
+
+        Args:
+            state: ``... x 4``: angles and angular velocities of shoulder and elbow, in rad and s.
+            action: ``... x 4``, of which 1 asks for the full torque.
+            p: Other values, ``...``, of ``forearm`` (a factor on its mass and inertia, else 1),
+                ``damping``, ``shoulder_gain`` and ``elbow_gain``.
+
+        Returns:
+            ``... x 4``.
+
+        Raises:
+            ValueError: If the last dimensions are not 4 and 4.
+        """
+        if state.shape[-1] != 4 or action.shape[-1] != 4:
+            raise ValueError(
+                "Expected states ... x 4 (theta_s, theta_e, theta_s_dot, theta_e_dot) and actions "
+                f"... x 4 (a1, a2, a3, a4), got {tuple(state.shape)} and {tuple(action.shape)}."
+            )
+        _, elbow, v_s, v_e = state.unbind(-1)
+        a1, a2, a3, a4 = action.unbind(-1)
+        own = {"damping": self.damping, "shoulder_gain": self.gains[0], "elbow_gain": self.gains[1]}
+        given = {"forearm": 1.0, **own, **(p or {})}
+        damping, fore = given["damping"], given["forearm"]
+        m_ss, m_se, m_ee = self._mass_matrix(elbow, fore)
+        swing = self._coupling * fore * elbow.sin()
+        load_s = given["shoulder_gain"] * (a3 - a4) - damping * v_s + swing * (2 * v_s + v_e) * v_e
+        load_e = given["elbow_gain"] * (a1 - a2) - damping * v_e - swing * v_s.square()
+        determinant = m_ss * m_ee - m_se.square()
+        shoulder_ddot = (m_ee * load_s - m_se * load_e) / determinant
+        elbow_ddot = (m_ss * load_e - m_se * load_s) / determinant
+        return torch.stack([v_s, v_e, shoulder_ddot, elbow_ddot], dim=-1)
+
+    def energy(self, state: Tensor) -> Tensor:
+        """The kinetic energy in J, ``...``, of states ``... x 4``; there is no other."""
+        _, elbow, v_s, v_e = state.unbind(-1)
+        m_ss, m_se, m_ee = self._mass_matrix(elbow)
+        return (m_ss * v_s.square() + m_ee * v_e.square()) / 2 + m_se * v_s * v_e
+
+    @property
+    def _coupling(self) -> float:
+        return self.masses[1] * self.lengths[0] * self.centres[1]
+
+    def _mass_matrix(self, elbow: Tensor, fore: Any = 1.0) -> tuple[Tensor, Tensor, Any]:
+        mass = fore * self.masses[1]
+        m_ee = fore * self.inertias[1] + mass * self.centres[1] ** 2
+        upper = self.inertias[0] + self.masses[0] * self.centres[0] ** 2
+        turn = self._coupling * fore * elbow.cos()
+        m_ss = upper + mass * self.lengths[0] ** 2 + m_ee + 2 * turn
+        return m_ss, m_ee + turn, m_ee
+
+
+REAL_ARM = ArmEquation()
+"""The links of the muscle arm; segments after Nijhof and Kouwenhoven (2000). No torques."""
+
+
+def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
+    """The arm as someone may believe it to be, who has no model of its muscles.
+
+    Its links are a tenth too heavy, its joints damped twice as much as the real ones; the torques
+    follow the actions at once, whatever the angles, and nothing limits the joints.
+
+    Args:
+        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
+            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
+
+    Raises:
+        ValueError: If the gains are not two finite numbers that are not negative.
+
+    Example:
+        >>> torque_arm().damping
+        1.0
+    """
+    return replace(
+        REAL_ARM,
+        masses=(1.1 * REAL_ARM.masses[0], 1.1 * REAL_ARM.masses[1]),
+        inertias=(1.1 * REAL_ARM.inertias[0], 1.1 * REAL_ARM.inertias[1]),
+        damping=1.0,
+        gains=gains,
+    )
+
+
+def torque_arm_physics(
+    equation: ArmEquation,
+    *,
+    substeps: int = SUBSTEPS,
+    gradient: Literal["autograd", "finite-difference"] = "autograd",
+    unknowns: Mapping[str, Unknown] | None = None,
+) -> ODEPhysics:
+    """The state of the arm 0.2 s later, under torques that follow the actions at once.
+
+    Unlike the environment, it does not clip actions. It integrates by Runge-Kutta of order four.
+
+    Args:
+        equation: The arm.
+        substeps: Integration steps.
+        gradient: As of :class:`~gpadjust.physics.ODEPhysics`.
+        unknowns: Parameters of the equation that are unknown.
+    """
+    return ODEPhysics(
+        equation,
+        step=ARM_TIME_STEP,
+        state_dim=4,
+        substeps=substeps,
+        name="torque_arm",
+        gradient=gradient,
+        unknowns=unknowns,
+    )

@@ -1,0 +1,239 @@
+"""The cart-pole's equation, physics and cost, against mechanics derived anew."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import sympy
+import torch
+from scipy.integrate import solve_ivp
+
+from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.physics import ODEPhysics
+from gpadjust.systems import CartPoleEquation, cart_pole, hand_distance_cm
+from gpadjust.systems.cart_pole import (
+    CART_POLE_RAW_SPEC,
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    cart_pole_cost,
+    cart_pole_reward,
+    cart_pole_start,
+    equation_physics,
+)
+from gpadjust.systems.reaching import arm_start, hand_position
+
+PARAMETERS = [(0.5, 0.5, 0.6, 0.1), (1.3, 0.2, 0.9, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def mechanics():
+    """Accelerations and energy from the Lagrangian of a cart and a rod, by integrals along it."""
+    cart, pole, length, damping, g, force, t, s = sympy.symbols("M m l b g a t s", positive=True)
+    x, theta = sympy.Function("x")(t), sympy.Function("theta")(t)
+    place = sympy.Matrix([x - s * sympy.sin(theta), s * sympy.cos(theta)])
+    speed = place.diff(t)
+    kinetic = cart * x.diff(t) ** 2 / 2
+    kinetic += sympy.integrate(sympy.expand(pole / length * speed.dot(speed) / 2), (s, 0, length))
+    potential = sympy.integrate(pole / length * g * place[1], (s, 0, length))
+    lagrangian = kinetic - potential
+    loads = {x: force - damping * x.diff(t), theta: 0}
+    balance = [
+        lagrangian.diff(q.diff(t)).diff(t) - lagrangian.diff(q) - load for q, load in loads.items()
+    ]
+    values = sympy.symbols("x theta x_dot theta_dot")
+    accelerations = sympy.symbols("x_ddot theta_ddot")
+    names = [
+        *zip([x.diff(t, 2), theta.diff(t, 2)], accelerations, strict=True),
+        *zip([x.diff(t), theta.diff(t)], values[2:], strict=True),
+        *zip([x, theta], values[:2], strict=True),
+    ]
+    solved = sympy.solve([e.subs(names) for e in balance], accelerations)
+    formulas = [*(solved[a] for a in accelerations), (kinetic + potential).subs(names)]
+    return sympy.lambdify([values, force, (cart, pole, length, damping, g)], formulas)
+
+
+@pytest.mark.parametrize("parameters", PARAMETERS)
+def test_equation_and_energy_are_those_of_the_lagrangian(mechanics, states_and_forces, parameters):
+    equation = CartPoleEquation(*parameters)
+    states, forces = states_and_forces(50)
+    rates = equation(states, forces)
+    x_ddot, theta_ddot, energy = mechanics(states.T, forces[:, 0], (*parameters, 9.82))
+    torch.testing.assert_close(rates[:, :2], states[:, 2:], rtol=0, atol=0)
+    torch.testing.assert_close(rates[:, 2], x_ddot)
+    torch.testing.assert_close(rates[:, 3], theta_ddot)
+    torch.testing.assert_close(equation.energy(states), energy)
+
+
+def test_power_of_force_and_friction_changes_the_energy(states_and_forces):
+    states, forces = states_and_forces(50)
+    states.requires_grad_()
+    (gradient,) = torch.autograd.grad(REAL_CART_POLE.energy(states).sum(), states)
+    power = (gradient * REAL_CART_POLE(states, forces)).sum(-1)
+    x_dot = states[:, 2]
+    torch.testing.assert_close(power, (forces[:, 0] - REAL_CART_POLE.damping * x_dot) * x_dot)
+
+
+@pytest.mark.parametrize("seconds", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_energy_is_conserved_without_damping(seconds):
+    equation = CartPoleEquation(0.5, 0.5, 0.6, 0.0)
+    physics = ODEPhysics(equation, step=0.1, state_dim=4, substeps=50)
+    state = torch.tensor([[0.0, 2.0, 0.3, 1.0], [0.0, 0.1, 0.0, 0.0]], dtype=torch.float64)
+    energy = equation.energy(state)
+    for _ in range(10 * seconds):
+        state = physics(torch.cat([state, torch.zeros(2, 1, dtype=torch.float64)], dim=-1))
+        torch.testing.assert_close(equation.energy(state), energy, rtol=1e-8, atol=0)
+
+
+def test_step_agrees_with_scipy(states_and_forces):
+    states, forces = states_and_forces(10)
+
+    def final(state, force):
+        def rate(t, y):
+            return REAL_CART_POLE(torch.tensor(y), force).numpy()
+
+        path = solve_ivp(rate, (0, 0.1), state.numpy(), method="DOP853", rtol=1e-11, atol=1e-11)
+        return torch.tensor(path.y[:, -1])
+
+    expected = torch.stack([final(*row) for row in zip(states, forces, strict=True)])
+    physics = equation_physics(REAL_CART_POLE)
+    X = torch.cat([states, forces], dim=-1)
+    torch.testing.assert_close(physics(X), expected, rtol=0, atol=1e-3)
+    fine = ODEPhysics(REAL_CART_POLE, step=0.1, state_dim=4, substeps=100)
+    torch.testing.assert_close(fine(X), expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("time_step", [0.01, 0.05, 0.13])
+def test_time_steps_can_be_others(time_step, states_and_forces):
+    X = torch.cat(states_and_forces(10), dim=-1)
+    fine = ODEPhysics(REAL_CART_POLE, step=time_step, state_dim=4, substeps=100)
+    physics = equation_physics(REAL_CART_POLE, time_step)
+    torch.testing.assert_close(physics(X), fine(X), rtol=0, atol=2e-3)
+    assert physics.step / physics.substeps <= 0.02 + 1e-12
+    believed = cart_pole(3, time_step=time_step).physics
+    assert (believed.step, believed.rhs) == (time_step, cart_pole(3).physics.rhs)
+
+
+def test_hanging_is_stable_and_upright_is_not():
+    nudge = torch.tensor([[0.0, 0.01, 0.0, 0.0], [0.0, math.pi + 0.01, 0.0, 0.0]])
+    rates = REAL_CART_POLE(nudge, torch.zeros(2, 1))[:, 3]
+    assert rates[0] > 0 > rates[1]
+
+
+def test_equation_takes_any_batch_and_is_differentiable(states_and_forces):
+    states, forces = states_and_forces(6)
+    blocks = REAL_CART_POLE(states.view(2, 3, 4), forces.view(2, 3, 1))
+    assert torch.equal(blocks.view(6, 4), REAL_CART_POLE(states, forces))
+    inputs = (states[:2].requires_grad_(), forces[:2].requires_grad_())
+    assert torch.autograd.gradcheck(REAL_CART_POLE, inputs)
+
+
+@pytest.mark.parametrize(("state_dim", "action_dim"), [(5, 1), (4, 2), (4, 0)])
+def test_equation_refuses_other_columns(state_dim, action_dim):
+    with pytest.raises(ValueError, match=r"states \.\.\. x 4 .* actions \.\.\. x 1"):
+        REAL_CART_POLE(torch.zeros(2, state_dim), torch.zeros(2, action_dim))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("cart_mass", 0.0), ("pole_mass", -1.0), ("pole_length", math.inf), ("damping", -0.1)],
+)
+def test_impossible_parameters_are_refused(name, value):
+    good = {"cart_mass": 0.5, "pole_mass": 0.5, "pole_length": 0.6, "damping": 0.1}
+    with pytest.raises(ValueError, match=name):
+        CartPoleEquation(**{**good, name: value})
+
+
+def test_what_is_no_number_or_state_is_refused():
+    with pytest.raises(TypeError, match="cart_mass must be a number; found 'heavy'"):
+        CartPoleEquation("heavy", 0.5, 0.6, 0.1)
+    with pytest.raises(TypeError, match=r"seed must be a whole number; found 1\.5"):
+        cart_pole(1.5)
+    with pytest.raises(ValueError, match="seed must be at least 0; found -1"):
+        cart_pole(-1)
+    for time_step in (0, -0.1, math.nan):
+        with pytest.raises(ValueError, match="time_step must be finite and above 0"):
+            cart_pole(time_step=time_step)
+    for start in (cart_pole_start, arm_start):
+        with pytest.raises(ValueError, match="n must be at least 0; found -1"):
+            start(-1)
+        with pytest.raises(TypeError, match="n must be a whole number"):
+            start(0.5)
+    for function, columns in ((cart_pole_cost, 5), (hand_distance_cm, 4), (hand_position, 3)):
+        with pytest.raises(ValueError, match=rf"of shape \.\.\. x \d.*, got \(2, {columns}\)"):
+            function(torch.zeros(2, columns))
+        with pytest.raises(TypeError, match=r"convert with `torch\.as_tensor"):
+            function(np.zeros((2, columns)))
+
+
+def test_random_physics_is_in_its_ranges_and_follows_its_seed():
+    equations = [cart_pole(seed).physics.rhs for seed in range(200)]
+    for name, low, high in [
+        ("cart_mass", 0.4, 0.6),
+        ("pole_mass", 0.5, 0.7),
+        ("pole_length", 0.5, 0.7),
+    ]:
+        values = [getattr(equation, name) for equation in equations]
+        assert low <= min(values) < low + 0.01
+        assert high - 0.01 < max(values) <= high
+    assert {equation.damping for equation in equations} == {0.0}
+    assert cart_pole(3).physics.rhs == equations[3]
+    assert len(set(equations)) == 200
+
+
+def test_physics_can_be_pickled(states_and_forces):
+    physics = cart_pole(0).physics
+    X = torch.cat(states_and_forces(5), dim=-1)
+    assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
+
+
+@pytest.mark.parametrize("spec", [CART_POLE_SPEC, CART_POLE_RAW_SPEC])
+def test_specs_fit_the_physics(spec, states_and_forces):
+    states, forces = states_and_forces(5)
+    physics = equation_physics(REAL_CART_POLE)
+    dynamics = PhysicsDynamics(spec, physics)
+    expected = physics(torch.cat([states, forces], dim=-1))
+    assert torch.equal(dynamics.sample(states, forces), expected)
+    assert spec.observe(states).shape == (5, 5 if spec.angles else 4)
+
+
+def test_cost_of_known_states():
+    states = torch.tensor(
+        [[0.0, 0.0, 3.0, 3.0], [0.0, math.pi, 0.0, 0.0], [0.6, math.pi / 2, 0.0, 0.0]],
+        dtype=torch.float64,
+    )
+    squares = torch.tensor([0.0, 1.2**2, 0.6**2], dtype=torch.float64)
+    torch.testing.assert_close(cart_pole_cost(states), 1 - torch.exp(-2 * squares))
+    longer = 1 - math.exp(-2 * 2.0**2)
+    torch.testing.assert_close(cart_pole_cost(states[1], pole_length=1.0).item(), longer)
+
+
+def test_cost_is_of_the_tip_and_within_its_bounds(states_and_forces):
+    states, forces = states_and_forces(60)
+    tips = torch.stack([states[:, 0] - 0.6 * states[:, 1].sin(), 0.6 * states[:, 1].cos()], dim=-1)
+    goal = torch.tensor([0.0, 0.6], dtype=torch.float64)
+    cost = cart_pole_cost(states)
+    torch.testing.assert_close(cost, 1 - torch.exp(-2 * (tips - goal).square().sum(-1)))
+    assert ((cost >= 0) & (cost <= 1)).all()
+    assert torch.equal(cart_pole_cost(states.view(3, 20, 4)).flatten(), cost)
+    assert torch.equal(cart_pole_reward(torch.zeros(60, 4), forces, states), -cost)
+
+
+def test_start_is_spread_around_hanging():
+    states = cart_pole_start(20_000)
+    assert states.dtype == torch.float64
+    mean = torch.tensor([0.0, math.pi, 0.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(states.mean(0), mean, rtol=0, atol=0.01)
+    covariance = 0.04 * torch.eye(4, dtype=torch.float64)
+    torch.testing.assert_close(states.T.cov(), covariance, rtol=0, atol=0.003)
+    torch.manual_seed(0)
+    assert torch.equal(cart_pole_start(20_000), states)
+
+
+def test_doing_nothing_costs_0_952():
+    physics = equation_physics(REAL_CART_POLE)
+    states, costs = cart_pole_start(4000), []
+    for _ in range(25):
+        states = physics(torch.cat([states, torch.zeros(4000, 1, dtype=torch.float64)], dim=-1))
+        costs.append(cart_pole_cost(states))
+    assert np.isclose(torch.stack(costs).mean().item(), 0.952, rtol=0, atol=0.001)

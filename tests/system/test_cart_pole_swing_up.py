@@ -1,0 +1,248 @@
+"""The cart-pole as a Gymnasium environment."""
+
+import copy
+import math
+import pickle
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from gpadjust.systems import CartPoleEquation, CartPoleSwingUpEnv
+from gpadjust.systems.cart_pole import (
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    cart_pole_cost,
+    equation_physics,
+)
+
+ID = "gpadjust/CartPoleSwingUp-v0"
+PUSH = np.array([6.0], dtype=np.float32)
+
+
+def rollout(env, num_steps=10, seed=0):
+    actions = np.random.default_rng(seed).uniform(-10, 10, (num_steps, 1)).astype(np.float32)
+    return [env.step(action) for action in actions]
+
+
+def same(transitions, others):
+    pairs = zip(transitions, others, strict=True)
+    return all(np.array_equal(a[0], b[0]) and a[1:] == b[1:] for a, b in pairs)
+
+
+def upright(**arguments):
+    env = CartPoleSwingUpEnv(**arguments)
+    env.reset(options={"state": [0.0, 0.0, 0.0, 0.0]})
+    return env
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space m[a-z]+ value is:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*For Box action spaces, we recommend:UserWarning")
+@pytest.mark.parametrize("encode_angle", [True, False])
+def test_gymnasium_finds_no_fault(encode_angle):
+    check_env(gym.make(ID, encode_angle=encode_angle).unwrapped)
+
+
+@pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized:UserWarning")
+def test_stable_baselines_finds_no_fault():
+    sb3_check_env(gym.make(ID, render_mode="rgb_array").unwrapped)
+
+
+def test_episode_is_truncated_after_25_steps():
+    env = gym.make(ID)
+    env.reset(seed=0)
+    ends = [transition[2:4] for transition in rollout(env, 25)]
+    assert ends == [(False, False)] * 24 + [(False, True)]
+
+
+def test_trajectory_is_that_of_the_physics(states_and_forces):
+    env = CartPoleSwingUpEnv()
+    env.reset(seed=0)
+    physics = equation_physics(REAL_CART_POLE)
+    state = torch.from_numpy(env.state).unsqueeze(0)
+    for force in states_and_forces(25)[1].float():
+        observation, reward, _, _, info = env.step(force.numpy())
+        state = physics(torch.cat([state, force.double().unsqueeze(0)], dim=-1))
+        assert np.array_equal(env.state, state[0].numpy())
+        assert reward == -info["cost"] == -cart_pole_cost(state).item()
+        assert np.array_equal(observation, CART_POLE_SPEC.observe(state)[0].float().numpy())
+
+
+def test_start_is_drawn_around_hanging():
+    env = CartPoleSwingUpEnv()
+    env.reset(seed=0)
+    states = []
+    for _ in range(2000):
+        env.reset()
+        states.append(env.state)
+    np.testing.assert_allclose(np.mean(states, axis=0), [0, math.pi, 0, 0], atol=0.02)
+    np.testing.assert_allclose(np.std(states, axis=0), 0.2, atol=0.02)
+
+
+def test_raw_observation_is_the_state_and_does_not_wrap():
+    env = CartPoleSwingUpEnv(encode_angle=False)
+    observation, _ = env.reset(options={"state": [0.1, 7.0, 0.0, 9.0]})
+    assert np.array_equal(observation, np.array([0.1, 7.0, 0.0, 9.0], dtype=np.float32))
+    observation = env.step(PUSH)[0]
+    assert np.array_equal(observation, env.state.astype(np.float32))
+    assert observation[1] > 7.0
+    assert env.observation_space.shape == (4,)
+
+
+def test_forces_are_clipped():
+    strong, strongest = upright(), upright()
+    assert same([strong.step(np.array([10.0]))], [strongest.step(np.array([1e6]))])
+
+
+def test_another_equation_changes_the_system():
+    equation = CartPoleEquation(0.5, 0.5, 1.0, 0.1)
+    env = CartPoleSwingUpEnv(equation=equation)
+    env.reset(options={"state": [0.0, math.pi, 0.0, 0.0]})
+    cost = env.step(np.zeros(1))[4]["cost"]
+    assert np.isclose(cost, 1 - math.exp(-2 * 2.0**2))
+
+
+def test_another_time_step_is_seen_in_steps_and_frames():
+    whole, halves = CartPoleSwingUpEnv(), CartPoleSwingUpEnv(time_step=0.05)
+    assert (whole.metadata["render_fps"], halves.metadata["render_fps"]) == (10, 20)
+    start = {"state": [0.0, 3.0, 0.1, 0.0]}
+    for env in (whole, halves):
+        env.reset(options=start)
+    push = np.array([4.0], dtype=np.float32)
+    whole.step(push)
+    halves.step(push)
+    halves.step(push)
+    np.testing.assert_allclose(halves.state, whole.state, atol=1e-5)
+    with pytest.raises(TypeError, match="time_step must be a number; found 'fast'"):
+        CartPoleSwingUpEnv(time_step="fast")
+
+
+def test_equal_seeds_give_equal_trajectories():
+    first, second = CartPoleSwingUpEnv(), CartPoleSwingUpEnv()
+    for _ in range(2):
+        assert np.array_equal(first.reset(seed=3)[0], second.reset(seed=3)[0])
+        assert same(rollout(first), rollout(second))
+        assert np.array_equal(first.reset()[0], second.reset()[0])
+    assert not np.array_equal(first.reset(seed=3)[0], first.reset()[0])
+
+
+# A window takes its time.
+@pytest.mark.parametrize(
+    "render_mode", [None, "rgb_array", pytest.param("human", marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("duplicate", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
+def test_copy_goes_on_as_the_original(render_mode, duplicate):
+    env = gym.make(ID, render_mode=render_mode)
+    env.reset(seed=0)
+    rollout(env, 3)
+    if render_mode:
+        env.render()
+    twin = duplicate(env)
+    assert same(rollout(env, 5), rollout(twin, 5))
+    assert np.array_equal(env.reset()[0], twin.reset()[0])
+    if render_mode == "rgb_array":
+        assert np.array_equal(env.render(), twin.render())
+    env.close()
+    twin.close()
+
+
+def test_frame_shows_pole_goal_and_force():
+    env = upright(render_mode="rgb_array")
+    still = env.render()
+    assert still.shape == (300, 600, 3)
+    assert still.dtype == np.uint8
+    assert len(np.unique(still.reshape(-1, 3), axis=0)) > 10
+
+    def red_level():
+        frame = env.render().astype(int)
+        return np.nonzero((frame[..., 0] > 180) & (frame[..., 1] < 100))[0].mean()
+
+    above = red_level()
+    env.step(PUSH)
+    assert not np.array_equal(env.render(), still)
+    env.reset(options={"state": [0.0, math.pi, 0.0, 0.0]})
+    assert above < 150 < red_level()
+
+
+def test_frame_follows_the_cart():
+    env = CartPoleSwingUpEnv(render_mode="rgb_array")
+    for x in (-40.0, 0.0, 40.0):
+        env.reset(options={"state": [x, 0.5, 0.0, 0.0]})
+        frame = env.render().astype(int)
+        assert ((frame[..., 2] > 110) & (frame[..., 0] < 60)).sum() > 500, "the cart is seen"
+
+
+def test_window_is_drawn_in_each_step_and_closed():
+    import pygame
+
+    env = upright(render_mode="human")
+    shown = pygame.surfarray.array3d(pygame.display.get_surface())
+    env.step(PUSH)
+    assert not np.array_equal(shown, pygame.surfarray.array3d(pygame.display.get_surface()))
+    assert env.render() is None
+    env.close()
+    assert pygame.display.get_surface() is None
+    env.close()
+
+
+def test_render_without_a_mode_warns():
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert upright().render() is None
+
+
+def test_missing_pygame_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    env = upright(render_mode="rgb_array")
+    with pytest.raises(gym.error.DependencyNotInstalled, match="pygame-ce"):
+        env.render()
+
+
+@pytest.mark.parametrize(
+    "action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.float32(1.0), "left"]
+)
+def test_bad_action_is_refused_and_changes_nothing(action):
+    env = upright()
+    with pytest.raises(ValueError, match="one finite force"):
+        env.step(action)
+    assert np.array_equal(env.state, np.zeros(4))
+
+
+@pytest.mark.parametrize(
+    "state", [[0.0, 1.0], [0.0, math.nan, 0, 0], [[0.0] * 4], "up", [[1], [2, 3]], [0, 0, 1e39, 0]]
+)
+def test_bad_start_is_refused(state):
+    with pytest.raises(ValueError, match="four finite numbers"):
+        CartPoleSwingUpEnv().reset(options={"state": state})
+
+
+def test_unknown_option_and_render_mode_are_refused():
+    with pytest.raises(ValueError, match="'start'"):
+        CartPoleSwingUpEnv().reset(options={"start": [0.0] * 4})
+    with pytest.raises(TypeError, match=r"options must be a dictionary.*found \['state'\]"):
+        CartPoleSwingUpEnv().reset(options=["state"])
+    with pytest.raises(ValueError, match="'ascii'"):
+        CartPoleSwingUpEnv(render_mode="ascii")
+    with pytest.raises(TypeError, match="encode_angle must be True or False; found 'no'"):
+        CartPoleSwingUpEnv(encode_angle="no")
+    with pytest.raises(TypeError, match=r"equation must be a CartPoleEquation.*found None"):
+        CartPoleSwingUpEnv(equation=None)
+
+
+def test_it_steps_from_any_start_that_it_takes():
+    env = CartPoleSwingUpEnv()
+    for state in ([100.0, 100.0, 100.0, 100.0], [-100.0, 1.0, 100.0, -100.0]):
+        env.reset(options={"state": state})
+        for force in (10.0, -10.0):
+            assert np.isfinite(env.step(np.array([force]))[0]).all()
+
+
+def test_step_and_render_need_a_reset():
+    env = CartPoleSwingUpEnv(render_mode="rgb_array")
+    with pytest.raises(gym.error.ResetNeeded, match="reset"):
+        env.step(PUSH)
+    with pytest.raises(gym.error.ResetNeeded, match="reset"):
+        env.render()

@@ -1,0 +1,486 @@
+"""The muscle arm as a Gymnasium environment."""
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+import gpadjust
+from gpadjust.systems import MuscleArmEnv, hand_distance_cm
+from gpadjust.systems.opensim import MUSCLES, load_opensim
+from gpadjust.systems.reaching import arm_reward, hand_position
+
+ID = "gpadjust/MuscleArm-v0"
+START = np.radians([35.0, 65.0, 0.0, 0.0])
+TARGET = np.radians([70.0, 40.0])
+GENTLE = np.array([0.2, 0.1, 0.3, 0.1], dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """The environment, to be reset by each test."""
+    return MuscleArmEnv()
+
+
+def start(env):
+    env.reset(seed=0, options={"state": START, "target": TARGET})
+    return env
+
+
+def rollout(env, num_steps=5, seed=0):
+    actions = np.random.default_rng(seed).uniform(0, 1, (num_steps, 4)).astype(np.float32)
+    return [env.step(action) for action in actions]
+
+
+def same(transitions, others):
+    pairs = zip(transitions, others, strict=True)
+    return all(np.array_equal(a[0], b[0]) and a[1:] == b[1:] for a, b in pairs)
+
+
+def python(code, folder):
+    """Run Python code in a folder, with this library."""
+    path = str(Path(gpadjust.__file__).parents[1])
+    command = [sys.executable, "-c", code]
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def test_golden_trajectory():
+    env = start(MuscleArmEnv(strength=0.3, accuracy=1e-8))
+    states = []
+    for _ in range(5):
+        env.step(np.array([0.2, 0.1, 0.3, 0.1]))
+        states.append(env.state[:4])
+    first, fifth = [0.6745856, 1.1299697, 0.613568, -0.0042265], [1.4363824, 1.1695989, 0.8287791]
+    np.testing.assert_allclose(states[0], first, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(states[4], [*fifth, 0.0578116], rtol=0, atol=1e-5)
+
+
+def test_default_accuracy_is_enough(arm):
+    fine = MuscleArmEnv(accuracy=1e-8)
+    rollout(start(arm), 15)
+    rollout(start(fine), 15)
+    np.testing.assert_allclose(arm.state[:2], fine.state[:2], rtol=0, atol=5e-5)
+
+
+def test_activations_follow_the_excitations_and_are_hidden(arm):
+    start(arm)
+    assert np.array_equal(arm.activations, np.full(6, 0.01))
+    arm.step(GENTLE)
+    np.testing.assert_allclose(arm.activations, [0.2, 0.1, 0.3, 0.1, 0, 0], atol=1e-3)
+    assert arm.observation_space.shape == (6,)
+
+
+@pytest.mark.parametrize("muscle", range(4))
+def test_each_action_moves_the_joints_to_its_side(arm, muscle):
+    start(arm)
+    arm.step(np.zeros(4))
+    relaxed = arm.state
+    start(arm)
+    arm.step(0.3 * np.eye(4)[muscle])
+    shoulder, elbow = arm.state[:2] - relaxed[:2]
+    moved = {0: elbow, 1: -elbow, 2: shoulder, 3: -shoulder}[muscle]
+    assert moved > 0.05
+
+
+def test_fibres_are_at_their_optimum_at_the_mean_start():
+    simulation = MuscleArmEnv().simulation
+    model, start_state = simulation._model, simulation._start
+    assert [model.getMuscles().get(i).getName() for i in range(6)] == [m.name for m in MUSCLES]
+    for joint, angle in zip(("shoulder", "elbow"), START[:2], strict=True):
+        model.getCoordinateSet().get(joint).setValue(start_state, angle)
+    model.realizeDynamics(start_state)
+    for i, muscle in enumerate(MUSCLES):
+        length = model.getMuscles().get(i).getFiberLength(start_state)
+        np.testing.assert_allclose(length, muscle.fibre, rtol=1e-6)
+    slack = [m.length(*START[:2]) - m.fibre for m in MUSCLES]
+    expected = [0.19921, 0.17302, 0.04580, 0.06340, 0.17287, 0.16803]
+    np.testing.assert_allclose(slack, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:.*For Box action spaces, we recommend:UserWarning")
+def test_gymnasium_finds_no_fault():
+    check_env(gym.make(ID).unwrapped)
+
+
+@pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric and normalized:UserWarning")
+def test_stable_baselines_finds_no_fault():
+    sb3_check_env(gym.make(ID, render_mode="rgb_array").unwrapped)
+
+
+def test_episode_is_truncated_after_15_steps():
+    env = gym.make(ID)
+    env.reset(seed=0)
+    ends = [transition[2:4] for transition in rollout(env, 15)]
+    assert ends == [(False, False)] * 14 + [(False, True)]
+
+
+def test_reward_and_distance_are_those_of_the_new_state(arm):
+    start(arm)
+    observation, reward, _, _, info = rollout(arm)[-1]
+    state = torch.from_numpy(arm.state)
+    assert np.array_equal(observation, arm.state.astype(np.float32))
+    assert np.array_equal(arm.state[4:], TARGET)
+    assert reward == arm_reward(state, state, state).item()
+    assert info == {
+        "hand_distance_cm": hand_distance_cm(state).item(),
+        "step_failed": False,
+    }
+
+
+def test_starts_and_targets_are_drawn(arm):
+    arm.reset(seed=0)
+    states = []
+    for _ in range(2000):
+        arm.reset()
+        states.append(np.degrees(arm.state))
+    np.testing.assert_allclose(np.mean(states, axis=0), [35, 65, 0, 0, 50, 50], atol=2)
+    np.testing.assert_allclose(np.std(states, axis=0), [5, 5, 0, 0, 28.9, 28.9], atol=1)
+    assert np.min(states, axis=0)[4:].min() >= 0
+    assert np.max(states, axis=0)[4:].max() <= 100
+
+
+def test_options_do_not_change_what_else_is_drawn(arm):
+    drawn = arm.reset(seed=5)[0]
+    assert np.array_equal(arm.reset(seed=5, options={"state": START})[0][4:], drawn[4:])
+    assert np.array_equal(arm.reset(seed=5, options={"target": TARGET})[0][:4], drawn[:4])
+
+
+def test_equal_seeds_give_equal_trajectories(arm):
+    other = MuscleArmEnv()
+    for _ in range(2):
+        assert np.array_equal(arm.reset(seed=3)[0], other.reset(seed=3)[0])
+        assert same(rollout(arm), rollout(other))
+        assert np.array_equal(arm.reset()[0], other.reset()[0])
+        assert same(rollout(arm), rollout(other))
+
+
+# A window takes its time.
+@pytest.mark.parametrize(
+    "render_mode", [None, "rgb_array", pytest.param("human", marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("duplicate", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
+def test_copy_goes_on_as_the_original(render_mode, duplicate):
+    env = gym.make(ID, render_mode=render_mode)
+    env.reset(seed=0)
+    rollout(env, 3)
+    if render_mode:
+        env.render()
+    twin = duplicate(env)
+    assert same(rollout(env, 3), rollout(twin, 3))
+    assert np.array_equal(env.reset()[0], twin.reset()[0])
+    if render_mode == "rgb_array":
+        assert np.array_equal(env.render(), twin.render())
+    env.close()
+    twin.close()
+
+
+def test_excitations_are_clipped(arm):
+    full = start(arm).step(np.array([1.0, 0.0, 1.0, 0.0]))
+    beyond = start(arm).step(np.array([7.0, -3.0, 1.5, -0.1]))
+    assert same([full], [beyond])
+
+
+def test_stronger_muscles_move_further(arm):
+    strong = start(MuscleArmEnv(strength=1.0))
+    strong.step(GENTLE)
+    start(arm).step(GENTLE)
+    assert strong.state[0] > arm.state[0] + 0.05
+
+
+@pytest.mark.parametrize(
+    "action", [np.full(4, np.nan), np.array([0.1, np.inf, 0.0, 0.0]), np.zeros(3), 0.5, "up"]
+)
+def test_bad_action_is_refused_and_changes_nothing(arm, action):
+    start(arm)
+    with pytest.raises(ValueError, match="four finite excitations"):
+        arm.step(action)
+    assert np.array_equal(arm.state[:4], START)
+    arm.step(GENTLE)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"state": [0.0, 1.0]}, "4 numbers theta_s"),
+        ({"state": [0.0, np.nan, 0.0, 0.0]}, "4 numbers theta_s"),
+        ({"state": "bent"}, "4 numbers theta_s.*found 'bent'"),
+        ({"state": [0.0, 0.0, 1e4, 0.0]}, "at most 6.283, 6.283, 100, 100"),
+        ({"target": [0.0, 1.0, 2.0]}, "2 numbers target_s"),
+        ({"start": START}, "Unknown option 'start'"),
+    ],
+)
+def test_bad_options_are_refused(arm, options, message):
+    with pytest.raises(ValueError, match=message):
+        arm.reset(options=options)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ({"strength": 0.0}, ValueError),
+        ({"strength": np.nan}, ValueError),
+        ({"strength": "strong"}, TypeError),
+        ({"accuracy": 1.0}, ValueError),
+        ({"accuracy": None}, TypeError),
+        ({"render_mode": "ascii"}, ValueError),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, error):
+    with pytest.raises(error, match=next(iter(arguments))):
+        MuscleArmEnv(**arguments)
+
+
+def test_step_and_render_need_a_reset():
+    env = MuscleArmEnv(render_mode="rgb_array")
+    with pytest.raises(gym.error.ResetNeeded, match="before the first step"):
+        env.step(GENTLE)
+    with pytest.raises(gym.error.ResetNeeded, match="reset"):
+        env.render()
+
+
+def test_a_failed_step_is_no_data_and_still_an_observation(arm, monkeypatch):
+    before = start(arm).state
+
+    def fail(*arguments):
+        raise RuntimeError("no convergence")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(arm.simulation, "step", fail)
+        with pytest.warns(UserWarning, match="no convergence"):
+            observation, _, terminated, truncated, info = arm.step(GENTLE)
+    assert info["step_failed"] is True
+    assert truncated
+    assert not terminated
+    assert arm.observation_space.contains(observation)
+    assert np.array_equal(observation, before.astype(np.float32))
+    assert start(arm).step(GENTLE)[4]["step_failed"] is False
+
+
+@pytest.mark.parametrize("speed", [1e3, 1e9])
+def test_failed_integration_truncates_and_reset_recovers(arm, speed):
+    expected = rollout(start(arm))
+    arm.state[2] = speed  # far beyond what the start may have
+    with pytest.warns(UserWarning, match="failed to integrate the arm from .* reset starts"):
+        observation, reward, terminated, truncated, info = arm.step(GENTLE)
+    assert truncated
+    assert not terminated
+    assert info["step_failed"] is True
+    assert np.isfinite(reward)
+    assert observation[2] == np.float32(speed)
+    with pytest.raises(gym.error.ResetNeeded, match="after a failed integration"):
+        arm.step(GENTLE)
+    assert same(rollout(start(arm)), expected)
+
+
+@pytest.mark.parametrize(
+    "num_trials",
+    [
+        pytest.param(10, id="10-full-trials"),
+        pytest.param(200, id="200-full-trials", marks=pytest.mark.slow),
+    ],
+)
+def test_random_trials_do_not_fail(arm, num_trials):
+    arm.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for trial in range(num_trials):
+        arm.reset()
+        for _ in range(15):
+            # Every second trial switches the muscles fully on and off.
+            action = rng.uniform(size=4)
+            observation, _, _, truncated, _ = arm.step(action.round() if trial % 2 else action)
+            assert not truncated
+            assert arm.observation_space.contains(observation)
+
+
+@pytest.mark.parametrize("num_trials", [300, pytest.param(1000, marks=pytest.mark.slow)])
+def test_resets_do_not_leak_memory(arm, num_trials):
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    def trial():
+        arm.reset()
+        arm.step(GENTLE)
+
+    for _ in range(50):
+        trial()
+    before = resident()
+    for _ in range(num_trials):
+        trial()
+    growth = resident() - before
+    print(f"memory growth over {num_trials} trials: {growth / 1e6:.2f} MB")
+    assert growth < 1e4 * num_trials
+
+
+BLUE, RED, GREEN, GREY, LIGHT = (
+    (31, 79, 130),
+    (204, 77, 77),
+    (44, 140, 68),
+    (110, 110, 110),
+    (215, 215, 215),
+)
+
+
+def near(frame, place, colour, margin):
+    """How many pixels around a place, in m from the shoulder, have a colour; and out of how many.
+
+    The frame is 480 x 400 pixels, of which 320 are a metre, with the shoulder at (240, 248).
+    """
+    x, y = round(240 + 320 * float(place[0])), round(248 - 320 * float(place[1]))
+    cut = frame[y - margin : y + margin + 1, x - margin : x + margin + 1].astype(int)
+    alike = np.abs(cut - colour).sum(-1) < 40
+    return alike.sum(), alike.size
+
+
+@pytest.fixture
+def frame():
+    """Draws an arm: its angles and target in rad."""
+    env = MuscleArmEnv(render_mode="rgb_array")
+
+    def draw(angles, target, activations=None):
+        env.reset(options={"state": [*angles, 0.0, 0.0], "target": target})
+        if activations is not None:
+            env.activations = np.array(activations, dtype=float)
+        return env.render()
+
+    yield draw
+    env.close()
+
+
+def test_frame_shows_the_target_where_it_is(frame):
+    places = {target: hand_position(torch.tensor(target)) for target in ((1.2, 0.4), (0.2, 0.3))}
+    for target in places:
+        shown = frame(START[:2], target)
+        assert shown.shape == (400, 480, 3)
+        assert shown.dtype == np.uint8
+        for other, place in places.items():
+            green, _ = near(shown, place, GREEN, 12)
+            assert (green > 50) if other == target else (green == 0)
+        upper_middle = 0.309 / 2 * np.array([np.cos(target[0]), np.sin(target[0])])
+        assert near(shown, upper_middle, LIGHT, 1) == (9, 9)
+        assert near(shown, hand_position(torch.tensor(START[:2])), GREEN, 2) == (25, 25)
+
+
+def test_frame_shows_the_links_where_they_are(frame):
+    for shoulder, elbow in ((0.6, 1.1), (0.3, 0.8)):
+        shown = frame((shoulder, elbow), (0.0, 0.0))
+        upper = 0.309 * np.array([np.cos(shoulder), np.sin(shoulder)])
+        fore = 0.333 * np.array([np.cos(shoulder + elbow), np.sin(shoulder + elbow)])
+        for middle in (upper / 2, upper + fore / 2):
+            assert near(shown, middle, GREY, 1) == (9, 9)
+
+
+@pytest.mark.parametrize("muscle", range(6))
+def test_frame_shows_how_active_each_muscle_is(frame, muscle):
+    rest, active = (
+        frame(START[:2], TARGET, share * np.eye(6)[muscle]).astype(int) for share in (0.0, 1.0)
+    )
+
+    def count(picture, colour):
+        return (np.abs(picture - colour).sum(-1) < 60).sum()
+
+    assert count(rest, RED) == 0
+    assert count(active, RED) > 50
+    assert 0 < count(active, BLUE) < count(rest, BLUE) - 20
+    half = frame(START[:2], TARGET, 0.5 * np.eye(6)[muscle])
+    assert count(half.astype(int), np.mean([BLUE, RED], axis=0)) > 30
+
+
+@pytest.mark.slow
+def test_nothing_is_printed_and_no_log_is_written(tmp_path):
+    code = (
+        "import sys, gymnasium, gpadjust.systems, numpy as np\n"
+        "assert 'opensim' not in sys.modules\n"
+        "env = gymnasium.make('gpadjust.systems:gpadjust/MuscleArm-v0')\n"
+        "env.reset(seed=0)\n"
+        "env.step(np.full(4, 0.5, dtype=np.float32))\n"
+        "import warnings; warnings.simplefilter('ignore')\n"
+        "env.unwrapped.state[2] = 1e4\n"
+        "assert env.step(np.zeros(4, dtype=np.float32))[3]\n"
+    )
+    run = python(code, tmp_path)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_opensim_only_the_arm_is_missing(tmp_path):
+    """And an id with the package needs no import of it."""
+    code = (
+        "import sys; sys.modules['opensim'] = None\n"
+        "import gpadjust\n"
+        "assert not {'gymnasium', 'gpadjust.systems'} & set(sys.modules)\n"
+        "import gymnasium\n"
+        "print(gymnasium.make('gpadjust.systems:gpadjust/CartPoleSwingUp-v0').unwrapped)\n"
+        "gpadjust.systems.arm().physics\n"
+        "makers = [lambda: gymnasium.make('gpadjust/MuscleArm-v0'), "
+        "lambda: gpadjust.systems.arm(opensim=True)]\n"
+        "for make in makers:\n"
+        "    try: make()\n"
+        "    except ImportError as error: print(error)\n"
+    )
+    run = python(code, tmp_path)
+    assert run.returncode == 0, run.stderr
+    message = 'The muscle arm needs OpenSim; run `pip install "gpadjust[arm]"`.'
+    cart_pole, *messages = run.stdout.splitlines()
+    assert "CartPoleSwingUpEnv" in cart_pole
+    assert messages == [message, message]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("raise ImportError('libosimCommon.so: cannot open shared object file')", "libosimCommon"),
+        ("import opensim.missing_part", "No module named 'opensim.missing_part'"),
+    ],
+)
+def test_a_broken_opensim_says_so_itself(tmp_path, monkeypatch, content, message):
+    (tmp_path / "opensim").mkdir()
+    (tmp_path / "opensim" / "__init__.py").write_text(content)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "opensim"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ImportError, match=message) as error:
+        load_opensim.__wrapped__()
+    assert "pip install" not in str(error.value)
+
+
+def test_the_logger_is_switched_off_once():
+    opensim = load_opensim()
+    opensim.Logger.setLevelString("critical")
+    try:
+        MuscleArmEnv()
+        assert opensim.Logger.getLevelString().lower() == "critical"
+    finally:
+        opensim.Logger.setLevelString("off")
+
+
+@pytest.mark.slow
+def test_arms_in_processes_of_their_own_are_the_same():
+    make = [partial(gym.make, f"gpadjust.systems:{ID}")] * 2
+    here, there = DummyVecEnv(make), SubprocVecEnv(make)
+    try:
+        for envs in (here, there):
+            envs.seed(3)
+        assert np.array_equal(here.reset(), there.reset())
+        actions = np.random.default_rng(0).uniform(0, 1, (16, 2, 4)).astype(np.float32)
+        for action in actions:  # beyond the end of an episode
+            states, rewards, ends, _ = there.step(action)
+            expected = here.step(action)
+            assert np.array_equal(states, expected[0])
+            assert np.array_equal(
+                rewards.astype(np.float32), expected[1]
+            )  # as DummyVecEnv has them
+            assert np.array_equal(ends, expected[2])
+    finally:
+        there.close()

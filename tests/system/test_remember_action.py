@@ -1,0 +1,105 @@
+"""Observations that hold the previous action."""
+
+import copy
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from gpadjust.systems import CartPoleSwingUpEnv, RememberAction
+
+
+def test_the_observation_ends_with_the_last_action():
+    env = RememberAction(CartPoleSwingUpEnv(encode_angle=False))
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (5,)
+    assert observation[-1] == 0
+    for force in (2.0, -1.0):
+        observation, *_ = env.step(np.array([force], dtype=np.float32))
+        assert observation[-1] == force
+    assert pickle.loads(pickle.dumps(env)).observation_space == env.observation_space
+    assert env.reset(seed=0)[0][-1] == 0
+
+
+def test_the_action_is_remembered_as_the_environment_takes_it():
+    env, plain = RememberAction(CartPoleSwingUpEnv()), CartPoleSwingUpEnv()
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    for force, taken in ((25.0, 10.0), (-11.0, -10.0)):
+        observation = env.step(np.array([force], dtype=np.float32))[0]
+        assert observation[-1] == taken
+        assert env.observation_space.contains(observation)
+        expected = plain.step(np.array([taken], dtype=np.float32))[0]
+        assert np.array_equal(observation[:-1], expected)
+
+
+def test_what_else_a_step_says_is_passed_on():
+    class Failing(CartPoleSwingUpEnv):
+        def step(self, action):
+            observation, reward, *_ = super().step(action)
+            return observation, reward, False, True, {"step_failed": True}
+
+    env = RememberAction(Failing())
+    env.reset(seed=0)
+    *_, truncated, info = env.step(np.array([2.0], dtype=np.float32))
+    assert truncated
+    assert info == {"step_failed": True}
+
+
+@pytest.mark.parametrize(
+    ("dtype", "expected"), [(np.float64, np.float64), (np.float16, np.float16), (int, np.float64)]
+)
+def test_observations_keep_a_floating_dtype(dtype, expected):
+    env = RememberAction(
+        gym.wrappers.TransformObservation(
+            CartPoleSwingUpEnv(),
+            lambda observation: (100 * observation).astype(dtype),
+            gym.spaces.Box(-1000, 1000, (5,), dtype=dtype),
+        )
+    )
+    assert env.observation_space.dtype == expected
+    first, _ = env.reset(seed=0)
+    second, *_ = env.step(np.array([0.25], dtype=np.float32))
+    assert first.dtype == second.dtype == expected
+    assert second[-1] == 0.25
+    assert env.observation_space.contains(second)
+
+
+@pytest.mark.parametrize(
+    "duplicate",
+    [
+        lambda env: gym.make(env.spec),
+        copy.deepcopy,
+        lambda env: pickle.loads(pickle.dumps(env)),
+        lambda env: gym.make(pickle.loads(pickle.dumps(copy.deepcopy(env))).spec),
+    ],
+)
+def test_a_registered_environment_can_be_made_again(duplicate):
+    env = RememberAction(gym.make("gpadjust/CartPoleSwingUp-v0", encode_angle=False))
+    twin = duplicate(env)
+    assert isinstance(twin, RememberAction)
+    assert twin.spec == env.spec
+    assert np.array_equal(twin.reset(seed=3)[0], env.reset(seed=3)[0])
+    force = np.array([2.0], dtype=np.float32)
+    assert np.array_equal(twin.step(force)[0], env.step(force)[0])
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN:UserWarning")  # of other things than faults
+def test_gymnasium_finds_no_fault():
+    check_env(RememberAction(CartPoleSwingUpEnv()), skip_render_check=True)
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (gym.spaces.Discrete(2), "an action space that is a Box of one dimension; found Discrete"),
+        (gym.spaces.Box(1, 2, (1,)), "the action zero, which is not in Box"),
+    ],
+)
+def test_other_actions_are_refused(space, message):
+    env = CartPoleSwingUpEnv()
+    env.action_space = space
+    with pytest.raises(ValueError, match=message):
+        RememberAction(env)

@@ -1,0 +1,230 @@
+"""The torque arm's equation and physics, against mechanics derived anew and against OpenSim."""
+
+import math
+import pickle
+from dataclasses import replace
+
+import joblib
+import numpy as np
+import pytest
+import sympy
+import torch
+
+from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.physics import ODEPhysics
+from gpadjust.systems import ArmEquation, arm, hand_distance_cm
+from gpadjust.systems.opensim import opensim_arm_physics
+from gpadjust.systems.reaching import ARM_SPEC, arm_reward, arm_start, arm_targets, hand_position
+from gpadjust.systems.torque_arm import REAL_ARM, torque_arm, torque_arm_physics
+
+OTHER_ARM = ArmEquation((1.3, 2.1), (0.4, 0.2), (0.1, 0.12), (0.03, 0.01), 0.2, (3.0, 5.0))
+
+
+@pytest.fixture
+def states_and_actions(uniform):
+    """Draws ``n`` states all over the joints' ranges, and actions."""
+
+    def draw(n, seed=0):
+        low = torch.tensor([-0.4, -0.1, -10, -10, 0, 0, 0, 0], dtype=torch.float64)
+        high = torch.tensor([2.3, 2.6, 10, 10, 1, 1, 1, 1], dtype=torch.float64)
+        rows = low + (high - low) * uniform(n, 8, seed=seed)
+        return rows[:, :4], rows[:, 4:]
+
+    return draw
+
+
+@pytest.fixture(scope="module")
+def mechanics():
+    """Unbalanced torques, given accelerations, and energy, from the Lagrangian of two links."""
+    t, *loads = sympy.symbols("t tau_s tau_e d")
+    m1, m2, l1, c1, c2, I1, I2 = sympy.symbols("m1 m2 l1 c1 c2 I1 I2", positive=True)
+    shoulder, elbow = sympy.Function("s")(t), sympy.Function("e")(t)
+
+    def along(angle):
+        return sympy.Matrix([sympy.cos(angle), sympy.sin(angle)])
+
+    speeds = [(c1 * along(shoulder)).diff(t)]
+    speeds.append((l1 * along(shoulder) + c2 * along(shoulder + elbow)).diff(t))
+    kinetic = (m1 * speeds[0].dot(speeds[0]) + m2 * speeds[1].dot(speeds[1])) / 2
+    kinetic += (I1 * shoulder.diff(t) ** 2 + I2 * (shoulder + elbow).diff(t) ** 2) / 2
+    *torques, damping = loads
+    balance = [
+        kinetic.diff(q.diff(t)).diff(t) - kinetic.diff(q) - torque + damping * q.diff(t)
+        for q, torque in zip((shoulder, elbow), torques, strict=True)
+    ]
+    values, accelerations = sympy.symbols("s e s_dot e_dot"), sympy.symbols("s_ddot e_ddot")
+    names = [
+        *zip([shoulder.diff(t, 2), elbow.diff(t, 2)], accelerations, strict=True),
+        *zip([shoulder.diff(t), elbow.diff(t)], values[2:], strict=True),
+        *zip([shoulder, elbow], values[:2], strict=True),
+    ]
+    formulas = [e.subs(names) for e in (*balance, kinetic)]
+    return sympy.lambdify([values, accelerations, loads, (m1, m2, l1, c1, c2, I1, I2)], formulas)
+
+
+@pytest.mark.parametrize("equation", [torque_arm(), OTHER_ARM])
+def test_equation_and_energy_are_those_of_the_lagrangian(mechanics, states_and_actions, equation):
+    states, actions = states_and_actions(50)
+    a1, a2, a3, a4 = actions.T
+    loads = (equation.gains[0] * (a3 - a4), equation.gains[1] * (a1 - a2), equation.damping)
+    links = (*equation.masses, equation.lengths[0], *equation.centres, *equation.inertias)
+    rates = equation(states, actions)
+    *unbalanced, energy = mechanics(states.T, rates[:, 2:].T, loads, links)
+    assert torch.equal(rates[:, :2], states[:, 2:])
+    torch.testing.assert_close(torch.stack(unbalanced), torch.zeros(2, 50).double())
+    torch.testing.assert_close(equation.energy(states), energy)
+
+
+def test_energy_is_conserved_for_2_s_without_damping_and_torque(states_and_actions):
+    equation = replace(OTHER_ARM, damping=0.0)
+    physics = ODEPhysics(equation, step=0.2, state_dim=4, substeps=200)
+    state = states_and_actions(3)[0]
+    energy = equation.energy(state)
+    for _ in range(10):
+        state = physics(torch.cat([state, torch.zeros(3, 4, dtype=torch.float64)], dim=-1))
+        torch.testing.assert_close(equation.energy(state), energy, rtol=1e-6, atol=0)
+
+
+def test_equation_takes_any_batch_and_is_differentiable(states_and_actions):
+    states, actions = states_and_actions(6)
+    blocks = OTHER_ARM(states.view(2, 3, 4), actions.view(2, 3, 4))
+    assert torch.equal(blocks.view(6, 4), OTHER_ARM(states, actions))
+    inputs = (states[:2].requires_grad_(), actions[:2].requires_grad_())
+    assert torch.autograd.gradcheck(OTHER_ARM, inputs)
+
+
+@pytest.mark.parametrize(("state_dim", "action_dim"), [(6, 4), (4, 2), (4, 0)])
+def test_equation_refuses_other_columns(state_dim, action_dim):
+    with pytest.raises(ValueError, match=r"states \.\.\. x 4 .* actions \.\.\. x 4"):
+        REAL_ARM(torch.zeros(2, state_dim), torch.zeros(2, action_dim))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("masses", (1.0, 0.0)),
+        ("lengths", (math.inf, 1.0)),
+        ("centres", (0.1, -0.1)),
+        ("inertias", (0.1, math.nan)),
+        ("damping", -0.1),
+        ("gains", (1.0, 2.0, 3.0)),
+    ],
+)
+def test_impossible_parameters_are_refused(name, value):
+    with pytest.raises(ValueError, match=name):
+        ArmEquation(**{name: value})
+
+
+def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
+    np.testing.assert_allclose(torque_arm().masses, (1.1 * 1.82, 1.1 * 1.43))
+    np.testing.assert_allclose(torque_arm().inertias, (1.1 * 0.018, 1.1 * 0.018))
+    assert torque_arm().lengths == REAL_ARM.lengths
+    assert torque_arm().gains == (8.0, 4.0)
+    assert torque_arm([5, 2.5]).gains == (5.0, 2.5)
+    for physics in (torque_arm, opensim_arm_physics):
+        with pytest.raises(ValueError, match=r"gains must be a pair.*found 0\.5"):
+            physics(0.5)
+        with pytest.raises(ValueError, match="gains must be a pair of finite numbers"):
+            physics(("strong", "weak"))
+        with pytest.raises(ValueError, match="gains must be finite and not negative"):
+            physics((8.0, -4.0))
+
+
+@pytest.mark.parametrize("gains", [(8.0, 4.0), (5.0, 2.5), (1.0, 9.0)])
+def test_ode_agrees_with_opensim(states_and_actions, gains):
+    X = torch.cat(states_and_actions(100), dim=-1)
+    gap = (torque_arm_physics(torque_arm(gains))(X) - opensim_arm_physics(gains)(X)).abs()
+    assert gap[:, :2].max() < 1e-5
+    assert gap[:, 2:].max() < 1e-4
+
+
+def test_substeps_are_enough(states_and_actions):
+    X = torch.cat(states_and_actions(100), dim=-1)
+    fine = ODEPhysics(torque_arm(), step=0.2, state_dim=4, substeps=400)
+    torch.testing.assert_close(arm().physics(X), fine(X), rtol=0, atol=2e-5)
+
+
+def test_gradients_of_the_two_physics_agree(states_and_actions):
+    X = torch.cat(states_and_actions(3), dim=-1).requires_grad_()
+    (exact,) = torch.autograd.grad(arm().physics(X).sum(), X)
+    (differences,) = torch.autograd.grad(arm(opensim=True).physics(X).sum(), X)
+    torch.testing.assert_close(differences, exact, rtol=1e-3, atol=1e-3)
+
+
+def test_opensim_physics_has_a_memo_and_a_light_pickle(states_and_actions):
+    X = torch.cat(states_and_actions(4), dim=-1)
+    physics = arm(opensim=True).physics
+    Y = physics(X)
+    copy = pickle.loads(pickle.dumps(physics))
+    copy.forget()
+    assert torch.equal(copy(X), Y)
+    physics.function = None
+    assert torch.equal(physics(X), Y)
+
+
+def test_threads_take_turns_in_opensim(states_and_actions):
+    X = torch.cat(states_and_actions(12), dim=-1)
+    expected = arm(opensim=True).physics(X)
+    with joblib.parallel_config(backend="threading", n_jobs=3):
+        assert torch.equal(arm(opensim=True).physics(X), expected)
+
+
+def test_opensim_physics_refuses_bad_arguments():
+    with pytest.raises(ValueError, match="accuracy"):
+        opensim_arm_physics(accuracy=0.0)
+
+
+def test_torque_arm_physics_can_be_pickled(states_and_actions):
+    physics = arm().physics
+    X = torch.cat(states_and_actions(5), dim=-1)
+    assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
+
+
+def test_spec_fits_the_physics(states_and_actions):
+    starts, (states, actions) = arm_start(5), states_and_actions(5)
+    starts[:, :4] = states
+    reached = PhysicsDynamics(ARM_SPEC, arm().physics).sample(starts, actions)
+    expected = arm().physics(torch.cat([states, actions], dim=-1))
+    assert torch.equal(reached, torch.cat([expected, starts[:, 4:]], dim=-1))
+    assert torch.equal(ARM_SPEC.observe(starts), starts)
+
+
+def test_reward_is_minus_the_error_of_the_angles(states_and_actions):
+    states = arm_start(12)
+    expected = [-math.hypot(*(s[:2] - s[4:]).tolist()) / math.sqrt(2) for s in states]
+    reward = arm_reward(torch.zeros(12, 6), states_and_actions(12)[1], states)
+    torch.testing.assert_close(reward, torch.tensor(expected, dtype=torch.float64))
+    blocks = arm_reward(states.view(3, 4, 6), torch.zeros(3, 4, 4), states.view(3, 4, 6))
+    assert torch.equal(blocks.flatten(), reward)
+
+
+def test_start_is_spread_around_its_mean_at_rest():
+    starts = arm_start(20_000)
+    degrees = starts.rad2deg()
+    mean = torch.tensor([35, 65, 0, 0, 50, 50], dtype=torch.float64)
+    torch.testing.assert_close(degrees.mean(0), mean, rtol=0, atol=1.0)
+    std = torch.tensor([5, 5, 0, 0, 100 / math.sqrt(12), 100 / math.sqrt(12)], dtype=torch.float64)
+    torch.testing.assert_close(degrees.std(0), std, rtol=0, atol=0.5)
+    assert 0 <= degrees[:, 4:].min() < 0.1 < 99.9 < degrees[:, 4:].max() <= 100
+    torch.manual_seed(0)
+    assert torch.equal(arm_start(20_000), starts)
+
+
+def test_targets_are_a_grid():
+    targets = arm_targets().rad2deg().round().int().tolist()
+    assert len({tuple(target) for target in targets}) == len(targets) == 121
+    assert {angle for target in targets for angle in target} == set(range(0, 101, 10))
+
+
+def test_hand_is_at_the_end_of_the_links():
+    angles = torch.tensor([[0, 0], [math.pi / 2, 0], [0, math.pi]], dtype=torch.float64)
+    expected = torch.tensor([[0.642, 0], [0, 0.642], [0.309 - 0.333, 0]], dtype=torch.float64)
+    torch.testing.assert_close(hand_position(angles), expected)
+    states = arm_start(5)
+    assert torch.equal(
+        hand_distance_cm(states.clone()[:, [4, 5, 2, 3, 4, 5]]), torch.zeros(5).double()
+    )
+    states[:, 4:] = states[:, :2] + torch.tensor([math.pi, 0])
+    torch.testing.assert_close(
+        hand_distance_cm(states), 200 * hand_position(states[:, :2]).norm(dim=-1)
+    )
