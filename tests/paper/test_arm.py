@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, torque_arm
+from gpadjust.control.checkpoint import RandomState
 from gpadjust.physics import ODEPhysics
-from gpadjust.rl.random_state import RandomState
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, torque_arm
 from paper.arm import Arm, Reaching, ReachingSettings, Settings
 from paper.arm import system as arm_system
 from paper.arm.arm import load_maps

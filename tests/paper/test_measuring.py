@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.envs import random_cart_pole_physics
+from gpadjust.systems import cart_pole
 from paper.common.runner import main, run_missing, runs_file
 from paper.measuring import (
     HELPS,
@@ -72,7 +72,7 @@ def test_problems(name):
 
 def test_the_cart_pole():
     system, X = problem("cartpole", 3), torch.tensor([[0.3, 0.1, 0.2, -0.5, 4.0]]).double()
-    believed = random_cart_pole_physics(3)(X) - X[:, :4]
+    believed = cart_pole(3).physics(X) - X[:, :4]
     torch.testing.assert_close(system.physics(X), believed)
     X = system.sobol(6, 0)
     for kind, expected in (("literal", CKA), ("phymean", PhysicsMeanGP), ("gp", ZeroMeanGP)):
