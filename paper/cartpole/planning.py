@@ -137,7 +137,7 @@ def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -
     time_step = settings.time_step
     if learner == "oracle":
         return PhysicsDynamics(CART_POLE_SPEC, equation_physics(equation(system), time_step))
-    physics = cart_pole(seed, time_step=time_step).physics
+    physics = cart_pole(seed, time_step=time_step, unknowns=learner == "fitted").physics
     if learner in ("phy", "fitted"):
         return PhysicsDynamics(CART_POLE_SPEC, physics)
     known = LEARNERS["cka" if learner == "search" else learner]
