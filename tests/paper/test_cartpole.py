@@ -222,7 +222,7 @@ def test_floors(tmp_path):
     experiment = Floor(out=tmp_path, runs=2, settings=settings)
     cases = experiment.cases()
     assert [case[0] for case in cases].count("arm") == 1
-    for case in cases[:4]:
+    for case in (case for case in cases if case[0] != "arm"):
         found = rounded(experiment.run(*case))
         assert 0.2 < found["found"] < 1
         assert len(found["forces"]) == 25
