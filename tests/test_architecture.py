@@ -18,14 +18,25 @@ from tests.systems import line, wave
 
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
-    *("checks", "physics", "states", "files", "envs", "gp", "models", "inference"),
-    *("validation", "report", "sklearn", "ax", "active", "dynamics", "records", "control", "rl"),
+    *("checks", "physics", "states", "files", "gp", "models", "inference"),
+    *(
+        "validation",
+        "report",
+        "sklearn",
+        "ax",
+        "active",
+        "dynamics",
+        "records",
+        "control",
+        "systems",
+    ),
+    "rl",
 ]
 
 
-CSV_TO_FREE_RUN = 45  # files that a log passes on the way to a judged free run
+CSV_TO_FREE_RUN = 46  # files that a log passes on the way to a judged free run
 FILES, CLASSES, FUNCTIONS = 32, 36, 256  # that the ten lines of the README pass; fewer are better
-REPORT, WITH_A_REPORT = 13, 35  # of report and validation, and of what is below, by a point fit
+REPORT, WITH_A_REPORT = 13, 34  # of report and validation, and of what is below, by a point fit
 
 
 def passed(call):

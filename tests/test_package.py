@@ -34,7 +34,7 @@ def test_what_is_not_needed_is_not_imported():
         "import gpadjust": "torch",
         "import gpadjust.states, gpadjust.files": "botorch gpytorch linear_operator gymnasium",
         "from gpadjust import ODEPhysics": "botorch gpytorch gymnasium",
-        "import gpadjust.envs": "botorch gpytorch linear_operator stable_baselines3 opensim",
+        "import gpadjust.systems": "botorch gpytorch linear_operator stable_baselines3 opensim",
     }
     code = "import sys\n" + "".join(
         f"{first}\nprint({first!r}, *set({absent.split()}) & {{*sys.modules}})\n"

@@ -475,33 +475,13 @@ def collect(
 ) -> Collection:
     """Measure where it teaches most, until the budget is spent.
 
-    It makes a :class:`Collection`, lets it :meth:`~Collection.run`, and closes it. With a log the
-    same call goes on where the last one was killed, or with a larger budget.
-
-    Args:
-        model_factory: As of :class:`Collection`.
-        oracle: As of :meth:`Collection.run`.
-        bounds: As of :class:`Collection`.
-        acquisition: As of :class:`Collection`.
-        budget: As of :meth:`Collection.run`.
-        progress: As of :meth:`Collection.run`.
-        max_failures: As of :meth:`Collection.run`.
-        options: The others of :class:`Collection`: ``batch_size``, ``initial``, ``data``,
-            ``num_outputs``, ``fit``, ``optimizer_options``, ``log`` and ``seed``.
+    It makes a :class:`Collection` with ``options``, lets it :meth:`~Collection.run`, and closes it:
+    arguments, errors and warnings are those of the two. With a log the same call goes on where the
+    last one was killed, or with a larger budget.
 
     Returns:
         The collection, with all data in ``X`` and ``Y``, the ``model`` of them, ``failed_X``, and
         ``ask``, ``tell`` and ``run`` to go on with.
-
-    Raises:
-        TypeError: As :class:`Collection` and :meth:`Collection.run`.
-        ValueError: As both.
-        LogError: As both.
-        CollectionError: As :meth:`Collection.run`; the points in it can be told to its
-            ``collection``.
-
-    Warns:
-        MeasurementWarning: If a measurement fails.
 
     Example:
         >>> from functools import partial

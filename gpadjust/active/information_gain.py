@@ -181,7 +181,7 @@ def _check(model: Any, about: str) -> None:
     if not set(model.rho_names if about == "rho" else ("delta",)) & set(model.term_names):
         other = "delta" if about == "rho" else "rho"
         raise TypeError(f"{name} has no unknown {about}; ask about {other!r}, or take CKA.")
-    if about == "delta" and model.has_centre:
+    if about == "delta" and model.has_center:
         raise ValueError(
             f"The {name} takes a center from f_p (by default it is learnt), so that delta is not "
             "independent of rho a priori and its information has no closed form: ask about 'rho' "

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gpadjust.inference import fit as fit_model
 from gpadjust.inference.warm_start import warm_start
@@ -41,7 +42,7 @@ def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
         tensors = {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()}
     except (AttributeError, TypeError, ValueError):  # a log may have been edited
         return False
-    if {name: p.shape for name, p in named.items()} != {n: t.shape for n, t in tensors.items()}:
+    if _shapes(named) != _shapes(tensors):
         return False
     with torch.no_grad():
         for name, parameter in named.items():
@@ -56,8 +57,12 @@ def _alike(model: Any, previous: Any) -> bool:
         return False
     if model.num_samples is not None or previous.num_samples is not None:
         return False
+    learnt = [
+        {name: p for name, p in each.named_parameters() if p.requires_grad}
+        for each in (model, previous)
+    ]
+    return _shapes(learnt[0]) == _shapes(learnt[1])
 
-    def shapes(model: Any) -> dict[str, torch.Size]:
-        return {name: p.shape for name, p in model.named_parameters() if p.requires_grad}
 
-    return shapes(model) == shapes(previous)
+def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, torch.Size]:
+    return {name: tensor.shape for name, tensor in tensors.items()}

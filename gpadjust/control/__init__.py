@@ -1,16 +1,14 @@
 """Tasks, planning and policy search in dynamics models, and agents that control by them."""
 
 from gpadjust.control.agent import Agent, Callback, print_progress
+from gpadjust.control.agents import MPCAgent, PolicySearchAgent
 from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
 from gpadjust.control.mpc import MPC, Planned
-from gpadjust.control.mpc_agent import MPCAgent
-from gpadjust.control.objectives import Objective, Return
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
-from gpadjust.control.policy_search_agent import PolicySearchAgent
 from gpadjust.control.recorded_episodes import RecordedEpisodes
-from gpadjust.control.rollouts import Rollout, Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
 from gpadjust.control.task import InitialStates, Reward, Step, Task, Termination
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import io
-import time
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -21,14 +20,13 @@ from gpadjust.checks import checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
     RandomState,
-    Resumable,
+    TaskAgent,
     layer_names,
     packed,
     pickled_environment,
     unpacked,
 )
-from gpadjust.control.learning import learn_dynamics
-from gpadjust.control.recorded_episodes import RecordedEpisodes
+from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
 from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.free_run import checked_horizons
@@ -50,7 +48,7 @@ class _Step(NamedTuple):
     terminated: bool
 
 
-class Agent(Resumable, ABC):
+class Agent(TaskAgent):
     """A controller that learns from real episodes: :meth:`learn` plays, learns and improves.
 
     A subclass says how it acts (:meth:`predict`) and what it improves in a model (:meth:`improve`).
@@ -323,52 +321,20 @@ class Agent(Resumable, ABC):
             whole=torch.ones(len(steps), dtype=torch.bool),
         )
 
-    def model_task(self) -> Task:
-        """The task, with what environment and real episodes tell where it says nothing.
-
-        Raises:
-            ValueError: If nobody says how long an episode is.
-        """
-        return self.recorded_episodes().complete(self.task, self.episode_length())
+    def env_attribute(self, name: str) -> Any:
+        """An attribute of the environment or of one that it wraps."""
+        return self.env.get_wrapper_attr(name)
 
     def known_task(self) -> Task | None:
-        """That task in the newest model, or in the physics; None if nothing is known yet."""
+        """``model_task`` in the newest model, or in the physics; None if nothing is known yet."""
         task = self.model_task()
         dynamics = task.dynamics.before_data()
         return None if dynamics is None else replace(task, dynamics=dynamics)
-
-    def episode_length(self) -> int:
-        """Steps of an episode: those of the task, or else the time limit of the environment.
-
-        Raises:
-            ValueError: If there is neither.
-        """
-        if self.task.episode_length is not None:
-            return self.task.episode_length
-        length = None if self.env.spec is None else self.env.spec.max_episode_steps
-        if length is None:
-            with suppress(AttributeError):  # a TimeLimit that was put around it by hand
-                length = self.env.get_wrapper_attr("_max_episode_steps")
-        if length is None:
-            raise ValueError(
-                "The environment has no time limit that could be read; give the task an "
-                "episode_length, the number of steps of an episode."
-            )
-        return int(length)
 
     def action_bounds(self) -> Tensor:
         """Lower and upper bounds of the actions, ``2 x action_dim``."""
         space = self.env.action_space
         return torch.from_numpy(np.stack([space.low, space.high]).astype(np.float64))
-
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add what is done inside to a part of ``wall_time``."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.wall_time[part] += time.perf_counter() - start
 
     def __repr__(self) -> str:
         """What acts where, in which dynamics, and after how many episodes."""
@@ -457,10 +423,6 @@ class Agent(Resumable, ABC):
     def save(self, path: Any) -> None:
         """Write a checkpoint, from which :func:`resume` makes the agent."""
         EpisodeCheckpoint(path).write(self)
-
-    def own_env(self) -> Any:
-        """The environment."""
-        return self.env
 
     @classmethod
     def described(cls, env: Any) -> dict[str, Any]:

@@ -6,9 +6,12 @@ import io
 import json
 import os
 import random
+import time
 import warnings
 import zipfile
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -18,6 +21,7 @@ import numpy as np
 import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
 
+from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.task import Task
 from gpadjust.files import sync_folder
 
@@ -25,24 +29,71 @@ _FORMAT = "gpadjust episode checkpoint, version 3"
 _OWN = ("manifest.json", "random.npz")
 
 
-class Resumable:
-    """What an agent says and takes back of a run, for :class:`EpisodeCheckpoint`.
+class TaskAgent(ABC):
+    """What all agents share: a task, which real episodes complete, and the parts of a checkpoint.
 
-    Args:
-        task: The task of the agent; not saved.
+    Attributes:
+        task: The task; not saved.
+        wall_time: Seconds spent on each part of the work.
     """
 
-    task: Task | None
+    task: Any
+    env: Any
+    wall_time: dict[str, float]
     _random_state: RandomState | None = None  # of a run that goes on, until `learn`
+
+    def ready_task(self) -> Task:
+        """The task, if the agent can learn with it."""
+        return self.task
+
+    def model_task(self) -> Task:
+        """The task, with what environment and real episodes tell where it says nothing.
+
+        Raises:
+            ValueError: If nobody says how long an episode is.
+        """
+        return self.recorded_episodes().complete(self.ready_task(), self.episode_length())
+
+    def episode_length(self) -> int:
+        """Steps of an episode: those of the task, or else the time limit of the environment.
+
+        Raises:
+            ValueError: If there is neither.
+        """
+        length = self.ready_task().episode_length
+        if length is None and (spec := self.env_attribute("spec")) is not None:
+            length = spec.max_episode_steps
+        if length is None:
+            with suppress(AttributeError):  # a TimeLimit that was put around it by hand
+                length = self.env_attribute("_max_episode_steps")
+        if length is None:
+            raise ValueError(
+                "The environment has no time limit that could be read; give the task an "
+                "episode_length, the number of steps of an episode."
+            )
+        return int(length)
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add what is done inside to a part of ``wall_time``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.wall_time[part] += time.perf_counter() - start
+
+    @abstractmethod
+    def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
+        """The real steps; or the newest of them only."""
+
+    @abstractmethod
+    def env_attribute(self, name: str) -> Any:
+        """An attribute of the environment or of one that it wraps."""
 
     @classmethod
     def wrapped(cls, env: Any) -> Any:
         """The user's environment as the agent holds it."""
         return env
-
-    @abstractmethod
-    def own_env(self) -> Any:
-        """The environment that the agent holds."""
 
     @classmethod
     @abstractmethod
@@ -108,9 +159,9 @@ class EpisodeCheckpoint:
                 f"{lock.lock_file}. Wait for it, or give this run a file of its own."
             ) from error
 
-    def __call__(self, agent: Resumable, event: str, values: Any = None) -> None:
+    def __call__(self, agent: TaskAgent, event: str, values: Any = None) -> None:
         """Write the file before an episode begins, and when the run is done."""
-        if not isinstance(agent, Resumable):
+        if not isinstance(agent, TaskAgent):
             raise TypeError(
                 "EpisodeCheckpoint is for learners with a model, such as MPCAgent and DynaSAC."
             )
@@ -121,7 +172,7 @@ class EpisodeCheckpoint:
         elif event == "done":
             self._write(agent)
 
-    def write(self, agent: Resumable) -> None:
+    def write(self, agent: TaskAgent) -> None:
         """Write the state of a run between two episodes.
 
         Raises:
@@ -130,11 +181,11 @@ class EpisodeCheckpoint:
         with self.locked():
             self._write(agent)
 
-    def _write(self, agent: Resumable) -> None:
+    def _write(self, agent: TaskAgent) -> None:
         manifest = {
             "format": _FORMAT,
             "algorithm": type(agent).__name__,
-            "environment": agent.described(agent.own_env()),
+            "environment": agent.described(agent.env),
             "task": None if agent.task is None else agent.task.describe(),
         }
         parts = {
@@ -157,7 +208,7 @@ class EpisodeCheckpoint:
             raise
 
 
-def resume(path: str | Path, env: Any, task: Task, algorithm: type[Resumable] | None = None) -> Any:
+def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | None = None) -> Any:
     """Read the agent of a run that :class:`EpisodeCheckpoint` wrote, ready to go on.
 
     Go on with ``agent.learn(total - agent.num_timesteps)`` (of Dyna with
@@ -221,10 +272,10 @@ def _compare(path: str | Path, part: str, found: Any, here: Any) -> None:
         )
 
 
-def _known(name: str) -> type[Resumable]:
+def _known(name: str) -> type[TaskAgent]:
     """The class of an agent by its name, of all that are imported."""
-    known: dict[str, type[Resumable]] = {}
-    waiting: list[Any] = [Resumable]
+    known: dict[str, type[TaskAgent]] = {}
+    waiting: list[Any] = [TaskAgent]
     while waiting:
         for each in waiting.pop().__subclasses__():
             known.setdefault(each.__name__, each)

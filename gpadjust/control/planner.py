@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from gpadjust.checks import checked_bounds, checked_number, checked_whole
-from gpadjust.control.objectives import Objective, Return
-from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollouts
 from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
 from gpadjust.control.task import Task
 

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from gpadjust.checks import checked_number, checked_whole
-from gpadjust.control.objectives import Objective, Return
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy
-from gpadjust.control.rollouts import Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollouts
 from gpadjust.control.task import Task
 
 

@@ -188,22 +188,7 @@ def free_run(
     state_bounds: Tensor | None,
     seed: int,
 ) -> FreeRun:
-    """Free runs of dynamics; see :meth:`~gpadjust.dynamics.Dynamics.free_run`.
-
-    Args:
-        spec: What the entries of states and actions are.
-        sample_functions: Draws so many functions of states and actions by a seed.
-        noise_variance: Variances of measured next states about a function.
-        initial_states: As there, like all that follows.
-        actions: The actions.
-        num_functions: The number of functions.
-        level: The probability of the intervals.
-        noise: Whether particles and intervals have the noise.
-        start_noise: By how much the initial states err.
-        process_noise: What each step adds to a particle.
-        state_bounds: Beyond which a particle is lost.
-        seed: The seed.
-    """
+    """Free runs of dynamics; for the arguments see :meth:`~gpadjust.dynamics.Dynamics.free_run`."""
     _check_start(spec, initial_states, actions)
     check_level(level)
     check_enough(num_functions, level)

@@ -22,7 +22,7 @@ from gpadjust.dynamics.learning import (
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state import LearntState, check_fingerprint, fingerprint
 from gpadjust.dynamics.targets import Target, Targets, check_physics
-from gpadjust.dynamics.varying_parameters import VaryingParameters
+from gpadjust.dynamics.varying_parameters import varying_parameters
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
 from gpadjust.models.factory import ModelFactory
@@ -344,11 +344,11 @@ class LearnedDynamics(Dynamics):
         if self.physics is None or not self.physics.unknowns or len(self._recipe.parts) > 1:
             return super()._varied(variation)
         drawn = learnt.model.physics_parameters
-        vary = VaryingParameters.of(self.physics, self.spec, drawn, learnt.data.actions, variation)
+        vary = varying_parameters(self.physics, self.spec, drawn, learnt.data.actions, variation)
 
         def sample_functions(num_functions: int, seed: int | None = None) -> TransitionFunctions:
             functions = self.sample_functions(num_functions, seed)
-            change = vary.changes(num_functions, seed)
+            change = vary(num_functions, seed)
 
             def step(states: Tensor, actions: Tensor) -> Tensor:
                 return functions(states, actions) + change(states, actions)

@@ -1,26 +1,47 @@
-"""Dynamics that are known."""
+"""Dynamics that are a physics alone, known or with unknown parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_whole
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.state import PhysicsProbes, check_fingerprint, fingerprint
+from gpadjust.dynamics.state import COLUMNS, PhysicsProbes, check_fingerprint, fingerprint
 from gpadjust.dynamics.targets import check_physics, next_values, parts_of, warn_of_differences
+from gpadjust.dynamics.trajectories import Trajectories
+from gpadjust.inference.calibrate import warn_of_parameters
+from gpadjust.inference.calibration import Misfit, or_infinite
+from gpadjust.inference.least_squares import descend, least_squares, spread_normal
 from gpadjust.models import Prediction
+from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 
+_SEARCHED = 512  # transitions by which parameters are searched for; all of them refine the best
+_DRAWS = 1024
+
 
 class PhysicsDynamics(Dynamics):
-    """The physics alone, without doubt or learning.
+    r"""The physics alone; of its unknown parameters, if it has any, the most likely ones.
 
     With the true system as physics it is the oracle that bounds what any model can do.
+
+    Unknown parameters are fitted at each `update`, to all transitions so far, by least squares of
+    one step: they minimise
+
+    .. math:: \sum_i \tfrac{n_i}{2} \log \sum_j r_{ij}^2 + \tfrac12 |z|^2
+
+    with the errors :math:`r_{ij}` of the :math:`n_i` measured next values of state i, so that each
+    state counts in units of its own error, and the coordinates z of the parameters, which are
+    standard normal by their prior (:class:`~gpadjust.physics.Unknown`). The search begins at the
+    guesses and the best of 512 draws from the prior, and is the same for the same transitions. A
+    parameter of which they tell nothing stays in the middle of its prior, with a warning. The
+    errors that are left are taken as the noise of measured next states; the functions have none.
 
     Args:
         spec: What the entries of states and actions are.
@@ -34,11 +55,15 @@ class PhysicsDynamics(Dynamics):
     Example:
         >>> import torch
         >>> from gpadjust.dynamics import PhysicsDynamics, StateSpec
-        >>> spec = StateSpec(["x"], ["v"])
-        >>> dynamics = PhysicsDynamics(spec, physics=lambda X: X[:, :1] + 0.1 * X[:, 1:])
-        >>> one = torch.ones(1, 1, dtype=torch.float64)
-        >>> dynamics.sample(one, one)
-        tensor([[1.1000]], dtype=torch.float64)
+        >>> from gpadjust.physics import FunctionPhysics, Unknown
+        >>> def coast(X, p):
+        ...     return X[:, :1] * (1 - p.drag).unsqueeze(-1) + 0.1 * X[:, 1:]
+        >>> physics = FunctionPhysics(coast, unknowns={"drag": Unknown(0.2, factor=2.0)})
+        >>> dynamics = PhysicsDynamics(StateSpec(["v"], ["force"]), physics)
+        >>> v, force = torch.rand(2, 20, 1, dtype=torch.float64)
+        >>> dynamics.update(v, force, 0.7 * v + 0.1 * force)
+        >>> dynamics.physics_parameters.mean
+        tensor([0.3000], dtype=torch.float64)
     """
 
     def __init__(self, spec: StateSpec, physics: Physics | Callable[[Tensor], Tensor]) -> None:
@@ -52,44 +77,81 @@ class PhysicsDynamics(Dynamics):
             )
         self._probes: PhysicsProbes | None = None
         self._compared = False  # with transitions
+        self._fitted: _Fitted | None = None
 
     @property
     def is_fitted(self) -> bool:
-        """True, as there is nothing to learn."""
+        """True, as the guesses serve before there are transitions."""
         return True
 
+    @property
+    def physics_parameters(self) -> PhysicsParameters:
+        """Unknown parameters: 1024 draws about the fitted ones, or the guesses before.
+
+        The draws are of the normal distribution (of the coordinates z) whose precision the slopes
+        of the physics at the optimum say; their ``sd`` are the standard errors, with the prior.
+
+        Raises:
+            ValueError: If the physics has none.
+        """
+        unknowns = self.physics.unknowns
+        if not unknowns:
+            return PhysicsParameters.of(None)
+        if self._fitted is None:
+            return PhysicsParameters(unknowns, unknowns.guess.unsqueeze(0))
+        point, precision = self._fitted.point, self._fitted.precision
+        spread = spread_normal((_DRAWS, len(point)), torch.Generator().manual_seed(0))
+        chol = torch.linalg.cholesky(precision + torch.eye(len(point)).to(precision))
+        away = torch.linalg.solve_triangular(chol.mT, spread.mT, upper=True).mT
+        return PhysicsParameters(unknowns, unknowns.at(point + away))
+
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
-        """Learn nothing; the first transitions show whether the physics returns next states.
+        """Fit unknown parameters to these and all earlier transitions.
+
+        The first transitions show whether the physics returns next states.
 
         Raises:
             TypeError: If they are not float64 tensors.
             ValueError: If shapes disagree, there are no rows, values are not finite, or states are
                 not what the spec says (:meth:`StateSpec.check_transitions`).
+            PhysicsError: If the physics fails at the guesses.
+
+        Warns:
+            ParameterWarning: If the transitions say next to nothing of a parameter, or contradict
+                its prior.
         """
         data = self._checked(states, actions, next_states)
-        if self._compared:
-            return
-        columns = self.spec.moving
-        change = self._change(data.states, data.actions)
-        warn_of_differences(self.physics.name, self.spec, data, columns, change)
+        if not self._compared:
+            columns = self.spec.moving
+            change = self._change(data.states, data.actions)
+            warn_of_differences(self.physics.name, self.spec, data, columns, change)
+            if self._probes is None:
+                self._probes = PhysicsProbes.of(data.states, data.actions, change, columns)
+        if self.physics.unknowns:
+            data = data if self._fitted is None else self._fitted.data.append(data)
+            self._fitted = _fit(self.physics, self.spec, data)
+            self.physics.forget()
         self._compared = True
-        if self._probes is None:
-            self._probes = PhysicsProbes.of(data.states, data.actions, change, columns)
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction:
-        """The next states, and zero variance."""
+        """The next states, and the variance of the noise, zero without unknown parameters."""
         with torch.no_grad():
-            following = self._step(states, actions)
-        return Prediction(following, torch.zeros_like(following))
+            following = self._step(states, actions, self._values)
+        return Prediction(following, self.noise_variance(following, actions))
+
+    def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Mean squares of the errors that the fitted parameters leave; else zero."""
+        if self._fitted is None:
+            return torch.zeros_like(states)
+        return self._fitted.noise.expand_as(states)
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The next states."""
-        with torch.no_grad():
-            return self._step(states, actions)
+        """The next states, with the noise if there is any."""
+        return super().sample(states, actions) if self._fitted else self.predict(states, actions)[0]
 
     def mean_function(self) -> TransitionFunctions:
         """The physics, with gradients as far as it has them."""
-        return self._step
+        return partial(self._step, parameters=self._values)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """The physics, whatever the number; the functions are those of :class:`LearnedDynamics`.
@@ -98,24 +160,30 @@ class PhysicsDynamics(Dynamics):
             ValueError: If ``num_functions`` is no positive whole number.
         """
         checked_whole("num_functions", num_functions, 1)
+        values = self._values
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_blocks(states, actions, num_functions)
-            return self._step(states, actions)
+            return self._step(states, actions, values)
 
         return step
 
     def describe(self) -> dict[str, str]:
         """What these dynamics are, each setting as a text."""
-        return fingerprint(type(self), self.spec)
+        unknowns = {name: repr(u) for name, u in self.physics.unknowns.items()}
+        return fingerprint(type(self), self.spec, **({"unknowns": unknowns} if unknowns else {}))
 
     def state_dict(self) -> dict[str, Any]:
-        """What these dynamics are, and what the physics said of the first transitions."""
+        """What these dynamics are, what was learnt, and what the physics said of some transitions.
+
+        That is at the guesses of unknown parameters.
+        """
         probes = None if self._probes is None else [tensor.clone() for tensor in self._probes]
-        return {"fingerprint": self.describe(), "probes": probes}
+        fitted = None if self._fitted is None else self._fitted.state_dict()
+        return {"fingerprint": self.describe(), "probes": probes, "fitted": fitted}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Check that the state is of such dynamics; there is nothing learnt.
+        """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
 
         The physics is asked about at most three transitions that the state holds.
 
@@ -125,27 +193,124 @@ class PhysicsDynamics(Dynamics):
             PhysicsError: If the physics fails.
         """
         check_fingerprint(state, self.describe())
-        given = state.get("probes")
-        if given is None:
-            return
-        moving = self.spec.moving
-        probes = PhysicsProbes.checked(given, self.spec, len(moving))
-        found = self._change(probes.states, probes.actions)
-        probes.check(found, self.physics.name, self.spec, moving)
-        self._probes = probes
+        given, moving = state.get("probes"), self.spec.moving
+        fitted = _Fitted.checked(state.get("fitted"), self.spec, len(self.physics.unknowns))
+        if given is not None:
+            probes = PhysicsProbes.checked(given, self.spec, len(moving))
+            found = self._change(probes.states, probes.actions)
+            probes.check(found, self.physics.name, self.spec, moving)
+            self._probes = probes
+        self._fitted = fitted
+        self.physics.forget()
+
+    @property
+    def _values(self) -> Tensor | None:
+        """The parameters that it follows, None for the guesses or without any."""
+        return None if self._fitted is None else self.physics.unknowns.at(self._fitted.point)
 
     def _change(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The change of the states that move."""
+        """The change of the states that move, at the guesses."""
         with torch.no_grad():
             following = self._step(states, actions)
         return self.spec.change(states, following)[..., self.spec.moving]
 
-    def _step(self, states: Tensor, actions: Tensor) -> Tensor:
+    def _step(self, states: Tensor, actions: Tensor, parameters: Tensor | None = None) -> Tensor:
         moving = self.spec.moving
         self._check_pair(states, actions)
         actions = actions.expand(*states.shape[:-1], -1)
         following = states.clone()
-        following[..., moving] = next_values(
-            self.physics, torch.cat([states[..., moving], actions], dim=-1), len(moving)
-        )
+        inputs = torch.cat([states[..., moving], actions], dim=-1)
+        following[..., moving] = next_values(self.physics, inputs, len(moving), parameters)
         return self.spec.remember(following, states, actions)
+
+
+class _Fitted(NamedTuple):
+    """Parameters that were fitted.
+
+    Args:
+        data: The transitions that they were fitted to.
+        point: Their coordinates, ``p``.
+        precision: What the transitions say of these, ``p x p``, without the prior.
+        noise: Mean squares of the errors, ``state_dim``, 0 of states that do not move.
+    """
+
+    data: Trajectories
+    point: Tensor
+    precision: Tensor
+    noise: Tensor
+
+    def state_dict(self) -> dict[str, Any]:
+        """All of it, in tensors; of the transitions their columns."""
+        columns = {name: getattr(self.data, name).clone() for name in COLUMNS}
+        tensors = {name: getattr(self, name).clone() for name in self._fields[1:]}
+        return {"transitions": columns, **tensors}
+
+    @classmethod
+    def checked(cls, state: Any, spec: StateSpec, p: int) -> _Fitted | None:
+        """Take a state; a RuntimeError if it is damaged."""
+        if state is None:
+            return None
+        shapes = {"point": (p,), "precision": (p, p), "noise": (spec.state_dim,)}
+        try:
+            data = Trajectories.checked(spec, **state["transitions"])
+            tensors = [state[name].clone() for name in shapes]
+            whole = [tuple(t.shape) for t in tensors] == [*shapes.values()]
+            whole = whole and all(t.dtype == torch.float64 and t.isfinite().all() for t in tensors)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise RuntimeError(f"The state is damaged in its fitted parameters. {error}") from error
+        if not whole:
+            raise RuntimeError(
+                "The state is damaged: expected fitted parameters as finite float64 tensors, "
+                f"{', '.join(f'{name} of shape {shape}' for name, shape in shapes.items())}."
+            )
+        return cls(data, *tensors)
+
+
+class _Steps(Misfit):
+    """Errors of a physics in one step, by the coordinates of its unknown parameters."""
+
+    def __init__(self, physics: Physics, spec: StateSpec, data: Trajectories) -> None:
+        self.physics, self.spec, self.data = physics, spec, data
+        moving = spec.moving
+        self.inputs = torch.cat([data.states[:, moving], data.actions], dim=-1)
+        self.targets = spec.change(data.states, data.next_states)[:, moving].mT
+        self.observed = ~self.targets.isnan()
+
+    @property
+    def point(self) -> Tensor:
+        """The coordinates of the guesses."""
+        return self.physics.unknowns.coordinates(self.physics.unknowns.guess)
+
+    def residuals(self, points: Tensor) -> Tensor:
+        """Next states less those of the physics, ``... x m x n``, of angles the shortest way."""
+        spec, values = self.spec, self.physics.unknowns.at(points)
+        following = or_infinite(self.physics.or_nan(self.inputs, values))
+        failed = ~following.isfinite()
+        predicted = self.data.states.expand(*following.shape[:-1], -1).clone()
+        predicted[..., spec.moving] = following.masked_fill(failed, 0.0)
+        error = spec.change(predicted, self.data.next_states)[..., spec.moving]
+        error = error.masked_fill(failed, torch.inf).mT
+        return error.where(self.observed, torch.zeros_like(error))
+
+
+@torch.no_grad()
+def _fit(physics: Physics, spec: StateSpec, data: Trajectories) -> _Fitted:
+    """The most likely parameters by all transitions."""
+    n, unknowns = len(data.states), physics.unknowns
+    whole = _Steps(physics, spec, data)
+    if not whole.residuals(whole.point).isfinite().all():
+        physics(whole.inputs)  # which says where it fails
+    rows = torch.linspace(0, n - 1, min(n, _SEARCHED), dtype=torch.float64).round().long()
+    generator = torch.Generator().manual_seed(0)
+    points = least_squares(_Steps(physics, spec, data.some(rows)), generator).points
+    found, values, variances, _ = descend(whole, points)
+    best = int(values.argmin())
+    near = whole.linearized(found[best])
+    weighted = near.slope / variances[best][:, None, None]
+    precision = (weighted.mT @ near.slope).sum(-3)
+    count = whole.observed.sum()
+    noise = torch.zeros(spec.state_dim, dtype=torch.float64)
+    square = near.residual.square().sum(-1) / whole.observed.sum(-1).clamp_min(1)
+    noise[spec.moving] = square * count / (count - len(unknowns)).clamp_min(1)
+    warn_of_parameters(unknowns.names, precision, near.point, stacklevel=4)
+    return _Fitted(data, near.point, precision, noise)

@@ -142,12 +142,7 @@ class PhysicsProbes(NamedTuple):
 
 
 class LearntState(NamedTuple):
-    """What :meth:`Learnt.state_dict` holds, once it is found to be whole.
-
-    Args:
-        data: As in :class:`Learnt`, like ``known``, ``chunks`` and ``searched_at``.
-        parameters: The state of the fitted model.
-    """
+    """State of :class:`LearnedDynamics`: as :class:`Learnt`, with that of the fitted model."""
 
     data: Trajectories
     known: Tensor | None
@@ -157,10 +152,10 @@ class LearntState(NamedTuple):
 
     @classmethod
     def checked(cls, state: Mapping[str, Any], spec: StateSpec, num_known: int) -> LearntState:
-        """Take a state.
+        """Take a state, whose tensors are copied.
 
         Args:
-            state: The state; its tensors are copied.
+            state: The state.
             spec: What the entries of states and actions are.
             num_known: The number of columns of what the physics says, 0 without one.
 
@@ -171,8 +166,13 @@ class LearntState(NamedTuple):
             if name not in state:
                 raise RuntimeError(f"The state is damaged: it lacks {name!r}.")
         given, known, parameters = state["transitions"], state["physics"], state["model"]
-        if not isinstance(given, Mapping) or {*given} != {*COLUMNS}:
-            raise _damaged("transitions", f"a dictionary of {', '.join(COLUMNS)}")
+
+        def expect(right: bool, name: str, expected: str) -> None:
+            if not right:
+                raise RuntimeError(f"The state is damaged: expected {name!r} as {expected}.")
+
+        whole = isinstance(given, Mapping) and {*given} == {*COLUMNS}
+        expect(whole, "transitions", f"a dictionary of {', '.join(COLUMNS)}")
         try:
             data = Trajectories.checked(spec, **given)
         except (TypeError, ValueError) as error:
@@ -184,32 +184,22 @@ class LearntState(NamedTuple):
                 f"The state is of dynamics with{there} a physics, but there is {here} here. Load "
                 "it into dynamics built as they were."
             )
-        if known is not None and not _is_finite(known, (n, num_known)):
-            raise _damaged("physics", f"finite float64 values of shape {(n, num_known)}")
+        if known is not None:
+            whole = torch.is_tensor(known) and known.dtype == torch.float64
+            whole = whole and known.shape == (n, num_known) and bool(known.isfinite().all())
+            expect(whole, "physics", f"finite float64 values of shape {(n, num_known)}")
+            known = known.clone()
         chunks, searched_at = state["chunks"], state["searched_at"]
-        whole = isinstance(chunks, list | tuple) and all(_is_count(size, n) for size in chunks)
-        if not whole or sum(chunks) != n:
-            raise _damaged("chunks", f"numbers of transitions, {n} in all")
-        if not _is_count(searched_at, n):
-            raise _damaged("searched_at", f"a number of transitions, at most {n}")
-        named = isinstance(parameters, Mapping)
-        if not named or any(not torch.is_tensor(t) or t.isnan().any() for t in parameters.values()):
-            raise _damaged("model", "a dictionary of tensors without NaN")
-        known = None if known is None else known.clone()
+        for size in [*chunks] if isinstance(chunks, list | tuple) else [None]:
+            whole = isinstance(size, int) and 1 <= size <= n
+            expect(whole, "chunks", f"numbers of transitions, {n} in all")
+        expect(sum(chunks) == n, "chunks", f"numbers of transitions, {n} in all")
+        whole = isinstance(searched_at, int) and 1 <= searched_at <= n
+        expect(whole, "searched_at", f"a number of transitions, at most {n}")
+        whole = isinstance(parameters, Mapping) and all(map(torch.is_tensor, parameters.values()))
+        whole = whole and not any(tensor.isnan().any() for tensor in parameters.values())
+        expect(whole, "model", "a dictionary of tensors without NaN")
         return cls(data, known, tuple(chunks), searched_at, dict(parameters))
-
-
-def _is_finite(values: Any, shape: tuple[int, int]) -> bool:
-    found = torch.is_tensor(values) and values.dtype == torch.float64 and values.shape == shape
-    return found and bool(values.isfinite().all())
-
-
-def _is_count(number: Any, most: int) -> bool:
-    return isinstance(number, int) and 1 <= number <= most
-
-
-def _damaged(name: str, expected: str) -> RuntimeError:
-    return RuntimeError(f"The state is damaged: expected {name!r} as {expected}.")
 
 
 def _text(value: Any) -> str:

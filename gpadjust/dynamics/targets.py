@@ -217,9 +217,11 @@ def parts_of(physics: Physics) -> dict[str, Physics]:
     return {physics.name: physics}
 
 
-def next_values(physics: Physics, inputs: Tensor, num_states: int) -> Tensor:
+def next_values(
+    physics: Physics, inputs: Tensor, num_states: int, parameters: Tensor | None = None
+) -> Tensor:
     """What the physics says, ``... x num_states``, from ``... x (num_states + a)``."""
-    Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0))
+    Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0), parameters)
     check_next_values(physics, Y, num_states)
     return Y
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -53,7 +53,7 @@ class Windows(NamedTuple):
         return self.some(spread_rows(len(self.states), number, seed, "windows"))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Trajectories:
     """Trajectories of a system: rows of transitions, and to which episode each belongs.
 
@@ -75,13 +75,19 @@ class Trajectories:
     states: Tensor
     actions: Tensor
     next_states: Tensor
-    episode: Tensor = None  # type: ignore[assignment]
+    episode: Tensor
 
-    def __post_init__(self) -> None:
-        """Number the episodes, and check them."""
-        episode = torch.arange(len(self.states)) if self.episode is None else self.episode
-        object.__setattr__(self, "episode", torch.as_tensor(episode).long())
-        rows = {"states": self.states, "actions": self.actions, "next_states": self.next_states}
+    def __init__(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        next_states: Tensor,
+        episode: Tensor | Sequence[int] | None = None,
+    ) -> None:
+        episode = torch.arange(len(states)) if episode is None else torch.as_tensor(episode)
+        rows = {"states": states, "actions": actions, "next_states": next_states}
+        for name, tensor in {**rows, "episode": episode.long()}.items():
+            object.__setattr__(self, name, tensor)
         found = {name: len(tensor) for name, tensor in {**rows, "episode": self.episode}.items()}
         if len({*found.values()}) > 1 or self.episode.dim() != 1:
             raise ValueError(
@@ -101,7 +107,7 @@ class Trajectories:
         states: Tensor,
         actions: Tensor,
         next_states: Tensor,
-        episode: Tensor | None = None,
+        episode: Tensor | Sequence[int] | None = None,
     ) -> Trajectories:
         """Take the user's tensors, copied.
 
@@ -128,7 +134,8 @@ class Trajectories:
                 check_observed("the predicted entries of next_states", tensor[:, spec.predicted])
             else:
                 check_finite(name, tensor)
-        return cls(*(tensor.detach().clone() for tensor in named.values()), episode)
+        states, actions, next_states = (tensor.detach().clone() for tensor in named.values())
+        return cls(states, actions, next_states, episode)
 
     def __iter__(self) -> Iterator[Tensor]:
         """States, actions and next states."""
@@ -143,8 +150,9 @@ class Trajectories:
         """These trajectories, then others; no episode goes on in them."""
         last = self.episode.max() if len(self.episode) else -1
         first = other.episode.min() if len(other.episode) else 0
-        parts = [torch.cat(pair) for pair in zip(self, other, strict=True)]
-        return Trajectories(*parts, torch.cat([self.episode, other.episode - first + last + 1]))
+        states, actions, next_states = (torch.cat(pair) for pair in zip(self, other, strict=True))
+        episode = torch.cat([self.episode, other.episode - first + last + 1])
+        return Trajectories(states, actions, next_states, episode)
 
     def some(self, rows: Tensor | slice) -> Trajectories:
         """The rows of these numbers, a slice, or those where ``N`` booleans are true.
@@ -155,7 +163,8 @@ class Trajectories:
         old = self.episode[numbers]
         ends = (numbers.diff() != 1) | (old.diff() != 0)
         new = torch.cat([torch.zeros_like(old[:1]), ends.long().cumsum(0)])
-        return Trajectories(*(tensor[numbers] for tensor in self), new)
+        states, actions, next_states = (tensor[numbers] for tensor in self)
+        return Trajectories(states, actions, next_states, new)
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
         """So many of the rows, drawn evenly: one of each of as many parts of the same length.

@@ -46,12 +46,12 @@ class Proposal(Protocol):
         ...
 
     def covariance(self) -> Tensor:
-        """That of all or part of it, ``B x p x p``."""
+        """Return the covariance of all draws or of a part, ``B x p x p``."""
         ...
 
 
 class Particles(NamedTuple):
-    """Equally likely draws, in two halves by turns that tell nothing of each other.
+    """Equally likely draws, in two alternating halves that are independent of each other.
 
     Attributes:
         positions: ``N x B x p``.
@@ -66,7 +66,7 @@ class Particles(NamedTuple):
     power: Tensor
 
     def effective_size(self) -> Tensor:
-        """How many independent draws tell as much, ``B``, as far as the two halves agree.
+        """Return the equivalent number of independent draws, ``B``, if the two halves agree.
 
         Their means are apart by the square root of ``4 / N`` standard deviations, if all count.
         """
@@ -77,7 +77,7 @@ class Particles(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Where particles are, and the negative log densities and gradients there.
+    """Positions of particles, and the negative log densities and gradients there.
 
     Attributes:
         positions: ``N x B x p``.
@@ -103,7 +103,7 @@ class _State(NamedTuple):
         return power * self.value + (1 - power) * self.first_value, gradient
 
     def rows(self, rows: Tensor) -> _State:
-        """Those of the numbers ``N' x B``."""
+        """Return the draws of the numbers ``N' x B``."""
         return _State(*(_gathered(part, rows) for part in self))
 
 
@@ -306,7 +306,7 @@ def resampled(weights: Tensor, number: int, generator: torch.Generator) -> Tenso
 
 
 def _gathered(values: Tensor, rows: Tensor) -> Tensor:
-    """Those of values ``N x B x ...`` of the numbers ``N' x B``."""
+    """Return the values ``N x B x ...`` at the numbers ``N' x B``."""
     return values[rows, torch.arange(rows.shape[-1], device=rows.device)]
 
 

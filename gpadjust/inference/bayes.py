@@ -54,10 +54,10 @@ class SamplingWarning(UserWarning):
 
 @dataclass(frozen=True, repr=False)
 class SampleResult:
-    """What sampling the hyper-parameters has reached; it prints as a sentence.
+    """Result of sampling the hyper-parameters; it prints as a sentence.
 
     Attributes:
-        effective_size: How many independent draws tell as much as those that were made, of each
+        effective_size: The equivalent number of independent draws of those that were made, of each
             output, ``batch_shape x (m)``: as many as were, if two halves of them agree. Beside
             unknown parameters of the physics also by the weights of theirs, as they are, or by
             what those remember that moved.
@@ -68,7 +68,7 @@ class SampleResult:
             0.3 at least.
         draws: Equally likely draws of each hyper-parameter of the model with its physics, ``k x``
             its shape, by its name: 16 to 256 by default, 1,024 beside unknown parameters of the
-            physics. Of a centre that is learnt in standard deviations of f_p from its mean.
+            physics. Of a center that is learnt in standard deviations of f_p from its mean.
         relevance: Posterior probability that the physics is of use at all, of each output, of the
             same shape; None of a model that is not weighed without it.
         num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
@@ -119,7 +119,7 @@ class _Draws(NamedTuple):
     rough: Tensor
 
     def is_good(self) -> Tensor:
-        """Whether they are of the posterior, ``B``."""
+        """True if the draws are of the posterior, ``B``."""
         return self.particles.power >= _LEAST_POWER
 
     def relevance(self, rival: _Draws) -> Tensor:
@@ -134,7 +134,7 @@ class _Draws(NamedTuple):
         )
 
     def log_evidence(self) -> Tensor:
-        """By all states, ``B``, or rough where particles are of the density on the way."""
+        """The log evidence by all states, ``B``; rough if particles are of a density on the way."""
         return self.particles.log_evidence.where(self.particles.power == 1, self.rough)
 
     def raw(self, rows: Tensor) -> dict[str, Tensor]:
@@ -212,7 +212,7 @@ def _with_parameters(
     num_draws: int,
     generator: torch.Generator,
 ) -> SampleResult:
-    """As :func:`sample`, of a model whose physics has unknown parameters."""
+    """Sample a model whose physics has unknown parameters."""
     copy, n = deepcopy(model), model.train_targets.shape[-1]
     settled = _settle_shared(copy, search)
     calibrated = calibrate_roughly(copy, search)
@@ -252,7 +252,9 @@ def _with_parameters(
     named = _named(parameters, vectors) | model.input_transform.remember(coordinates)
     _hold(model, held, settled)
     calibrated.calibration.direct(model, coordinates[rows])
-    warn_of_parameters(calibrated)
+    calibration, near = calibrated.calibration, calibrated.near
+    told = calibrated.information.precision.sum(-3)
+    warn_of_parameters(calibration.unknowns.names, told, near.point)
     return _result(size, is_good, named, parameters, hint=hint)
 
 
@@ -293,18 +295,18 @@ def _result(
 
 
 def _can_be_weighed(model: TermsGP) -> bool:
-    """Whether there are enough observations to weigh a model without its physics, or too many."""
+    """Return whether the number of observations allows to weigh a model without its physics."""
     fewest = int((~model.train_targets.isnan()).sum(-1).min())
     return fewest >= _LEAST_WEIGHED and model.train_targets.shape[-1] <= MANY
 
 
 def _default_num_draws(num_points: int) -> int:
-    """How many draws a fit begins with, if that is not said."""
+    """Return the default number of draws that a fit begins with."""
     return max(_DRAWS[0], min(_DRAWS[1], _COST // num_points**2))
 
 
 def default_num_samples(num_points: int) -> int:
-    """How many samples a model of so many observations holds, if that is not said."""
+    """Return the default number of samples that a model of so many observations holds."""
     return next(number for most, number in _SAMPLES.items() if num_points <= most)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -111,31 +112,38 @@ def calibrate_roughly(model: TermsGP, search: Search) -> Calibrated:
         return calibrate(model, search)
 
 
-def warn_of_parameters(calibrated: Calibrated) -> None:
+def warn_of_parameters(
+    names: Sequence[str], precision: Tensor, point: Tensor, stacklevel: int = 4
+) -> None:
     """Warn of parameters that the observations tell nothing of, or against what was known.
 
     The first are directions in which the observations have next to none of the prior's precision;
     the second are likely more standard deviations of the prior away from its middle than it allows.
+
+    Args:
+        names: Their names.
+        precision: What the observations say of their coordinates, ``p x p``, without the prior.
+        point: Their most likely coordinates, ``p``.
+        stacklevel: Whose call is warned of.
     """
-    names = calibrated.calibration.unknowns.names
 
     def of(which: Tensor) -> str:
         return ", ".join(name for name, yes in zip(names, which.tolist(), strict=True) if yes)
 
-    values, vectors = torch.linalg.eigh(calibrated.information.precision.sum(-3))
+    values, vectors = torch.linalg.eigh(precision)
     if silent := of(vectors[:, values < _UNTOLD].norm(dim=-1) > _TAKES_PART):
         warnings.warn(
             f"The observations say next to nothing of {silent} of the physics, or only of a "
             "combination of them: their posterior is their prior there. Observe where they matter, "
             "give narrower priors, or take one of them as known.",
             ParameterWarning,
-            stacklevel=4,
+            stacklevel=stacklevel,
         )
-    if against := of(calibrated.near.point.abs() > _FAR):
+    if against := of(point.abs() > _FAR):
         warnings.warn(
             f"Observations and prior disagree about {against} of the physics: most likely are "
             f"values more than {_FAR:g} standard deviations of the prior away. Look at guess, sd, "
             "factor and bounds, or at the physics.",
             ParameterWarning,
-            stacklevel=4,
+            stacklevel=stacklevel,
         )

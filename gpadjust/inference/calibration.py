@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import torch
@@ -58,7 +59,38 @@ class Information(NamedTuple):
         return torch.cholesky_solve(vector.unsqueeze(-1), chol).squeeze(-1), chol
 
 
-class Calibration:
+class Misfit(ABC):
+    """Targets, and what unknown parameters of a physics make of them.
+
+    Attributes:
+        targets: The observations, ``B x n``, NaN where there is none.
+        observed: Where there is one.
+    """
+
+    targets: Tensor
+    observed: Tensor
+
+    @property
+    @abstractmethod
+    def point(self) -> Tensor:
+        """Coordinates at which the physics works, ``p``."""
+
+    @abstractmethod
+    def residuals(self, points: Tensor) -> Tensor:
+        """As in :class:`LinearizedMean`, at points ``... x p``."""
+
+    @torch.no_grad()
+    def linearized(self, points: Tensor) -> LinearizedMean:
+        """The mean of the targets near points ``... x p``."""
+        p = points.shape[-1]
+        moves, here = _STEP * torch.eye(p).to(points), points.unsqueeze(-2)
+        residual = self.residuals(torch.cat([here, here + moves, here - moves], dim=-2))
+        here, up, down = residual.split([1, p, p], dim=-3)
+        slope = ((down - up) / (2 * _STEP)).movedim(-3, -1)
+        return LinearizedMean(points, here.squeeze(-3), slope.nan_to_num(0.0, 0.0, 0.0))
+
+
+class Calibration(Misfit):
     r"""The unknown parameters of a model's physics, which all of its ``B`` outputs share.
 
     In their coordinates z, which are standard normal by the prior, the mean of the targets is
@@ -126,16 +158,6 @@ class Calibration:
             kernel = term.kernel
             if isinstance(kernel, OrthogonalKernel):
                 kernel.set_directions(inputs[..., : term.num_inputs], slope.reshape(shape))
-
-    @torch.no_grad()
-    def linearized(self, points: Tensor) -> LinearizedMean:
-        """The prior mean near points ``... x p``."""
-        p = points.shape[-1]
-        moves, here = _STEP * torch.eye(p).to(points), points.unsqueeze(-2)
-        residual = self.residuals(torch.cat([here, here + moves, here - moves], dim=-2))
-        here, up, down = residual.split([1, p, p], dim=-3)
-        slope = ((down - up) / (2 * _STEP)).movedim(-3, -1)
-        return LinearizedMean(points, here.squeeze(-3), slope.nan_to_num(0.0, 0.0, 0.0))
 
     def check_slope(self, near: LinearizedMean) -> None:
         """Raise a ValueError if the mean has no slope by some parameters, for no good reason."""

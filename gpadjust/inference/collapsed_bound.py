@@ -35,7 +35,7 @@ class Observations(NamedTuple):
 
     @classmethod
     def of(cls, model: VariationalCKA) -> Observations:
-        """Those of a model."""
+        """Return the bound of a model."""
         (inputs,), known = model.train_inputs, model.noise.known
         with torch.no_grad():
             residual = model.train_targets - model.covar_module.at(inputs).mean()
@@ -67,7 +67,7 @@ class CollapsedBound:
     """
 
     def __init__(self, model: TermsGP, data: Observations, inducing_points: Tensor) -> None:
-        model.covar_module.train()  # in which centres have gradients
+        model.covar_module.train()  # in which centers have gradients
         self._model, self._data, self._points = model, data, inducing_points
 
     @cached_property
@@ -158,7 +158,7 @@ class CollapsedBound:
             yield part, (k, variance), torch.linalg.solve_triangular(chol, k.detach(), upper=False)
 
     def _covariances(self, inputs: Tensor) -> _Pair:
-        """Those with the inducing values, ``(m) x M x n``, and prior variances, ``(m) x n``."""
+        """Return covariances with inducing values, ``(m) x M x n``, and variances, ``(m) x n``."""
         f = self._model.at(inputs.expand(*self._points.shape[:-2], *inputs.shape[-2:]))
         return self._model.at(self._points).cross(f), f.variance()
 

@@ -21,7 +21,7 @@ from gpadjust.inference.vectors import Parameters, Values
 
 
 class MarginalizedParameters(NamedTuple):
-    """What unknown parameters of a physics add to the distribution of the targets.
+    """Contribution of a physics' unknown parameters to the distribution of the targets.
 
     Attributes:
         mean: Added to their mean, ``(m) x n``.
@@ -52,7 +52,7 @@ class _Part(NamedTuple):
     """A term of a sum in closed form; what may be learnt is said by name.
 
     Attributes:
-        x: Its inputs, centred, ``... x n x d``.
+        x: Its inputs, centerd, ``... x n x d``.
         profile: Its kernel as a function of the distance.
         lengthscale: The name of the lengthscales.
         scale: That of the outputscale, or None for 1.
@@ -173,12 +173,12 @@ def stationary_terms(
         return row.name
 
     likelihood, kernel, parts = Noise(model.likelihood), model.covar_module, []
-    centred = inputs - inputs.mean(-2, keepdim=True)
+    centerd = inputs - inputs.mean(-2, keepdim=True)
     for term in kernel.terms:
         form = None if term.kernel is None else stationary_parts(term.kernel, term.num_inputs)
         if form is not None:
             base, outer, profile = form
-            x, constant = centred[..., : term.num_inputs], getattr(term.basis, "learnt", None)
+            x, constant = centerd[..., : term.num_inputs], getattr(term.basis, "learnt", None)
             scale = None if outer is None else enter(outer.raw_outputscale)
             part = _Part(x, profile, enter(base.raw_lengthscale), scale, term.weights(inputs))
             if constant is not None:

@@ -179,7 +179,7 @@ def fit(
     Warns:
         OptimizationWarning: If the optimiser did not converge.
         SamplingWarning: If the draws do not show the posterior.
-        ParameterWarning: If the observations tell next to nothing of a parameter of the physics, or
+        ParameterWarning: If the observations hardly determine a parameter of the physics, or
             of a combination of some, or contradict its prior.
     """
     if isinstance(model, ModelListGP):
@@ -191,7 +191,7 @@ def fit(
         )
     if is_fully_bayesian(model) and not isinstance(model, TermsGP):
         raise RuntimeError(
-            f"The {type(model).__name__} holds samples of its hyper-parameters; build it anew, to "
+            f"The {type(model).__name__} holds samples of its hyper-parameters; build it again, to "
             "fit it."
         )
     method = method or ("bayes" if _can_be_sampled(model) else "map")
@@ -254,7 +254,7 @@ def _fit_list(
 
 
 def _can_be_sampled(model: Fittable) -> bool:
-    """Whether a model can hold samples, and has something to sample."""
+    """Return whether a model can hold samples, and has something to sample."""
     if not isinstance(model, TermsGP):
         return False
     try:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from gpadjust.inference.calibration import Calibration, or_infinite
+from gpadjust.inference.calibration import Misfit, or_infinite
 
 _GUESSES = 512  # of the parameters, of which the best are started from
 _STARTS = 32
@@ -42,7 +42,7 @@ class Optima(NamedTuple):
 
 
 @torch.no_grad()
-def least_squares(calibration: Calibration, generator: torch.Generator) -> Optima:
+def least_squares(misfit: Misfit, generator: torch.Generator) -> Optima:
     r"""The parameters that fit best without any Gaussian process.
 
     They minimise :math:`\sum_j \tfrac{n_j}{2} \log |r_j|^2 + \tfrac12 |z|^2`, with the variance
@@ -50,12 +50,12 @@ def least_squares(calibration: Calibration, generator: torch.Generator) -> Optim
     likely others that none did, so that more begin.
     """
     guesses, found = (
-        calibration.point.unsqueeze(0),
+        misfit.point.unsqueeze(0),
         [],
     )  # where it works, as the model was built there
     for _ in range(_ROUNDS_OF_SEARCHES):
         others = spread_normal((_GUESSES, guesses.shape[-1]), generator).to(guesses)
-        found.append(_descend(calibration, torch.cat([guesses, others])))
+        found.append(descend(misfit, torch.cat([guesses, others])))
         points, values, variances, hessians = map(torch.cat, zip(*found, strict=True))
         kept, square = _apart(points, values, hessians)
         share = (values[kept].min() - values[kept]).exp()
@@ -70,18 +70,18 @@ def least_squares(calibration: Calibration, generator: torch.Generator) -> Optim
     return Optima(points[kept], variances[kept[0]], unseen.item())
 
 
-def _descend(calibration: Calibration, guesses: Tensor) -> tuple[Tensor, ...]:
+def descend(misfit: Misfit, guesses: Tensor) -> tuple[Tensor, ...]:
     """Searches by Levenberg and Marquardt, which begin at the best of guesses ``... x p``.
 
     Returns:
         Where they came to, ``k x p``, what they minimise there, ``k``, variances of residuals,
         ``k x B``, and about the second derivatives, ``k x p x p``.
     """
-    values = _misfit(calibration, guesses, calibration.residuals(guesses))[0]
+    values = _misfit(misfit, guesses, misfit.residuals(guesses))[0]
     prior = torch.eye(guesses.shape[-1]).to(guesses).expand(len(guesses), -1, -1)
     best = _apart(guesses, values, prior)[0][:_STARTS]
-    near = calibration.linearized(guesses[best[values[best].isfinite()]])
-    values, variances = _misfit(calibration, near.point, near.residual)
+    near = misfit.linearized(guesses[best[values[best].isfinite()]])
+    values, variances = _misfit(misfit, near.point, near.residual)
     damping = values.new_full((len(values), 1, 1), 1e-3)
     hessians = torch.empty_like(damping).expand(-1, *prior.shape[1:]).clone()
     going = torch.arange(len(values), device=values.device)
@@ -92,8 +92,8 @@ def _descend(calibration: Calibration, guesses: Tensor) -> tuple[Tensor, ...]:
         gradient = (weighted.mT @ residual).sum(-3).squeeze(-1) - z
         hessian = hessians[going] = (weighted.mT @ slope).sum(-3) + prior[0]
         damped = hessian + damping[going] * torch.diag_embed(hessian.diagonal(dim1=1, dim2=2))
-        moved = calibration.linearized(z + torch.linalg.solve(damped, gradient))
-        found, others = _misfit(calibration, moved.point, moved.residual)
+        moved = misfit.linearized(z + torch.linalg.solve(damped, gradient))
+        found, others = _misfit(misfit, moved.point, moved.residual)
         better = found < values[going]
         arrived = better & (values[going] - found < _ARRIVED)
         damping[going] *= torch.where(better, 0.2, 5.0)[:, None, None]
@@ -106,10 +106,10 @@ def _descend(calibration: Calibration, guesses: Tensor) -> tuple[Tensor, ...]:
     return near.point, values, variances, hessians
 
 
-def _misfit(calibration: Calibration, z: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+def _misfit(misfit: Misfit, z: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """What least squares minimise, ``k``, and the variances of residuals, ``k x B``."""
-    count = calibration.observed.sum(-1).to(z)
-    least = _SILENT * calibration.targets.square().nanmean(-1) + torch.finfo(z.dtype).tiny
+    count = misfit.observed.sum(-1).to(z)
+    least = _SILENT * misfit.targets.square().nanmean(-1) + torch.finfo(z.dtype).tiny
     variances = (residual.square().sum(-1) / count).maximum(least)
     value = (0.5 * count * variances.log()).sum(-1) + 0.5 * z.square().sum(-1)
     return or_infinite(value), variances

@@ -49,7 +49,7 @@ class Search(NamedTuple):
 
 @dataclass(frozen=True)
 class FitResult:
-    """What a fit reached.
+    """Result of a fit.
 
     Attributes:
         log_likelihood: The log marginal likelihood (plus log priors, if the model has any) of
@@ -65,7 +65,7 @@ class FitResult:
 
 
 class Differentiable(Protocol):
-    """What L-BFGS brings to its minimum."""
+    """A function that L-BFGS minimises."""
 
     @property
     def parameters(self) -> Parameters:
@@ -113,7 +113,7 @@ def maximise(
 
 @contextmanager
 def centers_at_rest(model: BatchedMultiOutputGPyTorchModel) -> Iterator[None]:
-    """Let centres rest: the most likely ones are found far out, where intervals are too narrow."""
+    """Let centers rest: the most likely ones are found far out, where intervals are too narrow."""
     bases = [b for b in model.covar_module.modules() if isinstance(b, AppendedPhysics)]
     learnt = [basis.learnt for basis in bases if basis.learnt is not None]
     for center in learnt:
@@ -133,7 +133,7 @@ def optima(target: Target, search: Search) -> tuple[Tensor, Tensor]:
 
 
 def _starts(target: Target, search: Search) -> Tensor:
-    """Where L-BFGS starts, ``k x B x p``; an error if the target is finite nowhere."""
+    """Return the starts of L-BFGS, ``k x B x p``; an error if the target is finite nowhere."""
     parameters = target.parameters
     starts = parameters.clipped(parameters.current())
     if search.num_screened != 0:
@@ -207,7 +207,7 @@ def _screened(target: Target, search: Search) -> Tensor:
 
 
 def _rows(vectors: Tensor, numbers: Tensor) -> Tensor:
-    """Those of the vectors ``k x B x p`` of the numbers ``k' x B``, for each problem."""
+    """Return the vectors ``k x B x p`` of the numbers ``k' x B``, for each problem."""
     numbers = numbers.to(vectors.device)
     return vectors.gather(0, numbers.unsqueeze(-1).expand(-1, -1, vectors.shape[-1]))
 
@@ -219,7 +219,7 @@ def optimise(
 
     The optimiser has one box for all problems: it sees vectors less their lower bounds. Its first
     step is of length one, a factor of e in logarithms: a longer one may end in noise so small that
-    the nugget hides it, where nothing leads back.
+    the nugget hides it, where no gradient points back.
     """
     num_starts, num_problems, num_parameters = starts.shape
     parameters = target.parameters

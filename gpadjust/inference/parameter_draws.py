@@ -128,7 +128,7 @@ class ParameterDraws:
         """Move pairs by Metropolis' rule, so that they become draws of the posterior.
 
         Parameters go by differences of others (ter Braak 2006), each fourth time hyper-parameters
-        by the draws of them. Pairs of even and odd number tell nothing of each other.
+        by the draws of them. Pairs of even and odd number are independent.
 
         Args:
             which: Numbers of vectors of hyper-parameters, ``N``.
@@ -227,7 +227,7 @@ class ParameterDraws:
         return found, log_q - 0.5 * p * math.log(2 * math.pi)
 
     def _straight(self, near: LinearizedMean, chol: Tensor, number: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`_randomized`, of Student's t about the posterior of a linear mean.
+        """Return draws of Student's t about the posterior of a linear mean.
 
         Where a mean folds, randomised equations have no solution beyond the fold.
         """

@@ -32,7 +32,7 @@ def register_priors(model: BatchedMultiOutputGPyTorchModel) -> None:
     dimensions short ones take noise for a function. All are wide: functions that are nearly
     polynomial (long lengthscales, a large variance), a rho that is nearly constant, and data
     without noise are not ruled out. They were chosen on other data sets than those that are
-    reported. A centre that is learnt has N(0, 3^2), in standard deviations of
+    reported. A center that is learnt has N(0, 3^2), in standard deviations of
     f_p from its mean. The constant rho of an :class:`~gpadjust.AR1` has N(1, 1 + r^2) for levels
     whose targets have standard deviations of the ratio r, high to low, and the noise of each level
     has the variance of its own targets for v. Give a kernel or likelihood

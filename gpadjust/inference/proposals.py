@@ -1,4 +1,4 @@
-"""What draws of hyper-parameters begin with: the prior, and the optima of the posterior."""
+"""Proposals of hyper-parameters: the prior, and the optima of the posterior."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Normal(NamedTuple):
         return constant + 0.5 * white.square().sum(-1), white / self.sd
 
     def covariance(self) -> Tensor:
-        """Of each problem, ``B x p x p``."""
+        """Return the covariance of each problem, ``B x p x p``."""
         return torch.diag_embed(self.sd.square())
 
 
@@ -53,38 +53,38 @@ class Mixture(NamedTuple):
     """Mixtures of Student's t distributions, to draw from.
 
     Attributes:
-        centres: ``k x B x p``.
+        centers: ``k x B x p``.
         weights: ``k x B``, which sum to one.
         root: Roots of their shapes, lower triangular, ``k x B x p x p``.
     """
 
-    centres: Tensor
+    centers: Tensor
     weights: Tensor
     root: Tensor
 
     def sample(self, number: int, generator: torch.Generator) -> Tensor:
-        """Draw ``number x B x p``, of which the first is the first centre."""
-        problems, p = self.centres.shape[1:]
+        """Draw ``number x B x p``, of which the first is the first center."""
+        problems, p = self.centers.shape[1:]
         which = torch.multinomial(
             self.weights.mT.cpu(), number, replacement=True, generator=generator
-        ).mT.to(self.centres.device)
+        ).mT.to(self.centers.device)
         shape = (number, problems, p + _DEGREES)
         normal = torch.randn(shape, generator=generator, dtype=self.root.dtype).to(self.root)
         white = normal[..., :p] / normal[..., p:].square().mean(-1, keepdim=True).sqrt()
         every = torch.arange(problems, device=which.device)
         away = self.root[which, every] @ white.unsqueeze(-1)
-        found = self.centres[which, every] + away.squeeze(-1)
-        found[0] = self.centres[0]
+        found = self.centers[which, every] + away.squeeze(-1)
+        found[0] = self.centers[0]
         return found
 
     def covariance(self) -> Tensor:
-        """That of the shape of the first, ``B x p x p``."""
+        """Return the covariance of the shape of the first, ``B x p x p``."""
         return self.root[0] @ self.root[0].mT
 
     def value_and_gradient(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """The negative log density at ``N x B x p``, ``N x B``, and its gradient."""
         p = positions.shape[-1]
-        away = positions.unsqueeze(1) - self.centres  # N x k x B x p
+        away = positions.unsqueeze(1) - self.centers  # N x k x B x p
         white = torch.linalg.solve_triangular(self.root, away.unsqueeze(-1), upper=False)
         square = white.square().sum((-1, -2))
         log_size = self.root.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1)
@@ -92,9 +92,9 @@ class Mixture(NamedTuple):
         log_part = log_part - 0.5 * (_DEGREES + p) * torch.log1p(square / _DEGREES)
         pull = log_part.softmax(1) * (_DEGREES + p) / (_DEGREES + square)
         back = torch.linalg.solve_triangular(self.root.mT, white, upper=True).squeeze(-1)
-        at_centre = math.lgamma((_DEGREES + p) / 2) - math.lgamma(_DEGREES / 2)
-        at_centre -= 0.5 * p * math.log(_DEGREES * math.pi)
-        return -log_part.logsumexp(1) - at_centre, (pull.unsqueeze(-1) * back).sum(1)
+        at_center = math.lgamma((_DEGREES + p) / 2) - math.lgamma(_DEGREES / 2)
+        at_center -= 0.5 * p * math.log(_DEGREES * math.pi)
+        return -log_part.logsumexp(1) - at_center, (pull.unsqueeze(-1) * back).sum(1)
 
 
 class Both(NamedTuple):
@@ -123,7 +123,7 @@ class Both(NamedTuple):
         return math.log(2) - (-values).logsumexp(0), (share * gradients).sum(0)
 
     def covariance(self) -> Tensor:
-        """That of the first, ``B x p x p``."""
+        """Return the covariance of the first, ``B x p x p``."""
         return self.first.covariance()
 
 
@@ -140,21 +140,21 @@ def around_optima(
         num_screened=screened if search.num_screened is None else search.num_screened,
         max_iterations=min(search.max_iterations, _ITERATIONS),
     )
-    centres, values = optima(target, search)
-    values, order = values.to(centres).sort(dim=0)
-    centres = centres.gather(0, order.unsqueeze(-1).expand_as(centres))
-    near = (centres.unsqueeze(1) - centres).abs().amax(-1) < _APART  # k x k x B
+    centers, values = optima(target, search)
+    values, order = values.to(centers).sort(dim=0)
+    centers = centers.gather(0, order.unsqueeze(-1).expand_as(centers))
+    near = (centers.unsqueeze(1) - centers).abs().amax(-1) < _APART  # k x k x B
     again = torch.stack([row[:i].any(0) for i, row in enumerate(near)])  # k x B
-    first = again.to(centres).argsort(dim=0, stable=True)[:_MODES]
-    centres = centres.gather(0, first.unsqueeze(-1).expand(-1, -1, centres.shape[-1]))
+    first = again.to(centers).argsort(dim=0, stable=True)[:_MODES]
+    centers = centers.gather(0, first.unsqueeze(-1).expand(-1, -1, centers.shape[-1]))
     values, again = values.gather(0, first), again.gather(0, first)
-    root = laplace_root(target, centres)
+    root = laplace_root(target, centers)
     log_share = root.diagonal(dim1=-1, dim2=-2).abs().log().sum(-1) - values
     log_share = log_share.masked_fill(again, -math.inf)
     even = ~again / (~again).sum(0)
-    log_evidence = log_share.logsumexp(0) + 0.5 * centres.shape[-1] * math.log(2 * math.pi)
+    log_evidence = log_share.logsumexp(0) + 0.5 * centers.shape[-1] * math.log(2 * math.pi)
     weights = (1 - _EACH) * log_share.softmax(0) + _EACH * even
-    return Mixture(centres, weights, root), log_evidence
+    return Mixture(centers, weights, root), log_evidence
 
 
 def laplace_root(target: LogPosterior, optima: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Whether a physics is of any use: the same model without it, weighed by its evidence."""
+"""Use of a physics: the same model without it, weighed by its evidence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NONE = 1e-20  # variance of a rho that is switched off, in its typical size
 
 
 def is_scaled(term: Term) -> bool:
-    """Whether a term is a function that scales a physics."""
+    """Return whether a term is a function that scales a physics."""
     return isinstance(term.basis, AppendedPhysics) and term.kernel is not None
 
 
@@ -33,8 +33,8 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     is_plain = len(rest) == 1 and rest[0].basis is None and rest[0].kernel is not None
     if not (scaled and is_plain) or any(term.learns_mean for term in model.terms):
         return None
-    centres = [term.basis for term in scaled if term.basis.learns_center]
-    if any(basis.learnt is None and basis.center.any() for basis in centres):
+    centers = [term.basis for term in scaled if term.basis.learns_center]
+    if any(basis.learnt is None and basis.center.any() for basis in centers):
         return None
     other = deepcopy(model)
     rows = _of_scaled(other)
@@ -74,7 +74,7 @@ def probability(log_evidence: Tensor, without: Tensor, away: Tensor | float = 0.
         log_evidence: Of the model with its physics.
         without: Of that without.
         away: The constant between targets and their prior mean, in spreads of the targets. Below
-            one it is not told from what varies.
+            one it cannot be separated from the variation.
     """
     constant = torch.as_tensor(away).nan_to_num(nan=1.0, posinf=1.0).clamp_min(1.0).log()
     return (log_evidence - without + constant + math.log(1 / _DOUBT - 1)).sigmoid()

@@ -30,7 +30,7 @@ class LeftOut(NamedTuple):
     variance: Tensor
 
     def of(self, rows: slice) -> LeftOut:
-        """Those of some of the draws."""
+        """Return the predictions by some of the draws."""
         return LeftOut(self.mean[rows], self.variance[rows])
 
     def mixture(self, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,7 +54,7 @@ def left_out(target: LogPosterior, vectors: Tensor) -> LeftOut:
 
 
 def disagreement(predictions: LeftOut, weights: Tensor, targets: Tensor) -> Tensor:
-    """How far predictions by two halves of the draws are apart, ``B``.
+    """Return the distance of predictions by two halves of the draws, ``B``.
 
     Half of the root mean square difference of their means, in predicted standard deviations, which
     is the error of the mean of both; the halves are the draws by turns. Standard deviations of a

@@ -1,4 +1,4 @@
-"""What fits bring to an optimum or sample: functions of vectors of a model's parameters."""
+"""Functions of vectors of a model's parameters, which fits minimise or sample."""
 
 from __future__ import annotations
 
@@ -242,7 +242,7 @@ class LogLikelihood(Target):
 
     @torch.no_grad()
     def _is_homogeneous(self) -> bool:
-        """Whether a factor of all variances is one of the covariance, and no prior minds."""
+        """True if a factor of all variances scales the covariance, and no prior depends on it."""
         parameters = self.parameters
         one_noise = bool((parameters.noise.sum(-1) == 1).all())
         alone = self._log_priors is None and self._of_all is None

@@ -1,4 +1,4 @@
-"""How much of the residuals of a sparse model is function, and how much noise."""
+"""Shares of function and noise in the residuals of a sparse model."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def _of_one(
         return torch.zeros_like(size), spread, whole
     z = inputs / spread
     generator = torch.Generator().manual_seed(seed)
-    centres = torch.randperm(len(z), generator=generator)[: min(_BLOCKS, len(z) // k)].to(z.device)
-    nearest = torch.cdist(z[centres], z).topk(k, largest=False).indices
+    centers = torch.randperm(len(z), generator=generator)[: min(_BLOCKS, len(z) // k)].to(z.device)
+    nearest = torch.cdist(z[centers], z).topk(k, largest=False).indices
     x, r = z[nearest], residuals[nearest] / size.sqrt()
     x = x - x.mean(-2, keepdim=True)
     own = None if known is None else known[nearest] / size

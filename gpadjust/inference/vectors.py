@@ -124,7 +124,7 @@ class Parameters:
         return torch.minimum(torch.maximum(vectors, self.lower), self.upper)
 
     def is_allowed(self, vectors: Tensor) -> Tensor:
-        """Whether vectors keep to constraints and to the least noise, ``k x B``.
+        """Return whether vectors keep to constraints and to the least noise, ``k x B``.
 
         Bounds that the data suggest to a search do not count.
         """

@@ -16,7 +16,7 @@ from gpadjust.models.parameters import hyperparameters
 def warm_start(model: TermsModel, previous: TermsModel) -> None:
     """Give a model the hyper-parameters of an earlier one of the same structure.
 
-    They are the same in the user's units: lengthscales, centres, unknown parameters of the physics,
+    They are the same in the user's units: lengthscales, centers, unknown parameters of the physics,
     and the variance of a scaling of it, stay; the other variances follow the units that the outcome
     transforms put the targets in, which change with the data. Of a model that holds samples it is
     their mean.

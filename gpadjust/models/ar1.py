@@ -47,7 +47,7 @@ class LevelInput(InputTransform):
         return appended(self.base, X[..., :-1], X[..., -1:])
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
-        """As :meth:`transform`, with the base transform's own preprocessing."""
+        """Return :meth:`transform` with the preprocessing of the base transform."""
         X = self.with_level(X)
         return appended(self.base, X[..., :-1], X[..., -1:], preprocess=True)
 
@@ -105,10 +105,10 @@ class Level(Batched, gpytorch.Module):
 
 
 class LevelNoise(ComponentNoise):
-    """One variance for each level, told by the last column of the inputs."""
+    """One variance for each level, which is the last column of the inputs."""
 
     def selection(self, inputs: Tensor) -> Tensor:
-        """Which of the variances inputs ``... x n x (d + 1)`` have, ``... x n x 2``."""
+        """Return the shares of both variances at ``... x n x (d + 1)``, ``... x n x 2``."""
         return torch.stack([1 - inputs[..., -1], inputs[..., -1]], dim=-1)
 
 
@@ -216,7 +216,7 @@ class AR1(TermsGP):
         return basis.rho.squeeze(-1)
 
     def data(self) -> dict[str, Tensor | None]:
-        """As the base class, of each level."""
+        """Return the data of each level."""
         both: dict[str, Any] = super().data()
         both["train_X"], rows = self.measured_rows(both["train_X"])
         high = {name: None if v is None else v[..., rows, :] for name, v in both.items()}
@@ -228,12 +228,12 @@ class AR1(TermsGP):
         return inputs[..., :-1], slice(int((inputs[..., -1] == 0).sum(-1).max()), None)
 
     def trend_inputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """As the base class: each level has a trend of its own, as f_p and delta have."""
+        """Return the inputs of a trend for each level, as f_p and delta have one each."""
         level = inputs[..., -1:]
         return inputs[..., :-1], torch.cat([1 - level, level], dim=-1)
 
     def measured(self) -> Tensor:
-        """As the base class: targets of the high level."""
+        """Return a mask of the targets of the high level."""
         return super().measured() & (self.train_inputs[0][..., -1] == 1)
 
     def _new_inputs(self, X: Tensor) -> Tensor:

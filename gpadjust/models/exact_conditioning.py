@@ -1,4 +1,4 @@
-"""What observations say of a sum of terms: exactly, by the Cholesky factor of their covariance."""
+"""Exact posterior of a sum of terms, by the Cholesky factor of the covariance of observations."""
 
 from __future__ import annotations
 
@@ -158,12 +158,12 @@ def conditional_covariance(prior: Tensor, root: Tensor) -> Tensor:
 
 
 def least_variance(prior_variance: Tensor, n: int) -> Tensor:
-    """What rounding errors leave of a variance at a point that is known without noise."""
+    """Return the variance that rounding errors leave at a point that is known without noise."""
     return (4 * n * torch.finfo(prior_variance.dtype).eps * prior_variance).detach()
 
 
 class ExactConditioning(DefaultPredictionStrategy):
-    r"""What ``n`` noisy targets say, by two factors that new targets only border.
+    r"""Posterior given ``n`` noisy targets, by two factors that new targets only border.
 
     With the covariance :math:`K = L L^T` of the targets y and their prior mean m, they are L and
     :math:`\alpha = K^{-1} (y - m)` (Rasmussen and Williams 2006, sec. 2.2). For ``k`` further
@@ -195,7 +195,7 @@ class ExactConditioning(DefaultPredictionStrategy):
 
     @property
     def has_graph(self) -> bool:
-        """Whether gradients flow to what is remembered, which is then made anew each time."""
+        """True if gradients flow to the memory, which is then built again each time."""
         wanted = detach_test_caches.off() or self.train_inputs[0].requires_grad
         return torch.is_grad_enabled() and wanted
 

@@ -38,8 +38,8 @@ def release_samples(model: Any) -> None:
     """Reverse :func:`hold_samples`, with the first sample; see :meth:`TermsGP.release_samples`."""
     if model.train_targets.dim() > len(model._aug_batch_shape) + 1:
         raise RuntimeError(
-            "A model of fantasies cannot let go of its samples; take the model that they were made "
-            "of."
+            "A model of fantasies cannot drop its samples; take the model that the fantasies were "
+            "made of."
         )
     _change(model, lambda tensor: tensor[0], None)
     with torch.no_grad():
@@ -62,7 +62,7 @@ def take_samples(model: Any, index: Tensor, as_mixture: bool = False) -> Any:
 
 @torch.no_grad()
 def uses_physics(model: Any) -> Tensor:
-    """Which samples that a model holds have its physics; ``S x batch_shape x (m)``."""
+    """Mask of the samples of a model that have its physics; ``S x batch_shape x (m)``."""
     known = [term for term in model.terms if not term.learns_mean]
     same = [(term.mean == term.given_mean).squeeze(-1) for term in known]
     return torch.stack(same).all(0) if same else model.terms[0].mean.squeeze(-1).isfinite()

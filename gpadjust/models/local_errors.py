@@ -1,4 +1,4 @@
-"""Where left-out observations are missed by more than predicted: larger variances nearby."""
+"""Larger variances near left-out observations that were missed by more than predicted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _EXPECTED = 1.0  # observations that err as predicted, beside those near a point
 
 
 class LocalErrors(Module):
-    r"""How much larger errors are near a point than a Gaussian process of stationary kernels says.
+    r"""Ratio of errors near a point to those by a Gaussian process of stationary kernels.
 
     Where a function has a kink or a jump, as by dry friction or an impact, such a process is too
     sure nearby. With :math:`z_i^2` the squared error of a left-out observation over its predicted
@@ -50,11 +50,11 @@ class LocalErrors(Module):
 
     @property
     def are_expected(self) -> bool:
-        """Whether no error is larger than predicted, so that no variance is changed."""
+        """True if no error is larger than predicted, so that no variance is changed."""
         return bool((self.squares <= 1).all())
 
     def forward(self, x: Tensor) -> Tensor:
-        """What variances are multiplied by at inputs ``... x (m) x q x d``, ``... x (m) x q``."""
+        """Return the factor of variances at inputs ``... x (m) x q x d``, ``... x (m) x q``."""
         near = Stationary(self.lengthscale, x.new_ones(()), RBF).covariance(x, self.points)
         total = (near @ self.squares.unsqueeze(-1)).squeeze(-1)
         return ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0)
@@ -68,7 +68,7 @@ class LocalErrors(Module):
         self.squares, self.points = self.squares[..., :0], self.points[:0]
 
     def of_outputs(self, numbers: list[int]) -> LocalErrors:
-        """Those of some of several outputs."""
+        """Return the factors of some of several outputs."""
         taken = numbers if len(numbers) > 1 else numbers[0]
         squares, lengthscale = self.squares[..., taken, :], self.lengthscale[..., taken, :, :]
         found = LocalErrors(squares.shape[:-1], lengthscale.shape[-1])

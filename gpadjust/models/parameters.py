@@ -20,7 +20,7 @@ from gpadjust.gp.noise import Noise
 
 @dataclass(frozen=True)
 class Kind:
-    """What is assumed of a kind of parameter, in multiples of its typical size.
+    """Assumptions on a kind of parameter, in multiples of its typical size.
 
     Attributes:
         initial: Its value in a new model.
@@ -79,11 +79,11 @@ class LogInterval(Interval):
         return transformed_tensor.log()
 
     def check(self, tensor: Tensor) -> bool:
-        """Whether all elements are valid values of the parameter."""
+        """Return whether all elements are valid values of the parameter."""
         return bool((tensor >= 0).all()) if self.is_default else bool(super().check(tensor))
 
     def check_raw(self, tensor: Tensor) -> bool:
-        """Whether all elements are valid raw parameters."""
+        """Return whether all elements are valid raw parameters."""
         return self.check(self.transform(tensor))
 
 
@@ -140,7 +140,7 @@ class Hyperparameter:
         return raw if self.constraint is None else self.constraint.transform(raw)
 
     def value(self) -> Tensor:
-        """What vectors have of it: the raw parameter, or the logarithm of the parameter."""
+        """Its entry in vectors: the raw parameter, or the logarithm of the parameter."""
         raw = self.raw.detach()
         return self.parameter(raw).log() if self.squashes else raw
 
@@ -175,7 +175,7 @@ class Hyperparameter:
 def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparameter]:
     """The table of a model's parameters, in the order of ``model.named_parameters()``.
 
-    What each is, its place in the model tells: the lengthscale of a kernel, the outputscale of a
+    Its place in the model decides its kind: the lengthscale of a kernel, the outputscale of a
     ``ScaleKernel``, the noise of the likelihood, the constant of a term's basis.
     """
     inputs, targets = model.train_inputs[0], model.train_targets

@@ -1,4 +1,4 @@
-"""What a model knows of the unknown parameters of its physics."""
+"""Posterior of the unknown parameters of a model's physics."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PhysicsParameters(dict[str, Tensor]):
 
     @classmethod
     def of(cls, transform: PhysicsInput | None) -> PhysicsParameters:
-        """Those of a model's input transform."""
+        """Return the parameters of a model's input transform."""
         if transform is None:
             raise ValueError(
                 "The physics has no unknown parameters; a physics names them as "

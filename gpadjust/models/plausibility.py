@@ -1,4 +1,4 @@
-"""Whether a physics is obviously off at the training inputs, and why."""
+"""Check of a physics at the training inputs: is it obviously off, and why?"""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _STANDARD = 1e-6
 
 
 class _Fit(NamedTuple):
-    """How f_p is related to the targets of one output.
+    """Relation of f_p to the targets of one output.
 
     Attributes:
         n: Number of observations.
@@ -60,7 +60,7 @@ class _Fit(NamedTuple):
 
 
 def complaint(data: TrainingData, f: Tensor, scaled: bool, shifted: bool) -> str:
-    """What is obviously off with a physics, of each output; empty if nothing is.
+    """Return the obvious faults of a physics, of each output; empty if there are none.
 
     Args:
         data: The data.
@@ -86,7 +86,7 @@ def complaint(data: TrainingData, f: Tensor, scaled: bool, shifted: bool) -> str
 
 
 def is_standardised(values: Tensor) -> bool:
-    """Whether each column of ``n x d`` has mean 0 and standard deviation 1, as of a scaler.
+    """Return whether each column of ``n x d`` is standardised, as by a scaler.
 
     A column that is 0 throughout may be among them: a scaler makes that of a constant.
     """
@@ -98,7 +98,7 @@ def is_standardised(values: Tensor) -> bool:
 
 
 def _said(X: Tensor, y: Tensor, f: Tensor, scaled: bool, shifted: bool) -> str:
-    """What is off with one output of one data set."""
+    """Return the fault of one output of one data set."""
     seen = ~y.isnan()
     if int(seen.sum()) < _LEAST:
         return ""
@@ -115,7 +115,7 @@ def _said(X: Tensor, y: Tensor, f: Tensor, scaled: bool, shifted: bool) -> str:
 
 
 def _of_inputs(X: Tensor, fit: _Fit) -> str:
-    """Whether f_p is asked in scaled inputs."""
+    """Return a complaint if f_p is evaluated at scaled inputs."""
     most = _WORSE if fit.correlation > _FOLLOWS else 1.0
     if fit.rmse <= most * fit.sd or not is_standardised(X):
         return ""
@@ -127,7 +127,7 @@ def _of_inputs(X: Tensor, fit: _Fit) -> str:
 
 
 def _of_values(fit: _Fit, scaled: bool, shifted: bool) -> str:
-    """Whether f_p has a wrong sign, factor or offset."""
+    """Return a complaint if f_p has a wrong sign, factor or offset."""
     apart = fit.rmse > _NEAR * fit.size
     off = apart and fit.left > _FAR * fit.sd
     sure = apart and fit.n >= _MANY
@@ -151,7 +151,7 @@ def _of_values(fit: _Fit, scaled: bool, shifted: bool) -> str:
 
 
 def _fit(y: Tensor, f: Tensor, scaled: bool, shifted: bool) -> _Fit:
-    """How f_p is related to targets, ``n`` each."""
+    """Return the relation of f_p to targets, ``n`` each."""
     slope = float(f @ y / (f @ f)) if f.any() else 0.0
     if scaled:
         f = slope * f
@@ -189,7 +189,7 @@ def _rms(values: Tensor) -> float:
 
 
 def _times(factor: float) -> str:
-    """How many times too large or small."""
+    """Return a text for a factor, too large or too small."""
     large = abs(factor) >= 1
     times = abs(factor) if large else 1 / abs(factor)
     return f"about {_number(times, 2)} times too {'large' if large else 'small'}"

@@ -70,7 +70,7 @@ class ScaleFreePosterior(GPyTorchPosterior):
 
     @classmethod
     def of_outputs(cls, mean: Tensor, covariance: Tensor, has_outputs: bool) -> ScaleFreePosterior:
-        """Of independent outputs: moments ``... x (m) x q`` and ``... x (m) x q x q``."""
+        """Return a posterior of independent outputs, of moments ``... x (m) x q (x q)``."""
         operator = PosteriorCovariance(covariance)
         if not has_outputs:
             return cls(ScaleFreeNormal(mean, operator))

@@ -1,4 +1,4 @@
-"""What all models predict: marginals, intervals, joint posteriors and functions."""
+"""Predictions of all models: marginals, intervals, joint posteriors and functions."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from gpadjust.models.training_data import ArrayLike
 
 
 class WeightConditioning(ExactConditioning):
-    """What observations say of terms on features, by the exact posterior of their weights."""
+    """Posterior of terms on features, by the exact posterior of their weights."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -194,7 +194,7 @@ class RRA(TermsGP):
         return values
 
     def _functions_of_batches(self, number: int | None, num_features: int = 0) -> SampledFunctions:
-        """As the base class, but exactly."""
+        """Return exact functions, by the posterior of the weights."""
         with torch.no_grad():
             beta = self.weights()
             drawn = beta.mean.unsqueeze(0) if number is None else beta.sample(Size([number]))
@@ -217,7 +217,7 @@ class RRA(TermsGP):
 
 
 class PaperConditioning(WeightConditioning):
-    """As the base class, with the covariance that the paper has."""
+    """Weight conditioning with the covariance of the paper."""
 
     def regress(self) -> tuple[Tensor, Tensor]:
         """The paper's mean and root of the covariance of weights."""
@@ -235,7 +235,7 @@ class PaperRRA(RRA):
     .. math:: \hat\beta = (\Phi^T\Phi + \lambda I)^{-1}\Phi^T y, \quad
         \mathrm{Cov}(\beta) = (\Phi^T\Phi + I)^{-1},
 
-    which is no posterior's unless :math:`\lambda = 1`: it cannot be fully Bayesian, nor tell the
+    which is no posterior's unless :math:`\lambda = 1`: it cannot be fully Bayesian, nor give the
     information of an observation. The arguments are those of :class:`RRA`, without prior means, and
     always in the user's units.
     """
@@ -276,7 +276,7 @@ class PaperRRA(RRA):
             term.kernel.raw_outputscale.requires_grad_(False).zero_()  # an outputscale of 1
 
     def left_out(self) -> tuple[Tensor, Tensor]:
-        """As the base class, with the variance of the paper's covariance."""
+        """Return left-out predictions, with the variance of the paper's covariance."""
         mean, _ = super().left_out()
         with torch.no_grad():
             train = self.at(self.train_inputs[0])

@@ -81,8 +81,8 @@ def save(model: TermsModel | StackedGP, path: str | Path) -> Saved:
     if any(name is None or name.startswith("__main__:") for name in names):
         asked = {"physics", *missing}
         warnings.warn(
-            f"The physics of {path.name} is a lambda, or of the running script, so that other "
-            "programs cannot import it. They give it again, "
+            f"The physics of {path.name} is a lambda or belongs to the running script, so that "
+            "other programs cannot import it. Pass it again when you load the model, "
             f"load(path, {', '.join(f'{name}=...' for name in sorted(asked))}).",
             stacklevel=2,
         )
@@ -115,7 +115,7 @@ def content_of(model: TermsModel | StackedGP) -> dict[str, Any]:
     if lacking := _not_taken(type(model), [n for n, value in data.items() if value is not None]):
         raise ValueError(
             f"{name} could not be built again: its constructor takes no "
-            f"{' and no '.join(lacking)}. Call its arguments of data as the library does."
+            f"{' and no '.join(lacking)}. Name its data arguments as the library does."
         )
     if isinstance(transform, PhysicsInput):
         given: Any = transform.physics

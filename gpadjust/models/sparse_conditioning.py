@@ -1,4 +1,4 @@
-"""What observations say of a sum of terms: by its values at inducing points."""
+"""Posterior of a sum of terms by its values at inducing points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def inducing_root(covariance: Tensor) -> Tensor:
 
 
 class SparseConditioning:
-    r"""What is known of a sum of terms by its values at ``M`` inducing points (Titsias 2009).
+    r"""Posterior of a sum of terms by its values at ``M`` inducing points (Titsias 2009).
 
     With their prior covariance :math:`K = L L^T` and mean m, the values are :math:`m + L v` with
     :math:`v \sim N(\mu, C C^T)`. Where A is the covariance of what is predicted with them and

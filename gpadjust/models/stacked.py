@@ -381,7 +381,7 @@ def _checked(models: Any, weights: Any) -> tuple[TermsGP, Tensor]:
 
 @torch.no_grad()
 def _same_data(one: TermsGP, other: TermsGP) -> bool:
-    """Whether two models are of the same names, inputs and targets, but for rounding."""
+    """Return whether two models have the same names, inputs and targets, but for rounding."""
     if (one.input_names, one.output_names) != (other.input_names, other.output_names):
         return False
     ours, theirs = one.data(), other.data()

@@ -1,4 +1,4 @@
-"""What a model has learnt, in words and in the user's units."""
+"""Summary of a fitted model, in words and in the user's units."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _lines(model: Any) -> list[str]:
         mean = mean if abs(mean) > _ROUNDING * float(unit.flatten()[0]) else 0.0
         lines.append(f"  {term.name}: {'learnt ' * term.learns_mean}mean {mean:.4g}")
         if isinstance(term.basis, AppendedPhysics) and term.basis.learns_center:
-            lines.append(f"    centre {_text(term.basis.origin)}")
+            lines.append(f"    center {_text(term.basis.origin)}")
         own = set() if term.kernel is None else {*map(id, term.kernel.parameters())}
         lines += _of_kernel(model, [row for row in rows if id(row.raw) in own], unit)
     noise = model.noise.at(model.train_inputs[0]).mean(-1)
@@ -75,7 +75,7 @@ def _lines(model: Any) -> list[str]:
 
 
 def _alone(model: Any) -> list[str]:
-    """How far off each physics is by itself, at the observations of one output."""
+    """Return a line on the error of each physics alone, at the observations of one output."""
     shift, scale = model.units()
     inputs, y = model.train_inputs[0], model.train_targets * scale + shift
     named = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
@@ -123,7 +123,7 @@ def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str
 
 
 def _columns(model: Any, number: int, kernel: Any) -> list[tuple[str, float]]:
-    """What the lengthscales of a kernel are of, and what a length of one is in the user's units."""
+    """Return the names of a kernel's inputs, and a length of one in the user's units."""
     base: Any = getattr(model, "input_transform", None)
     base, names = getattr(base, "base", base), model.input_names
     lengths = [1.0] * len(names)

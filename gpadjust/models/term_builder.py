@@ -1,4 +1,4 @@
-"""What the terms of a model are made of, and what makes them."""
+"""The builder of a model's terms, from data and physics."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class TermBuilder:
         self._shift = self._zero if units is None else units.means
         self._scale = self._zero + 1 if units is None else units.stdvs
         self.given: list[object] = [likelihood]
-        # Of each physics: its values, and the mean of its rho and its centre, batch_shape x 1 x m.
+        # Of each physics: its values, and the mean of its rho and its center, batch_shape x 1 x m.
         self.f: list[Tensor] = []
         self._means: list[Tensor] = []
         self._centers: list[Tensor] = []
@@ -113,13 +113,13 @@ class TermBuilder:
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
     ) -> TermBuilder:
-        r"""What makes the terms of :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`.
+        r"""The builder of the terms of :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`.
 
         The model's input transform appends all f_i to the inputs
         (:class:`~gpadjust.gp.PhysicsInput`), once; the terms read those columns.
 
         With a center c the basis of rho is :math:`f_p - c`. The bias is then :math:`\delta =
-        \delta_0 - \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`. A centre that is
+        \delta_0 - \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`. A center that is
         learnt is in standard deviations of f_p from its mean.
 
         The arguments are those of :class:`~gpadjust.CKA`; a model without physics has None.
@@ -286,9 +286,9 @@ class TermBuilder:
             text = complaint(data, f, self._learns_mean, self._learns_offset)
         if text:
             warnings.warn(
-                f"Physics {physics.name!r}: {text} Look at `physics(train_X) - train_Y`, and mend "
-                "f_p rather than leave that to the fit: away from the data the model falls back "
-                "to f_p as it is.",
+                f"Physics {physics.name!r}: {text} Look at `physics(train_X) - train_Y`, and "
+                "correct f_p rather than leave that to the fit: away from the data the model falls "
+                "back to f_p as it is.",
                 PhysicsWarning,
                 stacklevel=stacklevel + 1,
             )

@@ -80,7 +80,7 @@ class TermsGP(TermsModel, SingleTaskGP):
             warnings.warn(
                 f"{type(self).__name__} is exact: of {n} points a fit takes from many minutes to "
                 f"hours, and each covariance {8e-9 * n**2:.1f} GB. gpadjust.VariationalCKA takes "
-                "the arguments of CKA and learns from all of them in minutes.",
+                "the arguments of CKA and is fitted to all of them in minutes.",
                 stacklevel=3,
             )
         made.warn_of_physics(stacklevel=3)
@@ -112,7 +112,7 @@ class TermsGP(TermsModel, SingleTaskGP):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether it was fitted, or has nothing to learn."""
+        """True if the model was fitted, or has nothing to fit."""
         return self.was_fitted or not any(p.requires_grad for p in self.parameters())
 
     def custom_fit(self, mll: MarginalLogLikelihood, **options: Any) -> MarginalLogLikelihood:
@@ -147,7 +147,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         return super().__call__(*args, **kwargs)
 
     def conditioning(self) -> ExactConditioning:
-        """As the base class."""
+        """Return the posterior of the terms; it is built if there is none."""
         if self.prediction_strategy is None:
             self.prediction_strategy = self.conditioning_class(
                 self.train_inputs[0], self.train_targets, self.noise, self.covar_module
@@ -205,11 +205,11 @@ class TermsGP(TermsModel, SingleTaskGP):
 
     @property
     def larger_errors(self) -> LocalErrors | None:
-        """As the base class."""
+        """The places of errors larger than the kernels', if there are any."""
         return None if self.local_errors.are_expected else self.local_errors
 
     def data(self) -> dict[str, Tensor | None]:
-        """As the base class."""
+        """Return the data of the model: raw inputs, targets and known variances."""
         self.eval()
         inputs = self._original_train_inputs
         inputs = self.train_inputs[0] if inputs is None else inputs
@@ -229,7 +229,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         return inputs, slice(None)
 
     def trend_inputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """What a trend in the targets is linear in, and which trend each row has one of.
+        """Return the inputs of a linear trend in the targets, and the trend of each row.
 
         Args:
             inputs: Raw training inputs, ``... x n x d``, with what the model added to them.
@@ -330,7 +330,7 @@ class TermsGP(TermsModel, SingleTaskGP):
 
     @property
     def _subset_batch_dict(self) -> dict[str, int]:
-        """Where in each batched parameter and buffer the outputs lie, for ``subset_output``."""
+        """The dimension of the outputs in each parameter and buffer, for ``subset_output``."""
         outputs: Size = self._aug_batch_shape
         return {
             name: len(outputs) - 1 - tensor.dim()
@@ -387,7 +387,7 @@ class TermsGP(TermsModel, SingleTaskGP):
     def with_observations(
         self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
     ) -> Self:
-        """As :meth:`condition_on_observations`, of checked tensors, where whole rows may be NaN."""
+        """Return a model of more observations, checked tensors of which whole rows may be NaN."""
         if self.noise.is_known and noise is None:
             raise ValueError(
                 "The model was built with known noise (train_Yvar), so that of new observations is "

@@ -1,4 +1,4 @@
-"""What a model that is a sum of terms says, whatever its data say of them."""
+"""Predictions of a model that is a sum of terms, by any conditioning on data."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class TermsModel(PredictiveModel):
 
     The base of exact models and of sparse ones, beside BoTorch's own of each. In an adjusted
     physics :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)` the terms that scale a physics are
-    the rhos; with a centre c, :math:`f_p - c` is what they scale, and :math:`\delta = \delta_0 -
+    the rhos; with a center c, :math:`f_p - c` is what they scale, and :math:`\delta = \delta_0 -
     \sum_i c_i \rho_i` for the model's own term :math:`\delta_0`.
 
     Attributes:
@@ -90,22 +90,22 @@ class TermsModel(PredictiveModel):
         return title(self)
 
     def conditioning(self) -> Any:
-        """What the data say of the terms; made if it is not there.
+        """Return the posterior of the terms; it is built if there is none.
 
         It has ``marginals`` and ``joint``: moments of a :class:`~gpadjust.gp.WeightedSum`.
         """
         raise NotImplementedError
 
     def data(self) -> dict[str, Tensor | None]:
-        """The data that the model could be built on: raw inputs, targets and known variances."""
+        """Return the data of the model: raw inputs, targets and known variances."""
         raise NotImplementedError
 
     def log_evidence(self) -> tuple[str, Tensor | None]:
-        """What says how well the model explains its data, and how much it is, ``... x (m)``."""
+        """Return the name and the value, ``... x (m)``, of the measure of fit."""
         raise NotImplementedError
 
     def summary(self) -> str:
-        """What the model has learnt, as a text in the user's units.
+        """Return the hyper-parameters, parameters and scores as a text in the user's units.
 
         The structure; unknown parameters of the physics; of each output the root mean square error
         of the physics alone at the observations; the log marginal likelihood; means, standard
@@ -141,9 +141,9 @@ class TermsModel(PredictiveModel):
         return tuple(t.name for t in self.terms if t.unit is not Unit.NONE)
 
     @property
-    def has_centre(self) -> bool:
-        """Whether a centre is taken from f_p, so that delta is not independent of rho a priori."""
-        return bool(self._centred())
+    def has_center(self) -> bool:
+        """True if a center is taken from f_p: delta then depends on rho a priori."""
+        return bool(self._centerd())
 
     @property
     def physics(self) -> Physics:
@@ -153,13 +153,13 @@ class TermsModel(PredictiveModel):
 
     @property
     def has_unknowns(self) -> bool:
-        """Whether its physics has unknown parameters."""
+        """True if the physics has unknown parameters."""
         transform = getattr(self, "input_transform", None)
         return isinstance(transform, PhysicsInput) and bool(transform.physics.unknowns)
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
-        """What the model knows of the unknown parameters of the physics; an error without any."""
+        """The posterior of the physics' unknown parameters; an error if there are none."""
         return PhysicsParameters.of(self.input_transform if self.has_unknowns else None)
 
     def rho(self, X: ArrayLike, physics: str | int | None = None, mixed: bool = True) -> Posterior:
@@ -240,7 +240,7 @@ class TermsModel(PredictiveModel):
         return float(mean[0] if self.num_samples is None else mean.mean())
 
     def fallback(self, X: ArrayLike) -> Tensor:
-        """What the model says where there are no data: its prior mean, such as f_p itself.
+        """Return the prediction far from all data: the prior mean, such as f_p itself.
 
         Weights of the physics that are unknown (``rho_mean="learn"``) are those it began with, 1,
         or least squares of several; after a point fit they are its estimates. Samples that do
@@ -299,11 +299,11 @@ class TermsModel(PredictiveModel):
 
     @property
     def larger_errors(self) -> LocalErrors | None:
-        """Where errors are larger than kernels say, if they are anywhere."""
+        """The places of errors larger than the kernels', if there are any."""
         return None
 
     def widening(self, inputs: Tensor) -> Tensor | None:
-        """What variances at transformed inputs are multiplied by, ``... x (m) x q``; None for 1."""
+        """Return the factor of variances at transformed inputs, ``... x (m) x q``; None for 1."""
         errors = self.larger_errors
         if errors is None:
             return None
@@ -352,7 +352,7 @@ class TermsModel(PredictiveModel):
         return self.covar_module.at(inputs)
 
     def model_inputs(self, X: ArrayLike, with_basis: bool = True) -> Tensor:
-        """What the terms read, ``... x (S) x (1) x q x (d + k)``, of raw ``X``, ``... x q x d``.
+        """Return the inputs of the terms, ``... x (S) x (1) x q x (d + k)``, at ``... x q x d``.
 
         There is a dimension for samples and one for outputs, where the model has them. Without
         basis the physics is not evaluated, and its columns are zero.
@@ -384,7 +384,7 @@ class TermsModel(PredictiveModel):
         return self.noise.at(inputs)
 
     def measured(self) -> Tensor:
-        """Which training targets are measurements of the function, ``... x (m) x n`` booleans."""
+        """Return a mask of the targets that measure the function, ``... x (m) x n``."""
         return ~self.train_targets.isnan()
 
     def units(self, unit: Unit = Unit.TARGET) -> tuple[Tensor, Tensor]:
@@ -406,16 +406,16 @@ class TermsModel(PredictiveModel):
         return values.mT if self._num_outputs > 1 else values.squeeze(-1)
 
     def _at(self, term: Term, inputs: Tensor) -> WeightedSum:
-        """A term in the user's meaning at transformed inputs: a bias has no centres beside it."""
+        """A term in the user's meaning at transformed inputs: a bias has no centers beside it."""
         parts: list[tuple[Term, Tensor | None]] = [(term, None)]
         shift: Tensor | float = 0.0
-        for other in self._centred() if term.unit is Unit.TARGET else ():
+        for other in self._centerd() if term.unit is Unit.TARGET else ():
             parts.append((other, -other.basis.origin / other.basis.scale))
             shift = shift + other.basis.moved_mean
         return WeightedSum(inputs, parts, shift)
 
-    def _centred(self) -> list[Term]:
-        """The terms from whose physics a centre is taken."""
+    def _centerd(self) -> list[Term]:
+        """The terms from whose physics a center is taken."""
         scaled = [term for term in self.terms if isinstance(term.basis, AppendedPhysics)]
         return [t for t in scaled if t.basis.learns_center or t.basis.offset.any()]
 
@@ -459,7 +459,7 @@ class TermsModel(PredictiveModel):
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether a file can hold an option."""
+    """Return whether a file can hold an option."""
     if isinstance(value, list | tuple):
         return all(map(_is_plain, value))
     return isinstance(value, bool | int | float | str | Tensor | None)

@@ -87,7 +87,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
 
     not_sampled = (
         "Expected method 'map' or None for a VariationalCKA, got 'bayes': so many observations "
-        "tell its hyper-parameters, which are not sampled."
+        "determine its hyper-parameters, which are not sampled."
     )
     _conditioning: SparseConditioning | None = None
     _has_transformed_inputs = True
@@ -187,7 +187,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         return tuple(name for name in super().term_names if name != self.rest.name)
 
     def at(self, inputs: Tensor) -> WeightedSum:
-        """As the base class, with the rest."""
+        """Return the weighted sum at inputs, with the rest."""
         return self._with_rest(super().at(inputs))
 
     def _at(self, term: Term, inputs: Tensor) -> WeightedSum:
@@ -198,7 +198,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         return WeightedSum(f.x, [*f.parts, (self.rest, None)], f.shift)
 
     def conditioning(self) -> SparseConditioning:
-        """As the base class, by the inducing values."""
+        """Return the posterior of the terms by the inducing values."""
         known = self._conditioning
         if known is None or known.train_inputs[0] is not self.inducing_points:  # as after `.to`
             known = self._conditioning = SparseConditioning(
@@ -238,7 +238,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         return TermsGP(made, [*self.covar_module.terms])
 
     def data(self) -> dict[str, Tensor | None]:
-        """As the base class."""
+        """Return the data of the model: raw inputs, targets and known variances."""
         return {"train_X": self._X, "train_Y": self._Y, "train_Yvar": self._Yvar}
 
     def _scale_known_noise(self) -> None:

@@ -237,7 +237,7 @@ class Physics(torch.nn.Module, ABC):
             if bad:
                 raise PhysicsError(
                     f"Physics {self.name!r} returned NaN or inf in {len(bad)} of {len(rows)} "
-                    "row(s), expected finite numbers. Mend it, or keep such inputs out:",
+                    "row(s), expected finite numbers. Correct it, or exclude such inputs:",
                     bad,
                     partial=Y.detach(),
                 )

@@ -124,7 +124,7 @@ class BlackBoxPhysics(Physics):
             first = next(iter(errors.values()))
             raise PhysicsError(
                 f"Physics {self.name!r} raised {described(first)}, in the first of {len(errors)} "
-                f"failed row(s) of {len(rows)}. Mend it, or keep such inputs out:",
+                f"failed row(s) of {len(rows)}. Correct it, or exclude such inputs:",
                 errors,
                 partial=torch.from_numpy(Y) if outputs else None,
             ) from first

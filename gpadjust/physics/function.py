@@ -203,9 +203,9 @@ def _in_common(parts: Sequence[Physics]) -> dict[str, Unknown]:
         for name, unknown in part.unknowns.items():
             if found.setdefault(name, unknown) != unknown:
                 raise ValueError(
-                    f"Several physics have an unknown parameter {name!r}, which is then one, but "
-                    f"say different things of it: {found[name]} and {unknown}. Say the same, or "
-                    "give it another name."
+                    f"Several physics have an unknown parameter {name!r}, which is then one "
+                    f"parameter, but with different priors: {found[name]} and {unknown}. Give one "
+                    "prior, or different names."
                 )
     return found
 

@@ -39,12 +39,7 @@ class Moments(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """What is known of the states of a stretch by what was measured before, and up to then.
-
-    Args:
-        ahead: Before the measurement.
-        known: After it.
-    """
+    """States of a stretch by what was measured before them, and by that and their own."""
 
     ahead: Moments
     known: Moments

@@ -264,8 +264,8 @@ class Records:
         parts = [(each.states[:-1], each.actions, each.states[1:]) for each in stretches]
         lengths = torch.tensor([len(each.actions) for each in stretches])
         episode = torch.arange(len(stretches)).repeat_interleave(lengths)
-        columns = (torch.cat(column) for column in zip(*parts, strict=True))
-        return Trajectories(*columns, episode), stretches
+        states, actions, following = (torch.cat(column) for column in zip(*parts, strict=True))
+        return Trajectories(states, actions, following, episode), stretches
 
     def _hidden(self, data: Trajectories) -> str:
         """What to do about states that were never measured; empty if there are none."""
@@ -297,18 +297,7 @@ def _read(
     delimiter: str,
     decimal: str,
 ) -> Record:
-    """The record in a file; see :meth:`Records.read_csv`.
-
-    Args:
-        file: The file.
-        spec: What the entries of states and actions are.
-        states: The column of each state; None if there is none.
-        actions: The column of each action.
-        time: The column of times, or the time from one row to the next.
-        segment: The column of labels, if there is one.
-        delimiter: What is between two fields.
-        decimal: The decimal mark of numbers.
-    """
+    """The record in a file; for the arguments see :meth:`Records.read_csv`."""
     table = CsvColumns(file, delimiter, decimal=decimal)
     if isinstance(time, str):
         times = table.numbers(time)

@@ -13,25 +13,9 @@ _FINEST = 0.5  # sampling steps: with shorter ones most new rows would lie betwe
 
 
 def resampled(record: Record, spec: StateSpec, step: float, max_gap: float | None) -> Record | None:
-    """A record with rows of this step from the beginning of each of its stretches, as segments.
+    """A record with rows of this step, as of :meth:`~gpadjust.records.Records.resampled`.
 
-    States are on the line between two rows, of angles the shortest way round, and NaN if one of the
-    two was not measured. Actions are means over the new steps of what was constant from row to row.
-    Of a stretch shorter than a step there is its first row.
-
-    Args:
-        record: The record.
-        spec: What the entries of states are.
-        step: The time from one new row to the next.
-        max_gap: The longest time between two rows that follow each other; None for the default of
-            :meth:`Record.stretches`.
-
-    Returns:
-        The new record; None if no stretch is as long as a step.
-
-    Raises:
-        ValueError: If the step is less than half the sampling step, or times differ so much that it
-            takes ``max_gap`` to say what a gap is.
+    Of a stretch shorter than a step there is its first row; None if no stretch is as long.
     """
     finest = _FINEST * record.sampling_step
     if step < finest:

@@ -133,9 +133,7 @@ def read_csv(
     lines = torch.tensor(table.lines)
     if left := [str(line) for line in lines[~seen].tolist()]:
         shown = [*left[:10], f"{len(left) - 10} more"] if len(left) > 10 else left
-        one = len(left) == 1
-        of = "has no output and is" if one else "have no output and are"
-        remarks.append(f"{'Line' if one else 'Lines'} {listed(shown)} {of} left out.")
+        remarks.append(f"Left out, as they have no output: line {listed(shown)}.")
     X, Y, lines = X[seen], Y[seen], lines[seen]
     for name, y in zip(names[d:], Y.unbind(-1), strict=True):
         if (number := int((~y.isnan()).sum())) < 2:
@@ -271,10 +269,14 @@ def _imported(path: str) -> Any:
         ) from error
     except (Exception, SystemExit) as error:  # importing runs the user's code
         last = traceback.extract_tb(error.__traceback__)[-1]
-        place = "" if isinstance(error, SyntaxError) else f" ({Path(last.filename).name}, line "
-        place = place and f"{place}{last.lineno})"
-        text = f"{type(error).__name__}: {error}{place}"
-        raise ValueError(f"{module} cannot be imported: {text}") from error
+        place = (
+            ""
+            if isinstance(error, SyntaxError)
+            else f" ({Path(last.filename).name}, line {last.lineno})"
+        )
+        raise ValueError(
+            f"{module} cannot be imported: {type(error).__name__}: {error}{place}"
+        ) from error
     try:
         return attrgetter(name)(found)
     except AttributeError as error:

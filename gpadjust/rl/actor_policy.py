@@ -29,12 +29,12 @@ def actor_policy(agent: SAC | TD3, spec: StateSpec) -> BoundedPolicy:
         >>> import torch
         >>> from gpadjust.control import PolicySearch, Task
         >>> from gpadjust.dynamics import PhysicsDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, cart_pole_start
-        >>> from gpadjust.envs import random_cart_pole_physics
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward, cart_pole_start
+        >>> from gpadjust.systems import cart_pole
         >>> from gpadjust.rl import actor_policy
         >>> from stable_baselines3 import SAC
         >>> agent = SAC("MlpPolicy", "gpadjust/CartPoleSwingUp-v0", seed=0)
-        >>> physics = PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> physics = PhysicsDynamics(CART_POLE_SPEC, cart_pole(0).physics)
         >>> task = Task(
         ...     physics, cart_pole_reward, initial_states=cart_pole_start, episode_length=5
         ... )

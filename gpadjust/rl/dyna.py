@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-import time
 import warnings
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import fields
 from pathlib import Path
@@ -33,8 +31,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
 from gpadjust.control.agent import check_spaces
-from gpadjust.control.checkpoint import RandomState, Resumable, packed, unpacked
-from gpadjust.control.learning import learn_dynamics
+from gpadjust.control.checkpoint import RandomState, TaskAgent, packed, unpacked
+from gpadjust.control.recorded_episodes import learn_dynamics
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
 from gpadjust.rl.checkpoint import (
     CheckpointCallback,
@@ -46,7 +44,7 @@ from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
 
-class Dyna(Resumable, OffPolicyAlgorithm):
+class Dyna(TaskAgent, OffPolicyAlgorithm):
     r"""What an off-policy learner needs to learn from real episodes and from those in a model.
 
     After each real episode it updates on what it has, as the learner does; teaches the real
@@ -375,50 +373,16 @@ class Dyna(Resumable, OffPolicyAlgorithm):
         spec = self.ready_task().dynamics.spec
         return self.replay_buffer.recorded(spec, self.policy.unscale_action, keep)
 
-    def episode_length(self) -> int:
-        """Steps of an episode: those of the task, or else the time limit of the environment.
-
-        Raises:
-            ValueError: If there is neither.
-        """
-        task = self.ready_task()
-        if task.episode_length is not None:
-            return task.episode_length
+    def env_attribute(self, name: str) -> Any:
+        """An attribute of the first environment."""
         if self.env is None:
             raise ValueError(
                 "Nobody says how long an episode is; give the task an episode_length, or the agent "
                 "an environment: load(..., env=env)."
             )
-        spec = self.env.get_attr("spec")[0]
-        length = None if spec is None else spec.max_episode_steps
-        if length is None:
-            with suppress(AttributeError):  # a TimeLimit that was put around it by hand
-                length = self.env.get_attr("_max_episode_steps")[0]
-        if length is None:
-            raise ValueError(
-                "The environment has no time limit that could be read; give the task an "
-                "episode_length, the number of steps of an episode."
-            )
-        return int(length)
-
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add what is done inside to a part of ``wall_time``."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.wall_time[part] += time.perf_counter() - start
+        return self.env.get_attr(name)[0]
 
     # The model
-
-    def model_task(self) -> Task:
-        """The task, with what environment and real episodes tell where it says nothing.
-
-        Raises:
-            ValueError: If nobody says how long an episode is.
-        """
-        return self.recorded_episodes().complete(self.ready_task(), self.episode_length())
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
         """The dynamics, as they stand, as an environment of ``num_envs`` particles.
@@ -540,11 +504,6 @@ class Dyna(Resumable, OffPolicyAlgorithm):
         """The user's environment in the wrappers of Stable-Baselines3."""
         return cls._wrap_env(env, verbose=0)
 
-    def own_env(self) -> VecEnv:
-        """The wrapped environment."""
-        assert self.env is not None, "an agent that learnt has one"
-        return self.env
-
     @classmethod
     def described(cls, env: VecEnv) -> dict[str, Any]:
         """Number, wrappers and spaces of the environments."""
@@ -558,7 +517,7 @@ class Dyna(Resumable, OffPolicyAlgorithm):
         return {
             "agent.zip": saved.getvalue(),
             "action_space.json": json.dumps(self._action_generator.state).encode(),
-            "environment.pkl": environment_state(self.own_env()),
+            "environment.pkl": environment_state(self.env),
             **buffers,
         }
 
@@ -634,10 +593,11 @@ class DynaSAC(Dyna, SAC):
         >>> import gymnasium
         >>> from gpadjust.control import Task
         >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> from gpadjust.rl import DynaOptions, DynaSAC
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole().physics)
         >>> task = Task(dynamics, cart_pole_reward)
         >>> agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), seed=0)
         >>> agent.learn(total_timesteps=25).num_episodes
@@ -657,10 +617,11 @@ class DynaTD3(Dyna, TD3):
         >>> from stable_baselines3.common.noise import NormalActionNoise
         >>> from gpadjust.control import Task
         >>> from gpadjust.dynamics import PhysicsDynamics
-        >>> from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+        >>> from gpadjust.systems import cart_pole
+        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> from gpadjust.rl import DynaOptions, DynaTD3
         >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, cart_pole().physics)
         >>> task = Task(dynamics, cart_pole_reward)
         >>> noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
         >>> options = DynaOptions(model_episodes=2)

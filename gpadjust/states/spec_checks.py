@@ -68,7 +68,7 @@ def check_previous(name: str, held: str, found: Tensor, before: Tensor, off: Ten
         row = int(wrong[0])
         raise ValueError(
             f"State {name!r} is said to hold the previous {held}, but is {float(found[row]):.3g} "
-            f"where that was {float(before[row]):.3g} in row {row}. Mend `previous`, or take "
+            f"where that was {float(before[row]):.3g} in row {row}. Correct `previous`, or take "
             f"{name!r} out of it, so that the model predicts it."
         )
 

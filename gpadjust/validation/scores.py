@@ -82,17 +82,10 @@ def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
     .. math:: \frac1S \sum_i A(y - \mu_i, \sigma_i^2)
         - \frac{1}{2 S^2} \sum_{i, j} A(\mu_i - \mu_j, \sigma_i^2 + \sigma_j^2)
 
-    Args:
-        mean: As in :func:`nlpd`, like the others.
-        variance: As there.
-        y: As there.
-        mixture_dim: As there.
-
     Returns:
         ``... x m``, in the units of ``y``.
 
-    Raises:
-        TypeError: As :func:`nlpd`, like ``ValueError``.
+    Arguments and errors are those of :func:`nlpd`.
 
     Example:
         >>> import torch
@@ -111,18 +104,11 @@ def crps(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None =
 def pit(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
     """Probability integral transform: the predicted distribution function at the true value.
 
-    Args:
-        mean: As in :func:`nlpd`, like the others.
-        variance: As there.
-        y: As there.
-        mixture_dim: As there.
-
     Returns:
         ``... x n x m``, between 0 and 1, or NaN where not observed; uniform if intervals
         of all levels hold (Dawid 1984).
 
-    Raises:
-        TypeError: As :func:`nlpd`, like ``ValueError``.
+    Arguments and errors are those of :func:`nlpd`.
 
     Example:
         >>> import torch
@@ -144,12 +130,7 @@ def coverage(
 ) -> Tensor:
     """Share of the points that lie within the central interval of a given level.
 
-    Args:
-        mean: As in :func:`nlpd`.
-        variance: As there.
-        y: As there.
-        level: Nominal coverage, between 0 and 1.
-        mixture_dim: As there.
+    Arguments are those of :func:`nlpd`, and the nominal coverage ``level``, between 0 and 1.
 
     Returns:
         ``... x m``, between 0 and 1; near ``level`` if the intervals hold.

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from gpadjust import CKA, BlackBoxPhysics, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import AngleInput
-from gpadjust.envs import REAL_CART_POLE, CartPoleEquation, random_cart_pole_physics
-from gpadjust.envs.cart_pole.system import SUBSTEP, TIME_STEP
 from gpadjust.physics import ODEPhysics
+from gpadjust.systems import CartPoleEquation, cart_pole
+from gpadjust.systems.cart_pole import REAL_CART_POLE, SUBSTEP, TIME_STEP
 from paper.active import PROBLEMS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
 from paper.pairs.functions import pair
@@ -107,7 +107,7 @@ def _pair(name: str) -> Callable[[int], Problem]:
 
 def _cart_pole(seed: int) -> Problem:
     upper = torch.tensor(CART_POLE_LIMITS, dtype=torch.float64)
-    believed = random_cart_pole_physics(seed).rhs
+    believed = cart_pole(seed).physics.rhs
     return Problem(
         torch.stack([-upper, upper]),
         _change(REAL_CART_POLE),

@@ -53,7 +53,7 @@ PAPER = ("mf", "phy", "gp", "cka", "rra")  # those that the paper compares
 
 
 def _check_opensim() -> None:
-    from gpadjust.envs.arm.opensim_model import load_opensim
+    from gpadjust.systems.opensim import load_opensim
 
     load_opensim()
 

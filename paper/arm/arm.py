@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from gpadjust.envs import REAL_ARM, arm_targets, hand_position
-from gpadjust.envs.arm.task import START_MEAN
+from gpadjust.systems.reaching import START_MEAN, arm_targets, hand_position
+from gpadjust.systems.torque_arm import REAL_ARM
 from paper.arm import SCENARIOS
 from paper.arm.claims import LAST, MAP_AFTER, claims, targets
 from paper.cartpole import Control

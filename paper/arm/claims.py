@@ -25,8 +25,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from gpadjust.envs import arm_targets, hand_position
-from gpadjust.envs.arm.task import START_MEAN
+from gpadjust.systems.reaching import START_MEAN, arm_targets, hand_position
 from paper.arm import PAPER, SCENARIOS, Settings
 from paper.common.verdicts import (
     Claim,

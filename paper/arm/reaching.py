@@ -19,20 +19,19 @@ from torch import Tensor
 
 from gpadjust.control import PolicySearch, PolicySearchAgent, Task, mlp_policy
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.envs import (
+from gpadjust.inference import SamplingWarning
+from gpadjust.physics import ODEPhysics
+from gpadjust.states import StateSpec
+from gpadjust.systems import MuscleArmEnv, RememberAction
+from gpadjust.systems.reaching import (
     ARM_MEMORY_SPEC,
     ARM_SPEC,
-    MuscleArmEnv,
-    RememberAction,
     arm_reward,
     arm_start,
     arm_targets,
     hand_position,
 )
-from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, torque_arm
-from gpadjust.inference import SamplingWarning
-from gpadjust.physics import ODEPhysics
-from gpadjust.states import StateSpec
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, torque_arm
 from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
 from paper.arm import Settings as ArmSettings
 from paper.arm.arm import BOUND, draw_arm

@@ -14,23 +14,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gpadjust.control import Task
-from gpadjust.envs import (
+from gpadjust.physics import Physics
+from gpadjust.systems import MuscleArmEnv, RememberAction, arm, hand_distance_cm
+from gpadjust.systems.opensim import MUSCLES, REST_ACTIVATION, ArmSimulation, build_muscle_arm
+from gpadjust.systems.reaching import (
     ARM_MEMORY_SPEC,
     ARM_SPEC,
-    REAL_ARM,
-    MuscleArmEnv,
-    RememberAction,
+    START_MEAN,
     arm_reward,
     arm_start,
     arm_targets,
-    hand_distance_cm,
-    opensim_arm_physics,
-    torque_arm_physics,
 )
-from gpadjust.envs.arm.opensim_model import MUSCLES, REST_ACTIVATION, build_muscle_arm
-from gpadjust.envs.arm.simulation import ArmSimulation
-from gpadjust.envs.arm.task import START_MEAN
-from gpadjust.physics import Physics
+from gpadjust.systems.torque_arm import REAL_ARM
 from paper.arm import Settings
 from paper.cartpole import Scenario
 from paper.cartpole.control import Recorder, System, dynamics
@@ -44,7 +39,7 @@ def system(scenario: Scenario, settings: Settings) -> System:
     env: gym.Env[Any, Any] = MuscleArmEnv(strength=settings.strength)
     if settings.memory:
         env = RememberAction(env)
-    physics: Physics = opensim_arm_physics() if settings.black_box else torque_arm_physics()
+    physics: Physics = arm(opensim=True).physics if settings.black_box else arm().physics
     spec = ARM_MEMORY_SPEC if settings.memory else ARM_SPEC
     task = Task(
         dynamics(scenario, settings, spec, physics, physics),

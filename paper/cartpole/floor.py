@@ -9,10 +9,9 @@ import torch
 
 from gpadjust.control import CrossEntropy, Planner, Return, Task
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward
-from gpadjust.envs.cart_pole.swing_up import MAX_FORCE
-from gpadjust.envs.cart_pole.system import START_MEAN
 from gpadjust.models.sampled_functions import seeded
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, START_MEAN, cart_pole_reward
+from gpadjust.systems.swing_up import MAX_FORCE
 from paper.cartpole import Floor, Settings
 from paper.cartpole.system import fixed_starts, true_physics
 from paper.common.experiment import Run, Table

@@ -26,17 +26,17 @@ from gpadjust.control import (
     Task,
 )
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.envs import (
-    CART_POLE_SPEC,
-    REAL_CART_POLE,
-    CartPoleSwingUpEnv,
-    cart_pole_reward,
-    cart_pole_start,
-    random_cart_pole_physics,
-)
-from gpadjust.envs.cart_pole.system import START_MEAN, CartPoleEquation, equation_physics
 from gpadjust.inference import SamplingWarning
 from gpadjust.states import StateSpec
+from gpadjust.systems import CartPoleEquation, CartPoleSwingUpEnv, cart_pole
+from gpadjust.systems.cart_pole import (
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    START_MEAN,
+    cart_pole_reward,
+    cart_pole_start,
+    equation_physics,
+)
 from paper.cartpole import (
     FRICTIONS,
     SENSORS,
@@ -138,7 +138,7 @@ def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -
     time_step = settings.time_step
     if learner == "oracle":
         return PhysicsDynamics(CART_POLE_SPEC, equation_physics(equation(system), time_step))
-    physics = random_cart_pole_physics(seed, time_step)
+    physics = cart_pole(seed, time_step=time_step).physics
     if learner in ("phy", "fitted"):
         return PhysicsDynamics(CART_POLE_SPEC, physics)
     known = LEARNERS["cka" if learner == "search" else learner]

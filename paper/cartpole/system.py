@@ -11,19 +11,19 @@ from torch import Tensor
 
 from gpadjust.control import Task
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.envs import (
+from gpadjust.physics import ODEPhysics
+from gpadjust.rl import DynaSAC, ModelVecEnv
+from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
+from gpadjust.systems.cart_pole import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
     REAL_CART_POLE,
-    CartPoleSwingUpEnv,
-    cart_pole_physics,
+    START_MEAN,
+    START_STD,
     cart_pole_reward,
     cart_pole_start,
-    random_cart_pole_physics,
+    equation_physics,
 )
-from gpadjust.envs.cart_pole.system import START_MEAN, START_STD
-from gpadjust.physics import ODEPhysics
-from gpadjust.rl import DynaSAC, ModelVecEnv
 from paper.cartpole import NUM_STARTS, Scenario, Settings
 from paper.cartpole.control import Recorder, System, dynamics
 
@@ -34,7 +34,7 @@ def system(scenario: Scenario, settings: Settings, seed: int) -> System:
         CartPoleSwingUpEnv(encode_angle=settings.encode_angle), settings.episode_length
     )
     spec = CART_POLE_SPEC if settings.encode_angle else CART_POLE_RAW_SPEC
-    model = dynamics(scenario, settings, spec, random_cart_pole_physics(seed), true_physics())
+    model = dynamics(scenario, settings, spec, cart_pole(seed).physics, true_physics())
     task = Task(
         model,
         cart_pole_reward,
@@ -46,8 +46,7 @@ def system(scenario: Scenario, settings: Settings, seed: int) -> System:
 
 def true_physics() -> ODEPhysics:
     """The system as it is."""
-    real = REAL_CART_POLE
-    return cart_pole_physics(real.cart_mass, real.pole_mass, real.pole_length, real.damping)
+    return equation_physics(REAL_CART_POLE)
 
 
 def fixed_starts(n: int) -> Tensor:
@@ -100,4 +99,4 @@ class CartPoleRecorder(Recorder):
 
     def found(self) -> dict[str, Any]:
         """The records, and the parameters of f_p, which are random."""
-        return {"physics": vars(random_cart_pole_physics(self.seed).rhs), **super().found()}
+        return {"physics": vars(cart_pole(self.seed).physics.rhs), **super().found()}

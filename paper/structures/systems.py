@@ -12,17 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gpadjust.dynamics import Trajectories
-from gpadjust.envs import (
-    ARM_SPEC,
-    CART_POLE_SPEC,
-    CartPoleSwingUpEnv,
-    MuscleArmEnv,
-    random_cart_pole_physics,
-    torque_arm_physics,
-)
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.records import Records
 from gpadjust.states import StateSpec
+from gpadjust.systems import CartPoleSwingUpEnv, MuscleArmEnv, arm, cart_pole
+from gpadjust.systems.cart_pole import CART_POLE_SPEC
+from gpadjust.systems.reaching import ARM_SPEC
 from paper.real.systems import DATA
 from paper.structures import ARM, SIMULATED
 
@@ -66,7 +61,7 @@ def system(name: str, n: int, num_test: int, seed: int) -> System:
         ValueError: If the records have fewer.
     """
     if name in SIMULATED:
-        physics = torque_arm_physics() if name == ARM else random_cart_pole_physics(seed)
+        physics = arm().physics if name == ARM else cart_pole(seed).physics
         spec = ARM_SPEC if name == ARM else CART_POLE_SPEC
         return System(spec, physics, episodes(name, n, seed), episodes(name, num_test, _TEST_SEED))
     known = recorded(name, _TRAIN[name])

@@ -12,6 +12,7 @@ from botorch.optim import optimize_acqf
 
 from gpadjust import BiasGP, BlackBoxPhysics, VariationalCKA, fit
 from gpadjust.active import qAdjustmentInformationGain
+from tests.systems import crude
 
 ABOUT = ["rho", "delta", "both"]
 BOUNDS = torch.tensor([[0.0, 0.0], [2.0, 2.0]], dtype=torch.float64)
@@ -167,8 +168,8 @@ class TestAgainstLinearAlgebra:
         assert max(expected.constant.values()) > 1
         assert_close(ask(model, X, about), expected.information(about), 1e-5)
 
-    def test_inducing_values_by_the_posterior_covariance(self, data, X, crude_physics):
-        model = VariationalCKA(*data(num_outputs=2), physics=crude_physics, num_inducing=5)
+    def test_inducing_values_by_the_posterior_covariance(self, data, X):
+        model = VariationalCKA(*data(num_outputs=2), physics=crude, num_inducing=5)
         fit(model, num_screened=0)
         expected = 0.0
         for j in range(2):
@@ -232,7 +233,7 @@ class TestLaws:
 
     @pytest.mark.parametrize("about", ABOUT)
     @pytest.mark.parametrize("factor", [1e-6, 1e5])
-    def test_units_do_not_matter(self, data, build, X, crude_physics, about, factor):
+    def test_units_do_not_matter(self, data, build, X, about, factor):
         D, Y = data()
         values = []
         for unit in (1.0, factor):
@@ -240,7 +241,7 @@ class TestLaws:
                 "CKA",
                 D / unit,
                 Y * unit,
-                physics=lambda X, u=unit: u * crude_physics(X * u)[..., :1],
+                physics=lambda X, u=unit: u * crude(X * u)[..., :1],
             )
             values.append(ask(model, X / unit, about))
         assert_close(values[1], values[0], 1e-6)
@@ -336,14 +337,12 @@ class TestShapes:
 class TestGradient:
     @pytest.mark.parametrize("about", ABOUT)
     @pytest.mark.parametrize("kind", ["CKA", "RRA", "held", "black box"])
-    def test_finite_differences(
-        self, data, build, shuffle, held, uniform, crude_physics, kind, about
-    ):
+    def test_finite_differences(self, data, build, shuffle, held, uniform, kind, about):
         D, Y = data(num_outputs=2)
         if kind == "held":
             model = held("CKA", D, Y)[0]
         elif kind == "black box":
-            physics = BlackBoxPhysics(lambda X: crude_physics(torch.from_numpy(X)).numpy())
+            physics = BlackBoxPhysics(lambda X: crude(torch.from_numpy(X)).numpy())
             model = shuffle(build("CKA", D, Y, physics=physics))
         else:
             model = shuffle(build(kind, D, Y))
@@ -408,8 +407,8 @@ class TestErrors:
         with pytest.raises(TypeError, match=f"rho or delta .* got {kind}"):
             qAdjustmentInformationGain(build(kind, *data()))
 
-    def test_inducing_values_of_a_sum(self, data, crude_physics):
-        model = VariationalCKA(*data(num_outputs=2), physics=crude_physics)
+    def test_inducing_values_of_a_sum(self, data):
+        model = VariationalCKA(*data(num_outputs=2), physics=crude)
         for about in ("rho", "delta"):
             with pytest.raises(TypeError, match=f"if {about} were known: ask about 'both'"):
                 qAdjustmentInformationGain(model, about)

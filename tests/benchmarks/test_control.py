@@ -7,12 +7,13 @@ import torch
 
 from gpadjust.control import MPC, Planned, Task
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.envs import (
+from gpadjust.systems import cart_pole
+from gpadjust.systems.cart_pole import (
     CART_POLE_SPEC,
-    cart_pole_physics,
+    REAL_CART_POLE,
     cart_pole_reward,
     cart_pole_start,
-    random_cart_pole_physics,
+    equation_physics,
 )
 
 
@@ -20,14 +21,14 @@ from gpadjust.envs import (
 def task():
     """The cart-pole, learnt from 100 transitions."""
     torch.manual_seed(0)
-    truth, states = cart_pole_physics(0.5, 0.5, 0.6, 0.1), cart_pole_start(4)
+    truth, states = equation_physics(REAL_CART_POLE), cart_pole_start(4)
     rows = []
     for _ in range(25):
         actions = 20 * torch.rand(4, 1, dtype=torch.float64) - 10
         following = truth(torch.cat([states, actions], dim=-1))
         rows.append((states, actions, following))
         states = following
-    dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+    dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics)
     dynamics.update(*(torch.cat(column) for column in zip(*rows, strict=True)))
     return Task(dynamics, cart_pole_reward, episode_length=25)
 

@@ -6,8 +6,9 @@ import numpy as np
 import opensim
 import pytest
 
-from gpadjust.envs import REAL_ARM, MuscleArmEnv
-from gpadjust.envs.arm.opensim_model import build_muscle_arm, controls
+from gpadjust.systems import MuscleArmEnv
+from gpadjust.systems.opensim import build_muscle_arm, controls
+from gpadjust.systems.torque_arm import REAL_ARM
 
 START = np.radians([35.0, 65.0, 0.0, 0.0])
 ACCURACY = 1e-5

@@ -7,8 +7,9 @@ import pytest
 
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
 from gpadjust.rl import DynaOptions, DynaSAC
+from gpadjust.systems import cart_pole
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
 
 
 @pytest.fixture
@@ -17,7 +18,7 @@ def agent():
     return DynaSAC(
         "MlpPolicy",
         gymnasium.make("gpadjust/CartPoleSwingUp-v0"),
-        Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward),
+        Task(LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics), cart_pole_reward),
         DynaOptions(updates_per_model_step=0, num_particles=5),
         policy_kwargs={"net_arch": [128, 128]},
         seed=0,

@@ -22,14 +22,10 @@ from gpadjust.control import (
     print_progress,
 )
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.envs import (
-    CART_POLE_SPEC,
-    CartPoleSwingUpEnv,
-    cart_pole_reward,
-    random_cart_pole_physics,
-)
 from gpadjust.models import ZeroMeanGP
 from gpadjust.physics import PhysicsError
+from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
 from tests.control.conftest import PLAN
 
 pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
@@ -314,7 +310,7 @@ def test_observations_in_another_order_cost_no_episode():
     order = [0, 3, 1, 2, 4]
     env = CartPoleSwingUpEnv()
     shuffled = TransformObservation(env, lambda seen: seen[order], env.observation_space)
-    dynamics = LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0))
+    dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole().physics)
     task = Task(dynamics, cart_pole_reward, episode_length=25)
     agent = MPCAgent(shuffled, task, PLAN, first=PLAN, seed=0)
     with pytest.raises(ValueError, match="sine and cosine of the angle 'theta'"):
@@ -394,7 +390,7 @@ def test_a_policy_is_made_as_told(make_agent):
 @pytest.mark.slow
 def test_the_cart_pole_swings_up_in_two_trials():
     env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    f_p = random_cart_pole_physics(3)
+    f_p = cart_pole(3).physics
     task = Task(LearnedDynamics(CART_POLE_SPEC, f_p), cart_pole_reward)
     agent = MPCAgent(env, task, seed=3).learn(50)
     assert agent.recorded_episodes(newest=25).rewards.mean() > -0.45

@@ -107,11 +107,12 @@ SCRIPT = """
     torch.set_num_threads(1)
     from gpadjust.control import CrossEntropy, EpisodeCheckpoint, MPCAgent, Planner, Task, resume
     from gpadjust.dynamics import LearnedDynamics
-    from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+    from gpadjust.systems import cart_pole
+    from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
 
     path = Path(sys.argv[1])
     env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    task = Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward)
+    task = Task(LearnedDynamics(CART_POLE_SPEC, cart_pole().physics), cart_pole_reward)
     if path.exists():
         agent = resume(path, env, task)
     else:

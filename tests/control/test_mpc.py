@@ -7,8 +7,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from gpadjust.control import MPC, CrossEntropy, PathIntegral, Planner, Return, Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.envs import CART_POLE_SPEC, CartPoleSwingUpEnv, cart_pole_reward
-from gpadjust.envs.cart_pole.system import REAL_CART_POLE, equation_physics
+from gpadjust.systems import CartPoleSwingUpEnv
+from gpadjust.systems.cart_pole import (
+    CART_POLE_SPEC,
+    REAL_CART_POLE,
+    cart_pole_reward,
+    equation_physics,
+)
 
 SPEC = StateSpec(["x"], ["v"])
 BOUNDS = torch.tensor([[-1.0], [2.0]], dtype=torch.float64)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from paper.planning.systems import FittedPhysics
 
 from gpadjust import CKA, CalibratedPhysics, ODEPhysics, PhysicsMeanGP, Unknown
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.envs import CART_POLE_SPEC, CartPoleSwingUpEnv
-from gpadjust.envs.cart_pole.system import CartPoleEquation
-from paper.planning.systems import FittedPhysics
+from gpadjust.systems import CartPoleSwingUpEnv
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, CartPoleEquation
 
 UNKNOWNS = {
     "cart_mass": Unknown(0.6, factor=1.5, unit="kg"),

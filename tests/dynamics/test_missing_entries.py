@@ -46,7 +46,7 @@ def test_each_state_is_learnt_from_its_own_rows(cart_pole_system, make, costly_k
             next_states.isnan(), next_states
         )
         alone = make(kind, system.spec, system.crude)
-        alone.fit(states, actions, filled)
+        alone.update(states, actions, filled)
         alone.load_state_dict({**alone.state_dict(), "model": dynamics.state_dict()["model"]})
         assert_same(alone.predict(*test), dynamics.predict(*test), column, rtol=1e-4, atol=1e-7)
 
@@ -106,7 +106,7 @@ def test_a_row_of_nothing_is_refused(cart_pole_system, make, holed):
     states, actions, next_states = holed
     dynamics = make("CKA", system.spec, system.crude)
     next_states[11] = math.nan
-    for call in (dynamics.update, dynamics.fit):
+    for call in (dynamics.update, make("CKA", system.spec, system.crude).update):
         with pytest.raises(ValueError, match=r"observation in each row.*\(row 11\)"):
             call(states, actions, next_states)
     dynamics.update(*system.trial(1))

@@ -22,7 +22,7 @@ def test_lines_are_those_of_an_editor(columns):
     assert table.names == ("x", "y\nin words")
     assert table.lines == (4, 6, 7, 9)
     assert table.numbers("x").tolist() == [1, 3, 5, 7]
-    with pytest.raises(ValueError, match=r"line 9, column 2 .*expected a number, found 'bad'"):
+    with pytest.raises(ValueError, match=r"line 9, column 2 .*'bad'"):
         table.numbers("y\nin words")
     with pytest.raises(ValueError, match="line 2: expected a column 'z'"):
         table.numbers("z")
@@ -57,15 +57,15 @@ def test_what_is_no_number(columns, decimal, text, hint):
 def test_a_column_that_is_not_there_has_the_likest_name(columns):
     table = columns("Flow [m3/h],head\n1,2\n")
     for near in ("flow", "Flow [l/s]", "flw"):
-        with pytest.raises(ValueError, match=r"Is it 'Flow \[m3/h\]'\? Say which column"):
+        with pytest.raises(ValueError, match=r"Is it 'Flow \[m3/h\]'\?"):
             table.numbers(near)
-    with pytest.raises(ValueError, match=r"found 'Flow \[m3/h\]', 'head'. Say which column"):
+    with pytest.raises(ValueError, match=r"found 'Flow \[m3/h\]', 'head'"):
         table.numbers("pressure")
 
 
 @pytest.mark.parametrize(("mark", "name"), [(";", "semicolons"), ("\t", "tabs"), ("|", "bars")])
 def test_another_delimiter_is_told(columns, mark, name):
-    with pytest.raises(ValueError, match=f"seem to be {name} .* say so by --delimiter"):
+    with pytest.raises(ValueError, match=rf"{name} .*--delimiter"):
         columns(f"x{mark}y\n1{mark}2\n", option="--{} {!r}").numbers("x")
-    with pytest.raises(ValueError, match=f"expected 1 field,.* seem to be {name}"):
+    with pytest.raises(ValueError, match=rf"1 field,.* {name}"):
         columns(f"x{mark}y\n1{mark}2,5\n")

@@ -49,13 +49,13 @@ def test_one_output_of_several(uniform):
 
 def test_several_outputs_without_saying_which(uniform):
     kernel = PhysicsScaledKernel(RBFKernel().double(), lambda X: X)
-    with pytest.raises(ValueError, match="has 2 outputs; say with `output=`"):
+    with pytest.raises(ValueError, match=r"2 outputs.*`output=`"):
         kernel(uniform(5, 2)).to_dense()
 
 
 def test_last_dim_is_batch(uniform):
     kernel = PhysicsScaledKernel(RBFKernel().double(), physics)
-    with pytest.raises(ValueError, match="cannot take `last_dim_is_batch=True`"):
+    with pytest.raises(ValueError, match="last_dim_is_batch"):
         kernel.forward(uniform(5, 2), uniform(5, 2), last_dim_is_batch=True)
 
 

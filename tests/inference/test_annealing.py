@@ -48,11 +48,11 @@ def standard(x):
     return 0.5 * x.square().sum(-1)
 
 
-def around(centre, sd=1.0, p=2, problems=1):
+def around(center, sd=1.0, p=2, problems=1):
     """One t distribution for each problem, round."""
-    centres = torch.full((1, problems, p), float(centre), dtype=torch.float64)
+    centers = torch.full((1, problems, p), float(center), dtype=torch.float64)
     root = (sd * torch.eye(p, dtype=torch.float64)).expand(1, problems, p, p)
-    return Mixture(centres, torch.ones_like(centres[..., 0]), root)
+    return Mixture(centers, torch.ones_like(centers[..., 0]), root)
 
 
 def draw(density, proposal, num_gradients=GRADIENTS, seed=0):
@@ -79,11 +79,11 @@ class TestMoments:
     def test_of_gaussians_of_several_problems(self, gaussians, is_off):
         mean, covariance, sd = gaussians
         root = torch.linalg.cholesky(covariance)
-        centre = mean
+        center = mean
         if is_off:  # in place and in shape, of one problem more than of the other
-            centre = mean + torch.tensor([[1.0], [4.0]]) * sd
+            center = mean + torch.tensor([[1.0], [4.0]]) * sd
             root = torch.diag_embed(sd * torch.tensor([[2.0], [0.4]]))
-        proposal = Mixture(centre[None], torch.ones(1, 2, dtype=torch.float64), root[None])
+        proposal = Mixture(center[None], torch.ones(1, 2, dtype=torch.float64), root[None])
         found = draw(gaussian(mean, torch.linalg.inv(covariance)), proposal)
         assert found.positions.shape == (2 * PARTICLES, 2, 3)
         assert found.log_ratio.shape == (2 * PARTICLES, 2)
@@ -248,15 +248,15 @@ class TestMixture:
     @pytest.fixture
     def mixture(self):
         """Three components of two problems in four dimensions, each with a root of its own."""
-        centres = torch.randn(3, 2, 4, generator=generator(), dtype=torch.float64)
+        centers = torch.randn(3, 2, 4, generator=generator(), dtype=torch.float64)
         weights = torch.tensor([[0.2, 0.5], [0.3, 0.1], [0.5, 0.4]], dtype=torch.float64)
         root = torch.randn(3, 2, 4, 4, generator=generator(1), dtype=torch.float64).tril()
-        return Mixture(centres, weights, root)
+        return Mixture(centers, weights, root)
 
     def test_density_and_gradient(self, mixture):
         sign = mixture.root.diagonal(dim1=-2, dim2=-1).sign()
         root = mixture.root * sign.unsqueeze(-2)
-        parts = dist.MultivariateStudentT(root.new_tensor(5.0), mixture.centres, root)
+        parts = dist.MultivariateStudentT(root.new_tensor(5.0), mixture.centers, root)
         x = mixture.sample(7, generator(2)).requires_grad_()
         expected = -(parts.log_prob(x.unsqueeze(1)) + mixture.weights.log()).logsumexp(1)
         value, gradient = mixture.value_and_gradient(x.detach())
@@ -268,8 +268,8 @@ class TestMixture:
         x = mixture.sample(number, generator())
         assert x.shape == (number, 2, 4)
         weights = mixture.weights[..., None]
-        mean = (weights * mixture.centres).sum(0)
-        away = mixture.centres - mean
+        mean = (weights * mixture.centers).sum(0)
+        away = mixture.centers - mean
         covariance = 5 / 3 * mixture.root @ mixture.root.mT + away[..., None] * away[..., None, :]
         covariance = (weights[..., None] * covariance).sum(0)
         sd = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -285,7 +285,7 @@ class TestMixture:
         off = below - below[-1] * torch.linspace(0, 1, 4000)
         assert off.abs().max() < 1.95 / math.sqrt(4000)  # Kolmogorov and Smirnov, one in thousand
 
-    def test_its_first_centre_is_among_the_draws(self):
+    def test_its_first_center_is_among_the_draws(self):
         # The only place where there is any density.
         def point(x):
             return standard(x).where((x == 3.0).all(-1), math.inf)

@@ -14,11 +14,11 @@ FIT = {"num_screened": 16, "num_starts": 2, "max_iterations": 60}
 BUILD = {
     "CKA": CKA,
     "PhysicsMeanGP": PhysicsMeanGP,
-    "CKA, centred, rho mean": partial(CKA, center="mean", rho_mean="learn"),
+    "CKA, centerd, rho mean": partial(CKA, center="mean", rho_mean="learn"),
     "CKA, both means": partial(CKA, rho_mean="learn", delta_mean="learn"),
 }
 # Points that are needed at least.
-FEWEST = dict.fromkeys(BUILD, 2) | {"CKA, centred, rho mean": 3, "CKA, both means": 4}
+FEWEST = dict.fromkeys(BUILD, 2) | {"CKA, centerd, rho mean": 3, "CKA, both means": 4}
 
 
 def wave(X):

@@ -172,7 +172,7 @@ def test_a_physics_that_fails_beside_the_best_parameters_is_told(by, method):
     X = torch.linspace(0.1, 1, 9, dtype=torch.float64).unsqueeze(-1)
     model = CKA(X, 2 * X + 0.1, physics=failing_above(1.5, by))
     before = {name: value.clone() for name, value in model.named_parameters()}
-    with pytest.raises(ValueError, match=r"fails at a = 1\.50.*best parameters.*bounds"):
+    with pytest.raises(ValueError, match=r"a = 1\.50.*bounds"):
         fit(model, method)
     assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
     inside = CalibratedPhysics(X, 1.2 * X + 0.1, 1e-4, physics=failing_above(1.4, by))
@@ -184,7 +184,7 @@ def test_parameters_that_nothing_tells_apart_are_named():
     X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
     unknowns = {"a": Unknown(1.0, sd=1.0), "b": Unknown(1.0, sd=1.0), "c": Unknown(1.0, sd=1.0)}
     law = FunctionPhysics(lambda X, p: (p.a + p.b) * X[:, 0] + p.c, unknowns=unknowns)
-    with pytest.warns(ParameterWarning, match="next to nothing of a, b of the physics"):
+    with pytest.warns(ParameterWarning, match="nothing of a, b of"):
         fit(CalibratedPhysics(X, 2 * X + 1, 0.01, physics=law))
 
 
@@ -250,12 +250,12 @@ def test_what_cannot_be_calibrated_is_told():
     X, Y = data()
     law = FunctionPhysics(lines, unknowns=PRIORS)
     silent = CKA(X, Y, physics=law, rho_mean=0.0)
-    with pytest.raises(ValueError, match=r"change nothing at the training inputs.*rho_mean=1\.0"):
+    with pytest.raises(ValueError, match=r"nothing.*rho_mean=1\.0"):
         fit(silent, "map")
     batch = CKA(X.expand(2, -1, -1), Y.expand(2, -1, -1), physics=law)
-    with pytest.raises(ValueError, match="of one data set to learn unknown parameters"):
+    with pytest.raises(ValueError, match=r"one data set.*unknown"):
         fit(batch, "map")
-    with pytest.raises(ValueError, match=r"AR1 samples its low level once.*a, b\. CKA learns"):
+    with pytest.raises(ValueError, match=r"AR1.*a, b\. CKA"):
         AR1(X, Y, physics=law, bounds=[[0.0, 0.0], [1.0, 1.0]])
 
 
@@ -297,7 +297,7 @@ def test_a_curved_ridge_is_followed():
 def test_a_prior_that_the_observations_contradict_is_named():
     X = torch.linspace(0, 1, 9, dtype=torch.float64).unsqueeze(-1)
     law = FunctionPhysics(lambda X, p: p.a * X[:, 0], unknowns={"a": Unknown(1000.0, sd=1.0)})
-    with pytest.warns(ParameterWarning, match="prior disagree about a of the physics"):
+    with pytest.warns(ParameterWarning, match="prior disagree about a of"):
         fit(CalibratedPhysics(X, 2 * X, 0.01, physics=law))
 
 

@@ -122,7 +122,7 @@ class TestResult:
 
 def test_no_convergence_is_said(model):
     before = log_likelihood(model)
-    with pytest.warns(OptimizationWarning, match="did not converge for 2 of 2 outputs within 1"):
+    with pytest.warns(OptimizationWarning, match="not converge for 2 of 2 outputs"):
         result = fit(model, "map", num_screened=0, num_starts=1, max_iterations=1)
     assert not result.converged.any()
     assert (log_likelihood(model) >= before).all()
@@ -241,8 +241,8 @@ class TestUsersChoices:
     def test_priors_are_honoured(self, XY):
         X, Y = XY
         batch = torch.Size([2])
-        for centre in (-3.0, 1.0):
-            prior = LogNormalPrior(centre, 0.02)
+        for center in (-3.0, 1.0):
+            prior = LogNormalPrior(center, 0.02)
             base = MaternKernel(ard_num_dims=2, batch_shape=batch, lengthscale_prior=prior)
             kernel = ScaleKernel(base, batch_shape=batch).double()
             fit(
@@ -251,7 +251,7 @@ class TestUsersChoices:
                 num_screened=8,
                 num_starts=1,
             )
-            assert ((base.lengthscale.log() - centre).abs() < 0.1).all()
+            assert ((base.lengthscale.log() - center).abs() < 0.1).all()
 
     def test_fixed_parameters_stay(self, XY):
         model = CKA(*XY, physics=ripple)

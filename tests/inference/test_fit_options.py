@@ -51,7 +51,7 @@ class TestBadInput:
                 fit(model, method, **{option: value})
 
     def test_models(self, model):
-        with pytest.raises(TypeError, match=r"Expected a model of gpadjust.*got Linear"):
+        with pytest.raises(TypeError, match=r"model of gpadjust.*Linear"):
             fit(torch.nn.Linear(2, 1))
         with pytest.raises(ValueError, match="no learnable parameter"):
             fit(model.requires_grad_(False), "bayes")
@@ -62,9 +62,9 @@ class TestBadInput:
             raw.fill_(float("nan"))
         raw.requires_grad_(False)
         before = [p.clone() for p in model.parameters() if p.requires_grad]
-        with pytest.raises(RuntimeError, match="could not be evaluated at any start"):
+        with pytest.raises(RuntimeError, match="not be evaluated"):
             fit(model, **QUICK)
-        with pytest.raises(RuntimeError, match="could not be evaluated at any start"):
+        with pytest.raises(RuntimeError, match="not be evaluated"):
             fit(model, "map", **QUICK)
         after = [p for p in model.parameters() if p.requires_grad]
         assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
@@ -98,7 +98,7 @@ class TestMethodsOfOnesOwn:
     def test_its_options_are_checked(self, model):
         with pytest.raises(ValueError, match="steps must be at least 1; found 0"):
             fit(model, "nudge", steps=0)
-        with pytest.raises(ValueError, match=r"'map' has no option 'steps'; it is one .* 'nudge'"):
+        with pytest.raises(ValueError, match=r"no option 'steps'.*'nudge'"):
             fit(model, "map", steps=2)
 
 

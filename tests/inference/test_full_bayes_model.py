@@ -32,8 +32,8 @@ VARIANTS = {
     "sum": ("CKA", lambda m: {"delta_covar_module": partial_sum(m)}),
     "Normalize": ("CKA", lambda m: {"input_transform": Normalize(2)}),
     "AR1-Normalize": ("AR1", lambda m: {"input_transform": Normalize(2)}),
-    "centred": ("CKA", lambda m: {"center": "mean"}),
-    "learnt centre": ("CKA", lambda m: {"center": "learn"}),
+    "centerd": ("CKA", lambda m: {"center": "mean"}),
+    "learnt center": ("CKA", lambda m: {"center": "learn"}),
     "learnt means": (
         "CKA",
         lambda m: {"center": "mean", "rho_mean": "learn", "delta_mean": "learn"},
@@ -41,7 +41,7 @@ VARIANTS = {
     "no outcome transform": ("CKA", lambda m: {"outcome_transform": None}),
 }
 _NAMES = [*KINDS, *VARIANTS, "CKA-known", "AR1-known"]
-_QUICK = ["CKA", "AR1", "RRA", "learnt means", "learnt centre", "Normalize", "CKA-known"]
+_QUICK = ["CKA", "AR1", "RRA", "learnt means", "learnt center", "Normalize", "CKA-known"]
 CASES = [pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow) for name in _NAMES]
 
 
@@ -218,7 +218,7 @@ class TestCopies:
         model, _ = held("CKA", *data())
         fresh = build("CKA", *data())
         expected = model.train_targets
-        with pytest.raises(RuntimeError, match=r"another number.*release_samples\(\)` first"):
+        with pytest.raises(RuntimeError, match=r"number.*release_samples\(\)"):
             model.load_state_dict(fresh.state_dict())
         assert model.num_samples == 3
         assert torch.equal(model.train_targets, expected)

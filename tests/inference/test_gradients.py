@@ -79,7 +79,7 @@ MODELS = {
     "ScaleGP": of(ScaleGP),
     "ZeroMeanGP": lambda X, Y, m: ZeroMeanGP(X, Y),
     "known noise": lambda X, Y, m: CKA(X, Y, torch.full_like(Y, 0.01), physics=physics(m)),
-    "centre": of(CKA, center="learn"),
+    "center": of(CKA, center="learn"),
     "both means": of(CKA, center="mean", rho_mean="learn", delta_mean="learn"),
     "two physics": lambda X, Y, m: CKA(
         X, Y, physics=[physics(m), lambda X: X[..., :1] + physics(m)(X).sin()], center="mean"

@@ -66,8 +66,8 @@ BUILD = {
     "CKA": lambda X, Y: CKA(X, Y, physics=ripple),
     "known noise": lambda X, Y: CKA(X, Y, torch.full_like(Y, 0.01), physics=ripple),
     "learnt means": lambda X, Y: CKA(X, Y, physics=ripple, rho_mean="learn", delta_mean="learn"),
-    "learnt centre": lambda X, Y: CKA(X, Y, physics=ripple, center="learn"),
-    "learnt centre and means": lambda X, Y: CKA(
+    "learnt center": lambda X, Y: CKA(X, Y, physics=ripple, center="learn"),
+    "learnt center and means": lambda X, Y: CKA(
         X, Y, physics=ripple, center="learn", rho_mean="learn", delta_mean="learn"
     ),
     "two physics": lambda X, Y: CKA(X, Y, physics=[ripple, lambda X: X], rho_mean=[1.0, 0.5]),

@@ -434,7 +434,7 @@ class TestTracesOfSamplesWithoutPhysics:
         fit(model, "map")
         torch.testing.assert_close(model.fallback(Z), unrelated(Z))
 
-    def test_a_centre_that_moved(self, data):
+    def test_a_center_that_moved(self, data):
         X, Y, _ = data
         model = CKA(X, Y, physics=unrelated)
         with torch.no_grad():

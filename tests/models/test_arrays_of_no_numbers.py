@@ -66,25 +66,25 @@ def physics(X):
 @pytest.mark.parametrize(("values", "message"), REFUSED)
 class TestRefused:
     def test_inputs(self, values, message):
-        with pytest.raises(TypeError, match=f"train_X to hold numbers.*{message}"):
+        with pytest.raises(TypeError, match=rf"train_X to hold numbers.*{message}"):
             CKA(column(values), column(ONE_TO_SIX), physics=physics)
 
     def test_targets(self, values, message):
-        with pytest.raises(TypeError, match=f"train_Y to hold numbers.*{message}"):
+        with pytest.raises(TypeError, match=rf"train_Y to hold numbers.*{message}"):
             CKA(column(ONE_TO_SIX), column(values), physics=physics)
 
     def test_questions_and_observations(self, values, message):
         model = CKA(column(ONE_TO_SIX), column(ONE_TO_SIX), physics=physics)
-        with pytest.raises(TypeError, match=f"X to hold numbers.*{message}"):
+        with pytest.raises(TypeError, match=rf"X to hold numbers.*{message}"):
             model.predict(column(values))
-        with pytest.raises(TypeError, match=f"Y to hold numbers.*{message}"):
+        with pytest.raises(TypeError, match=rf"Y to hold numbers.*{message}"):
             model.condition_on_observations(column(ONE_TO_SIX), column(values))
 
     def test_records(self, values, message):
         numbers = column(ONE_TO_SIX)
-        with pytest.raises(TypeError, match=f"times to hold numbers.*{message}"):
+        with pytest.raises(TypeError, match=rf"times to hold numbers.*{message}"):
             Record(values, numbers, numbers)
-        with pytest.raises(TypeError, match=f"states to hold numbers.*{message}"):
+        with pytest.raises(TypeError, match=rf"states to hold numbers.*{message}"):
             Record(ONE_TO_SIX, column(values), numbers)
 
 
@@ -97,7 +97,7 @@ def test_the_way_out_of_times(values):
 
 def test_a_frame_with_a_column_of_times():
     frame = pd.DataFrame({"t": DATES, "x": ONE_TO_SIX})
-    with pytest.raises(TypeError, match="train_X to hold numbers only, found dates or times"):
+    with pytest.raises(TypeError, match=r"train_X.*dates or times"):
         CKA(frame, column(ONE_TO_SIX), physics=physics)
 
 
@@ -105,9 +105,9 @@ class TestMasked:
     values = np.ma.masked_array(column(ONE_TO_SIX), mask=column(ONE_TO_SIX) == 3)
 
     def test_inputs_and_targets(self):
-        with pytest.raises(ValueError, match="train_X without masked values, found 1"):
+        with pytest.raises(ValueError, match="train_X without masked"):
             CKA(self.values, column(ONE_TO_SIX), physics=physics)
-        with pytest.raises(ValueError, match=r"train_Y without.*`train_Y.filled\(np.nan\)`"):
+        with pytest.raises(ValueError, match=r"train_Y.filled\(np.nan\)"):
             CKA(column(ONE_TO_SIX), self.values, physics=physics)
         with pytest.raises(ValueError, match="times without masked values"):
             Record(self.values[:, 0], column(ONE_TO_SIX), column(ONE_TO_SIX))
@@ -147,11 +147,11 @@ def test_inputs_of_one_dimension(make, build, kind):
     options = {"low_X": Y, "low_Y": Y, "physics": None} if kind == "AR1" else {}
     if kind not in ("ZeroMeanGP", "AR1"):
         options["physics"] = physics
-    with pytest.raises(ValueError, match=r"train_X with at least 2 dim.*train_X.reshape\(-1, 1\)"):
+    with pytest.raises(ValueError, match=r"train_X.reshape\(-1, 1\)"):
         build(kind, X, Y, **options)
 
 
 def test_inputs_of_one_dimension_of_a_sparse_model():
     X = torch.as_tensor(ONE_TO_SIX)
-    with pytest.raises(ValueError, match="train_X with at least 2 dimensions"):
+    with pytest.raises(ValueError, match=r"train_X.*2 dimensions"):
         VariationalCKA(X, X.unsqueeze(-1), physics=physics)

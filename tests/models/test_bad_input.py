@@ -59,26 +59,26 @@ def test_data(build, kind, XY):
 
 def test_a_function_in_the_place_of_variances(build, kind, XY):
     for physics in ({}, {} if kind == "ZeroMeanGP" else {"physics": lambda X: X.sum(-1)}):
-        with pytest.raises(TypeError, match="a function as train_Yvar: did you mean physics="):
+        with pytest.raises(TypeError, match=r"train_Yvar.*physics="):
             type(build(kind, *XY))(*XY, lambda X: X.sum(-1), **physics)
 
 
 def test_an_output_that_is_hardly_observed(build, kind, data):
     X, Y = data(num_outputs=2)
     Y[1:, 1] = torch.nan
-    with pytest.raises(ValueError, match=r"at least 2 observations .* column\(s\) \[1\]"):
+    with pytest.raises(ValueError, match=r"2 observations.*\[1\]"):
         build(kind, X, Y)
 
 
 def test_a_likelihood_of_one_output_for_two(data):
     X, Y = data(num_outputs=2)
-    with pytest.raises(ValueError, match=r"batch_shape \(2,\), one for each output"):
+    with pytest.raises(ValueError, match=r"batch_shape \(2,\)"):
         CKA(X, Y, physics=lambda X: X, likelihood=GaussianLikelihood().double())
 
 
 @pytest.mark.parametrize("kind", ["ZeroMeanGP", "CKA", "RRA"])
 def test_noise_and_a_likelihood(build, kind, XY):
-    with pytest.raises(ValueError, match="train_Yvar or a likelihood, got both"):
+    with pytest.raises(ValueError, match="train_Yvar or a likelihood"):
         build(kind, *XY, 0.1, likelihood=GaussianLikelihood().double())
 
 
@@ -100,7 +100,7 @@ def test_physics(build, kind, XY):
         with pytest.raises(error, match=says):
             build(kind, *XY, physics=physics)
     if kind != "AR1":
-        with pytest.raises(TypeError, match="Expected a physics, got None; ZeroMeanGP is"):
+        with pytest.raises(TypeError, match=r"None.*ZeroMeanGP"):
             build(kind, *XY, physics=None)
 
 
@@ -114,7 +114,7 @@ def test_a_physics_that_fails_at_a_prediction(XY):
 
 class TestScaleGP:
     def test_zero_physics(self, XY):
-        with pytest.raises(ValueError, match=r"zero at all training inputs.*BiasGP or CKA"):
+        with pytest.raises(ValueError, match=r"zero at all.*BiasGP or CKA"):
             ScaleGP(*XY, physics=lambda X: torch.zeros(len(X), dtype=X.dtype))
 
     def test_zero_in_one_output(self, data):
@@ -125,7 +125,7 @@ class TestScaleGP:
     def test_physics_near_zero(self, XY):
         X, Y = XY
         zero = X[3, 0].item()
-        with pytest.warns(UserWarning, match="nearly zero at 1 of 9 training inputs"):
+        with pytest.warns(UserWarning, match="zero at 1 of 9"):
             ScaleGP(X, Y, physics=lambda X: X[:, 0] - zero)
 
 
@@ -196,7 +196,7 @@ def test_options(build, XY, kind, option, error, says):
 
 
 def test_too_few_points_for_unknown_means(build, XY):
-    with pytest.raises(ValueError, match=r"at least 4 points to learn 2 constant means"):
+    with pytest.raises(ValueError, match=r"4 points.*2 constant means"):
         build("CKA", XY[0][:3], XY[1][:3], rho_mean="learn", delta_mean="learn")
 
 
@@ -232,9 +232,9 @@ def test_predictions(build, kind, XY, uniform):
     for method in methods:
         with pytest.raises(TypeError, match=r"in float64, got torch\.float32"):
             method(Z.float())
-        with pytest.raises(TypeError, match="a NumPy array or a DataFrame, got list"):
+        with pytest.raises(TypeError, match="DataFrame, got list"):
             method(Z.tolist())
-        with pytest.raises(ValueError, match=r"Expected X with 2 columns.*got shape \(4, 5\)"):
+        with pytest.raises(ValueError, match=r"2 columns.*\(4, 5\)"):
             method(uniform(4, 5))
     if kind != "AR1":
         with pytest.raises(ValueError, match=r"model.posterior\(X\)"):
@@ -242,7 +242,7 @@ def test_predictions(build, kind, XY, uniform):
 
 
 def test_rra(build, data, XY):
-    with pytest.raises(ValueError, match=r"this model has batch_shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"batch_shape \(2,\)"):
         build("RRA", *data(batch_shape=(2,))).pyro_model()
     model = build("RRA", *XY)
     with pytest.raises(ValueError, match="`Y` without `X`"):
@@ -255,5 +255,5 @@ def test_rra(build, data, XY):
 @pytest.mark.parametrize("kind", ["ZeroMeanGP", "PhysicsMeanGP", "ScaleGP", "CKA", "RRA"])
 def test_an_argument_that_there_is_none_of(build, kind, XY):
     """The constructor of the model is named, and what it takes."""
-    with pytest.raises(TypeError, match=rf"{kind}\(\) got an unexpected .*'center_'; .*likelihood"):
+    with pytest.raises(TypeError, match=rf"{kind}\(\).*'center_'.*likelihood"):
         build(kind, *XY, center_=1.0)

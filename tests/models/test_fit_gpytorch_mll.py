@@ -48,9 +48,17 @@ def fit_by_botorch(model, of=ExactMarginalLogLikelihood, **options):
 
 
 @pytest.mark.filterwarnings("ignore:f_p is nearly zero")
-@pytest.mark.parametrize("noise", [0.0, pytest.param(1e-6, marks=pytest.mark.slow), 0.1])
-@pytest.mark.parametrize("unit", [1e-6, 1.0, pytest.param(1e6, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("n", [5, 12, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("noise", "unit", "n"),
+    [
+        (0.0, 1e-6, 5),
+        (0.1, 1.0, 12),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((1e-6, 1.0, 12), (0.0, 1e6, 12), (0.1, 1e6, 60), (1e-6, 1e-6, 60))
+        ),
+    ],
+)
 def test_as_likely_as_the_search(data, build, kind, num_outputs, noise, unit, n):
     X, Y = data(n=max(n, 8) if kind == "AR1" else n, num_outputs=num_outputs, seed=n)
     Y = unit * (Y + noise * Y.std(0) * torch.randn_like(Y))

@@ -32,9 +32,9 @@ def test_columns_in_another_order(data, build):
     X, Y = data()
     frame = pd.DataFrame(X.numpy(), columns=["speed", "load"])
     model, other = build("CKA", frame, Y), frame[["load", "speed"]]
-    with pytest.raises(ValueError, match=r"columns \('speed', 'load'\), in this order"):
+    with pytest.raises(ValueError, match=r"\('speed', 'load'\).*order"):
         model.predict(other)
-    with pytest.raises(ValueError, match=r"columns \('speed', 'load'\), in this order"):
+    with pytest.raises(ValueError, match=r"\('speed', 'load'\).*order"):
         model.condition_on_observations(other, Y)
 
 
@@ -42,7 +42,7 @@ def test_integers_and_series(data, build, uniform):
     X, Y = data()
     whole = (10 * X).round()
     series = pd.Series(Y.squeeze(-1).numpy(), name="u")
-    with pytest.raises(ValueError, match=r"train_Y with at least 2 dimensions.*reshape\(-1, 1\)"):
+    with pytest.raises(ValueError, match=r"train_Y.*reshape\(-1, 1\)"):
         CKA(whole.numpy().astype(int), series, physics=lambda X: 2 + X.sum(-1) / 10)
     model = CKA(whole.numpy().astype(int), series.to_frame(), physics=lambda X: 2 + X.sum(-1) / 10)
     assert model.output_names == ("u",)

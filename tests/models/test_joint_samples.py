@@ -54,10 +54,12 @@ def model_of(data, build):
     return model_of
 
 
-@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize(
+    ("q", "size"),
+    [(1, 1e-6), (20, 1.0), (20, 1e6), pytest.param(200, 1e-6, marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize("noisy", [True, False], ids=["noisy", "exact"])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("q", [1, 20, pytest.param(200, marks=pytest.mark.slow)])
 def test_one_output(model_of, uniform, kind, noisy, size, q):
     model, X = model_of(kind, noisy, size)
     Z = torch.cat([X[: q // 4], uniform(q - len(X[: q // 4]), 2, high=2.0, seed=1)])

@@ -1,4 +1,4 @@
-"""A centre that is learnt: the models of fixed centres, and offsets that make no difference."""
+"""A center that is learnt: the models of fixed centers, and offsets that make no difference."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def XY(uniform):
 
 
 def move(model, center):
-    """Bring the learnt centre to a number in the user's units."""
+    """Bring the learnt center to a number in the user's units."""
     for term in model.terms:
         if term.name == "rho":
             basis = term.basis
@@ -30,7 +30,7 @@ def move(model, center):
 
 @pytest.mark.parametrize("center", [0.0, 5.5, -3.0])
 @pytest.mark.parametrize("cls", [CKA, RRA])
-def test_it_is_the_model_of_a_fixed_centre(XY, uniform, close, cls, center):
+def test_it_is_the_model_of_a_fixed_center(XY, uniform, close, cls, center):
     X, Y = XY
     Z = uniform(6, 2, seed=1)
     options = {"num_features": 16, "seed": 0} if cls is RRA else {}
@@ -50,7 +50,7 @@ def test_it_is_the_model_of_a_fixed_centre(XY, uniform, close, cls, center):
     assert model.term_mean("rho") == pytest.approx(1.0)
 
 
-def test_the_prior_mean_is_the_physics_wherever_the_centre_is(XY):
+def test_the_prior_mean_is_the_physics_wherever_the_center_is(XY):
     X, Y = XY
     model = CKA(X, Y, physics=crude, center="learn")
     far = 1e3 + X
@@ -74,7 +74,7 @@ def test_an_offset_of_targets_and_physics_changes_nothing(XY, uniform, method):
     assert ((sd / other).log().abs() < 0.3).all()
 
 
-def test_a_centre_that_is_right_is_found(uniform):
+def test_a_center_that_is_right_is_found(uniform):
     # y = rho(x) (f_p - 8) with a rho that varies much, about f_p of a mean of 5.
     X = uniform(30, 2)
     Y = crude(X) + X[:, :1].exp().sin() * (crude(X) - 8)
@@ -83,7 +83,7 @@ def test_a_centre_that_is_right_is_found(uniform):
     assert (model.terms[0].basis.origin - 8).abs().max() < 0.3
 
 
-def test_a_later_model_starts_with_the_same_centre(XY, uniform):
+def test_a_later_model_starts_with_the_same_center(XY, uniform):
     X, Y = XY
     model = move(CKA(X, Y, physics=crude, center="learn"), 4.2)
     more = uniform(12, 2, seed=3)
@@ -145,7 +145,7 @@ def test_a_parameter_of_the_physics_with_its_name(XY):
 
 def test_the_summary_tells_it(XY):
     model = move(CKA(*XY, physics=crude, center="learn"), 4.25)
-    assert "centre 4.25" in model.summary()
+    assert "center 4.25" in model.summary()
 
 
 @pytest.mark.parametrize("cls", [CKA, RRA])

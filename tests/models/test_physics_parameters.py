@@ -129,7 +129,7 @@ class TestPhysicsParameters:
         assert len(parameters) == 2
         assert "mass" not in parameters
         assert torch.equal(parameters["b"], parameters.draws[:, 1])
-        with pytest.raises(KeyError, match="no parameter 'mass'; there are a, b"):
+        with pytest.raises(KeyError, match=r"'mass'.*a, b"):
             parameters["mass"]
 
     def test_moments_and_intervals(self, parameters):
@@ -142,7 +142,7 @@ class TestPhysicsParameters:
 
     @pytest.mark.parametrize("level", [0.0, 1.0, 95, float("nan")])
     def test_of_no_level(self, parameters, level):
-        with pytest.raises(ValueError, match=f"level must be between 0 and 1; found {level}"):
+        with pytest.raises(ValueError, match=f"between 0 and 1; found {level}"):
             parameters.interval(level)
 
     def test_are_shown_as_a_table(self, parameters):
@@ -154,7 +154,7 @@ class TestPhysicsParameters:
     def test_of_a_model_that_has_none(self, waves):
         X, Y, _ = waves(1)
         for model in (CKA(X, Y, physics=lambda X: X[:, 0]), ZeroMeanGP(X, Y)):
-            with pytest.raises(ValueError, match="no unknown parameters; a physics names them as"):
+            with pytest.raises(ValueError, match="no unknown parameters"):
                 _ = model.physics_parameters
 
     def test_of_a_model_that_was_not_fitted(self, make, waves):
@@ -193,7 +193,7 @@ class TestPhysicsParameters:
 @pytest.mark.parametrize("physics", [torch.sin, [torch.sin, torch.cos]])
 def test_calibrated_physics_of_a_physics_that_is_known(waves, physics):
     X, Y, _ = waves(2)
-    with pytest.raises(ValueError, match=r"no unknown parameter.*say which it has with unknowns="):
+    with pytest.raises(ValueError, match=r"no unknown parameter.*unknowns="):
         CalibratedPhysics(X, Y, physics=physics)
 
 
@@ -330,7 +330,7 @@ class TestStates:
     def test_of_no_samples_into_one_that_holds_some(self, others, make, waves, num_outputs):
         X, Y, Z = waves(num_outputs)
         before = others[2].predict(Z)
-        with pytest.raises(RuntimeError, match=r"another model.*`model.release_samples\(\)` first"):
+        with pytest.raises(RuntimeError, match=r"another model.*release_samples\(\)"):
             others[2].load_state_dict(make(X, Y).state_dict())
         same(others[2].predict(Z), before)
 
@@ -353,7 +353,7 @@ def test_a_file_of_another_prior_is_refused(waves, tmp_path):
     with pytest.warns(UserWarning, match="cannot import it"):
         save(model, tmp_path / "model.pt")
     other = physics_of(1, a=Unknown(1.0, sd=0.6))  # the same guess
-    with pytest.raises(ValueError, match=r"another physics.*the same priors of unknown"):
+    with pytest.raises(ValueError, match=r"another physics.*priors"):
         load(tmp_path / "model.pt", physics=other)
 
 

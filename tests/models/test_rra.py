@@ -18,7 +18,7 @@ def _clear_pyro():
     pyro.set_rng_seed(0)
 
 
-DESIGNS = ["plain", "centred", "transformed", "known-noise", "learnt mean"]
+DESIGNS = ["plain", "centerd", "transformed", "known-noise", "learnt mean"]
 WITH_PYRO = [("transformed", 2), ("learnt mean", 1), ("known-noise", 2)]
 
 
@@ -27,7 +27,7 @@ def rra(request, data, build, num_outputs, shuffle):
     """An RRA with few features."""
     X, Y = data(num_outputs=num_outputs)
     options = {"num_features": 4}
-    if request.param == "centred":
+    if request.param == "centerd":
         options["center"] = "mean"
     if request.param == "transformed":
         options |= {

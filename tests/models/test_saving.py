@@ -54,15 +54,13 @@ class Passing(CKA):
 
 def saved(model, path):
     """Save a model of a physics that has no name, without the warning of it."""
-    with pytest.warns(
-        UserWarning, match=r"other programs cannot import it.*load\(path, .*physics="
-    ):
+    with pytest.warns(UserWarning, match=r"cannot import.*load\(path, .*physics="):
         save(model, path)
 
 
 BUILDS = {
     "CKA": lambda X, Y: CKA(X, Y, physics=relu, center="mean", delta_mean="learn"),
-    "learnt centre": lambda X, Y: CKA(X, Y, physics=relu, center="learn"),
+    "learnt center": lambda X, Y: CKA(X, Y, physics=relu, center="learn"),
     "several": lambda X, Y: CKA(X, Y, 0.01, physics={"a": relu, "b": silu}),
     "RRA": lambda X, Y: RRA(X, Y, physics=relu, num_features=16, seed=3),
     "physics mean": lambda X, Y: PhysicsMeanGP(X, Y, physics=relu, rho_mean=0.9),
@@ -103,7 +101,7 @@ def test_what_has_no_name_is_given_again(uniform, path):
     options = {"physics": lambda X: relu(X), "input_transform": Normalize(2)}
     model = CKA(X, Y, **options)
     saved(model, path)
-    with pytest.raises(ValueError, match="could not hold input_transform and physics"):
+    with pytest.raises(ValueError, match="input_transform and physics"):
         load(path)
     same(model.predict(Z), load(path, **options).predict(Z))
 
@@ -111,10 +109,10 @@ def test_what_has_no_name_is_given_again(uniform, path):
 def test_another_physics_is_refused(uniform, path):
     X, Y, _ = problem(uniform)
     save(CKA(X, Y, physics={"a": relu, "b": silu}), path)
-    with pytest.raises(ValueError, match=r"saved with another physics.*same order"):
+    with pytest.raises(ValueError, match=r"another physics.*same order"):
         load(path, physics={"a": silu, "b": relu})
     subset = CKA(X, Y, physics=relu).subset_output([1])
-    with pytest.raises(ValueError, match="all outputs of its physics, got a subset"):
+    with pytest.raises(ValueError, match="got a subset"):
         save(subset, path)
 
 
@@ -135,7 +133,7 @@ def test_a_state_of_another_model_changes_nothing(uniform):
     state = {name: value + 1 for name, value in model.state_dict().items()}
     state["covar_module.terms.0.kernel.base_kernel.raw_lengthscale"] = torch.ones(2, 1, 3)
     for wrong in (state, ZeroMeanGP(X, Y).state_dict()):
-        with pytest.raises(RuntimeError, match=r"left as it was; they differ in .*terms\.0"):
+        with pytest.raises(RuntimeError, match=r"as it was.*terms\.0"):
             model.load_state_dict(wrong)
     torch.testing.assert_close(model.predict(Z), before)
 
@@ -170,10 +168,10 @@ def test_a_kernel_is_given_again(uniform, path, name):
     with pytest.raises(ValueError, match=f"could not hold {name}"):
         load(path)
     same(model.predict(Z), load(path, **{name: kernel}).predict(Z))
-    with pytest.raises(ValueError, match=r"other kernels: expected .*MaternKernel 0\.5.*RBFKernel"):
+    with pytest.raises(ValueError, match=r"MaternKernel 0\.5.*RBFKernel"):
         load(path, **{name: scaled_rbf})
     save(AR1(X, Y, physics=relu, low_X=X + 0.1), path)
-    with pytest.raises(ValueError, match=rf"model\.pt: it does not take {name}, but .*: nothing"):
+    with pytest.raises(ValueError, match=rf"model\.pt: .*{name}.*: nothing"):
         load(path, **{name: kernel})
 
 
@@ -197,13 +195,13 @@ def test_known_noise_of_later_observations(uniform, path):
 
 def test_a_stacked_model_comes_back(uniform, path):
     X, Y, Z = problem(uniform)
-    models = {name: BUILDS[name](X, Y) for name in ("learnt centre", "zero mean")}
+    models = {name: BUILDS[name](X, Y) for name in ("learnt center", "zero mean")}
     stacked = StackedGP(models, torch.tensor([[0.5, 0.25], [0.5, 0.75]]).double())
     save(stacked, path)
     again = load(path)
     assert again.weights == stacked.weights
     same(again.predict(Z), stacked.predict(Z))
-    with pytest.raises(ValueError, match="take the StackedGP that it was made from"):
+    with pytest.raises(ValueError, match="take the StackedGP"):
         save(stacked.subset_output([0]), path)
     same(load(path).predict(Z), stacked.predict(Z))
 
@@ -227,12 +225,12 @@ def test_files_that_are_no_models(path):
     with pytest.raises(FileNotFoundError):
         load(path)
     path.write_bytes(b"no model")
-    with pytest.raises(ValueError, match="is not a model that gpadjust saved"):
+    with pytest.raises(ValueError, match="not a model"):
         load(path)
     torch.save({"format": 99}, path)
     with pytest.raises(ValueError, match="expected format 3"):
         load(path)
-    with pytest.raises(TypeError, match="Expected a model of gpadjust, got Linear"):
+    with pytest.raises(TypeError, match=r"model of gpadjust.*Linear"):
         save(torch.nn.Linear(1, 1), path)
 
 
@@ -310,7 +308,7 @@ class TestFilesOfStrangers:
         sys.modules.pop("planted_module", None)
 
     def test_a_class_of_no_module_that_was_imported(self, content, planted):
-        with pytest.raises(ValueError, match="module 'planted_module' was not imported: do so"):
+        with pytest.raises(ValueError, match="'planted_module' was not imported"):
             load(content(**{"class": "planted_module:X"}))
         assert not planted.exists()
         for name in ("gpadjust.models.structures:None", "builtins:dict", "torch.nn:Linear"):
@@ -362,11 +360,9 @@ class TestFilesOfStrangers:
 
     def test_what_is_given_beside_the_file(self, content, uniform):
         for given in ({"foo": 1}, {"train_Y": uniform(8, 2)}, {"center": 0.0}):
-            with pytest.raises(
-                ValueError, match=rf"does not take {next(iter(given))}, but only.*physics"
-            ):
+            with pytest.raises(ValueError, match=rf"{next(iter(given))}.*physics"):
                 load(content(), **given)
-        with pytest.raises(ValueError, match=r"model\.pt is damaged, or what was given is wrong"):
+        with pytest.raises(ValueError, match=r"model\.pt is damaged"):
             load(content(), physics=3.0)
 
 
@@ -395,7 +391,7 @@ def test_a_physics_of_small_units_is_compared(uniform, path):
 def test_data_under_other_names(uniform, path):
     """No file is written that cannot be read."""
     X, Y, Z = problem(uniform)
-    with pytest.raises(ValueError, match=r"Renamed could not be built.*no train_X and no train_Y"):
+    with pytest.raises(ValueError, match=r"Renamed.*train_X.*train_Y"):
         save(Renamed(X, Y, physics=relu), path)
     assert not path.exists()
     model = Passing(X, Y, physics=relu)

@@ -69,7 +69,7 @@ def test_names(uniform, close):
     for named in (1, -1, "drift", "rho_drift"):
         close(model.rho(Z, physics=named).mean, model.term("rho_drift", Z).mean)
     for wrong in (None, 2, "weight"):
-        with pytest.raises(ValueError, match=r"physics to be one of swing, drift, or a number"):
+        with pytest.raises(ValueError, match=r"swing, drift, or a number"):
             model.rho(Z, physics=wrong)
     assert CKA(X, Y, physics=[swing]).term_names == ("rho", "delta")
     assert CKA(X, Y, physics=[lambda X: swing(X), drift]).rho_names == ("rho_f_1", "rho_drift")
@@ -121,13 +121,13 @@ def test_errors_name_the_one_that_failed(uniform):
         return swing(X) / (X[:, :1] < 5)
 
     model = CKA(X, Y, physics={"good": swing, "bad": broken}).eval()
-    with pytest.raises(PhysicsError, match=r"'bad'.* returned NaN or inf in 1 of 2"):
+    with pytest.raises(PhysicsError, match=r"'bad'.*NaN or inf in 1 of 2"):
         model.posterior(torch.tensor([[0.0, 0.5], [9.0, 0.5]], dtype=torch.float64))
-    with pytest.raises(ValueError, match="Expected rho_mean to be 'learn', a number, or 2 numbers"):
+    with pytest.raises(ValueError, match=r"rho_mean.*'learn'.*2 numbers"):
         CKA(X, Y, physics=[swing, drift], rho_mean=[1.0])
-    with pytest.raises(ValueError, match="Expected 2 kernels of rho, one for each physics, got 1"):
+    with pytest.raises(ValueError, match=r"2 kernels of rho.*got 1"):
         CKA(X, Y, physics=[swing, drift], rho_covar_module=[None])
-    with pytest.raises(PhysicsError, match="differ in their number of outputs"):
+    with pytest.raises(PhysicsError, match="number of outputs"):
         CKA(X, Y, physics=[swing, lambda X: X[:, 0]])
 
 

@@ -135,7 +135,7 @@ def test_functions_are_spread_over_the_components(models, weights, Z):
     mean, variance = stacked.predict(Z)
     assert ((values.mean(0) - mean).abs() < 0.3 * variance.sqrt()).all()
     assert functions(Z.expand(3, -1, -1)).shape == (400, 3, 5, 2)
-    with pytest.raises(ValueError, match=r"each of 400 functions, 400 x q x d"):
+    with pytest.raises(ValueError, match=r"400 functions, 400 x q x d"):
         functions.each(Z.expand(3, -1, -1))
     few = stacked.sample_functions(1, seed=0)
     assert torch.equal(few(Z), stacked.sample_functions(1, seed=0)(Z))
@@ -229,7 +229,7 @@ def test_it_tells_what_it_is_of(models, weights):
 
 
 def test_it_is_not_trained(models, weights):
-    with pytest.raises(RuntimeError, match="made of fitted models, and not trained"):
+    with pytest.raises(RuntimeError, match="not trained"):
         StackedGP(models, weights).train()
 
 
@@ -271,7 +271,7 @@ def test_bad_input(data, models, weights, Z):
         StackedGP([*models.values()], weights)
     with pytest.raises(TypeError, match="got a Linear as 'mean'"):
         StackedGP({**models, "mean": torch.nn.Linear(1, 1)}, weights)
-    with pytest.raises(TypeError, match="Expected weights as a tensor or lists"):
+    with pytest.raises(TypeError, match="weights as a tensor"):
         StackedGP(models, [[1.0], [0.5, 0.5]])
     with pytest.raises(ValueError, match="num_components"):
         StackedGP(models, weights, num_components=0)

@@ -356,14 +356,14 @@ def test_texts(one):
 
 def test_an_exact_model_of_many_points_warns():
     X, Y = problem(5001)
-    with pytest.warns(UserWarning, match="gpadjust.VariationalCKA takes the arguments of CKA"):
+    with pytest.warns(UserWarning, match="VariationalCKA"):
         CKA(X, Y, physics=wave)
 
 
 def test_stacking_and_comparison_want_exact_models(one):
-    with pytest.raises(TypeError, match="Expected exact models such as CKA, got a VariationalCKA"):
+    with pytest.raises(TypeError, match=r"exact models.*VariationalCKA"):
         StackedGP({"many": one}, [[1.0]])
-    with pytest.raises(TypeError, match="to make a gpadjust TermsGP, got VariationalCKA"):
+    with pytest.raises(TypeError, match="TermsGP, got VariationalCKA"):
         compare(*problem(8), wave, structures=[Structure("many", VariationalCKA)])
 
 

@@ -110,9 +110,9 @@ FAULTS = (
         "The information is that before the model was trained or given other data.",
     ),
     Fault(
-        "gpadjust/dynamics/scores.py",
-        "found = mean + spec.change(prediction[0], data.next_states)[:, spec.moving]",
-        "found = data.next_states[:, spec.moving]",
+        "gpadjust/dynamics/base.py",
+        "found = (mean + self.spec.change(mean, data.next_states))[:, moving]",
+        "found = data.next_states[:, moving]",
         "An angle that wraps between prediction and truth counts as an error of a full turn.",
     ),
     Fault(
@@ -122,7 +122,7 @@ FAULTS = (
         "The parameters of a physics that learns stay where they were.",
     ),
     Fault(
-        "gpadjust/envs/remember_action.py",
+        "gpadjust/systems/wrappers.py",
         "taken = np.clip(action, self._taken.low, self._taken.high)",
         "taken = action",
         "The action that is remembered is not the one that was taken.",

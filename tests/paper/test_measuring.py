@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
-from gpadjust.envs import random_cart_pole_physics
+from gpadjust.systems import cart_pole
 from paper.active import Active
 from paper.active import Settings as ActiveSettings
 from paper.active import run as active_run
@@ -60,7 +60,7 @@ def test_problems(name):
 
 def test_the_cart_pole():
     system, X = problem("cartpole", 3), torch.tensor([[0.3, 0.1, 0.2, -0.5, 4.0]]).double()
-    believed = random_cart_pole_physics(3)(X) - X[:, :4]
+    believed = cart_pole(3).physics(X) - X[:, :4]
     torch.testing.assert_close(system.physics(X), believed)
     X = system.sobol(6, 0)
     for kind, expected in (("CKA", CKA), ("physics mean", PhysicsMeanGP), ("GP", ZeroMeanGP)):

@@ -144,7 +144,7 @@ class TestGradients:
     def test_none_warns_once_and_is_a_constant(self, points):
         physics = BlackBoxPhysics(waves, gradient=None, name="mill")
         X = points(3, 2).requires_grad_()
-        with pytest.warns(UserWarning, match="No gradient.*'mill'.*'with_grad': False"):
+        with pytest.warns(UserWarning, match=r"No gradient.*'mill'.*'with_grad': False"):
             assert not physics(X).requires_grad
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -174,24 +174,24 @@ class TestGradients:
     )
     def test_wrong_jacobian(self, jacobian, message, points):
         Y = BlackBoxPhysics(waves, gradient=jacobian, name="mill")(points(3, 2).requires_grad_())
-        with pytest.raises(PhysicsError, match="gradient of physics 'mill'.*" + message):
+        with pytest.raises(PhysicsError, match=r"gradient of physics 'mill'.*" + message):
             Y.sum().backward()
 
 
 class TestSettings:
     def test_bad_ones(self):
         for gradient in ("autograd", 1, True):
-            with pytest.raises(ValueError, match=f"None for no gradient; found {gradient!r}"):
+            with pytest.raises(ValueError, match=rf"gradient.*found {gradient!r}"):
                 BlackBoxPhysics(waves, gradient=gradient)
         for fd_step in (0.0, -1.0, float("nan"), [0.1, 0.0], []):
             with pytest.raises(ValueError, match="fd_step must be positive"):
                 BlackBoxPhysics(waves, fd_step=fd_step)
-        with pytest.raises(TypeError, match="function must be callable; found list"):
+        with pytest.raises(TypeError, match="callable; found list"):
             BlackBoxPhysics([])
 
     def test_steps_for_other_columns(self, points):
         physics = BlackBoxPhysics(waves, fd_step=[0.1, 0.1, 0.1])
-        with pytest.raises(ValueError, match=r"fd_step of physics 'waves' has 3 entries.*1 or 2"):
+        with pytest.raises(ValueError, match=r"'waves' has 3 entries.*1 or 2"):
             physics(points(4, 2).requires_grad_())
 
 
@@ -227,7 +227,7 @@ class TestFailures:
 
         physics = BlackBoxPhysics(fragile, batched=False)
         physics(torch.tensor([[2.0]]))
-        with pytest.raises(PhysicsError, match=r"returned 3 output\(s\), expected 2"):
+        with pytest.raises(PhysicsError, match=r"3 output\(s\), expected 2"):
             physics(torch.tensor([[3.0], [0.0]]))
 
     @pytest.mark.parametrize("grad", [False, True])

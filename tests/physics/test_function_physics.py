@@ -45,27 +45,27 @@ def test_parameters_of_a_module_are_learnt(points):
     "function", [lambda X: X.detach().numpy() ** 2, lambda X: X.detach().numpy().sum()]
 )
 def test_numpy_result(function, grad, points):
-    with pytest.raises(PhysicsError, match=r"'noodle' computes with NumPy.*BlackBoxPhysics\("):
+    with pytest.raises(PhysicsError, match=r"'noodle'.*NumPy.*BlackBoxPhysics\("):
         FunctionPhysics(function, name="noodle")(points(3, 2).requires_grad_(grad))
 
 
 def test_numpy_inside_where_a_gradient_is_needed(points):
     physics = FunctionPhysics(lambda X: torch.from_numpy(np.sin(X.numpy())))
-    with pytest.raises(PhysicsError, match=r"computes with NumPy.*BlackBoxPhysics\(") as caught:
+    with pytest.raises(PhysicsError, match=r"NumPy.*BlackBoxPhysics\(") as caught:
         physics(points(3, 2).requires_grad_())
     assert "Can't call numpy()" in str(caught.value.__cause__)
 
 
 def test_other_runtime_errors_are_not_taken_for_numpy(points):
     physics = FunctionPhysics(lambda X: X @ X)
-    with pytest.raises(PhysicsError, match="raised RuntimeError: mat1 and mat2"):
+    with pytest.raises(PhysicsError, match="RuntimeError: mat1"):
         physics(points(3, 2))
 
 
 def test_missing_gradient_warns_once(points):
     physics = FunctionPhysics(lambda X: X.detach() ** 2, name="stone")
     X = points(3, 2).requires_grad_()
-    with pytest.warns(UserWarning, match=r"No gradient flows through physics 'stone'.*BlackBox"):
+    with pytest.warns(UserWarning, match=r"No gradient.*'stone'.*BlackBox"):
         assert torch.equal(physics(X), X.detach() ** 2)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -115,7 +115,7 @@ def test_pickle_of_a_method_that_holds_its_physics(dumps, points):
 def test_as_physics_wraps_callables(points):
     X, physics = points(3, 2), BlackBoxPhysics(np.sin)
     assert as_physics(physics) is physics
-    with pytest.raises(TypeError, match="function must be callable; found float"):
+    with pytest.raises(TypeError, match="callable; found float"):
         FunctionPhysics(1.0)
     assert isinstance(as_physics(torch.sin), FunctionPhysics)
     assert torch.equal(as_physics(torch.sin)(X), X.sin())

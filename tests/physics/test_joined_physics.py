@@ -97,14 +97,14 @@ class TestErrors:
 
     def test_differ_in_their_number_of_outputs(self, points):
         joined = JoinedPhysics([torch.sin, total], name="pair")
-        with pytest.raises(PhysicsError, match=r"'pair'.*found 2 of 'sin', 1 of 'total'; expected"):
+        with pytest.raises(PhysicsError, match=r"'pair'.*2 of 'sin', 1 of 'total'"):
             joined(points(3, 2))
 
     @pytest.mark.parametrize("grad", [False, True])
     def test_of_a_part_names_it_and_the_rows_of_X(self, grad):
         joined = JoinedPhysics([total, FunctionPhysics(first_log, inputs=[1])])
         X = torch.tensor([[1.0, 1.0], [5.0, -1.0]], requires_grad=grad)
-        with pytest.raises(PhysicsError, match="Physics 'first_log' returned NaN") as caught:
+        with pytest.raises(PhysicsError, match=r"'first_log'.*NaN") as caught:
             joined(X.unsqueeze(0).expand(2, 2, 2))
         assert caught.value.rows == (1, 3)
         assert caught.value.inputs.tolist() == [[5.0, -1.0]] * 2

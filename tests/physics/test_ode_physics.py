@@ -160,14 +160,14 @@ class TestErrors:
 
     def test_adaptive_method_gives_up_on_a_blow_up(self):
         physics = ODEPhysics(lambda s, a: s**2, 2.0, 1, method="dopri5")
-        with pytest.raises(PhysicsError, match="did not reach the end of the time step"):
+        with pytest.raises(PhysicsError, match="not reach the end"):
             physics(torch.ones(1, 1, dtype=torch.float64))
 
     def test_other_assertions_are_the_user_s(self):
         def rhs(state, action):
             raise AssertionError("negative mass")
 
-        with pytest.raises(PhysicsError, match="raised AssertionError: negative mass"):
+        with pytest.raises(PhysicsError, match="AssertionError: negative mass"):
             ODEPhysics(rhs, 0.1, 1, method="dopri5")(torch.ones(1, 1))
 
     @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ class TestErrors:
             physics(points(3, 2))
 
     def test_too_few_columns_for_the_state(self, points):
-        with pytest.raises(PhysicsError, match=r"needs 3 state column\(s\).*2 column\(s\)"):
+        with pytest.raises(PhysicsError, match=r"3 state column.*2 column"):
             ODEPhysics(decay, 0.1, 3)(points(4, 2))
 
     def test_blow_up_names_the_row(self):
@@ -221,7 +221,7 @@ def test_gradients_by_finite_differences_are_those_of_autograd():
     learnt = ODEPhysics(Spring(), **options, gradient="finite-difference")
     learnt(X).sum().backward()  # parameters are learnt by autograd all the same
     assert learnt.rhs.stiffness.grad.abs() > 0
-    with pytest.raises(ValueError, match="Unknown gradient 'none'; use 'autograd' or 'finite"):
+    with pytest.raises(ValueError, match=r"'none'.*'autograd' or 'finite"):
         ODEPhysics(decay, **options, gradient="none")
 
 

@@ -54,7 +54,7 @@ class TestShapes:
 
     def test_no_rows_after_a_first_call(self, counter, points):
         physics = FunctionPhysics(counter)
-        with pytest.raises(PhysicsError, match=r"'RowCounter' was given no rows.*at least one row"):
+        with pytest.raises(PhysicsError, match=r"'RowCounter'.*no rows"):
             physics(points(0, 3))
         physics(points(2, 3))
         assert physics(points(4, 0, 3)).shape == (4, 0, 2)
@@ -98,7 +98,7 @@ def test_bad_settings_and_inputs(points):
         with pytest.raises(error, match=says):
             BlackBoxPhysics(square, **options)
     for X in ([[1.0]], torch.tensor([[1]])):
-        with pytest.raises(TypeError, match=r"takes a floating-point.*found (list|torch.int64)"):
+        with pytest.raises(TypeError, match=r"floating-point.*found (list|torch.int64)"):
             FunctionPhysics(square)(X)
     for shape in ((3,), (3, 0)):
         with pytest.raises(ValueError, match=re.escape(f"batch_shape x n x d; found {shape}")):
@@ -175,7 +175,7 @@ class TestMemo:
     def test_a_new_number_of_outputs_is_seen_behind_known_rows(self, points):
         physics = BlackBoxPhysics(lambda X: np.repeat(X, len(X), 1))
         physics(points(2, 1))
-        with pytest.raises(PhysicsError, match=r"returned 1 output\(s\), expected 2 as before"):
+        with pytest.raises(PhysicsError, match=r"1 output\(s\), expected 2"):
             physics(points(3, 1))
 
 
@@ -223,7 +223,7 @@ class TestGradients:
     def test_hidden_parameter_is_taken_as_a_constant(self, points):
         gain = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
         physics = FunctionPhysics(lambda X: gain * X)
-        with pytest.warns(UserWarning, match="not one of its parameters.*requires_grad_"):
+        with pytest.warns(UserWarning, match=r"parameters.*requires_grad_"):
             Y = physics(points(3, 1))
         assert not Y.requires_grad
 
@@ -251,7 +251,7 @@ class TestChecks:
     def test_not_finite_names_rows_of_the_flattened_X(self, value, grad):
         physics = FunctionPhysics(lambda X: torch.where(X > 6, value, X), name="spike")
         X = torch.arange(9.0).reshape(3, 3, 1).requires_grad_(grad)
-        with pytest.raises(PhysicsError, match=r"'spike' returned NaN or inf in 2 of 9") as caught:
+        with pytest.raises(PhysicsError, match=r"'spike'.*NaN or inf in 2 of 9") as caught:
             physics(X)
         assert caught.value.rows == (7, 8)
         assert caught.value.inputs.tolist() == [[7.0], [8.0]]

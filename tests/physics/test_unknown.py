@@ -165,12 +165,12 @@ class TestNames:
         "name", ["two words", "1st", "_hidden", "lambda", "rows", "numpy", "keys", 3]
     )
     def test_that_can_be_no_attribute(self, name):
-        with pytest.raises(ValueError, match=f"names such as 'mass'.*found {name!r}"):
+        with pytest.raises(ValueError, match=rf"names.*found {name!r}"):
             FunctionPhysics(wave, unknowns={name: A})
 
     @pytest.mark.parametrize("given", [{"mass": 1.0}, ["mass"], A])
     def test_without_priors(self, given):
-        with pytest.raises(TypeError, match=r"names to Unknown\(guess, sd=.*'mass': Unknown\(1.0"):
+        with pytest.raises(TypeError, match=r"Unknown\(guess, sd="):
             FunctionPhysics(wave, unknowns=given)
 
 
@@ -189,7 +189,7 @@ class TestParameterValues:
 
     def test_of_another_name(self):
         values = ParameterValues(("mass", "length"), torch.ones(3, 2))
-        with pytest.raises(KeyError, match="no parameter 'drag'; there are mass, length"):
+        with pytest.raises(KeyError, match=r"'drag'.*mass, length"):
             values["drag"]
         with pytest.raises(AttributeError, match="no parameter 'drag'"):
             _ = values.drag
@@ -248,7 +248,7 @@ class TestCalls:
             MAKE["function"]()(points(3, 2), values)
 
     def test_of_a_physics_that_has_none(self, points):
-        with pytest.raises(ValueError, match=r"'sin' has 0 unknown parameter\(s\); expected"):
+        with pytest.raises(ValueError, match=r"'sin' has 0 unknown"):
             FunctionPhysics(torch.sin)(points(3, 2), torch.ones(2))
 
 
@@ -328,7 +328,7 @@ class TestFailures:
 
     def test_or_nan_of_an_error_without_rows(self):
         physics = FunctionPhysics(lambda X, p: [1.0], unknowns=LOW)
-        with pytest.raises(PhysicsError, match="returned list, expected a real tensor"):
+        with pytest.raises(PhysicsError, match="list, expected a real tensor"):
             physics.or_nan(torch.ones(2, 1), torch.zeros(1))
 
     def test_or_nan_runs_a_simulation_once(self):
@@ -356,10 +356,10 @@ def test_pickles_and_copies(name, points):
 def test_a_function_that_takes_other_arguments_is_told_what_it_is_called_with():
     X = torch.ones(2, 1, dtype=torch.float64)
     without = FunctionPhysics(lambda X: X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    with pytest.raises(PhysicsError, match=r"unknown parameters, p, are its last argument: p\.a"):
+    with pytest.raises(PhysicsError, match=r"unknown parameters, p, .*p\.a"):
         without(X)
     with pytest.raises(PhysicsError, match="are named as unknowns="):
         FunctionPhysics(lambda X, p: p.a * X[:, 0])(X)
     misspelt = FunctionPhysics(lambda X, p: p.b * X[:, 0], unknowns={"a": Unknown(1.0, sd=1.0)})
-    with pytest.raises(PhysicsError, match=r"there is no parameter 'b'; there are a\. The call"):
+    with pytest.raises(PhysicsError, match=r"no parameter 'b'.*a\."):
         misspelt(X)

@@ -6,13 +6,13 @@ import re
 import numpy as np
 import pytest
 import torch
-from gpadjust.records.stretches import in_control_steps
 
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
 from gpadjust.records import Record, Records, SmoothingWarning, smooth
 from gpadjust.records.chain import Chain, Known
 from gpadjust.records.kalman import Link, Moments, Smoothed, draw_paths, smooth_chain
+from gpadjust.records.record import in_control_steps
 
 STEP, LENGTH = 0.1, 150
 SPEC = StateSpec(["x", "v"], ["force"])

@@ -7,7 +7,7 @@ import torch
 
 from gpadjust import CalibratedPhysics
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.varying_parameters import VaryingParameters
+from gpadjust.dynamics.varying_parameters import varying_parameters
 from gpadjust.models import PhysicsParameters
 from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
@@ -136,16 +136,17 @@ def test_parameters_vary_more_beyond_the_actions_but_no_more_than_half_of_the_pr
         PhysicsParameters(spring().unknowns, torch.tensor([[4.0, 0.3]]).double()),
         (torch.tensor([[-1.0], [1.0]]).double()),
     )
-    vary = VaryingParameters.of(spring(), SPEC, learnt, actions, torch.tensor([0.1, 0.0]).double())
+    vary = varying_parameters(spring(), SPEC, learnt, actions, torch.tensor([0.1, 0.0]).double())
     states = torch.tensor([[0.6, 0.0]]).double().expand(64, 1, 2)
     for force in (1 + beyond, -1 - beyond):
         u = torch.full((1, 1), force).double()
-        change = vary.changes(64, 0)(states, u)[..., 1]
-        near = vary.changes(64, 0)(states, torch.sign(u))[..., 1]
+        change = vary(64, 0)(states, u)[..., 1]
+        near = vary(64, 0)(states, torch.sign(u))[..., 1]
         assert float(change.std() / near.std()) == pytest.approx(factor, rel=0.1)
     # An action that was always the same: by its own size.
-    still = VaryingParameters.of(spring(), SPEC, learnt, 2 * actions.abs(), 0.1)
-    assert still._growth(torch.tensor([[3.0]]).double()).item() == pytest.approx(2.0)
+    still = varying_parameters(spring(), SPEC, learnt, 2 * actions.abs(), 0.1)
+    near, far = (still(64, 0)(states, torch.full((1, 1), u).double())[..., 1] for u in (2.0, 3.0))
+    assert float(far.std() / near.std()) == pytest.approx(2.0, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def test_a_page_and_a_model_that_its_code_loads(folder, read, capsys, undrawn, f
     assert "data.csv: 8 rows, head [m] from time [s]." in err
     page = read(folder / "report.html")
     assert page.needs_nothing_else()
-    assert "Line 4 has no output and is left out." in page.text
+    assert "Left out, as they have no output: line 4." in page.text
     told = dict(page.tables["How this page came about"])
     assert told["command"].endswith(f"--physics hill:{function} --seed 3")
     worst = page.tables["The 5 observations of head [m] that are farthest from their predictions"]

@@ -5,10 +5,10 @@ from dataclasses import fields
 import gymnasium
 import pytest
 
-import gpadjust.envs
 from gpadjust.control import Task
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, REAL_CART_POLE, equation_physics
 from tests.point import *  # noqa: F403
 from tests.point import assert_equal
 
@@ -52,7 +52,7 @@ def cart_pole():
 def cart_pole_dynamics():
     """The real cart-pole."""
     return PhysicsDynamics(
-        gpadjust.envs.CART_POLE_SPEC, gpadjust.envs.cart_pole_physics(0.5, 0.5, 0.6, 0.1)
+        CART_POLE_SPEC, equation_physics(REAL_CART_POLE)
     )
 
 

@@ -22,12 +22,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from gpadjust.control import EpisodeCheckpoint, Task, resume
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.envs import (
-    CART_POLE_SPEC,
-    cart_pole_reward,
-    random_cart_pole_physics,
-)
 from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
 
 TOTAL = 20  # four episodes of the point
 
@@ -156,7 +152,8 @@ SCRIPT = """
     torch.set_num_threads(1)
     from gpadjust.control import EpisodeCheckpoint, Task, resume
     from gpadjust.dynamics import LearnedDynamics
-    from gpadjust.envs import CART_POLE_SPEC, cart_pole_reward, random_cart_pole_physics
+    from gpadjust.systems import cart_pole
+    from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
     from gpadjust.rl import DynaOptions, DynaSAC, EpisodeCheckpoint, resume
 
     class Tells(BaseCallback):
@@ -168,7 +165,7 @@ SCRIPT = """
 
     path = Path(sys.argv[1])
     env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    task = Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward)
+    task = Task(LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics), cart_pole_reward)
     if path.exists():
         agent = resume(path, env, task)
     else:
@@ -402,7 +399,7 @@ def test_cart_pole_of_co_kriging(sampling, cart_pole, assert_same, tmp_path):
     path = tmp_path / "run.ckpt"
 
     def task():
-        return Task(LearnedDynamics(CART_POLE_SPEC, random_cart_pole_physics(0)), cart_pole_reward)
+        return Task(LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics), cart_pole_reward)
 
     def agent():
         return DynaSAC(

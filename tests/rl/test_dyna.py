@@ -23,16 +23,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.envs import (
-    CART_POLE_SPEC,
-    cart_pole_reward,
-    cart_pole_start,
-    random_cart_pole_physics,
-)
 from gpadjust.models import Prediction, ZeroMeanGP
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC, DynaTD3, ModelVecEnv
 from gpadjust.rl.buffer import CompactReplayBuffer
+from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward, cart_pole_start
 
 POINT_SPEC = StateSpec(["x"], ["v"])
 
@@ -264,7 +259,7 @@ def test_a_trivial_task_is_improved(point_agent, algorithm):
 def test_cart_pole(cart_pole):
     dynamics = LearnedDynamics(
         CART_POLE_SPEC,
-        random_cart_pole_physics(0),
+        cart_pole(0).physics,
         fit_options={"num_screened": 8, "num_starts": 1, "num_samples": 3, "num_draws": 16},
     )
     agent = DynaSAC(

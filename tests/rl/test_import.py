@@ -7,7 +7,8 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    ("package", "missing"), [("gpadjust.rl", "stable_baselines3"), ("gpadjust.envs", "gymnasium")]
+    ("package", "missing"),
+    [("gpadjust.rl", "stable_baselines3"), ("gpadjust.systems", "gymnasium")],
 )
 def test_what_is_missing_is_named(package, missing, monkeypatch):
     monkeypatch.delitem(sys.modules, package)

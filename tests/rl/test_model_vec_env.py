@@ -12,10 +12,10 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from gpadjust.envs import cart_pole_reward, cart_pole_start
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import ModelVecEnv
 from gpadjust.rl.buffer import CompactReplayBuffer
+from gpadjust.systems.cart_pole import cart_pole_reward, cart_pole_start
 
 
 @pytest.fixture

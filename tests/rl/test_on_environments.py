@@ -7,18 +7,10 @@ import torch
 
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, StateSpec
-from gpadjust.envs import (
-    ARM_SPEC,
-    CART_POLE_RAW_SPEC,
-    CartPoleSwingUpEnv,
-    RememberAction,
-    arm_reward,
-    cart_pole_reward,
-    cart_pole_start,
-    random_cart_pole_physics,
-    torque_arm_physics,
-)
 from gpadjust.rl import DynaOptions, DynaSAC
+from gpadjust.systems import CartPoleSwingUpEnv, RememberAction, arm, cart_pole
+from gpadjust.systems.cart_pole import CART_POLE_RAW_SPEC, cart_pole_reward, cart_pole_start
+from gpadjust.systems.reaching import ARM_SPEC, arm_reward
 
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
 
@@ -34,7 +26,7 @@ def test_actions_taken_in_the_model_are_remembered():
     def starts(n):
         return torch.cat([cart_pole_start(n), torch.zeros(n, 1, dtype=torch.float64)], -1)
 
-    dynamics = LearnedDynamics(spec, random_cart_pole_physics(0))
+    dynamics = LearnedDynamics(spec, cart_pole(0).physics)
     task = Task(dynamics, reward, initial_states=starts)
     agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), **SMALL).learn(10)
     model = agent.replay_buffer.model_buffer
@@ -50,7 +42,7 @@ def test_actions_taken_in_the_model_are_remembered():
 @pytest.mark.slow
 def test_the_muscle_arm():
     env = gym.make("gpadjust/MuscleArm-v0")
-    task = Task(LearnedDynamics(ARM_SPEC, torque_arm_physics()), arm_reward)
+    task = Task(LearnedDynamics(ARM_SPEC, arm().physics), arm_reward)
     agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), **SMALL).learn(30)
     assert agent.num_episodes == 2
     assert agent.replay_buffer.model_buffer.size() == 2 * 2 * 15

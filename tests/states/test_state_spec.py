@@ -62,7 +62,7 @@ def test_sine_and_cosine_that_are_elsewhere_are_found():
     spec.check_observations(noisy)
     spec.check_observations(noisy[:0])
     swapped = noisy[:, [0, 3, 1, 2, 4]]
-    with pytest.raises(ValueError, match=r"Entries 1 and 2 of .* of the angle 'theta', found -?\d"):
+    with pytest.raises(ValueError, match=r"1 and 2 .*'theta', found -?\d"):
         spec.check_observations(swapped)
     ARM.check_observations(ARM.observe(torch.randn(5, 3)))
 
@@ -131,7 +131,7 @@ def test_what_does_not_move_passes():
 def test_an_exogenous_state_that_moves_is_named():
     states, following = swing(10)
     following[4, 0] += 0.01
-    with pytest.raises(ValueError, match=r"'goal' .* changes by 0.01 in row 4"):
+    with pytest.raises(ValueError, match=r"'goal' .*0\.01 in row 4"):
         ARM.check_transitions(states, following)
 
 
@@ -140,7 +140,7 @@ def test_a_wrong_step_is_found(factor):
     states, following = swing(25, step=0.1 * abs(factor))
     if factor < 0:
         states[:, 2], following[:, 2] = -states[:, 2], -following[:, 2]
-    with pytest.raises(ValueError, match=rf"step=0.1, but moves {factor:.2g}"):
+    with pytest.raises(ValueError, match=rf"step=0.1.* {factor:.2g}"):
         ARM.check_transitions(states, following)
 
 
@@ -180,12 +180,12 @@ def test_what_is_no_previous_action_is_named():
     following = MEMORY.complete(states, actions, states[:, 1:2])
     MEMORY.check_transitions(states, following + 1e-7 * (following == actions[:, 1:]), actions)
     following[3, 0] += 0.1
-    with pytest.raises(ValueError, match=r"'last' .* previous action 'a', but is .* in row 3"):
+    with pytest.raises(ValueError, match=r"'last' .*'a'.* row 3"):
         MEMORY.check_transitions(states, following, actions)
     scales = torch.tensor([1e4, 1.0])  # another action's does not matter
     with pytest.raises(ValueError, match=r"'last' .* in row 3"):
         MEMORY.check_transitions(states, following, scales * actions)
-    with pytest.raises(ValueError, match="without actions; pass `actions`"):
+    with pytest.raises(ValueError, match="pass `actions`"):
         MEMORY.check_transitions(states, following)
 
 

@@ -8,10 +8,11 @@ from botorch.models.transforms import Log, Normalize, Standardize
 from gpadjust import VariationalCKA
 from gpadjust.models.training_data import standardize
 from gpadjust.validation import coverage, crps, leave_one_out, nlpd, pit, rmse
+from tests.systems import crude
 
 
 @pytest.fixture
-def construct(build, crude_physics, uniform):
+def construct(build, uniform):
     """Builds a model by its name; AR1 with the same low level each time."""
 
     def construct(kind, X, Y, Yvar=None, **options):
@@ -19,7 +20,7 @@ def construct(build, crude_physics, uniform):
             return SingleTaskGP(X, Y, Yvar, **options)
         if kind == "AR1":
             options["low_X"] = uniform(10, 2, high=2.0, seed=8).expand(*X.shape[:-2], 10, 2)
-            options["low_Y"] = crude_physics(options["low_X"])[..., : Y.shape[-1]]
+            options["low_Y"] = crude(options["low_X"])[..., : Y.shape[-1]]
         return build(kind, X, Y, Yvar, **options)
 
     return construct

@@ -21,6 +21,7 @@ from gpadjust.validation.plots import (
     plot_pit,
     plot_prediction,
 )
+from tests.systems import crude
 
 mpl.use("Agg")
 Z95 = 1.959963984540054
@@ -61,10 +62,10 @@ def band(ax):
     }
 
 
-def test_inducing_points(data, crude_physics):
+def test_inducing_points(data):
     X, Y = data(num_outputs=2)
     Y[:3, 1] = torch.nan
-    model = VariationalCKA(X, Y, physics=crude_physics)
+    model = VariationalCKA(X, Y, physics=crude)
     axes = plot_adjustment(model, output=1)
     assert axes.shape == (2, 2)  # the rest is drawn with delta
     assert len(axes[0, 0].lines[-1].get_xdata()) == 6

@@ -10,6 +10,7 @@ from gpadjust import AR1, CKA, BiasGP, StackedGP, VariationalCKA, ZeroMeanGP, fi
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.validation import Trust, trust
 from gpadjust.validation.plots import plot_trust, plot_trust_pair
+from tests.systems import crude
 
 mpl.use("Agg")
 Z95 = 1.959963984540054
@@ -111,20 +112,20 @@ def test_outputs_are_judged_one_by_one(data, build):
 
 
 @pytest.mark.parametrize("kind", ["CKA", "PhysicsMeanGP", "ScaleGP", "RRA", "BiasGP"])
-def test_all_models_with_a_physics_fall_back_to_it(kind, data, build, crude_physics):
+def test_all_models_with_a_physics_fall_back_to_it(kind, data, build):
     X, Y = data(num_outputs=2)
     model = build(kind, X, Y)
     Z = 3 * torch.rand(7, 2, dtype=torch.float64)
-    torch.testing.assert_close(model.fallback(Z), crude_physics(Z))
+    torch.testing.assert_close(model.fallback(Z), crude(Z))
     assert trust(model, Z).side.shape == (7, 2)
 
 
-def test_inducing_points_fall_back_to_the_physics_too(data, crude_physics):
+def test_inducing_points_fall_back_to_the_physics_too(data):
     X, Y = data(num_outputs=2)
     Y[:3, 0] = torch.nan
-    model = VariationalCKA(X, Y, physics=crude_physics)
+    model = VariationalCKA(X, Y, physics=crude)
     Z = 3 * torch.rand(7, 2, dtype=torch.float64)
-    torch.testing.assert_close(model.fallback(Z), crude_physics(Z))
+    torch.testing.assert_close(model.fallback(Z), crude(Z))
     assert trust(model, Z).side.shape == (7, 2)
     assert trust(model, num_points=9).side.shape == (9, 2)
 

@@ -11,20 +11,11 @@ import sympy
 import torch
 
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.envs import (
-    ARM_SPEC,
-    REAL_ARM,
-    ArmEquation,
-    arm_reward,
-    arm_start,
-    arm_targets,
-    hand_distance_cm,
-    hand_position,
-    opensim_arm_physics,
-    torque_arm,
-    torque_arm_physics,
-)
 from gpadjust.physics import ODEPhysics
+from gpadjust.systems import ArmEquation, arm, hand_distance_cm
+from gpadjust.systems.opensim import opensim_arm_physics
+from gpadjust.systems.reaching import ARM_SPEC, arm_reward, arm_start, arm_targets, hand_position
+from gpadjust.systems.torque_arm import REAL_ARM, torque_arm, torque_arm_physics
 
 OTHER_ARM = ArmEquation((1.3, 2.1), (0.4, 0.2), (0.1, 0.12), (0.03, 0.01), 0.2, (3.0, 5.0))
 
@@ -130,7 +121,7 @@ def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
     assert torque_arm().lengths == REAL_ARM.lengths
     assert torque_arm().gains == (8.0, 4.0)
     assert torque_arm([5, 2.5]).gains == (5.0, 2.5)
-    for physics in (torque_arm, torque_arm_physics, opensim_arm_physics):
+    for physics in (torque_arm, opensim_arm_physics):
         with pytest.raises(ValueError, match=r"gains must be a pair.*found 0\.5"):
             physics(0.5)
         with pytest.raises(ValueError, match="gains must be a pair of finite numbers"):
@@ -142,7 +133,7 @@ def test_torque_arm_is_a_tenth_too_heavy_and_takes_any_gains():
 @pytest.mark.parametrize("gains", [(8.0, 4.0), (5.0, 2.5), (1.0, 9.0)])
 def test_ode_agrees_with_opensim(states_and_actions, gains):
     X = torch.cat(states_and_actions(100), dim=-1)
-    gap = (torque_arm_physics(gains)(X) - opensim_arm_physics(gains)(X)).abs()
+    gap = (torque_arm_physics(torque_arm(gains))(X) - opensim_arm_physics(gains)(X)).abs()
     assert gap[:, :2].max() < 1e-5
     assert gap[:, 2:].max() < 1e-4
 
@@ -150,19 +141,19 @@ def test_ode_agrees_with_opensim(states_and_actions, gains):
 def test_substeps_are_enough(states_and_actions):
     X = torch.cat(states_and_actions(100), dim=-1)
     fine = ODEPhysics(torque_arm(), step=0.2, state_dim=4, substeps=400)
-    torch.testing.assert_close(torque_arm_physics()(X), fine(X), rtol=0, atol=2e-5)
+    torch.testing.assert_close(arm().physics(X), fine(X), rtol=0, atol=2e-5)
 
 
 def test_gradients_of_the_two_physics_agree(states_and_actions):
     X = torch.cat(states_and_actions(3), dim=-1).requires_grad_()
-    (exact,) = torch.autograd.grad(torque_arm_physics()(X).sum(), X)
-    (differences,) = torch.autograd.grad(opensim_arm_physics()(X).sum(), X)
+    (exact,) = torch.autograd.grad(arm().physics(X).sum(), X)
+    (differences,) = torch.autograd.grad(arm(opensim=True).physics(X).sum(), X)
     torch.testing.assert_close(differences, exact, rtol=1e-3, atol=1e-3)
 
 
 def test_opensim_physics_has_a_memo_and_a_light_pickle(states_and_actions):
     X = torch.cat(states_and_actions(4), dim=-1)
-    physics = opensim_arm_physics()
+    physics = arm(opensim=True).physics
     Y = physics(X)
     copy = pickle.loads(pickle.dumps(physics))
     copy.forget()
@@ -173,9 +164,9 @@ def test_opensim_physics_has_a_memo_and_a_light_pickle(states_and_actions):
 
 def test_threads_take_turns_in_opensim(states_and_actions):
     X = torch.cat(states_and_actions(12), dim=-1)
-    expected = opensim_arm_physics()(X)
+    expected = arm(opensim=True).physics(X)
     with joblib.parallel_config(backend="threading", n_jobs=3):
-        assert torch.equal(opensim_arm_physics()(X), expected)
+        assert torch.equal(arm(opensim=True).physics(X), expected)
 
 
 def test_opensim_physics_refuses_bad_arguments():
@@ -184,7 +175,7 @@ def test_opensim_physics_refuses_bad_arguments():
 
 
 def test_torque_arm_physics_can_be_pickled(states_and_actions):
-    physics = torque_arm_physics()
+    physics = arm().physics
     X = torch.cat(states_and_actions(5), dim=-1)
     assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
@@ -192,8 +183,8 @@ def test_torque_arm_physics_can_be_pickled(states_and_actions):
 def test_spec_fits_the_physics(states_and_actions):
     starts, (states, actions) = arm_start(5), states_and_actions(5)
     starts[:, :4] = states
-    reached = PhysicsDynamics(ARM_SPEC, torque_arm_physics()).sample(starts, actions)
-    expected = torque_arm_physics()(torch.cat([states, actions], dim=-1))
+    reached = PhysicsDynamics(ARM_SPEC, arm().physics).sample(starts, actions)
+    expected = arm().physics(torch.cat([states, actions], dim=-1))
     assert torch.equal(reached, torch.cat([expected, starts[:, 4:]], dim=-1))
     assert torch.equal(ARM_SPEC.observe(starts), starts)
 

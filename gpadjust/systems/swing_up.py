@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.checks import check_switch, checked_options, finite_array
-from gpadjust.envs.cart_pole.system import (
+from gpadjust.systems.cart_pole import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
     REAL_CART_POLE,
@@ -21,8 +21,8 @@ from gpadjust.envs.cart_pole.system import (
     cart_pole_cost,
     equation_physics,
 )
-from gpadjust.envs.cart_pole.view import CartPoleView
-from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv
+from gpadjust.systems.cart_pole_view import CartPoleView
+from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
 
 MAX_FORCE = 10.0
 MAX_START = 100.0  # far beyond what forces do; the equation can be integrated there
@@ -35,7 +35,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
     forces are clipped. The observation is
     :math:`[x, \sin\theta, \cos\theta, \dot{x}, \dot\theta]`, with the angle from upright;
     ``state`` has the true state in float64. The reward is minus the cost
-    of :func:`~gpadjust.envs.cart_pole_cost` of the state that was reached, in [-1, 0]; the
+    of the state that was reached, in [-1, 0], by the distance of the tip from its goal; the
     ``info`` of a step has the ``"cost"``. An episode does not terminate; ``gym.make`` truncates it
     after 25 steps.
 
@@ -59,7 +59,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
 
     Example:
         >>> import gymnasium
-        >>> env = gymnasium.make("gpadjust.envs:gpadjust/CartPoleSwingUp-v0")
+        >>> env = gymnasium.make("gpadjust.systems:gpadjust/CartPoleSwingUp-v0")
         >>> observation, info = env.reset(options={"state": [0.0, 0.0, 0.0, 0.0]})
         >>> observation
         array([0., 0., 1., 0., 0.], dtype=float32)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.arm.torque_arm import REAL_ARM
-from gpadjust.envs.view import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, Colour, View
+from gpadjust.systems.rendering import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, Colour, View
+from gpadjust.systems.torque_arm import REAL_ARM
 
 WIDTH, HEIGHT = 480, 400
 METRE = 320.0  # pixels

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from gpadjust.envs import CartPoleSwingUpEnv, RememberAction
+from gpadjust.systems import CartPoleSwingUpEnv, RememberAction
 
 
 def test_the_observation_ends_with_the_last_action():

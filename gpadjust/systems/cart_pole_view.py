@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.envs.view import BLACK, BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, View
+from gpadjust.systems.rendering import BLACK, BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, View
 
 WIDTH, HEIGHT = 600, 300
 METRE = 140.0  # pixels

@@ -1,15 +1,21 @@
-"""The arm as a model of OpenSim, with muscles or with torques."""
+"""The arm in OpenSim: models with muscles or with torques, their integration, a physics."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from threading import Lock
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gpadjust.checks import checked_number
-from gpadjust.envs.arm.torque_arm import ArmEquation
+from gpadjust.physics import BlackBoxPhysics
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, ArmEquation, torque_arm
 
 JOINTS = ("shoulder", "elbow")
 LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow
@@ -54,6 +60,7 @@ MUSCLES = (
 Actions excite the first four, in this order; the last two are passive.
 """
 NUM_EXCITED = 4
+FD_STEP = 1e-3  # in rad, rad/s and 1: far above the error of the integration
 
 
 @lru_cache(maxsize=1)
@@ -214,3 +221,134 @@ def _add_controller(opensim: ModuleType, model: Any, actuators: list[Any]) -> No
         controller.addActuator(actuator)
         controller.prescribeControlForActuator(actuator.getName(), opensim.Constant(0.0))
     model.addController(controller)
+
+
+class ArmSimulation:
+    """The arm in OpenSim, integrated for 0.2 s at a time by Runge-Kutta-Merson.
+
+    A step depends on its arguments alone. The simulation can be pickled and copied: the model is
+    built anew.
+
+    Args:
+        build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` and
+            :func:`build_torque_arm` do (:mod:`gpadjust.systems.opensim`): a
+            ``functools.partial`` of one of these can be pickled.
+        accuracy: The relative accuracy of the integrator.
+
+    Raises:
+        ImportError: If ``opensim`` is missing.
+        TypeError: If accuracy is no number.
+        ValueError: If accuracy is not in (0, 1), or ``build`` refuses its arguments.
+
+    Example:
+        >>> from functools import partial
+        >>> from gpadjust.systems.opensim import build_torque_arm
+        >>> from gpadjust.systems.torque_arm import REAL_ARM
+        >>> simulation = ArmSimulation(partial(build_torque_arm, REAL_ARM), accuracy=1e-6)
+        >>> simulation.step(np.array([0.6, 1.1, 0.0, 0.0]), np.zeros(2)).round(6)
+        array([0.6, 1.1, 0. , 0. ])
+    """
+
+    def __init__(self, build: Callable[[], Any], accuracy: float) -> None:
+        checked_number("accuracy", accuracy, above=0, below=1)
+        self.build = build
+        self.accuracy = accuracy
+        self._start_anew()
+
+    def step(self, state: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The state after 0.2 s.
+
+        Args:
+            state: Angles and velocities, then the six activations if there are muscles.
+            inputs: Excitations of the four driven muscles, or torques of shoulder and elbow in N m.
+
+        Raises:
+            RuntimeError: If the integration fails, or ends in numbers that are not finite.
+        """
+        with self._lock:
+            for constant, value in zip(self._controls, inputs.tolist(), strict=True):
+                constant.setValue(value)
+            for i, value in enumerate(state.tolist()):
+                self._vector.set(i, value)
+            self._start.setTime(0.0)
+            self._start.setY(self._vector)
+            self._manager.initialize(self._start)
+            # Copied at once: what OpenSim returns is a reference.
+            end = np.array(self._manager.integrate(ARM_TIME_STEP).getY().to_numpy())
+        if not np.isfinite(end).all():
+            raise RuntimeError("The integration ended in NaN or inf.")
+        return end
+
+    def _start_anew(self) -> None:
+        self._lock = Lock()
+        opensim = load_opensim()
+        self._model = self.build()
+        self._start = self._model.initSystem()
+        self._controls = controls(self._model)
+        self._vector = opensim.Vector(self._start.getNY(), 0.0)
+        self._manager = opensim.Manager(self._model)
+        self._manager.setWriteToStorage(False)
+        self._manager.setPerformAnalyses(False)
+        # In this order: a new method forgets the accuracy.
+        self._manager.setIntegratorMethod(opensim.Manager.IntegratorMethod_RungeKuttaMerson)
+        self._manager.setIntegratorAccuracy(self.accuracy)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"build": self.build, "accuracy": self.accuracy}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._start_anew()
+
+
+def opensim_arm_physics(
+    gains: tuple[float, float] = (8.0, 4.0), accuracy: float = 1e-6
+) -> BlackBoxPhysics:
+    """The physics of :func:`torque_arm_physics`, computed by OpenSim, a row at a time.
+
+    The two agree to 1e-5 rad. In parallel it runs in processes (``joblib``'s ``loky``): threads
+    take turns.
+
+    Args:
+        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
+            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
+        accuracy: The relative accuracy of the integrator.
+
+    Returns:
+        A physics of columns ``[theta_s, theta_e, theta_s_dot, theta_e_dot, a1, a2, a3, a4]``, in
+        rad and s, with gradients by finite differences.
+
+    Raises:
+        ImportError: If ``opensim`` is missing.
+        ValueError: If the gains are not two finite numbers that are not negative, or ``accuracy``
+            is not in (0, 1).
+
+    Example:
+        >>> import torch
+        >>> physics = opensim_arm_physics()
+        >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
+        tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
+    """
+    step = _TorqueStep(torque_arm(gains), accuracy)
+    return BlackBoxPhysics(step, batched=False, fd_step=FD_STEP, name="opensim_arm")
+
+
+class _TorqueStep:
+    """A step of one row; a light pickle, as each process keeps the models it has built."""
+
+    def __init__(self, equation: ArmEquation, accuracy: float) -> None:
+        self.equation = equation
+        self.accuracy = accuracy
+        _simulation(equation, accuracy)  # bad arguments are found now
+
+    def __call__(self, row: NDArray[np.float64]) -> NDArray[np.float64]:
+        if row.shape != (8,):
+            raise ValueError(f"expected rows of 4 states and 4 actions; found shape {row.shape}")
+        a1, a2, a3, a4 = row[4:]
+        torques = np.array(self.equation.gains) * (a3 - a4, a1 - a2)
+        return _simulation(self.equation, self.accuracy).step(row[:4], torques)
+
+
+@lru_cache(maxsize=8)
+def _simulation(equation: ArmEquation, accuracy: float) -> ArmSimulation:
+    return ArmSimulation(partial(build_torque_arm, equation), accuracy)

@@ -13,12 +13,23 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.checks import checked_options, finite_array
-from gpadjust.envs.arm.opensim_model import MUSCLES, NUM_EXCITED, REST_ACTIVATION, build_muscle_arm
-from gpadjust.envs.arm.simulation import ArmSimulation
-from gpadjust.envs.arm.task import MAX_TARGET, START_MEAN, START_STD, angle_error, hand_distance_cm
-from gpadjust.envs.arm.torque_arm import ARM_TIME_STEP, REAL_ARM
-from gpadjust.envs.arm.view import ArmView
-from gpadjust.envs.viewed_env import RENDER_MODES, ViewedEnv
+from gpadjust.systems.arm_view import ArmView
+from gpadjust.systems.opensim import (
+    MUSCLES,
+    NUM_EXCITED,
+    REST_ACTIVATION,
+    ArmSimulation,
+    build_muscle_arm,
+)
+from gpadjust.systems.reaching import (
+    MAX_TARGET,
+    START_MEAN,
+    START_STD,
+    angle_error,
+    hand_distance_cm,
+)
+from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, REAL_ARM
 
 # The arm itself stays within 3 rad and 20 rad/s.
 HIGH = np.array([2 * math.pi, 2 * math.pi, 100, 100, 2 * math.pi, 2 * math.pi], dtype=np.float32)
@@ -34,11 +45,11 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
 
     The observation is :math:`[\theta_s, \theta_e, \dot\theta_s, \dot\theta_e, \theta_s^*,
     \theta_e^*]`: angles of shoulder and elbow in rad, their velocities in rad/s, and the angles to
-    reach; ``state`` has it in float64, ``activations`` the six activations. The reward is
-    :func:`~gpadjust.envs.arm_reward`, minus the root mean square error of the angles that were
-    reached, in rad; the ``info`` of a step has ``"hand_distance_cm"``, from the hand to where it
-    should be. An episode does not terminate; ``gym.make`` truncates it after 15 steps. It starts
-    at rest around 35° and 65° with a standard deviation of 5°, targets are from U(0°, 100°) each.
+    reach; ``state`` has it in float64, ``activations`` the six activations. The reward is minus the
+    root mean square error of the angles that were reached, in rad; the ``info`` of a step has
+    ``"hand_distance_cm"``, from the hand to where it should be. An episode does not terminate;
+    ``gym.make`` truncates it after 15 steps. It starts at rest around 35° and 65° with a standard
+    deviation of 5°, targets are from U(0°, 100°) each.
 
     The ``info`` of each step has ``"step_failed"``. Should an integration fail it is True, and the
     step warns and truncates the episode. Its observation and reward are then those of the state
@@ -64,7 +75,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
 
     Example:
         >>> import gymnasium
-        >>> env = gymnasium.make("gpadjust.envs:gpadjust/MuscleArm-v0")
+        >>> env = gymnasium.make("gpadjust.systems:gpadjust/MuscleArm-v0")
         >>> observation, info = env.reset(
         ...     options={"state": [0.6, 1.1, 0.0, 0.0], "target": [1.0, 1.1]}
         ... )

@@ -10,21 +10,18 @@ import torch
 from scipy.integrate import solve_ivp
 
 from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.envs import (
+from gpadjust.physics import ODEPhysics
+from gpadjust.systems import CartPoleEquation, cart_pole, hand_distance_cm
+from gpadjust.systems.cart_pole import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
     REAL_CART_POLE,
-    CartPoleEquation,
-    arm_start,
     cart_pole_cost,
-    cart_pole_physics,
     cart_pole_reward,
     cart_pole_start,
-    hand_distance_cm,
-    hand_position,
-    random_cart_pole_physics,
+    equation_physics,
 )
-from gpadjust.physics import ODEPhysics
+from gpadjust.systems.reaching import arm_start, hand_position
 
 PARAMETERS = [(0.5, 0.5, 0.6, 0.1), (1.3, 0.2, 0.9, 0.0)]
 
@@ -99,7 +96,7 @@ def test_step_agrees_with_scipy(states_and_forces):
         return torch.tensor(path.y[:, -1])
 
     expected = torch.stack([final(*row) for row in zip(states, forces, strict=True)])
-    physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1)
+    physics = equation_physics(REAL_CART_POLE)
     X = torch.cat([states, forces], dim=-1)
     torch.testing.assert_close(physics(X), expected, rtol=0, atol=1e-3)
     fine = ODEPhysics(REAL_CART_POLE, step=0.1, state_dim=4, substeps=100)
@@ -110,11 +107,11 @@ def test_step_agrees_with_scipy(states_and_forces):
 def test_time_steps_can_be_others(time_step, states_and_forces):
     X = torch.cat(states_and_forces(10), dim=-1)
     fine = ODEPhysics(REAL_CART_POLE, step=time_step, state_dim=4, substeps=100)
-    physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1, time_step)
+    physics = equation_physics(REAL_CART_POLE, time_step)
     torch.testing.assert_close(physics(X), fine(X), rtol=0, atol=2e-3)
     assert physics.step / physics.substeps <= 0.02 + 1e-12
-    believed = random_cart_pole_physics(3, time_step)
-    assert (believed.step, believed.rhs) == (time_step, random_cart_pole_physics(3).rhs)
+    believed = cart_pole(3, time_step=time_step).physics
+    assert (believed.step, believed.rhs) == (time_step, cart_pole(3).physics.rhs)
 
 
 def test_hanging_is_stable_and_upright_is_not():
@@ -144,19 +141,19 @@ def test_equation_refuses_other_columns(state_dim, action_dim):
 def test_impossible_parameters_are_refused(name, value):
     good = {"cart_mass": 0.5, "pole_mass": 0.5, "pole_length": 0.6, "damping": 0.1}
     with pytest.raises(ValueError, match=name):
-        cart_pole_physics(**{**good, name: value})
+        CartPoleEquation(**{**good, name: value})
 
 
 def test_what_is_no_number_or_state_is_refused():
     with pytest.raises(TypeError, match="cart_mass must be a number; found 'heavy'"):
-        cart_pole_physics("heavy", 0.5, 0.6, 0.1)
+        CartPoleEquation("heavy", 0.5, 0.6, 0.1)
     with pytest.raises(TypeError, match=r"seed must be a whole number; found 1\.5"):
-        random_cart_pole_physics(1.5)
+        cart_pole(1.5)
     with pytest.raises(ValueError, match="seed must be at least 0; found -1"):
-        random_cart_pole_physics(-1)
+        cart_pole(-1)
     for time_step in (0, -0.1, math.nan):
         with pytest.raises(ValueError, match="time_step must be finite and above 0"):
-            random_cart_pole_physics(0, time_step)
+            cart_pole(time_step=time_step)
     for start in (cart_pole_start, arm_start):
         with pytest.raises(ValueError, match="n must be at least 0; found -1"):
             start(-1)
@@ -170,7 +167,7 @@ def test_what_is_no_number_or_state_is_refused():
 
 
 def test_random_physics_is_in_its_ranges_and_follows_its_seed():
-    equations = [random_cart_pole_physics(seed).rhs for seed in range(200)]
+    equations = [cart_pole(seed).physics.rhs for seed in range(200)]
     for name, low, high in [
         ("cart_mass", 0.4, 0.6),
         ("pole_mass", 0.5, 0.7),
@@ -180,12 +177,12 @@ def test_random_physics_is_in_its_ranges_and_follows_its_seed():
         assert low <= min(values) < low + 0.01
         assert high - 0.01 < max(values) <= high
     assert {equation.damping for equation in equations} == {0.0}
-    assert random_cart_pole_physics(3).rhs == equations[3]
+    assert cart_pole(3).physics.rhs == equations[3]
     assert len(set(equations)) == 200
 
 
 def test_physics_can_be_pickled(states_and_forces):
-    physics = random_cart_pole_physics(0)
+    physics = cart_pole(0).physics
     X = torch.cat(states_and_forces(5), dim=-1)
     assert torch.equal(pickle.loads(pickle.dumps(physics))(X), physics(X))
 
@@ -193,7 +190,7 @@ def test_physics_can_be_pickled(states_and_forces):
 @pytest.mark.parametrize("spec", [CART_POLE_SPEC, CART_POLE_RAW_SPEC])
 def test_specs_fit_the_physics(spec, states_and_forces):
     states, forces = states_and_forces(5)
-    physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1)
+    physics = equation_physics(REAL_CART_POLE)
     dynamics = PhysicsDynamics(spec, physics)
     expected = physics(torch.cat([states, forces], dim=-1))
     assert torch.equal(dynamics.sample(states, forces), expected)
@@ -234,7 +231,7 @@ def test_start_is_spread_around_hanging():
 
 
 def test_doing_nothing_costs_0_952():
-    physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1)
+    physics = equation_physics(REAL_CART_POLE)
     states, costs = cart_pole_start(4000), []
     for _ in range(25):
         states = physics(torch.cat([states, torch.zeros(4000, 1, dtype=torch.float64)], dim=-1))

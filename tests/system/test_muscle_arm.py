@@ -17,13 +17,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import gpadjust
-from gpadjust.envs import (
-    MuscleArmEnv,
-    arm_reward,
-    hand_distance_cm,
-    hand_position,
-)
-from gpadjust.envs.arm.opensim_model import MUSCLES, load_opensim
+from gpadjust.systems import MuscleArmEnv, hand_distance_cm
+from gpadjust.systems.opensim import MUSCLES, load_opensim
+from gpadjust.systems.reaching import arm_reward, hand_position
 
 ID = "gpadjust/MuscleArm-v0"
 START = np.radians([35.0, 65.0, 0.0, 0.0])
@@ -404,9 +400,9 @@ def test_frame_shows_how_active_each_muscle_is(frame, muscle):
 @pytest.mark.slow
 def test_nothing_is_printed_and_no_log_is_written(tmp_path):
     code = (
-        "import sys, gymnasium, gpadjust.envs, numpy as np\n"
+        "import sys, gymnasium, gpadjust.systems, numpy as np\n"
         "assert 'opensim' not in sys.modules\n"
-        "env = gymnasium.make('gpadjust.envs:gpadjust/MuscleArm-v0')\n"
+        "env = gymnasium.make('gpadjust.systems:gpadjust/MuscleArm-v0')\n"
         "env.reset(seed=0)\n"
         "env.step(np.full(4, 0.5, dtype=np.float32))\n"
         "import warnings; warnings.simplefilter('ignore')\n"
@@ -423,12 +419,12 @@ def test_without_opensim_only_the_arm_is_missing(tmp_path):
     code = (
         "import sys; sys.modules['opensim'] = None\n"
         "import gpadjust\n"
-        "assert not {'gymnasium', 'gpadjust.envs'} & set(sys.modules)\n"
+        "assert not {'gymnasium', 'gpadjust.systems'} & set(sys.modules)\n"
         "import gymnasium\n"
-        "print(gymnasium.make('gpadjust.envs:gpadjust/CartPoleSwingUp-v0').unwrapped)\n"
-        "gpadjust.envs.torque_arm_physics()\n"
+        "print(gymnasium.make('gpadjust.systems:gpadjust/CartPoleSwingUp-v0').unwrapped)\n"
+        "gpadjust.systems.arm().physics\n"
         "makers = [lambda: gymnasium.make('gpadjust/MuscleArm-v0'), "
-        "gpadjust.envs.opensim_arm_physics]\n"
+        "lambda: gpadjust.systems.arm(opensim=True)]\n"
         "for make in makers:\n"
         "    try: make()\n"
         "    except ImportError as error: print(error)\n"
@@ -471,7 +467,7 @@ def test_the_logger_is_switched_off_once():
 
 @pytest.mark.slow
 def test_arms_in_processes_of_their_own_are_the_same():
-    make = [partial(gym.make, f"gpadjust.envs:{ID}")] * 2
+    make = [partial(gym.make, f"gpadjust.systems:{ID}")] * 2
     here, there = DummyVecEnv(make), SubprocVecEnv(make)
     try:
         for envs in (here, there):

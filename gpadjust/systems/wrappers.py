@@ -1,12 +1,17 @@
-"""Observations that hold the previous action."""
+"""Environments seen otherwise: with the previous action, through noisy sensors."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import NDArray
+
+from gpadjust.checks import checked_number
+from gpadjust.states import StateSpec
 
 Array = NDArray[np.float32]
 
@@ -32,7 +37,7 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
 
     Example:
         >>> import gymnasium
-        >>> from gpadjust.envs import RememberAction
+        >>> from gpadjust.systems import RememberAction
         >>> env = RememberAction(gymnasium.make("gpadjust/CartPoleSwingUp-v0"))
         >>> _ = env.reset(seed=0)
         >>> observation, *_ = env.step(np.array([3.0], dtype=np.float32))
@@ -83,3 +88,43 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
 
     def _extended(self, observation: Array, action: Array) -> Array:
         return np.concatenate([observation, action]).astype(self._dtype)
+
+
+class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.RecordConstructorArgs):
+    """Adds normal noise to the states that an environment observes; rewards are of the true state.
+
+    Args:
+        env: The environment, which observes the states of the spec.
+        spec: What they are; an angle gets its noise before its sine and cosine are taken.
+        sd: Standard deviations by the name of the state; the others have no noise.
+
+    Raises:
+        TypeError: If a standard deviation is no number.
+        ValueError: If one is negative, or there is no such state.
+
+    Example:
+        >>> from gpadjust import systems
+        >>> env = systems.cart_pole(noise={"x": 0.01, "theta": 0.02}).make()
+        >>> _ = env.reset(seed=0)
+    """
+
+    def __init__(
+        self, env: gym.Env[Array, Array], spec: StateSpec, sd: Mapping[str, float]
+    ) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, spec=spec, sd=dict(sd))
+        gym.ObservationWrapper.__init__(self, env)
+        self.spec_of_states = spec
+        for name, value in sd.items():
+            checked_number(f"The noise of {name!r}", value, least=0)
+            if name not in spec.states:
+                raise ValueError(f"There is no state {name!r}; the states are {spec.states}.")
+        self._columns = [i for i, name in enumerate(spec.states) if name in sd]
+        self._sd = np.array([sd[spec.states[i]] for i in self._columns])
+
+    def observation(self, observation: Array) -> Array:
+        """Add the noise, by the environment's generator."""
+        spec = self.spec_of_states
+        state = spec.decode(torch.from_numpy(observation.astype(np.float64)))
+        noise = self._sd * self.unwrapped.np_random.normal(size=len(self._sd))
+        state[self._columns] += torch.from_numpy(noise)
+        return spec.observe(state).numpy().astype(observation.dtype)

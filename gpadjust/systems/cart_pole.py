@@ -1,22 +1,29 @@
-"""The cart-pole: its equation of motion, its physics, its states and its cost."""
+"""The cart-pole as a system: its equation of motion, physics, states, cost and starts."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gpadjust.checks import check_columns, checked_number, checked_whole
-from gpadjust.physics import ODEPhysics
+from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.states import StateSpec
+from gpadjust.systems.system import System
+from gpadjust.systems.wrappers import NoisySensors
 
 TIME_STEP = 0.1
 SUBSTEP = 0.02  # s, the longest: a single Euler step of 0.1 s errs by 0.3 rad/s
 START_MEAN = (0.0, math.pi, 0.0, 0.0)
 START_STD = 0.2
+_SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
 
 CART_POLE_SPEC = StateSpec(
     ["x", "theta", "x_dot", "theta_dot"], actions=["force"], angles=["theta"]
@@ -42,7 +49,8 @@ class CartPoleEquation:
 
     This is the system of Deisenroth, "Efficient Reinforcement Learning using Gaussian Processes",
     2010, Appendix C, with the angle taken from upright. Its tip is at
-    :math:`(x - l \sin\theta, l \cos\theta)`.
+    :math:`(x - l \sin\theta, l \cos\theta)`. Dry friction takes :math:`d \tanh(\dot{x} / 0.05)`
+    from the force, drag turns the pole by :math:`-k \dot\theta |\dot\theta|`.
 
     Args:
         cart_mass: The mass :math:`m_c` of the cart, in kg.
@@ -50,10 +58,12 @@ class CartPoleEquation:
         pole_length: The length :math:`l` of the pole, in m.
         damping: The friction :math:`b` between cart and track, in N s/m.
         gravity: The acceleration :math:`g` of gravity, in m/s²; as Deisenroth has it, 9.82.
+        dry: The dry friction d of the cart, in N.
+        drag: The drag k of the pole, in N m s²/rad².
 
     Raises:
         TypeError: If one of them is no number.
-        ValueError: If a mass, the length or the gravity is not positive, or the damping negative.
+        ValueError: If a mass, the length or the gravity is not positive, or another one negative.
 
     Example:
         >>> equation = CartPoleEquation(0.5, 0.5, 0.6, 0.1)
@@ -66,25 +76,23 @@ class CartPoleEquation:
     pole_length: float
     damping: float
     gravity: float = 9.82
+    dry: float = 0.0
+    drag: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the parameters."""
         for entry in fields(self):
-            value = getattr(self, entry.name)
-            least = "not negative" if entry.name == "damping" else "positive"
-            try:
-                finite = math.isfinite(value)
-            except TypeError:
-                raise TypeError(f"{entry.name} must be a number; found {value!r}.") from None
-            if not finite or value < 0 or (value == 0 and least == "positive"):
-                raise ValueError(f"{entry.name} must be finite and {least}; found {value}.")
+            friction = entry.name in ("damping", "dry", "drag")
+            limits = {"least": 0} if friction else {"above": 0}
+            checked_number(entry.name, getattr(self, entry.name), **limits)
 
-    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
+    def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
         """The time derivative of the state.
 
         Args:
             state: ``... x 4``: position, angle, velocity and angular velocity, in m, rad and s.
             action: ``... x 1``, the force in N.
+            p: Other values of some parameters by name, ``...`` each.
 
         Returns:
             ``... x 4``.
@@ -98,14 +106,23 @@ class CartPoleEquation:
                 f"got {tuple(state.shape)} and {tuple(action.shape)}."
             )
         _, theta, x_dot, theta_dot = state.unbind(-1)
-        m, length, g = self.pole_mass, self.pole_length, self.gravity
-        M = self.cart_mass + m
+        own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        given = {**own, **(p or {})}
+        m, length, g = given["pole_mass"], given["pole_length"], given["gravity"]
+        M = given["cart_mass"] + m
         sin, cos = theta.sin(), theta.cos()
-        force = action[..., 0] - self.damping * x_dot
+        push = action[..., 0]
+        if _is_there(given["dry"]):
+            push = push - given["dry"] * (x_dot / _SOFT).tanh()
+        force = push - given["damping"] * x_dot
         swing = m * length * theta_dot.square() * sin
         inertia = 4 * M - 3 * m * cos.square()
         x_ddot = (-2 * swing + 3 * m * g * sin * cos + 4 * force) / inertia
         theta_ddot = (-3 * swing * cos + 6 * M * g * sin + 6 * force * cos) / (length * inertia)
+        if _is_there(given["drag"]):
+            torque = -given["drag"] * theta_dot * theta_dot.abs()
+            x_ddot = x_ddot + 6 * cos * torque / (length * inertia)
+            theta_ddot = theta_ddot + 12 * M * torque / (m * length**2 * inertia)
         return torch.stack([x_dot, theta_dot, x_ddot, theta_ddot], dim=-1)
 
     def energy(self, state: Tensor) -> Tensor:
@@ -128,69 +145,53 @@ REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6,
 """The system to control."""
 
 
-def cart_pole_physics(
-    cart_mass: float,
-    pole_mass: float,
-    pole_length: float,
-    damping: float,
-    time_step: float = TIME_STEP,
-) -> ODEPhysics:
-    """The state of a cart-pole a time step later, under a force that is held.
-
-    It does not limit the force, as the environment does.
-
-    Args:
-        cart_mass: The mass of the cart, in kg.
-        pole_mass: The mass of the pole, in kg.
-        pole_length: The length of the pole, in m.
-        damping: The friction between cart and track, in N s/m.
-        time_step: In s.
-
-    Returns:
-        A physics of columns ``[x, theta, x_dot, theta_dot, force]``, by Runge-Kutta of order four
-        with substeps of at most 0.02 s.
-
-    Example:
-        >>> physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1)
-        >>> physics(torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
-        tensor([[0.0081, 0.0206, 0.1627, 0.4233]], dtype=torch.float64)
-    """
-    equation = CartPoleEquation(cart_mass, pole_mass, pole_length, damping)
-    return equation_physics(equation, time_step)
+def _is_there(friction: float | Tensor) -> bool:
+    return torch.is_tensor(friction) or friction != 0
 
 
 def equation_physics(
-    equation: CartPoleEquation | nn.Module, time_step: float = TIME_STEP, name: str = "cart_pole"
+    equation: Callable[..., Tensor],
+    time_step: float = TIME_STEP,
+    unknowns: Mapping[str, Unknown] | None = None,
 ) -> ODEPhysics:
-    """A time step, in s, of such an equation."""
+    """The state of a cart-pole a time step later, under a force that is held.
+
+    It does not limit the force, as the environment does. It integrates by Runge-Kutta of order four
+    with substeps of at most 0.02 s.
+
+    Args:
+        equation: Such as a :class:`CartPoleEquation`.
+        time_step: In s.
+        unknowns: Parameters of the equation that are unknown.
+
+    Returns:
+        A physics of columns ``[x, theta, x_dot, theta_dot, force]``.
+
+    Example:
+        >>> physics = equation_physics(REAL_CART_POLE)
+        >>> physics(torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
+        tensor([[0.0081, 0.0206, 0.1627, 0.4233]], dtype=torch.float64)
+    """
     checked_number("time_step", time_step, above=0)
     substeps = math.ceil(round(time_step / SUBSTEP, 6))
-    return ODEPhysics(equation, time_step, state_dim=4, substeps=substeps, name=name)
+    return ODEPhysics(
+        equation, time_step, state_dim=4, substeps=substeps, unknowns=unknowns, name="cart_pole"
+    )
 
 
-def random_cart_pole_physics(seed: int, time_step: float = TIME_STEP) -> ODEPhysics:
-    """The physics as someone may believe it to be, who has not measured the system.
+def believed_cart_pole(seed: int) -> CartPoleEquation:
+    """The cart-pole as someone may believe it to be, who has not measured it.
 
     The masses are drawn from U(0.4, 0.6) kg for the cart and U(0.5, 0.7) kg for the pole, the
     length from U(0.5, 0.7) m; there is no friction.
 
-    Args:
-        seed: The same seed gives the same physics.
-        time_step: In s.
-
-    Returns:
-        A physics as :func:`cart_pole_physics` builds it; ``physics.rhs`` has the parameters.
-
     Raises:
         TypeError: If ``seed`` is no whole number.
-        ValueError: If it is negative, or ``time_step`` not positive.
+        ValueError: If it is negative.
     """
-    checked_whole("seed", seed, 0)
-    cart_mass, pole_mass, pole_length = np.random.default_rng(seed).uniform(
-        [0.4, 0.5, 0.5], [0.6, 0.7, 0.7]
-    )
-    drawn = (float(cart_mass), float(pole_mass), float(pole_length))
-    return cart_pole_physics(*drawn, damping=0.0, time_step=time_step)
+    random = np.random.default_rng(checked_whole("seed", seed, 0))
+    drawn = random.uniform([0.4, 0.5, 0.5], [0.6, 0.7, 0.7])
+    return CartPoleEquation(*map(float, drawn), damping=0.0)
 
 
 def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_length) -> Tensor:
@@ -229,3 +230,65 @@ def cart_pole_start(n: int) -> Tensor:
     checked_whole("n", n, 0)
     mean = torch.tensor(START_MEAN, dtype=torch.float64)
     return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)
+
+
+def cart_pole(
+    seed: int = 0,
+    *,
+    dry: float = 0.0,
+    drag: float = 0.0,
+    noise: Mapping[str, float] | None = None,
+    unknowns: bool = False,
+    encode_angle: bool = True,
+    time_step: float = TIME_STEP,
+    episode_length: int = 25,
+) -> System:
+    """The swing-up of a cart-pole; its physics has other masses, another length and no friction.
+
+    Its environment is :class:`CartPoleSwingUpEnv`.
+
+    Args:
+        seed: Of the physics, whose masses are drawn from U(0.4, 0.6) kg for the cart and
+            U(0.5, 0.7) kg for the pole, the length from U(0.5, 0.7) m.
+        dry: Dry friction of the real cart, in N, which no parameter of the physics describes.
+        drag: Drag of the real pole, in N m s²/rad², likewise.
+        noise: Standard deviations of the sensors' noise, by the name of the state.
+        unknowns: Whether masses, length and damping of the physics are unknown parameters.
+        encode_angle: As of the environment.
+        time_step: In s.
+        episode_length: In steps.
+
+    Raises:
+        TypeError: If an option is of another kind.
+        ValueError: If it is out of range.
+
+    Example:
+        >>> from gpadjust import systems
+        >>> systems.cart_pole(seed=1, unknowns=True).unknowns["damping"].prior_text
+        '0 to 1'
+    """
+    believed, named = believed_cart_pole(seed), None
+    if unknowns:
+        named = {
+            "cart_mass": Unknown(believed.cart_mass, factor=1.5, unit="kg"),
+            "pole_mass": Unknown(believed.pole_mass, factor=1.5, unit="kg"),
+            "pole_length": Unknown(believed.pole_length, factor=1.5, unit="m"),
+            "damping": Unknown(0.05, bounds=(0.0, 1.0), unit="N s/m"),
+        }
+    real: dict[str, Any] = {"encode_angle": encode_angle, "time_step": time_step}
+    real["equation"] = replace(REAL_CART_POLE, dry=dry, drag=drag)
+    spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
+    return System(
+        partial(_make, spec, noise, max_episode_steps=episode_length, **real),
+        spec,
+        equation_physics(believed, time_step, named),
+        cart_pole_reward,
+        start=cart_pole_start,
+        episode_length=episode_length,
+    )
+
+
+def _make(spec: StateSpec, noise: Mapping[str, float] | None, **options: Any) -> gym.Env[Any, Any]:
+    """The environment."""
+    env = gym.make("gpadjust/CartPoleSwingUp-v0", **options)
+    return NoisySensors(env, spec, noise) if noise else env

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import check_columns, checked_whole
-from gpadjust.envs.arm.torque_arm import REAL_ARM
 from gpadjust.states import StateSpec
+from gpadjust.systems.torque_arm import REAL_ARM
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)
@@ -65,17 +65,18 @@ def arm_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
     return -angle_error(next_states)
 
 
-def arm_start(n: int) -> Tensor:
+def arm_start(n: int, spec: StateSpec = ARM_SPEC) -> Tensor:
     r"""Draw ``n x 6`` start states, at rest, and targets from PyTorch's generator.
 
     The angles are from :math:`\mathcal{N}((35°, 65°), (5°)^2 I)`, each angle of the targets from
-    :math:`\mathcal{U}(0°, 100°)`.
+    :math:`\mathcal{U}(0°, 100°)`. Previous actions of a spec that has them are zero.
     """
     checked_whole("n", n, 0)
     angles = torch.tensor(START_MEAN, dtype=torch.float64)
     angles = angles + START_STD * torch.randn(n, 2, dtype=torch.float64)
     targets = MAX_TARGET * torch.rand(n, 2, dtype=torch.float64)
-    return torch.cat([angles, torch.zeros_like(angles), targets], dim=-1)
+    before = angles.new_zeros(n, len(spec.previous))
+    return torch.cat([angles, torch.zeros_like(angles), targets, before], dim=-1)
 
 
 def arm_targets() -> Tensor:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from gpadjust.checks import finite_array
-from gpadjust.physics import ODEPhysics
+from gpadjust.physics import ODEPhysics, Unknown
 
 ARM_TIME_STEP = 0.2
 SUBSTEPS = 40  # of 5 ms: the damping of the light forearm makes the equation stiff
@@ -80,12 +81,14 @@ class ArmEquation:
             value = float(numbers) if single else tuple(numbers.tolist())
             object.__setattr__(self, entry.name, value)
 
-    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
+    def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
         """The time derivative of the state.
 
         Args:
             state: ``... x 4``: angles and angular velocities of shoulder and elbow, in rad and s.
             action: ``... x 4``, of which 1 asks for the full torque.
+            p: Other values, ``...``, of ``forearm`` (a factor on its mass and inertia, else 1),
+                ``damping``, ``shoulder_gain`` and ``elbow_gain``.
 
         Returns:
             ``... x 4``.
@@ -100,10 +103,13 @@ class ArmEquation:
             )
         _, elbow, v_s, v_e = state.unbind(-1)
         a1, a2, a3, a4 = action.unbind(-1)
-        m_ss, m_se, m_ee = self._mass_matrix(elbow)
-        swing = self._coupling * elbow.sin()
-        load_s = self.gains[0] * (a3 - a4) - self.damping * v_s + swing * (2 * v_s + v_e) * v_e
-        load_e = self.gains[1] * (a1 - a2) - self.damping * v_e - swing * v_s.square()
+        own = {"damping": self.damping, "shoulder_gain": self.gains[0], "elbow_gain": self.gains[1]}
+        given = {"forearm": 1.0, **own, **(p or {})}
+        damping, fore = given["damping"], given["forearm"]
+        m_ss, m_se, m_ee = self._mass_matrix(elbow, fore)
+        swing = self._coupling * fore * elbow.sin()
+        load_s = given["shoulder_gain"] * (a3 - a4) - damping * v_s + swing * (2 * v_s + v_e) * v_e
+        load_e = given["elbow_gain"] * (a1 - a2) - damping * v_e - swing * v_s.square()
         determinant = m_ss * m_ee - m_se.square()
         shoulder_ddot = (m_ee * load_s - m_se * load_e) / determinant
         elbow_ddot = (m_ss * load_e - m_se * load_s) / determinant
@@ -119,11 +125,12 @@ class ArmEquation:
     def _coupling(self) -> float:
         return self.masses[1] * self.lengths[0] * self.centres[1]
 
-    def _mass_matrix(self, elbow: Tensor) -> tuple[Tensor, Tensor, float]:
-        m_ee = self.inertias[1] + self.masses[1] * self.centres[1] ** 2
+    def _mass_matrix(self, elbow: Tensor, fore: Any = 1.0) -> tuple[Tensor, Tensor, Any]:
+        mass = fore * self.masses[1]
+        m_ee = fore * self.inertias[1] + mass * self.centres[1] ** 2
         upper = self.inertias[0] + self.masses[0] * self.centres[0] ** 2
-        turn = self._coupling * elbow.cos()
-        m_ss = upper + self.masses[1] * self.lengths[0] ** 2 + m_ee + 2 * turn
+        turn = self._coupling * fore * elbow.cos()
+        m_ss = upper + mass * self.lengths[0] ** 2 + m_ee + 2 * turn
         return m_ss, m_ee + turn, m_ee
 
 
@@ -158,39 +165,28 @@ def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
 
 
 def torque_arm_physics(
-    gains: tuple[float, float] = (8.0, 4.0),
+    equation: ArmEquation,
     *,
     substeps: int = SUBSTEPS,
     gradient: Literal["autograd", "finite-difference"] = "autograd",
+    unknowns: Mapping[str, Unknown] | None = None,
 ) -> ODEPhysics:
     """The state of the arm 0.2 s later, under torques that follow the actions at once.
 
-    Unlike the environment, it does not clip actions.
+    Unlike the environment, it does not clip actions. It integrates by Runge-Kutta of order four.
 
     Args:
-        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
-            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
-        substeps: Integration steps, of 5 ms by default. With 8 (which err by 2e-4 rad) and
-            ``gradient="finite-difference"`` a gradient along an episode takes a tenth of the time.
+        equation: The arm.
+        substeps: Integration steps.
         gradient: As of :class:`~gpadjust.physics.ODEPhysics`.
-
-    Returns:
-        A physics of columns ``[theta_s, theta_e, theta_s_dot, theta_e_dot, a1, a2, a3, a4]``, in
-        rad and s, by Runge-Kutta of order four.
-
-    Raises:
-        ValueError: If the gains are not two finite numbers that are not negative.
-
-    Example:
-        >>> physics = torque_arm_physics()
-        >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
-        tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
+        unknowns: Parameters of the equation that are unknown.
     """
     return ODEPhysics(
-        torque_arm(gains),
+        equation,
         step=ARM_TIME_STEP,
         state_dim=4,
         substeps=substeps,
         name="torque_arm",
         gradient=gradient,
+        unknowns=unknowns,
     )

@@ -12,12 +12,12 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from gpadjust.envs import (
+from gpadjust.systems import CartPoleEquation, CartPoleSwingUpEnv
+from gpadjust.systems.cart_pole import (
     CART_POLE_SPEC,
-    CartPoleEquation,
-    CartPoleSwingUpEnv,
+    REAL_CART_POLE,
     cart_pole_cost,
-    cart_pole_physics,
+    equation_physics,
 )
 
 ID = "gpadjust/CartPoleSwingUp-v0"
@@ -62,7 +62,7 @@ def test_episode_is_truncated_after_25_steps():
 def test_trajectory_is_that_of_the_physics(states_and_forces):
     env = CartPoleSwingUpEnv()
     env.reset(seed=0)
-    physics = cart_pole_physics(0.5, 0.5, 0.6, 0.1)
+    physics = equation_physics(REAL_CART_POLE)
     state = torch.from_numpy(env.state).unsqueeze(0)
     for force in states_and_forces(25)[1].float():
         observation, reward, _, _, info = env.step(force.numpy())

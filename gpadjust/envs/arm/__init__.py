@@ -1,1 +1,0 @@
-"""A planar arm that reaches for targets, driven by muscles, or in the crude physics by torques."""

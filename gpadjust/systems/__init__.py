@@ -1,0 +1,49 @@
+"""Systems to control: each an environment, and what is known of it, in one object.
+
+To import this package registers the environments with Gymnasium; ``gym.make`` imports it by itself
+where the id names it, as in ``gym.make("gpadjust.systems:gpadjust/CartPoleSwingUp-v0")``.
+
+A step that failed, as where a simulator could not integrate, truncates the episode and says
+``info["step_failed"] = True``: its observation and reward are no data, and no learner of this
+library takes them as such. Environments of your own may say so, too.
+"""
+
+try:
+    import gymnasium as _gymnasium
+except ImportError as error:
+    raise ImportError(
+        'gpadjust.systems needs Gymnasium; run `pip install "gpadjust[rl]"`.'
+    ) from error
+
+from gpadjust.systems.arm import arm
+from gpadjust.systems.cart_pole import CartPoleEquation, cart_pole
+from gpadjust.systems.muscle_arm import MuscleArmEnv
+from gpadjust.systems.reaching import hand_distance_cm
+from gpadjust.systems.swing_up import CartPoleSwingUpEnv
+from gpadjust.systems.system import System
+from gpadjust.systems.torque_arm import ArmEquation
+from gpadjust.systems.wrappers import NoisySensors, RememberAction
+
+_gymnasium.register(
+    id="gpadjust/CartPoleSwingUp-v0",
+    entry_point="gpadjust.systems.swing_up:CartPoleSwingUpEnv",
+    max_episode_steps=25,
+)
+_gymnasium.register(
+    id="gpadjust/MuscleArm-v0",
+    entry_point="gpadjust.systems.muscle_arm:MuscleArmEnv",
+    max_episode_steps=15,
+)
+
+__all__ = [
+    "ArmEquation",
+    "CartPoleEquation",
+    "CartPoleSwingUpEnv",
+    "MuscleArmEnv",
+    "NoisySensors",
+    "RememberAction",
+    "System",
+    "arm",
+    "cart_pole",
+    "hand_distance_cm",
+]

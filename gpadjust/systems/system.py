@@ -1,0 +1,108 @@
+"""A system to control: its environment and what is known of it, in one object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+from torch import Tensor
+
+from gpadjust.physics import Physics, Unknown, as_physics
+from gpadjust.states import StateSpec
+
+if TYPE_CHECKING:
+    from gpadjust.control import Task
+    from gpadjust.dynamics import Dynamics
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A system to control: the real one as an environment, and what is known of it.
+
+    Args:
+        env: Makes the environment, such as its class; keyword arguments of :meth:`make` are passed
+            on.
+        spec: What the entries of states and actions are.
+        physics: f_p, the next values of the states that are neither exogenous nor previous values,
+            from these and the actions; possibly with unknown parameters.
+        reward: Known rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
+            states ``N x state_dim``.
+        start: Draws ``n`` states at which episodes start, ``n x state_dim``. Default: those at
+            which real episodes started.
+        terminated: Whether states ``N x state_dim`` end an episode, ``N`` booleans. Default: none.
+        episode_length: Steps after which an episode is truncated. Default: the time limit of the
+            environment.
+        state_bounds: As of a :class:`~gpadjust.control.Task`.
+
+    Raises:
+        TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec`` no
+            :class:`~gpadjust.states.StateSpec`.
+
+    Example:
+        >>> from gpadjust import systems
+        >>> cart_pole = systems.cart_pole(dry=0.5)
+        >>> env, task = cart_pole.make(), cart_pole.task()
+        >>> task.dynamics.spec.states
+        ('x', 'theta', 'x_dot', 'theta_dot')
+    """
+
+    env: Callable[..., gym.Env[Any, Any]]
+    spec: StateSpec
+    physics: Physics | Callable[[Tensor], Tensor]
+    reward: Callable[[Tensor, Tensor, Tensor], Tensor]
+    _: KW_ONLY
+    start: Callable[[int], Tensor] | None = None
+    terminated: Callable[[Tensor], Tensor] | None = None
+    episode_length: int | None = None
+    state_bounds: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        """Check the parts that a task does not check."""
+        if not isinstance(self.spec, StateSpec):
+            raise TypeError(f"spec must be a StateSpec; found {self.spec!r}.")
+        for name in ("env", "reward"):
+            if not callable(getattr(self, name)):
+                hint = ", its class or `lambda: env`" if name == "env" else ""
+                raise TypeError(f"{name} must be a function{hint}; found {getattr(self, name)!r}.")
+        object.__setattr__(self, "physics", as_physics(self.physics))
+
+    @property
+    def unknowns(self) -> Mapping[str, Unknown]:
+        """The unknown parameters of the physics, by name."""
+        return as_physics(self.physics).unknowns
+
+    def make(self, **options: Any) -> gym.Env[Any, Any]:
+        """Make an environment, truncated after ``episode_length`` steps.
+
+        Args:
+            options: Keyword arguments of ``env``, such as ``render_mode="human"``.
+        """
+        env = self.env(**options)
+        if self.episode_length is None or (env.spec and env.spec.max_episode_steps):
+            return env
+        return gym.wrappers.TimeLimit(env, self.episode_length)
+
+    def task(self, dynamics: Dynamics | None = None) -> Task:
+        """The task that agents and planners take.
+
+        Args:
+            dynamics: The model of the system, which learns: make others for another run. Default:
+                :class:`~gpadjust.dynamics.LearnedDynamics` with the physics.
+
+        Raises:
+            TypeError: If ``dynamics`` are none, or a function takes other arguments.
+            ValueError: If a number or the bounds are out of range.
+        """
+        from gpadjust.control import Task
+        from gpadjust.dynamics import LearnedDynamics
+
+        return Task(
+            LearnedDynamics(self.spec, self.physics) if dynamics is None else dynamics,
+            self.reward,
+            terminated=self.terminated,
+            initial_states=self.start,
+            episode_length=self.episode_length,
+            state_bounds=self.state_bounds,
+        )

@@ -1,0 +1,228 @@
+"""Dynamics that are a physics with unknown parameters, fitted by least squares of one step."""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.inference.calibrate import ParameterWarning
+from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
+
+LINE = StateSpec(["x"], ["a"])
+TRUTH = {"gravity": 9.0, "drag": 0.3}
+
+
+def pendulum(state, action, p):
+    theta, rate = state.unbind(-1)
+    return torch.stack([rate, -p.gravity * theta.sin() - p.drag * rate + action[:, 0]], -1)
+
+
+def swing(**guesses):
+    unknowns = {
+        "gravity": Unknown(guesses.get("gravity", 6.0), factor=2.0),
+        "drag": Unknown(guesses.get("drag", 0.1), bounds=(0.0, 1.0)),
+    }
+    return ODEPhysics(pendulum, 0.1, 2, substeps=4, unknowns=unknowns)
+
+
+PENDULUM = StateSpec(["theta", "rate"], ["torque"], angles=["theta"])
+
+
+def swings(n=60, noise=0.0, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    states = 3 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    actions = torch.randn(n, 1, generator=generator, dtype=torch.float64)
+    values = torch.tensor([*TRUTH.values()], dtype=torch.float64)
+    following = swing()(torch.cat([states, actions], -1), values)
+    sd = noise * torch.tensor([0.1, 1.0], dtype=torch.float64)
+    following = following + sd * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    return states, actions, following
+
+
+def found(dynamics):
+    parameters = dynamics.physics_parameters
+    return {name: parameters[name].median().item() for name in parameters}
+
+
+def test_without_noise_the_parameters_are_exact():
+    dynamics = PhysicsDynamics(PENDULUM, swing())
+    assert dynamics.physics_parameters.mean.tolist() == [6.0, 0.1]
+    states, actions, following = swings()
+    dynamics.update(states, actions, following)
+    assert found(dynamics) == pytest.approx(TRUTH, rel=1e-6)
+    mean, variance = dynamics.predict(states, actions)
+    torch.testing.assert_close(mean, following, rtol=0, atol=1e-6)
+    assert (variance < 1e-10).all()
+
+
+def test_angles_that_come_wrapped_are_the_same():
+    states, actions, following = swings()
+    one, other = PhysicsDynamics(PENDULUM, swing()), PhysicsDynamics(PENDULUM, swing())
+    one.update(states, actions, following)
+    wrapped = following.clone()
+    wrapped[:, 0] = torch.atan2(following[:, 0].sin(), following[:, 0].cos())
+    assert (wrapped - following).abs().max() > 6
+    other.update(states, actions, wrapped)
+    assert found(other) == pytest.approx(found(one), rel=1e-6)
+
+
+def test_standard_errors_are_those_of_repeated_data():
+    estimates, errors = [], []
+    for seed in range(40):
+        dynamics = PhysicsDynamics(PENDULUM, swing())
+        dynamics.update(*swings(40, noise=0.1, seed=seed))
+        estimates.append(dynamics.physics_parameters.mean)
+        errors.append(dynamics.physics_parameters.sd)
+    spread, said = torch.stack(estimates).std(0), torch.stack(errors).mean(0)
+    assert (said / spread > 0.75).all()
+    assert (said / spread < 1.33).all()
+    truth = torch.tensor([*TRUTH.values()], dtype=torch.float64)
+    assert ((torch.stack(estimates).mean(0) - truth).abs() < 4 * spread / 40**0.5).all()
+
+
+def test_linear_parameters_of_one_output_are_those_of_lstsq():
+    generator = torch.Generator().manual_seed(1)
+    X = torch.randn(30, 2, generator=generator, dtype=torch.float64)
+    y = X @ torch.tensor([[0.4], [-1.3]], dtype=torch.float64)
+    y = y + 0.2 * torch.randn(30, 1, generator=generator, dtype=torch.float64)
+    unknowns = {"a": Unknown(0.0, sd=1e3), "b": Unknown(0.0, sd=1e3)}
+    line = FunctionPhysics(lambda X, p: p.a * X[:, 0] + p.b * X[:, 1], unknowns=unknowns)
+    dynamics = PhysicsDynamics(LINE, line)
+    dynamics.update(X[:, :1], X[:, 1:], y)
+    expected = torch.linalg.lstsq(X, y).solution.flatten()
+    torch.testing.assert_close(dynamics._values, expected, rtol=1e-4, atol=1e-5)
+    rest = y - X @ expected.unsqueeze(-1)
+    variance = rest.square().sum() / 28  # two degrees of freedom less
+    torch.testing.assert_close(dynamics.noise_variance(y[:1], y[:1]), variance.view(1, 1))
+    errors = (variance * torch.linalg.inv(X.mT @ X).diagonal()).sqrt()
+    # The density takes the mean square without these degrees.
+    errors = errors * (28 / 30) ** 0.5
+    torch.testing.assert_close(dynamics.physics_parameters.sd, errors, rtol=0.02, atol=0)
+
+
+def test_each_state_counts_in_units_of_its_own_error():
+    states, actions, following = swings(60, noise=0.1)
+    following[:, 0] += 0.8 * torch.randn(60, generator=torch.Generator().manual_seed(3)).double()
+    dynamics = PhysicsDynamics(PENDULUM, swing())
+    dynamics.update(states, actions, following)
+    assert found(dynamics)["gravity"] == pytest.approx(9.0, rel=0.03)
+    noise = dynamics.noise_variance(states[:1], actions[:1]).sqrt()[0]
+    assert noise.tolist() == pytest.approx([0.8, 0.1], rel=0.2)
+
+
+def test_a_parameter_of_which_nothing_is_known_stays_where_it_was():
+    states, actions, following = swings(noise=0.01)
+    states[:, 1] = 0  # no drag
+    unknowns = {**swing().unknowns, "buoyancy": Unknown(2.0, sd=0.5)}
+    physics = ODEPhysics(pendulum, 0.1, 2, substeps=4, unknowns=unknowns)
+    dynamics = PhysicsDynamics(PENDULUM, physics)
+    with pytest.warns(ParameterWarning, match="next to nothing of .*buoyancy"):
+        dynamics.update(states, actions, following)
+    assert found(dynamics)["buoyancy"] == pytest.approx(2.0, abs=0.01)
+    assert dynamics.physics_parameters.sd[2] == pytest.approx(0.5, rel=0.02)
+
+
+def test_entries_that_were_not_measured_are_left_out():
+    states, actions, following = swings(80, noise=0.05)
+    gaps = following.clone()
+    gaps[40:, 0] = torch.nan
+    gaps[:40, 1] = torch.nan
+    dynamics = PhysicsDynamics(PENDULUM, swing())
+    dynamics.update(states, actions, gaps)
+    assert found(dynamics)["gravity"] == pytest.approx(9.0, rel=0.03)
+    assert dynamics.noise_variance(states, actions).isfinite().all()
+
+
+def test_an_update_goes_by_all_transitions_so_far():
+    states, actions, following = swings(60, noise=0.1)
+    at_once, later = PhysicsDynamics(PENDULUM, swing()), PhysicsDynamics(PENDULUM, swing())
+    at_once.update(states, actions, following)
+    later.update(states[:20], actions[:20], following[:20])
+    before = later.mean_function()
+    first = before(states, actions)
+    later.update(states[20:], actions[20:], following[20:])
+    assert torch.equal(later._values, at_once._values)
+    assert torch.equal(before(states, actions), first)  # a function stays as it was
+    assert not torch.equal(later.mean_function()(states, actions), first)
+
+
+def test_a_dynamics_that_was_saved_goes_on_bit_for_bit():
+    states, actions, following = swings(60, noise=0.1)
+    one, other = PhysicsDynamics(PENDULUM, swing()), PhysicsDynamics(PENDULUM, swing())
+    one.update(states[:30], actions[:30], following[:30])
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(one.predict(states, actions).mean, other.predict(states, actions).mean)
+    for dynamics in (one, other):
+        dynamics.update(states[30:], actions[30:], following[30:])
+    assert torch.equal(one._values, other._values)
+    assert torch.equal(one.physics_parameters.draws, other.physics_parameters.draws)
+    other.load_state_dict(PhysicsDynamics(PENDULUM, swing()).state_dict())
+    assert found(other) == {"gravity": 6.0, "drag": 0.1}
+
+
+def test_a_state_of_others_is_refused():
+    dynamics = PhysicsDynamics(PENDULUM, swing())
+    dynamics.update(*swings(20))
+    state = dynamics.state_dict()
+    with pytest.raises(RuntimeError, match=r"unknowns is .* in the state"):
+        PhysicsDynamics(PENDULUM, swing(gravity=7.0)).load_state_dict(state)
+    for damage in ({"point": torch.zeros(3).double()}, {"noise": None}, {"transitions": {}}):
+        damaged = {**state, "fitted": {**state["fitted"], **damage}}
+        with pytest.raises(RuntimeError, match="damaged"):
+            PhysicsDynamics(PENDULUM, swing()).load_state_dict(damaged)
+
+
+def test_values_at_which_the_physics_fails_are_not_tried_further():
+    def root(X, p):
+        if (p.a < 0.5).any():
+            raise ValueError("no such thing")
+        return (p.a - 0.5).sqrt().unsqueeze(-1) * X[:, :1]
+
+    x = torch.linspace(1, 2, 9, dtype=torch.float64).unsqueeze(-1)
+    physics = FunctionPhysics(root, unknowns={"a": Unknown(1.0, bounds=(0.0, 3.0))})
+    dynamics = PhysicsDynamics(LINE, physics)
+    dynamics.update(x, x, 0.5 * x)
+    assert dynamics._values.item() == pytest.approx(0.75, rel=1e-6)
+    always = FunctionPhysics(lambda X, p: X[:, :1] / 0, unknowns={"a": Unknown(1.0, sd=1.0)})
+    with pytest.raises(PhysicsError, match="NaN or inf"):
+        PhysicsDynamics(LINE, always).update(x, x, x)
+
+
+def test_several_optima_are_told_apart():
+    """A sine of unknown frequency: from the guess alone, descent ends elsewhere."""
+    x = torch.linspace(0, 3, 25, dtype=torch.float64).unsqueeze(-1)
+    physics = FunctionPhysics(
+        lambda X, p: (p.omega * X[:, 0]).sin(), unknowns={"omega": Unknown(2.0, bounds=(0.0, 20.0))}
+    )
+    dynamics = PhysicsDynamics(LINE, physics)
+    dynamics.update(x, x, (13.0 * x).sin())
+    assert dynamics._values.item() == pytest.approx(13.0, rel=1e-6)
+
+
+def test_samples_have_the_noise_and_functions_have_none():
+    states, actions, following = swings(60, noise=0.3)
+    dynamics = PhysicsDynamics(PENDULUM, swing())
+    dynamics.update(states, actions, following)
+    state, action = states[:1].expand(4000, -1), actions[:1].expand(4000, -1)
+    drawn = dynamics.sample(state, action)
+    mean, variance = dynamics.predict(states[:1], actions[:1])
+    torch.testing.assert_close(drawn.mean(0), mean[0], rtol=0, atol=0.02)
+    torch.testing.assert_close(drawn.var(0), variance[0], rtol=0.1, atol=0)
+    functions = dynamics.sample_functions(2)(states.expand(2, -1, -1), actions.expand(2, -1, -1))
+    assert torch.equal(functions[0], functions[1])
+    assert math.isclose(variance[0, 1] ** 0.5, 0.3, rel_tol=0.2)
+
+
+def test_more_transitions_than_are_searched_by():
+    dynamics = PhysicsDynamics(PENDULUM, swing())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dynamics.update(*swings(2000, noise=0.1))
+    assert found(dynamics) == pytest.approx(TRUTH, rel=0.05)
+
+
+def test_a_physics_without_unknowns_has_no_parameters():
+    with pytest.raises(ValueError, match="no unknown parameters"):
+        PhysicsDynamics(LINE, lambda X: X[:, :1]).physics_parameters  # noqa: B018
