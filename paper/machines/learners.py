@@ -64,7 +64,8 @@ def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:
         if known.model is None:
             return fitted
         fitted.update(*data)
-        physics = fitted.physics
+        found = fitted.physics_parameters
+        physics = machine.physics(dict(zip(found, found.mean.tolist(), strict=True)))
     elif known.physics != "none":
         physics = machine.physics(known.physics)
     if known.model is None:
