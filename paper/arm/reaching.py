@@ -20,6 +20,7 @@ from torch import Tensor
 from gpadjust.control import PolicySearch, PolicySearchAgent, mlp_policy
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.physics import as_physics
 from gpadjust.states import StateSpec
 from gpadjust.systems import System, arm
 from gpadjust.systems.reaching import (
@@ -161,7 +162,7 @@ def bounds(spec: StateSpec) -> Tensor:
 def dynamics(settings: ReachingSettings, system: str, learner: str) -> Dynamics:
     """What the policy is trained in, at its start."""
     arm = system_of(system, settings, unknowns=learner == "fitted")
-    spec, physics = arm.spec, arm.physics
+    spec, physics = arm.spec, as_physics(arm.physics)
     if learner in ("phy", "fitted"):
         return PhysicsDynamics(spec, physics)
     if learner == "ensemble":

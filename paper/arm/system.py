@@ -36,7 +36,8 @@ def setup(scenario: Scenario, settings: Settings) -> Setup:
         opensim=settings.black_box,
         episode_length=settings.episode_length,
     )
-    model = dynamics(scenario, settings, system.spec, system.physics, system.physics)
+    physics: Any = system.physics
+    model = dynamics(scenario, settings, system.spec, physics, physics)
     recorder = ArmRecorder(settings, scenario.kind == "none")
     return Setup(system.make(), system.task(model), recorder)
 

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -357,6 +358,10 @@ TARGETS = {
 }
 
 
+def _ticks(ax: Axes, title: str, own: pd.DataFrame) -> None:
+    ax.set_xticks(range(1, own["episode"].max() + 1))
+
+
 def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
     """Draw the cost of the trials, models over each other, a panel for each system."""
     trials = frame(runs, "trials")
@@ -367,10 +372,9 @@ def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
         return f"{system} ({few if few == many else f'{few} to {many}'} runs)"
 
     parts = {title(label, own): own for label, own in groups(trials, "system", _SYSTEMS).items()}
-    lines = {
-        name: (label, "tab:cyan" if name == "search" else LEARNERS[name].color)
-        for name, label in _LEARNERS.items()
-    }
+    colors = {name: known.color for name, known in LEARNERS.items()}
+    colors |= {"search": "tab:cyan", "structured": "tab:olive"}
+    lines = {name: (label, colors[name]) for name, label in _LEARNERS.items()}
     return [
         draw_curves(
             experiment.out / "planning.png",
@@ -379,6 +383,6 @@ def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
             lines,
             labels=("trial", "cost, median and quartiles"),
             share=False,
-            finish=lambda ax, _, own: ax.set_xticks(range(1, own["episode"].max() + 1)),
+            finish=_ticks,
         )
     ]

@@ -17,6 +17,7 @@ from gpadjust.systems.cart_pole import (
     REAL_CART_POLE,
     START_MEAN,
     START_STD,
+    believed_cart_pole,
     cart_pole_reward,
     equation_physics,
 )
@@ -28,7 +29,8 @@ def setup(scenario: Scenario, settings: Settings, seed: int) -> Setup:
     """A run's cart-pole, its task, and its recorder."""
     length, encode = settings.episode_length, settings.encode_angle
     system = cart_pole(seed, encode_angle=encode, episode_length=length)
-    model = dynamics(scenario, settings, system.spec, system.physics, true_physics())
+    physics: Any = system.physics
+    model = dynamics(scenario, settings, system.spec, physics, true_physics())
     recorder = CartPoleRecorder(settings, scenario.kind == "none", seed)
     return Setup(system.make(), system.task(model), recorder)
 
@@ -85,4 +87,4 @@ class CartPoleRecorder(Recorder):
 
     def found(self) -> dict[str, Any]:
         """The records, and the parameters of f_p, which are random."""
-        return {"physics": vars(cart_pole(self.seed).physics.rhs), **super().found()}
+        return {"physics": vars(believed_cart_pole(self.seed)), **super().found()}

@@ -58,7 +58,8 @@ def learnt(name: str, machine: Machine, data: Any, seed: int) -> Learnt:
 
 
 def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:
-    known, physics = REAL_LEARNERS[name], None
+    known = REAL_LEARNERS[name]
+    physics: Any = None
     if known.physics == "fitted":
         fitted = PhysicsDynamics(machine.spec, machine.physics())
         if known.model is None:
