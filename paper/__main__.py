@@ -11,56 +11,22 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
 
-EXPERIMENTS = {
-    "forrester": ("forrester:Forrester", "eight models of Forrester's function (figure 1)"),
-    "multifidelity": ("pairs:Multifidelity", "eight methods on functions of low and high fidelity"),
-    "calibration": (
-        "calibration:Calibration",
-        "do intervals hold? CKA by each method of inference",
-    ),
-    "structures": (
-        "structures:Structures",
-        "does the richer model pay? CKA beside what it contains",
-    ),
-    "active": ("active:Active", "error over measurements, by who chooses them"),
-    "cartpole": ("cartpole:CartPole", "learners that swing up a cart-pole"),
-    "arm": ("arm:Arm", "learners that reach with a muscle arm"),
-    "foresight": ("machines:Foresight", "do dynamics foresee the next trial, and know how well?"),
-    "planning": ("cartpole:Planning", "cart-poles that are swung up by planning in several models"),
-    "reaching": (
-        "arm:Reaching",
-        "muscle arms that reach after a few trials, by several models",
-    ),
-    "parameters": (
-        "parameters:Parameters",
-        "intervals of a physics' parameters, by several discrepancies",
-    ),
-    "real": ("machines:Real", "learners of real machines, by free runs beside what was measured"),
-    "elsewhere": ("machines:Elsewhere", "free runs on other torques, loads, days and machines"),
-    "tanks": ("machines:Tanks", "cascaded tanks: structures of f_p and GPs, by a free run"),
-    "large": ("large:Large", "100,000 observations: inducing points, or an exact model of some"),
-    "optimisation": (
-        "optimisation:Optimisation",
-        "trials of Bayesian optimisation in Ax, with and without f_p",
-    ),
-    "misled": ("misled:Misled", "Bayesian optimisation with a physics that misleads, or helps"),
-    "choice": ("structures:Choice", "a physics of no use, and what compare recommends"),
-    "kinks": (
-        "machines:Kinks",
-        "next states of systems with dry friction, impacts, gaps and switches",
-    ),
-    "ridges": (
-        "parameters:Ridges",
-        "intervals of parameters on a ridge, or of which several values do",
-    ),
-    "polynomials": (
-        "pairs:Polynomials",
-        "CKA, AR1 and MFK on functions that are nearly polynomials",
-    ),
-    "seeds": ("calibration:Seeds", "fits of the same data by several seeds, beside long sampling"),
-    "floor": ("cartpole:Floor", "what the control tasks cost at best"),
+CHAPTERS = {
+    "forrester": ("Forrester",),
+    "pairs": ("Multifidelity", "Polynomials", "Large"),
+    "calibration": ("Calibration", "Seeds"),
+    "structures": ("Structures", "Choice"),
+    "parameters": ("Parameters", "Ridges"),
+    "measuring": ("Active", "Optimisation", "Misled"),
+    "cartpole": ("CartPole", "Planning", "Floor"),
+    "arm": ("Arm", "Reaching"),
+    "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
-"""By name, its class (with the chapter that declares it) and what it is about."""
+"""Folders, and the classes of the experiments that they declare."""
+EXPERIMENTS = {
+    kind.lower(): f"paper.{chapter}:{kind}" for chapter, kinds in CHAPTERS.items() for kind in kinds
+}
+"""Classes of the experiments, by their names."""
 _OTHER = {
     "all": "run what is missing of every experiment, with --out paper/results/NAME, then report",
     "report": "copy the results that are committed into the pages",
@@ -74,13 +40,13 @@ def main() -> None:
         _run(name, arguments)
     elif name == "all":  # options are those that all experiments have
         for each in EXPERIMENTS:
-            print(f"\n{each}: {EXPERIMENTS[each][1]}")
+            print(f"\n{each}: {_about(each)}")
             _run(each, ["--out", f"{Path(__file__).parent}/results/{each}", *arguments])
         import_module("paper.report").report()
     elif name == "report" and not arguments:
         import_module("paper.report").report()
     else:
-        lines = [f"  {known:<15}{what}" for known, (_, what) in EXPERIMENTS.items()]
+        lines = [f"  {known:<15}{_about(known)}" for known in EXPERIMENTS]
         lines += [f"  {known:<15}{what}" for known, what in _OTHER.items()]
         usage = f"usage: python -m paper experiment [options]\n\n{__doc__}\n" + "\n".join(lines)
         if {"-h", "--help"} & {name, *arguments}:
@@ -89,10 +55,15 @@ def main() -> None:
         raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
 
 
+def _about(name: str) -> str:
+    """The first line of what its class says."""
+    return str(resolve_name(EXPERIMENTS[name]).__doc__).partition("\n")[0]
+
+
 def _run(name: str, arguments: list[str]) -> None:
     import tyro
 
-    kind = resolve_name(f"paper.{EXPERIMENTS[name][0]}")
+    kind = resolve_name(EXPERIMENTS[name])
     config = [tyro.conf.FlagCreatePairsOff, *([tyro.conf.OmitArgPrefixes] if kind.flat else [])]
     experiment = tyro.cli(kind, prog=f"python -m paper {name}", args=arguments, config=config)
     runner = import_module("paper.common.runner")

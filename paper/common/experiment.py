@@ -8,7 +8,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from pkgutil import resolve_name
@@ -18,8 +17,6 @@ Case = tuple[Any, ...]
 """What is run once: a value of each axis, and a seed."""
 Run = dict[str, Any]
 """A case that was run: its values by name, what identifies the run, and what it found."""
-Task = Case  # goes, like Record, when no chapter needs it
-Record = Run
 Axes = Mapping[str | tuple[str, ...], Mapping[Any, str]]
 
 
@@ -38,11 +35,11 @@ class Experiment:
     ``axes``, and with settings as further fields; it imports nothing slow, because the command line
     is made of it. Beside it lies a module with the ``name`` of each experiment, which has
 
-    - ``run(experiment, *case)``: runs a case with one thread; returns what it found, as JSON has it.
+    - ``run(experiment, *case)``: runs a case with one thread; returns what it found, for JSON.
       A run that can go on after an interruption keeps its state at ``experiment.unfinished(*case)``
       (a path, to which it adds a suffix) and removes it when it ends.
     - ``tables(runs, experiment)``: tables of all runs, by name.
-    - ``first_look(runs)``, if wanted: a short table of the first few runs, None if they are too few.
+    - ``first_look(runs)``, if wanted: a short table of the first runs, None if they are too few.
     - ``draw(runs, experiment)``, if there are figures: draws them into ``experiment.out`` and
       returns their files.
     """
@@ -64,7 +61,7 @@ class Experiment:
     """run nothing; make tables and figures of the runs that are there"""
     other_versions: Literal["refuse", "keep", "replace"] = "refuse"
     """what becomes of runs of other versions of the packages, or of other defaults of the library,
-    if more are to be run: nothing is run, they are kept beside the new ones, or they are run again"""
+    if more are to be run: nothing is run, they are kept with the new ones, or they are run again"""
 
     name: ClassVar[str]
     """on the command line, and in the markers of the pages"""
@@ -105,8 +102,6 @@ class Experiment:
         Raises:
             ValueError: If ``only`` has a name that no axis has.
         """
-        if hasattr(self, "tasks"):  # goes when all chapters have axes
-            return [tuple(task) for task in self.tasks()]
         parts = [
             [value if isinstance(name, tuple) else (value,) for value in values]
             for name, values in self.axes.items()
@@ -170,26 +165,7 @@ class Experiment:
 
     def _module(self) -> Any:
         """The experiment's module, imported when it is needed."""
-        if find_spec(f"{type(self).__module__}.{self.name}") is None:  # goes with the old chapters
-            return _Old(type(self).__module__)
         return import_module(f"{type(self).__module__}.{self.name}")
-
-
-class _Old:
-    """The modules of a chapter of the old form; goes when there is none."""
-
-    def __init__(self, folder: str) -> None:
-        self.folder = folder
-
-    def run(self, experiment: Any, *case: Any) -> Any:
-        module = import_module(f"{self.folder}.run")
-        return module.run(experiment, *case, unfinished=experiment.unfinished(*case))
-
-    def __getattr__(self, name: str) -> Any:
-        part = {"draw": "figure"}.get(name, "tables")
-        if find_spec(f"{self.folder}.{part}") is None:
-            raise AttributeError(name)
-        return getattr(import_module(f"{self.folder}.{part}"), name)
 
 
 def title(case: Case) -> str:

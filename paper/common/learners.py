@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, wraps
 from pkgutil import resolve_name
 from typing import Any
 
@@ -34,8 +34,9 @@ class Learner:
             raise ValueError(f"{self.label}: the chapter makes its model")
         kind = resolve_name(f"gpadjust.models:{self.model}")
         if self.adjusts:
-            return partial(kind, **self.options)
+            return partial(kind, **self.options) if self.options else kind
 
+        @wraps(kind)
         def without_physics(X: Any, Y: Any, physics: Any = None, **options: Any) -> Any:
             return kind(X, Y, **{**self.options, **options})
 

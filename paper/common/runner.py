@@ -138,9 +138,9 @@ def run_one(experiment: Experiment, case: Case) -> Case:
 def check_settings(path: Path, case: Case, run: Run, experiment: Experiment) -> None:
     """Refuse a run that was made with other settings, and say which.
 
-    Settings that it lacks are not meant: a run without them is one of another version.
+    Settings that only one of them has are not meant: such a run is one of another version.
     """
-    differ = differences(run["settings"], _described(experiment, case[:-1]), new=False)
+    differ = differences(run["settings"], _described(experiment, case[:-1]), of_both=True)
     if differ:
         raise Refused(
             f"{path}: {title(case)} was made with other settings: {differ}. Choose another --out, "
@@ -149,7 +149,7 @@ def check_settings(path: Path, case: Case, run: Run, experiment: Experiment) -> 
 
 
 def _by_others(run: Run, experiment: Experiment, asked: bool = True) -> str:
-    """The first version, default or new setting in which a run differs; empty if there is none.
+    """The first version, default or setting in which a run differs; empty if there is none.
 
     Of the packages, those count that are still used; of the settings, those of kinds of cases that
     are asked for.

@@ -85,18 +85,20 @@ class RunsFile:
         return self.path.read_bytes().rfind(b"\n") + 1
 
 
-def differences(found: Mapping[str, Any], expected: Mapping[str, Any], *, new: bool = True) -> str:
+def differences(
+    found: Mapping[str, Any], expected: Mapping[str, Any], *, of_both: bool = False
+) -> str:
     """The first entry that differs, in words; empty if there is none. Python's version may.
 
     Args:
         found: Of a run.
         expected: As it would be now.
-        new: Whether entries that only ``expected`` has count.
+        of_both: Whether only entries that both have count.
     """
-    for name in {**found, **expected} if new else found:
+    for name in [n for n in found if n in expected] if of_both else {**found, **expected}:
         was, now = found.get(name, "not there"), expected.get(name, "not there")
         if isinstance(was, dict) and isinstance(now, dict):
-            inner = differences(was, now, new=new)
+            inner = differences(was, now, of_both=of_both)
             if inner:
                 return f"{name}.{inner}"
         elif was != now and name != "python":

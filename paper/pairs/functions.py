@@ -67,6 +67,15 @@ class Pair:
         """The function of low fidelity as f_p, with an empty memo."""
         return BlackBoxPhysics(self.low, gradient=None, name=f"{self.name}, low fidelity")
 
+    def smooth_physics(self) -> BlackBoxPhysics:
+        """The same with gradients by finite differences, also at the bounds, where inputs end."""
+        lower, upper = self.bounds.numpy()
+
+        def low(X: Array) -> Array:
+            return self.low(np.clip(X, lower, upper))
+
+        return BlackBoxPhysics(low, name=f"{self.name}, low fidelity")
+
     def scaled(self, unit: Tensor) -> Tensor:
         """Map the unit cube to the bounds."""
         return self.bounds[0] + (self.bounds[1] - self.bounds[0]) * unit

@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 from botorch.exceptions.warnings import OptimizationWarning
-from gpadjust.dynamics.scores import score_transitions
 from torch import Tensor
 
 from gpadjust import fit
@@ -76,8 +75,7 @@ def _of_system(data: System, name: str) -> Run:
         return dynamics
 
     dynamics, found = _timed(learnt)
-    prediction = dynamics.predict(data.test.states, data.test.actions)
-    scores = score_transitions(data.spec, prediction, data.test)
+    scores = dynamics.score(*data.test)
     change = data.spec.change(data.test.states, data.test.next_states)[:, data.spec.moving]
     sd = change.std(0)
     return {

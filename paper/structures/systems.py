@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -18,11 +18,11 @@ from gpadjust.states import StateSpec
 from gpadjust.systems import CartPoleSwingUpEnv, MuscleArmEnv, arm, cart_pole
 from gpadjust.systems.cart_pole import CART_POLE_SPEC
 from gpadjust.systems.reaching import ARM_SPEC
-from paper.real.systems import DATA
+from paper.machines.pendulums import Rates, double_pendulum, pendulum, sums_of_masses
+from paper.machines.records import DATA
 from paper.structures import ARM, SIMULATED
 
 CONTROL_STEP = 0.04  # s
-_GRAVITY = 9.81
 _TEST_SEED = 20_000  # no run has it
 _EPISODE = {"arm": 15, "cart-pole": 25}  # steps, as the environments' ids have them
 _TRAIN = {"pendulum": ("energy_shaping",), "double-pendulum": ("00", "02", "03")}
@@ -113,41 +113,18 @@ def recorded(name: str, numbers: tuple[str, ...]) -> Trajectories:
 def pendulum_physics() -> ODEPhysics:
     """A point mass on a rod, of the authors' mass and length, without friction."""
     mass, length = 0.6755, 0.5
-
-    def rates(state: Tensor, action: Tensor) -> Tensor:
-        q, dq = state.unbind(-1)
-        torque = action[:, 0] - mass * _GRAVITY * length * q.sin()
-        return torch.stack([dq, torque / (mass * length**2)], dim=-1)
-
-    return _step(rates, 2, "pendulum")
+    known = {"inertia": mass * length**2, "moment": mass * length, "viscous": 0.0, "coulomb": 0.0}
+    return _step(pendulum, known, 2, "pendulum")
 
 
 def double_pendulum_physics() -> ODEPhysics:
-    """Two rigid links with the parameters of the authors' first model, without friction.
-
-    The equation of motion of Spong, Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006,
-    section 7.3, with inertias about the joints.
-    """
-    mass_1, mass_2, length, centre_1, centre_2 = 0.608, 0.630, 0.3, 0.275, 0.166
-    inertia_1, inertia_2 = 0.0547, 0.0252
-    coupling = mass_2 * length * centre_2
-
-    def rates(state: Tensor, action: Tensor) -> Tensor:
-        q1, q2, dq1, dq2 = state.unbind(-1)
-        across = inertia_2 + coupling * q2.cos()
-        whole = inertia_1 + mass_2 * length**2 + coupling * q2.cos() + across
-        swing = coupling * q2.sin()
-        both = mass_2 * centre_2 * _GRAVITY * (q1 + q2).sin()
-        first = (mass_1 * centre_1 + mass_2 * length) * _GRAVITY * q1.sin()
-        torque_1 = action[:, 0] + swing * (2 * dq1 + dq2) * dq2 - first - both
-        torque_2 = action[:, 1] - swing * dq1.square() - both
-        size = whole * inertia_2 - across.square()
-        ddq1 = (inertia_2 * torque_1 - across * torque_2) / size
-        ddq2 = (whole * torque_2 - across * torque_1) / size
-        return torch.stack([dq1, dq2, ddq1, ddq2], dim=-1)
-
-    return _step(rates, 4, "double_pendulum")
+    """Two rigid links with the parameters of the authors' first model, without friction."""
+    known = sums_of_masses((0.608, 0.0547, 0.275), (0.630, 0.0252, 0.166), 0.3, rotor=0.0)
+    return _step(double_pendulum, known, 4, "double_pendulum")
 
 
-def _step(rates: Callable[[Tensor, Tensor], Tensor], state_dim: int, name: str) -> ODEPhysics:
-    return ODEPhysics(rates, step=CONTROL_STEP, state_dim=state_dim, substeps=4, name=name)
+def _step(rates: Rates, parameters: Mapping[str, float], dim: int, name: str) -> ODEPhysics:
+    def known(state: Tensor, action: Tensor) -> Tensor:
+        return rates(state, action, parameters)
+
+    return ODEPhysics(known, step=CONTROL_STEP, state_dim=dim, substeps=4, name=name)

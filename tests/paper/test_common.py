@@ -153,7 +153,7 @@ def test_pages_show_the_committed_results(path):
 
 def committed(name):
     """An experiment, and its runs that are committed."""
-    kind = resolve_name(f"paper.{EXPERIMENTS[name][0]}")
+    kind = resolve_name(EXPERIMENTS[name])
     experiment = kind(out=PAPER / "results" / name)
     return experiment, runs_file(experiment).read()
 
@@ -165,7 +165,7 @@ def test_committed_runs_have_the_settings_of_today(name):
     today = {kind: experiment.describe(*kind) for kind in {case[:-1] for case in runs}}
     for case, run in runs.items():
         expected = json.loads(json.dumps(today[case[:-1]]))
-        assert not differences(run["settings"], expected, new=False), case
+        assert not differences(run["settings"], expected, of_both=True), case
 
 
 @pytest.mark.slow

@@ -3,25 +3,37 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 
 from gpadjust import CKA, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.systems import cart_pole
-from paper.active import Active
-from paper.active import Settings as ActiveSettings
-from paper.active import run as active_run
-from paper.active.problems import problem
-from paper.active.run import LEARNERS, integrated_variance, measured, scored
-from paper.active.tables import needed, verdicts
 from paper.common.runner import main, run_missing, runs_file
+from paper.measuring import (
+    HELPS,
+    MISLEADS,
+    Active,
+    Misled,
+    MisledSettings,
+    Optimisation,
+    OptimisationSettings,
+    Settings,
+    active,
+    misled,
+    optimisation,
+    searched,
+)
+from paper.measuring.active import CHOOSERS, integrated_variance, measured, needed, scored, verdicts
+from paper.measuring.problems import problem
+from paper.measuring.searched import reactor, textbook
 
 # The tiny settings stop optimisations early.
 pytestmark = pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.BotorchWarning")
 
 
-TINY = ActiveSettings(
+TINY = Settings(
     budget=6,
     every=2,
     num_test=20,
@@ -63,14 +75,14 @@ def test_the_cart_pole():
     believed = cart_pole(3).physics(X) - X[:, :4]
     torch.testing.assert_close(system.physics(X), believed)
     X = system.sobol(6, 0)
-    for kind, expected in (("CKA", CKA), ("physics mean", PhysicsMeanGP), ("GP", ZeroMeanGP)):
+    for kind, expected in (("literal", CKA), ("phymean", PhysicsMeanGP), ("gp", ZeroMeanGP)):
         model = system.model(X, system.truth(X), kind)
         assert isinstance(model, expected)
         once_round = X + torch.tensor([0, 2 * math.pi, 0, 0, 0], dtype=torch.float64)
         torch.testing.assert_close(model.predict(X).mean, model.predict(once_round).mean)
 
 
-@pytest.mark.parametrize("kind", ["CKA", "GP"])
+@pytest.mark.parametrize("kind", ["literal", "gp"])
 def test_integrated_variance_of_outputs_is_the_sum_in_their_units(kind):
     system = problem("cartpole", 0)
     X, points, x = system.sobol(7, 0), system.sobol(3, 5), system.sobol(1, 9)
@@ -87,7 +99,7 @@ def test_all_learners_of_a_seed_begin_alike(tmp_path):
     system = problem("forrester", 0)
     points = {
         name: measured(system, learner, learner.model, TINY, 2, tmp_path / f"{name}.jsonl")
-        for name, learner in LEARNERS.items()
+        for name, learner in CHOOSERS.items()
         if learner.model is not None
     }
     assert all(torch.equal(X[:4], system.sobol(4, 2)) for X in points.values())
@@ -98,7 +110,7 @@ def test_all_learners_of_a_seed_begin_alike(tmp_path):
 
 def test_scores():
     system = problem("forrester", 0)
-    found = scored(system, "CKA", replace(ActiveSettings(), budget=6, every=2), system.sobol(6, 0))
+    found = scored(system, "literal", replace(Settings(), budget=6, every=2), system.sobol(6, 0))
     assert found["measurements"] == [4, 6]
     assert found["nrmse"][1] < found["nrmse"][0] < 2
 
@@ -109,8 +121,7 @@ def test_smoke(tmp_path, capsys):
         out=tmp_path,
         runs=2,
         jobs=1,
-        problems=("forrester",),
-        learners=("f_p", "phy", "gp", "cka"),
+        only=("forrester", "f_p", "phy", "gp", "cka"),
         forrester=TINY,
     )
     main(experiment)
@@ -121,7 +132,7 @@ def test_smoke(tmp_path, capsys):
 
 def test_an_interrupted_run_goes_on(tmp_path, monkeypatch):
     whole, cut = (
-        Active(out=tmp_path / name, runs=1, jobs=1, problems=("forrester",), learners=("both",),
+        Active(out=tmp_path / name, runs=1, jobs=1, only=("forrester", "both"),
                forrester=TINY) for name in ("whole", "cut")
     )  # fmt: skip
     run_missing(whole)
@@ -139,7 +150,7 @@ def test_an_interrupted_run_goes_on(tmp_path, monkeypatch):
 
         return replace(system, truth=measure)
 
-    monkeypatch.setattr(active_run, "problem", interrupted)
+    monkeypatch.setattr(active, "problem", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_missing(cut)
     run_missing(cut)
@@ -172,3 +183,122 @@ def test_verdicts(cka, verdict, said):
     (claim,) = verdicts(scores(gp=[[3.0, 2.0, 1.5, 1.0]] * 2, cka=cka))
     assert (claim.id, claim.verdict) == ("M1", verdict)
     assert said in claim.measured
+
+
+def test_the_best_of_forrester_is_known():
+    best, distance = searched.scale("forrester", 256)
+    assert best == pytest.approx(-6.020740, abs=1e-5)
+    assert distance > 4
+
+
+@pytest.mark.parametrize("name", optimisation.PROBLEMS)
+def test_f_p_is_not_the_truth_but_like_it(name):
+    system = searched.problem(name)
+    X = system.points(128)
+    for metric, physics in system.physics.items():
+        columns = X.unbind(-1) if name == "reactor" else [X]
+        crude, true = physics(*columns).flatten(), system.truth(X)[metric]
+        assert torch.corrcoef(torch.stack([crude, true]))[0, 1] > 0.1
+        assert not torch.allclose(crude, true, rtol=0.02)
+
+
+def test_the_reactor_keeps_its_mass():
+    X = searched.problem("reactor").points(64)
+    for b, c in (reactor(*X.unbind(-1)), textbook(*X.unbind(-1))):
+        assert (b >= 0).all()
+        assert (c >= -1e-9).all()
+        assert (b + c <= 1 + 1e-9).all()
+
+
+def test_a_trial_beyond_the_limit_counts_for_nothing():
+    system = searched.problem("reactor")
+    assert system.values({"output": 0.9, "impurity": 0.5}) == np.inf
+    assert system.values({"output": 0.5, "impurity": 0.01}) == -0.5
+
+
+def finished(learner, seed, trials, values):
+    return {
+        "problem": "forrester",
+        "learner": learner,
+        "seed": seed,
+        "trials": trials,
+        "seconds": 1.0,
+        "regrets": values,
+    }
+
+
+def test_a_run_that_never_comes_near_counts_as_longer_than_all():
+    ours = [finished("cka", seed, 6, [None, 0.5, 0.2, 0.1, 0.1, 0.004]) for seed in range(3)]
+    theirs = [finished("ax", seed, None, [0.5] * 12) for seed in range(3)]
+    runs = optimisation.load(ours + theirs)
+    (judged,) = optimisation.verdicts(runs, most=12)
+    assert judged.verdict == "met"
+    assert "6, Ax's default more than 12" in judged.measured
+    (judged,) = optimisation.verdicts(
+        runs, most=10
+    )  # 6 is more than half of 11, but may be less than their half
+    assert judged.verdict == "inconclusive"
+    (judged,) = optimisation.verdicts(
+        optimisation.load([*ours, *(finished("ax", s, 11, [0.0] * 11) for s in range(3))]), 12
+    )
+    assert judged.verdict == "missed"
+    curve = optimisation.regrets(ours, 12)
+    assert len(curve) == 36
+    assert curve.groupby("trial")["regret"].median()[[1, 12]].tolist() == [np.inf, 0.004]
+
+
+@pytest.mark.slow
+def test_a_run_in_ax(tmp_path):
+    settings = OptimisationSettings(trials=7, num_random=64)
+    main(Optimisation(out=tmp_path, runs=2, jobs=1, only=("forrester",), settings=settings))
+    text = (tmp_path / "tables.md").read_text()
+    assert "needs at most half the trials" in text
+    assert (tmp_path / "regrets.png").exists()
+
+
+FEW = MisledSettings(initial=3, trials=1, restarts=1, raw_samples=4, mc_samples=8)
+
+
+@pytest.mark.parametrize("name", MISLEADS + HELPS)
+def test_where_the_physics_says_the_best_is(name):
+    """Near the best of the function if it helps, at a regret above a fifth of the range if not."""
+    given = misled.PROBLEMS[name]
+    X = torch.rand(20_000, given.num_inputs, dtype=torch.float64)
+    highest, size = misled._range(given)
+    assert given.truth(X).max() <= highest + 1e-9
+    regret = (highest - given.truth(X[given.physics(X).argmax()].unsqueeze(0)).item()) / size
+    assert (regret > 0.2) == (name in MISLEADS)
+
+
+def record(problem, method, seed, regrets):
+    return {
+        "problem": problem,
+        "method": method,
+        "seed": seed,
+        "regrets": regrets,
+        "relevance": [0.5 if method == "cka" else None] * len(regrets),
+    }
+
+
+def test_targets_of_misled(tmp_path):
+    records = [
+        record(problem, method, seed, regrets)
+        for problem in MISLEADS + HELPS
+        for seed in range(3)
+        for method, regrets in (
+            ("stgp", [9.0, 3.0, 0.5, 0.4]),
+            ("zero", [9.0, 3.0, 2.0, 0.43]),
+            ("cka", [0.5, 0.5, 0.5, 0.5 if seed else 6.0]),
+        )
+    ]
+    found = misled.tables(records, Misled(out=tmp_path))["targets"].text.splitlines()[2:]
+    verdicts = {line.split(" | ")[0].strip("| "): line.split("**")[1] for line in found}
+    assert verdicts == {"B1": "met", "B2": "missed", "B3": "met", "B4": "missed", "B5": "met"}
+    rows = misled.tables(records, Misled(out=tmp_path))["regrets"].text
+    assert "| moved peak | SingleTaskGP | 3 | 0.4 | 0.4 | 0 | 3 |  |" in rows
+
+
+def test_a_run_of_few_trials(tmp_path):
+    main(Misled(out=tmp_path, runs=2, jobs=1, only=("unrelated",), settings=FEW))
+    text = (tmp_path / "tables.md").read_text()
+    assert all(label in text for label in misled.METHODS.values())

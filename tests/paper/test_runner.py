@@ -113,9 +113,9 @@ def test_runs_of_other_settings_are_refused(tmp_path):
     main(Toy(out=tmp_path))
     with pytest.raises(Refused, match=r"a-0 was made with other settings: scale was 1\.0 and is "):
         main(Toy(out=tmp_path, scale=2.0))
-    gone = {"settings": {"inner": {"kind": "a", "more": 1}}}
-    with pytest.raises(Refused, match=r"inner\.more was 1 and is now not there"):
-        check_settings(tmp_path, ("a", 0), gone, Toy(out=tmp_path))
+    other = {"settings": {"inner": {"kind": "b", "more": 1}}}
+    with pytest.raises(Refused, match=r"inner\.kind was b and is now a"):
+        check_settings(tmp_path, ("a", 0), other, Toy(out=tmp_path))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,10 +133,19 @@ class Calling(Toy):
     calls: ClassVar[tuple[str, ...]] = ("json.dumps",)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Less(Toy):
+    """Without a setting that it had."""
+
+    def describe(self, *kind):
+        return {"scale": self.scale}
+
+
 def test_runs_that_lack_a_setting_or_the_defaults_are_of_another_version(tmp_path):
     """Also if a default of the library changes; nothing is said as long as nothing is to be run."""
     main(Toy(out=tmp_path, runs=2))
     for kind, said in (
+        (Less, r"inner was .* and is now not there\. Pass --other-versions"),
         (More, r"sort was not there and is now new\. Pass --other-versions"),
         (Calling, "the defaults of the library are not said"),
     ):

@@ -51,9 +51,7 @@ def cart_pole():
 @pytest.fixture
 def cart_pole_dynamics():
     """The real cart-pole."""
-    return PhysicsDynamics(
-        CART_POLE_SPEC, equation_physics(REAL_CART_POLE)
-    )
+    return PhysicsDynamics(CART_POLE_SPEC, equation_physics(REAL_CART_POLE))
 
 
 @pytest.fixture

@@ -5,24 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
-import numpy as np
 import torch
 from botorch.utils.sampling import draw_sobol_samples
-from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust import CKA, BlackBoxPhysics, PhysicsMeanGP, ZeroMeanGP
 from gpadjust.dynamics import AngleInput
 from gpadjust.physics import ODEPhysics
 from gpadjust.systems import CartPoleEquation, cart_pole
 from gpadjust.systems.cart_pole import REAL_CART_POLE, SUBSTEP, TIME_STEP
-from paper.active import PROBLEMS
+from paper.common.learners import LEARNERS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
 from paper.pairs.functions import pair
 
-Model = Literal["CKA", "physics mean", "GP"]
 CART_POLE_LIMITS = (1.0, math.pi, 3.0, 8.0, 10.0)  # m, rad, m/s, rad/s, N, to either side
 _TEST_SEED = 20_000  # beyond those of runs, so that their points are others
 
@@ -58,28 +54,24 @@ class Problem:
         X = self.sobol(n, _TEST_SEED)
         return X, self.truth(X)
 
-    def model(self, X: Tensor, Y: Tensor, kind: Model) -> CKA | PhysicsMeanGP | ZeroMeanGP:
-        """A new model of measurements."""
+    def model(self, X: Tensor, Y: Tensor, kind: str) -> Any:
+        """A new model of measurements, of ``paper.common.learners``."""
         transform = AngleInput(self.angles) if self.angles else None
-        if kind == "GP":
-            return ZeroMeanGP(X, Y, input_transform=transform)
-        if kind == "CKA":  # the literal one
-            return CKA(X, Y, physics=self.physics, center=0.0, input_transform=transform)
-        return PhysicsMeanGP(X, Y, physics=self.physics, input_transform=transform)
+        return LEARNERS[kind].make(X, Y, physics=self.physics, input_transform=transform)
 
 
 def problem(name: str, seed: int) -> Problem:
     """The problem of a given name.
 
     Args:
-        name: One of ``PROBLEMS``.
+        name: One of the experiment's.
         seed: Of the physics, where it is random.
 
     Raises:
         ValueError: If there is no such problem.
     """
     if name not in _MAKE:
-        raise ValueError(f"There is no problem {name!r}; there are {', '.join(PROBLEMS)}.")
+        raise ValueError(f"There is no problem {name!r}; there are {', '.join(_MAKE)}.")
     return _MAKE[name](seed)
 
 
@@ -93,14 +85,7 @@ def _pair(name: str) -> Callable[[int], Problem]:
 
     def make(seed: int) -> Problem:
         functions = pair(name)
-        lower, upper = functions.bounds.numpy()
-
-        def low(X: NDArray[np.float64]) -> NDArray[np.float64]:
-            # Finite differences reach beyond the bounds, where these functions need not exist.
-            return functions.low(np.clip(X, lower, upper))
-
-        physics = BlackBoxPhysics(low, name=f"{name}, low fidelity")
-        return Problem(functions.bounds, functions.truth, physics)
+        return Problem(functions.bounds, functions.truth, functions.smooth_physics())
 
     return make
 
