@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from paper.planning.systems import FittedPhysics
 
 from gpadjust import CKA, CalibratedPhysics, ODEPhysics, PhysicsMeanGP, Unknown
-from gpadjust.dynamics import LearnedDynamics
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.systems import CartPoleSwingUpEnv
 from gpadjust.systems.cart_pole import CART_POLE_SPEC, CartPoleEquation
 
@@ -20,16 +19,8 @@ GUESS = CartPoleEquation(0.6, 0.6, 0.7, 0.05)
 NOISE = 0.01  # m, rad, m/s, rad/s
 
 
-def equation(state, action, p):
-    known = object.__new__(CartPoleEquation)
-    for name in p:
-        object.__setattr__(known, name, p[name])  # a value for each row, which its checks refuse
-    object.__setattr__(known, "gravity", 9.82)
-    return known(state, action)
-
-
 def physics():
-    return ODEPhysics(equation, 0.1, 4, unknowns=UNKNOWNS)
+    return ODEPhysics(GUESS, 0.1, 4, unknowns=UNKNOWNS)
 
 
 def trial(seed, noise=0.0):
@@ -71,7 +62,7 @@ def test_with_noise_it_is_as_good_as_least_squares():
     errors = {name: [] for name in ("least squares", "calibrated", "delta", "rho and delta")}
     for seed in range(5):
         data = trial(seed, NOISE)
-        fitted = FittedPhysics(GUESS, 0.1)
+        fitted = PhysicsDynamics(CART_POLE_SPEC, physics())
         fitted.update(*data)
         errors["least squares"].append(error(fitted))
         models = (CalibratedPhysics, PhysicsMeanGP, CKA)
