@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-<<<<<<< HEAD
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, Unknown
-=======
-from gpadjust import CKA, CalibratedPhysics, ODEPhysics, PhysicsMeanGP, Unknown
->>>>>>> c262fd38b0773fc83a4aed7959e58b469626ce5d
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.systems import CartPoleSwingUpEnv
 from gpadjust.systems.cart_pole import CART_POLE_SPEC, CartPoleEquation, equation_physics
@@ -23,11 +19,7 @@ NOISE = 0.01  # m, rad, m/s, rad/s
 
 
 def physics():
-<<<<<<< HEAD
     return equation_physics(CartPoleEquation(0.6, 0.6, 0.7, 0.05), unknowns=UNKNOWNS)
-=======
-    return ODEPhysics(GUESS, 0.1, 4, unknowns=UNKNOWNS)
->>>>>>> c262fd38b0773fc83a4aed7959e58b469626ce5d
 
 
 def trial(seed, noise=0.0):
