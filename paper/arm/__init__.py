@@ -12,7 +12,7 @@ from paper.common.experiment import Axes, Experiment
 from paper.common.learners import labels
 
 if TYPE_CHECKING:
-    from paper.cartpole.control import System
+    from paper.cartpole.control import Setup
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,11 +80,11 @@ class Arm(Control):
         """Refuse a machine without OpenSim."""
         _check_opensim()
 
-    def system(self, name: str, seed: int) -> System:
+    def setup(self, name: str, seed: int) -> Setup:
         """The arm; nothing in f_p is random."""
-        from paper.arm.system import system
+        from paper.arm.system import setup
 
-        return system(self.known[name], self.settings_of(name))
+        return setup(self.known[name], self.settings_of(name))
 
 
 BOUNDS = {"angles": (-2.0, 4.0), "velocities": (-40.0, 40.0)}
@@ -163,5 +163,6 @@ class Reaching(Experiment):
         system, learner = kind
         settings = {**asdict(self.settings), "trials": self.trials(system, learner)}
         del settings["long_trials"]
-        sensors = {"sensors": SENSORS} if system == "sensors" else {}
-        return {**settings, "bounds": BOUNDS, **sensors}
+        more: dict[str, Any] = {"sensors": SENSORS} if system == "sensors" else {}
+        more |= {"fitted_by": "PhysicsDynamics"} if learner == "fitted" else {}
+        return {**settings, "bounds": BOUNDS, **more}

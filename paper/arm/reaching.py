@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch
@@ -17,26 +17,21 @@ from numpy.typing import NDArray
 from stable_baselines3.common.noise import NormalActionNoise
 from torch import Tensor
 
-from gpadjust.control import PolicySearch, PolicySearchAgent, Task, mlp_policy
+from gpadjust.control import PolicySearch, PolicySearchAgent, mlp_policy
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.inference import SamplingWarning
-from gpadjust.physics import ODEPhysics
+from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.physics import as_physics
 from gpadjust.states import StateSpec
-from gpadjust.systems import MuscleArmEnv, RememberAction
+from gpadjust.systems import System, arm
 from gpadjust.systems.reaching import (
-    ARM_MEMORY_SPEC,
-    ARM_SPEC,
-    arm_reward,
-    arm_start,
     arm_targets,
     hand_position,
 )
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, torque_arm
 from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
 from paper.arm import Settings as ArmSettings
 from paper.arm.arm import BOUND, draw_arm
-from paper.arm.system import memory_start, reach, score
-from paper.cartpole.planning import Sensors, trials_table
+from paper.arm.system import reach, score
+from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
 from paper.common.figures import panels, save
@@ -60,7 +55,8 @@ _SYSTEMS, _LABELS = Reaching.axes["system"], Reaching.axes["learner"]
 
 def run(experiment: Reaching, system: str, learner: str, seed: int) -> Run:
     """Make the trials; return the hand's errors after each, and times."""
-    warnings.simplefilter("ignore", SamplingWarning)
+    for category in (SamplingWarning, ParameterWarning):
+        warnings.simplefilter("ignore", category)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     warnings.filterwarnings("ignore", message=".* of the episodes of the policy left the bounds")
     settings, trials = experiment.settings, experiment.trials(system, learner)
@@ -92,7 +88,7 @@ def evaluate(agent: Any, system: str, settings: ReachingSettings, seed: int) -> 
         memory=system == "memory",
         episode_length=settings.episode_length,
     )
-    policy = NoisyPolicy(agent, settings, seed) if system == "sensors" else agent
+    policy = NoisyPolicy(agent, seed) if system == "sensors" else agent
     found: dict[str, Any] = score(reach(policy, arm))
     return found
 
@@ -102,31 +98,25 @@ class NoisyPolicy:
 
     Args:
         policy: The policy, with Stable-Baselines3's ``predict``.
-        settings: Of the arm.
         seed: Of the noise.
     """
 
-    def __init__(self, policy: Any, settings: ReachingSettings, seed: int) -> None:
+    def __init__(self, policy: Any, seed: int) -> None:
         self.policy = policy
-        self.sensors = Sensors(MuscleArmEnv(strength=settings.strength), ARM_SPEC, _SD)
         self.random = np.random.default_rng(seed)
 
     def predict(self, observation: NDArray[np.float32], *, deterministic: bool) -> Any:
         """Actions for a batch of observations."""
-        seen = self.sensors.noisy(observation, self.random)
-        return self.policy.predict(seen, deterministic=deterministic)
+        seen = observation.astype(np.float64)
+        seen[:, :4] += np.array([*_SD.values()]) * self.random.normal(size=seen[:, :4].shape)
+        return self.policy.predict(seen.astype(np.float32), deterministic=deterministic)
 
 
 def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> PolicySearchAgent:
     """The agent of a run, at its start."""
     settings = experiment.settings
-    task = Task(
-        dynamics(settings, system, learner),
-        arm_reward,
-        initial_states=memory_start if system == "memory" else arm_start,
-        episode_length=settings.episode_length,
-        state_bounds=bounds(spec_of(system)),
-    )
+    known = system_of(system, settings)
+    task = replace(known.task(dynamics(settings, system, learner)), state_bounds=bounds(known.spec))
     search = PolicySearch(
         updates=settings.updates,
         num_starts=settings.starts,
@@ -136,7 +126,7 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
     # Of actions scaled to [-1, 1], as Stable-Baselines3 has it.
     sd = 2 * settings.noise * np.ones(4)
     return PolicySearchAgent(
-        environment(system, settings),
+        known.make(),
         task,
         partial(mlp_policy, first_actions=[settings.first_action] * 4),
         search,
@@ -147,18 +137,18 @@ def make_agent(experiment: Reaching, system: str, learner: str, seed: int) -> Po
     )
 
 
-def environment(system: str, settings: ReachingSettings) -> gym.Env[Any, Any]:
-    """The real arm."""
-    env: gym.Env[Any, Any] = MuscleArmEnv(strength=settings.strength)
-    if system == "memory":
-        env = RememberAction(env)
-    env = Sensors(env, ARM_SPEC, _SD) if system == "sensors" else env
-    return gym.wrappers.TimeLimit(env, settings.episode_length)
-
-
-def spec_of(system: str) -> StateSpec:
-    """The entries of its states."""
-    return ARM_MEMORY_SPEC if system == "memory" else ARM_SPEC
+def system_of(name: str, settings: ReachingSettings, **options: Any) -> System:
+    """An arm, and what is known of it."""
+    return arm(
+        strength=settings.strength,
+        gains=_GAINS.get(name, (8.0, 4.0)),
+        memory=name == "memory",
+        noise=_SD if name == "sensors" else None,
+        substeps=settings.substeps,
+        gradient="finite-difference",
+        episode_length=settings.episode_length,
+        **options,
+    )
 
 
 def bounds(spec: StateSpec) -> Tensor:
@@ -171,16 +161,8 @@ def bounds(spec: StateSpec) -> Tensor:
 
 def dynamics(settings: ReachingSettings, system: str, learner: str) -> Dynamics:
     """What the policy is trained in, at its start."""
-    spec = spec_of(system)
-    equation = torque_arm(_GAINS[system]) if system in _GAINS else torque_arm()
-    physics = ODEPhysics(
-        equation,
-        step=ARM_TIME_STEP,
-        state_dim=4,
-        substeps=settings.substeps,
-        name="torque_arm",
-        gradient="finite-difference",
-    )
+    arm = system_of(system, settings, unknowns=learner == "fitted")
+    spec, physics = arm.spec, as_physics(arm.physics)
     if learner in ("phy", "fitted"):
         return PhysicsDynamics(spec, physics)
     if learner == "ensemble":

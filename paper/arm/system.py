@@ -7,53 +7,39 @@ import warnings
 from functools import lru_cache, partial
 from typing import Any, Protocol
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.control import Task
-from gpadjust.physics import Physics
-from gpadjust.systems import MuscleArmEnv, RememberAction, arm, hand_distance_cm
+from gpadjust.systems import arm, hand_distance_cm
 from gpadjust.systems.opensim import MUSCLES, REST_ACTIVATION, ArmSimulation, build_muscle_arm
 from gpadjust.systems.reaching import (
-    ARM_MEMORY_SPEC,
-    ARM_SPEC,
     START_MEAN,
     arm_reward,
-    arm_start,
     arm_targets,
 )
 from gpadjust.systems.torque_arm import REAL_ARM
 from paper.arm import Settings
 from paper.cartpole import Scenario
-from paper.cartpole.control import Recorder, System, dynamics
+from paper.cartpole.control import Recorder, Setup, dynamics
 
 NUM_LAST_STEPS = 5  # of the second score
 ACCURACY = 1e-5  # the environment's
 
 
-def system(scenario: Scenario, settings: Settings) -> System:
+def setup(scenario: Scenario, settings: Settings) -> Setup:
     """A run's arm, its task, and its recorder."""
-    env: gym.Env[Any, Any] = MuscleArmEnv(strength=settings.strength)
-    if settings.memory:
-        env = RememberAction(env)
-    physics: Physics = arm(opensim=True).physics if settings.black_box else arm().physics
-    spec = ARM_MEMORY_SPEC if settings.memory else ARM_SPEC
-    task = Task(
-        dynamics(scenario, settings, spec, physics, physics),
-        arm_reward,
-        initial_states=memory_start if settings.memory else arm_start,
+    system = arm(
+        strength=settings.strength,
+        memory=settings.memory,
+        opensim=settings.black_box,
         episode_length=settings.episode_length,
     )
+    physics: Any = system.physics
+    model = dynamics(scenario, settings, system.spec, physics, physics)
     recorder = ArmRecorder(settings, scenario.kind == "none")
-    return System(gym.wrappers.TimeLimit(env, settings.episode_length), task, recorder)
-
-
-def memory_start(n: int) -> Tensor:
-    """Draw ``n x 10`` start states, with no action before them, from PyTorch's generator."""
-    return torch.cat([arm_start(n), torch.zeros(n, 4, dtype=torch.float64)], dim=-1)
+    return Setup(system.make(), system.task(model), recorder)
 
 
 class Policy(Protocol):

@@ -11,7 +11,7 @@ from paper.common.experiment import Axes, Experiment
 from paper.common.learners import LEARNERS, LITERAL, Learner, labels
 
 if TYPE_CHECKING:
-    from paper.cartpole.control import System
+    from paper.cartpole.control import Setup
 
 NUM_STARTS = 20  # of the evaluation
 
@@ -119,7 +119,7 @@ class Control(Experiment):
     rmses: ClassVar[Mapping[str, str]]
     """the states that models predict, and what they are called in tables, with units"""
 
-    def system(self, name: str, seed: int) -> System:
+    def setup(self, name: str, seed: int) -> Setup:
         """The real system, what is known of it, and who writes down what happens, for a run."""
         raise NotImplementedError
 
@@ -205,11 +205,11 @@ class CartPole(Control):
         "theta_dot": "theta', rad/s",
     }
 
-    def system(self, name: str, seed: int) -> System:
+    def setup(self, name: str, seed: int) -> Setup:
         """The cart-pole; all learners of a seed have the same f_p."""
-        from paper.cartpole.system import system
+        from paper.cartpole.system import setup
 
-        return system(self.known[name], self.settings_of(name), seed)
+        return setup(self.known[name], self.settings_of(name), seed)
 
 
 FRICTIONS = {"friction": (0.3, 0.005), "strong-friction": (0.6, 0.01)}
@@ -292,7 +292,10 @@ class Planning(Experiment):
             "mc-pilco": "in MC-PILCO's protocol",
         },
         "learner": labels("cka", "phymean", "phy")
-        | {"fitted": "f_p and viscous friction, fitted"}
+        | {
+            "fitted": "f_p and viscous friction, fitted",
+            "structured": "f_p with dry friction and drag, fitted",
+        }
         | labels("gp", "rra")
         | {"search": "CKA, policy search"}
         | labels("oracle"),
@@ -323,6 +326,7 @@ class Planning(Experiment):
         more: dict[str, Any] = {"friction": FRICTIONS[system]} if system in FRICTIONS else {}
         more |= {"sensors": SENSORS} if system == "sensors" else {}
         more |= {"small_noise": SMALL_NOISE} if system == "mc-pilco" else {}
+        more |= {"fitted_by": "PhysicsDynamics"} if learner in ("fitted", "structured") else {}
         return {**settings, **more}
 
 

@@ -34,7 +34,7 @@ _SAID = ("task", "options", "seed", "verbose", "tensorboard_log", "_init_setup_m
 PARTS = ("fit", "rollout", "update")
 
 
-class System(NamedTuple):
+class Setup(NamedTuple):
     """What a run is about.
 
     Args:
@@ -67,21 +67,21 @@ def dynamics(
 
 def make_agent(experiment: Control, name: str, seed: int) -> DynaSAC:
     """A learner, at its start."""
-    system = experiment.system(name, seed)
+    setup = experiment.setup(name, seed)
     options, arguments = _options(experiment, name), _arguments(experiment, name)
-    return DynaSAC("MlpPolicy", system.env, system.task, options, **arguments, seed=seed)
+    return DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
 
 
 def described(experiment: Control, name: str) -> dict[str, Any]:
     """Settings, all options of the learner in force, and what its dynamics are."""
-    system, settings = experiment.system(name, 0), asdict(experiment.settings_of(name))
+    setup, settings = experiment.setup(name, 0), asdict(experiment.settings_of(name))
     learner = {**_defaults(SAC), **_defaults(Dyna), **_arguments(experiment, name)}
     options = asdict(_options(experiment, name))
     found = {
         **settings,
         "learner": {key: learner[key] for key in learner if key not in {*settings, *_SAID}},
         "options": {key: options[key] for key in options if key not in settings},
-        "task": system.task.describe(),
+        "task": setup.task.describe(),
     }
     if experiment.known[name].kind == "none":
         del found["task"]
@@ -96,10 +96,10 @@ def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallb
         Refused: If an unfinished run is of other settings or versions.
     """
     checkpoint = Path(f"{experiment.unfinished(name, seed)}.ckpt")
-    settings, system = experiment.settings_of(name), experiment.system(name, seed)
+    settings, setup = experiment.settings_of(name), experiment.setup(name, seed)
     now = {"settings": described(experiment, name), "versions": versions(experiment.packages)}
     if checkpoint.exists():
-        agent: Any = resume(checkpoint, system.env, system.task)
+        agent: Any = resume(checkpoint, setup.env, setup.task)
         differ = differences(agent.notes["made"], now)
         if differ:
             raise Refused(
@@ -111,11 +111,11 @@ def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallb
         agent.notes["made"] = now
     agent.learn(
         settings.episodes * settings.episode_length - agent.num_timesteps,
-        callback=[system.recorder, *callbacks, EpisodeCheckpoint(checkpoint)],
+        callback=[setup.recorder, *callbacks, EpisodeCheckpoint(checkpoint)],
         log_interval=settings.episodes + 1,  # nothing is shown
         reset_num_timesteps=False,
     )
-    found = system.recorder.found()
+    found = setup.recorder.found()
     for path in (checkpoint, Path(f"{checkpoint}.lock")):
         path.unlink(missing_ok=True)
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,18 +24,16 @@ from gpadjust.control import (
     Planner,
     PolicySearch,
     PolicySearchAgent,
-    Task,
 )
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
-from gpadjust.inference import SamplingWarning
-from gpadjust.states import StateSpec
-from gpadjust.systems import CartPoleEquation, CartPoleSwingUpEnv, cart_pole
+from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.physics import Unknown
+from gpadjust.systems import NoisySensors, System, cart_pole
 from gpadjust.systems.cart_pole import (
     CART_POLE_SPEC,
     REAL_CART_POLE,
     START_MEAN,
-    cart_pole_reward,
-    cart_pole_start,
+    believed_cart_pole,
     equation_physics,
 )
 from paper.cartpole import (
@@ -52,14 +51,20 @@ from paper.common.runner import runs_file
 from paper.common.tables import claims_table, frame, groups, markdown, number, of, table
 from paper.common.verdicts import Claim, Curves, Finding, judge, met
 
-_SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
+FRICTION_UNKNOWNS = {
+    "dry": Unknown(0.2, bounds=(0.0, 2.0), unit="N"),
+    "drag": Unknown(0.005, bounds=(0.0, 0.1), unit="N m s²/rad²"),
+}
+"""The terms that f_p lacks on the systems with friction, for the baseline that is told of them."""
+
 _BOUND = 50.0  # of all entries of the state, in m, rad and s, where a policy is searched for
 _LEARNERS, _SYSTEMS = Planning.axes["learner"], Planning.axes["system"]
 
 
 def run(experiment: Planning, system: str, learner: str, seed: int) -> Run:
     """Make the trials; return cost and times of each."""
-    warnings.simplefilter("ignore", SamplingWarning)
+    for category in (SamplingWarning, ParameterWarning):
+        warnings.simplefilter("ignore", category)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     settings = experiment.settings_of(system)
     agent = make_agent(experiment, system, learner, seed)
@@ -90,13 +95,11 @@ def make_agent(
     settings = experiment.settings_of(system)
     env, length = environment(system, settings), settings.episode_length
     each_step, first = planners(settings)
-    task = Task(
-        dynamics(settings, system, learner, seed),
-        mc_pilco_reward if system == "mc-pilco" else cart_pole_reward,
-        initial_states=cart_pole_start,
-        episode_length=length,
-        state_bounds=torch.tensor([[-_BOUND] * 4, [_BOUND] * 4]) if learner == "search" else None,
-    )
+    task = system_of(system, settings).task(dynamics(settings, system, learner, seed))
+    if system == "mc-pilco":
+        task = replace(task, reward=mc_pilco_reward)
+    if learner == "search":
+        task = replace(task, state_bounds=torch.tensor([[-_BOUND] * 4, [_BOUND] * 4]))
     common: dict[str, Any] = {
         "reward_tolerance": None,
         "score_horizons": (),
@@ -133,78 +136,33 @@ def planners(settings: PlanningSettings) -> tuple[Planner, Planner]:
     return each_step, first
 
 
+def system_of(name: str, settings: PlanningSettings, seed: int = 0, **options: Any) -> System:
+    """A cart-pole, and what is known of it."""
+    dry, drag = FRICTIONS.get(name, (0.0, 0.0))
+    given: dict[str, Any] = {"time_step": settings.time_step, **options}
+    return cart_pole(seed, dry=dry, drag=drag, episode_length=settings.episode_length, **given)
+
+
 def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -> Dynamics:
     """What is planned in, at its start."""
-    time_step = settings.time_step
     if learner == "oracle":
-        return PhysicsDynamics(CART_POLE_SPEC, equation_physics(equation(system), time_step))
-    physics = cart_pole(seed, time_step=time_step).physics
+        dry, drag = FRICTIONS.get(system, (0.0, 0.0))
+        real = replace(REAL_CART_POLE, dry=dry, drag=drag)
+        return PhysicsDynamics(CART_POLE_SPEC, equation_physics(real, settings.time_step))
+    known = system_of(system, settings, seed, unknowns=learner in ("fitted", "structured"))
+    if learner == "structured":
+        unknowns = {**known.unknowns, **FRICTION_UNKNOWNS}
+        physics = equation_physics(believed_cart_pole(seed), settings.time_step, unknowns)
+        return PhysicsDynamics(known.spec, physics)
     if learner in ("phy", "fitted"):
-        return PhysicsDynamics(CART_POLE_SPEC, physics)
-    known = LEARNERS["cka" if learner == "search" else learner]
-    return LearnedDynamics(CART_POLE_SPEC, physics if known.adjusts else None, model=known.make)
+        return PhysicsDynamics(known.spec, known.physics)
+    made = LEARNERS["cka" if learner == "search" else learner]
+    return LearnedDynamics(known.spec, known.physics if made.adjusts else None, model=made.make)
 
 
 def wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles in [-pi, pi)."""
     return (angles + np.pi) % (2 * np.pi) - np.pi
-
-
-@dataclass(frozen=True)
-class FrictionEquation(CartPoleEquation):
-    r"""The equation with dry friction of the cart and drag of the pole.
-
-    The force on the cart is less by :math:`d \tanh(\dot{x} / 0.05)`; on the pole acts a torque
-    :math:`-k \dot\theta |\dot\theta|`.
-
-    Args:
-        dry: The dry friction d, in N.
-        drag: The drag k, in N m s²/rad².
-    """
-
-    dry: float = 0.0
-    drag: float = 0.0
-
-    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
-        """The time derivative of the state ``... x 4``, with the action ``... x 1``."""
-        theta, x_dot, theta_dot = state.unbind(-1)[1:]
-        dry = self.dry * (x_dot / _SOFT).tanh()
-        rates = super().__call__(state, action - dry.unsqueeze(-1))
-        torque = -self.drag * theta_dot * theta_dot.abs()
-        m, length = self.pole_mass, self.pole_length
-        total = self.cart_mass + m
-        inertia = 4 * total - 3 * m * theta.cos().square()
-        x_ddot = 6 * theta.cos() * torque / (length * inertia)
-        theta_ddot = 12 * total * torque / (m * length**2 * inertia)
-        zero = torch.zeros_like(torque)
-        return rates + torch.stack([zero, zero, x_ddot, theta_ddot], dim=-1)
-
-
-class Sensors(gym.ObservationWrapper[Any, Any, Any]):
-    """Observations with noise, by the environment's generator; the reward is of the true state.
-
-    Args:
-        env: The environment.
-        spec: What the entries of its states are.
-        sd: Standard deviations of the noise by the name of the entry; of others there is none.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], spec: StateSpec, sd: Mapping[str, float]) -> None:
-        super().__init__(env)
-        self.spec = spec
-        self.columns = [i for i, name in enumerate(spec.states) if name in sd]
-        self.sd = np.array([sd[spec.states[i]] for i in self.columns])
-
-    def observation(self, observation: Any) -> Any:
-        """Add the noise to the state."""
-        return self.noisy(observation, self.unwrapped.np_random)
-
-    def noisy(self, observation: NDArray[Any], random: np.random.Generator) -> NDArray[np.float32]:
-        """Observations ``... x observation_dim`` as the sensors have them."""
-        state = self.spec.decode(torch.from_numpy(observation.astype(np.float64)))
-        noise = self.sd * random.normal(size=(*state.shape[:-1], len(self.sd)))
-        state[..., self.columns] += torch.from_numpy(noise)
-        return self.spec.observe(state).numpy().astype(np.float32)
 
 
 class Still(gym.Wrapper[Any, Any, Any, Any]):
@@ -241,27 +199,15 @@ class Watched(gym.Wrapper[Any, Any, Any, Any]):
         return result
 
 
-def equation(system: str) -> CartPoleEquation:
-    """The equation of motion of a system."""
-    if system not in FRICTIONS:
-        return REAL_CART_POLE
-    dry, drag = FRICTIONS[system]
-    real = REAL_CART_POLE
-    masses = (real.cart_mass, real.pole_mass)
-    return FrictionEquation(*masses, real.pole_length, real.damping, dry=dry, drag=drag)
-
-
 def environment(system: str, settings: PlanningSettings) -> Watched:
     """The real system."""
-    env: gym.Env[Any, Any] = CartPoleSwingUpEnv(
-        equation=equation(system), time_step=settings.time_step
-    )
+    env: gym.Env[Any, Any] = system_of(system, settings).make()
     if system == "sensors":
-        env = Sensors(env, CART_POLE_SPEC, SENSORS)
+        env = NoisySensors(env, CART_POLE_SPEC, SENSORS)
     elif system == "mc-pilco":
         small = dict.fromkeys(CART_POLE_SPEC.states, SMALL_NOISE)
-        env = Sensors(Still(env), CART_POLE_SPEC, small)
-    return Watched(gym.wrappers.TimeLimit(env, settings.episode_length))
+        env = NoisySensors(Still(env), CART_POLE_SPEC, small)
+    return Watched(env)
 
 
 def mc_pilco_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
@@ -412,6 +358,10 @@ TARGETS = {
 }
 
 
+def _ticks(ax: Axes, title: str, own: pd.DataFrame) -> None:
+    ax.set_xticks(range(1, own["episode"].max() + 1))
+
+
 def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
     """Draw the cost of the trials, models over each other, a panel for each system."""
     trials = frame(runs, "trials")
@@ -422,10 +372,9 @@ def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
         return f"{system} ({few if few == many else f'{few} to {many}'} runs)"
 
     parts = {title(label, own): own for label, own in groups(trials, "system", _SYSTEMS).items()}
-    lines = {
-        name: (label, "tab:cyan" if name == "search" else LEARNERS[name].color)
-        for name, label in _LEARNERS.items()
-    }
+    colors = {name: known.color for name, known in LEARNERS.items()}
+    colors |= {"search": "tab:cyan", "structured": "tab:olive"}
+    lines = {name: (label, colors[name]) for name, label in _LEARNERS.items()}
     return [
         draw_curves(
             experiment.out / "planning.png",
@@ -434,6 +383,6 @@ def draw(runs: Sequence[Run], experiment: Planning) -> list[Path]:
             lines,
             labels=("trial", "cost, median and quartiles"),
             share=False,
-            finish=lambda ax, _, own: ax.set_xticks(range(1, own["episode"].max() + 1)),
+            finish=_ticks,
         )
     ]

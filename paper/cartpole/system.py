@@ -2,46 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpadjust.control import Task
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.physics import ODEPhysics
 from gpadjust.rl import DynaSAC, ModelVecEnv
-from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
+from gpadjust.systems import cart_pole
 from gpadjust.systems.cart_pole import (
-    CART_POLE_RAW_SPEC,
-    CART_POLE_SPEC,
     REAL_CART_POLE,
     START_MEAN,
     START_STD,
+    believed_cart_pole,
     cart_pole_reward,
-    cart_pole_start,
     equation_physics,
 )
 from paper.cartpole import NUM_STARTS, Scenario, Settings
-from paper.cartpole.control import Recorder, System, dynamics
+from paper.cartpole.control import Recorder, Setup, dynamics
 
 
-def system(scenario: Scenario, settings: Settings, seed: int) -> System:
+def setup(scenario: Scenario, settings: Settings, seed: int) -> Setup:
     """A run's cart-pole, its task, and its recorder."""
-    env = gym.wrappers.TimeLimit(
-        CartPoleSwingUpEnv(encode_angle=settings.encode_angle), settings.episode_length
-    )
-    spec = CART_POLE_SPEC if settings.encode_angle else CART_POLE_RAW_SPEC
-    model = dynamics(scenario, settings, spec, cart_pole(seed).physics, true_physics())
-    task = Task(
-        model,
-        cart_pole_reward,
-        initial_states=cart_pole_start,
-        episode_length=settings.episode_length,
-    )
-    return System(env, task, CartPoleRecorder(settings, scenario.kind == "none", seed))
+    length, encode = settings.episode_length, settings.encode_angle
+    system = cart_pole(seed, encode_angle=encode, episode_length=length)
+    physics: Any = system.physics
+    model = dynamics(scenario, settings, system.spec, physics, true_physics())
+    recorder = CartPoleRecorder(settings, scenario.kind == "none", seed)
+    return Setup(system.make(), system.task(model), recorder)
 
 
 def true_physics() -> ODEPhysics:
@@ -58,12 +49,9 @@ def fixed_starts(n: int) -> Tensor:
 
 def evaluate(agent: DynaSAC, settings: Settings) -> float:
     """The mean cost of the deterministic policy over the fixed starts; draws no random number."""
-    spec = CART_POLE_SPEC if settings.encode_angle else CART_POLE_RAW_SPEC
-    task = Task(
-        PhysicsDynamics(spec, true_physics()),
-        cart_pole_reward,
-        initial_states=fixed_starts,
-        episode_length=settings.episode_length,
+    system = cart_pole(encode_angle=settings.encode_angle, episode_length=settings.episode_length)
+    task = replace(
+        system.task(PhysicsDynamics(system.spec, true_physics())), initial_states=fixed_starts
     )
     spaces: Any = (agent.observation_space, agent.action_space)
     env = ModelVecEnv(task, NUM_STARTS, *spaces)
@@ -99,4 +87,4 @@ class CartPoleRecorder(Recorder):
 
     def found(self) -> dict[str, Any]:
         """The records, and the parameters of f_p, which are random."""
-        return {"physics": vars(cart_pole(self.seed).physics.rhs), **super().found()}
+        return {"physics": vars(believed_cart_pole(self.seed)), **super().found()}

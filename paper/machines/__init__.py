@@ -117,7 +117,8 @@ class Real(Experiment):
         """The settings of a run, and the records and parameters of its system."""
         from paper.machines.records import REAL
 
-        scored = {"horizons": list(HORIZONS), "start_noise": "learnt"}
+        scored: dict[str, Any] = {"horizons": list(HORIZONS), "start_noise": "learnt"}
+        scored |= {"fitted_by": "PhysicsDynamics"} if "fitted" in kind[2] else {}
         return {**asdict(self.settings), **scored, **REAL[kind[0]].describe()}
 
 
@@ -182,6 +183,7 @@ class Elsewhere(Experiment):
         }
         train = [f"{known.folder}/{file}" for file in known.train]
         found = {"step": known.describe()["step"], "train": train, "tests": tests}
+        found |= {"fitted_by": "PhysicsDynamics"} if kind[1] == "fitted" else {}
         return {**asdict(self.settings), "another": ANOTHER, **found}
 
 

@@ -58,13 +58,15 @@ def learnt(name: str, machine: Machine, data: Any, seed: int) -> Learnt:
 
 
 def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:
-    known, physics = REAL_LEARNERS[name], None
+    known = REAL_LEARNERS[name]
+    physics: Any = None
     if known.physics == "fitted":
         fitted = PhysicsDynamics(machine.spec, machine.physics())
         if known.model is None:
             return fitted
         fitted.update(*data)
-        physics = fitted.physics
+        found = fitted.physics_parameters
+        physics = machine.physics(dict(zip(found, found.mean.tolist(), strict=True)))
     elif known.physics != "none":
         physics = machine.physics(known.physics)
     if known.model is None:

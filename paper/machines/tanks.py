@@ -462,7 +462,7 @@ def _free_run(ax: Axes, record: Run, experiment: Tanks) -> None:
     _, lower = measured("Val", experiment.settings.samples)
     minutes = STEP / 60 * torch.arange(len(lower)).double()
     rows, path = minutes[::_KEPT].tolist(), record["path"]
-    band = {"color": "tab:blue", "alpha": 0.25, "lw": 0, "label": "95 %"}
+    band: dict[str, Any] = {"color": "tab:blue", "alpha": 0.25, "lw": 0, "label": "95 %"}
     ax.fill_between(rows, path["lower"], path["upper"], **band)
     ax.plot(rows, path["mean"], color="tab:blue", lw=1.2, label="free run")
     ax.plot(minutes, lower, color="black", lw=1.0, ls="--", label="measured")

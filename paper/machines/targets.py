@@ -20,7 +20,7 @@ _CALIBRATED = {
     **dict.fromkeys(("calibrated-delta", "calibrated-cka", "calibrated-orthogonal"), "calibrated"),
     **dict.fromkeys(("smoothed-delta", "smoothed-cka"), "smoothed"),
 }
-_ALONE = {**_OURS, **_CALIBRATED}
+ALONE = {**_OURS, **_CALIBRATED}
 _NEAR, _FAR = ("double-pendulum", "near"), ("double-pendulum", "far")
 _ERRORS = ("rmse-1", "rmse-10", "rmse-20", "rmse-40")
 _Ratios = Iterator[tuple[tuple[Any, ...], float]]
@@ -31,7 +31,7 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
     order = ("phymean", "phymean-identified", "phymean-fitted", "cka", "cka-identified", "rra")
     ours = [*order, "rra-identified", *_CALIBRATED]
     by_crude, by_identified = (
-        [name for name in ours if _ALONE[name] == known] for known in ("phy", "phy-identified")
+        [name for name in ours if ALONE[name] == known] for known in ("phy", "phy-identified")
     )
 
     def lowest(
@@ -115,7 +115,7 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
     near = "double pendulum, near, n = 100, second angle after 1 s: at most"
     calibrated = [*_CALIBRATED]
     fitted = ratios(["phymean-fitted", *calibrated], same("fitted"))
-    contained = ratios(ours, lambda cell: same(_ALONE[cell[2]], "gp")(cell), 50)
+    contained = ratios(ours, lambda cell: same(ALONE[cell[2]], "gp")(cell), 50)
     pendulum = ratios(calibrated, same("gp", "fitted"), system="pendulum")
     between = ("coverage-10", "coverage-20")
     better = "never worse than the better of f_p alone and GP by over 10 %, n >= 50"
