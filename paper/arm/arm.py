@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 
 from gpadjust.systems.reaching import START_MEAN, arm_targets, hand_position
 from gpadjust.systems.torque_arm import REAL_ARM
-from paper.arm import SCENARIOS
 from paper.arm.claims import LAST, MAP_AFTER, claims, targets
 from paper.cartpole import Control
 from paper.cartpole.control import (
@@ -22,7 +21,6 @@ from paper.cartpole.control import (
     foresight,
     load,
     seconds_of_a_run,
-    short_summary,
     summary,
     updates_table,
 )
@@ -34,15 +32,6 @@ from paper.common.verdicts import Curves, judge
 MEASURES = {"all_steps": "all steps", "last_five": "last five steps"}
 WINDOWS = ((3, 9), (24, 30))
 _SHOWN = (3, 6, 9, 12, 18, 24, 30)  # episodes
-_SHORT = (
-    "mf",
-    "mf-best",
-    "phy",
-    "gp",
-    "cka",
-    "rra",
-    "cka-memory",
-)  # the learners of the main README
 
 
 def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
@@ -101,10 +90,6 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
             digits=1,
         )
         found[name] = Table(f"Hand's error in cm, {MEASURES[measure]}", text)
-    labels = {n: f"{SCENARIOS[n].label} ({len(every.seeds(n))})" for n in _SHORT}
-    few = {f"at {episode}": partial(_at, every, episode) for episode in (3, 6, 12, LAST)}
-    short = short_summary(every, labels, few, "hand's error, cm", 8, " cm", 1)
-    found["short"] = Table("Hand's error in cm, all steps", short)
     found["memory"] = Table("With and without the previous action, cm", _memory(every, experiment))
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
     parts = {

@@ -113,7 +113,12 @@ class Control(Experiment):
     settings: ControlSettings
 
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.dynamics.LearnedDynamics",)
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.rl.Dyna",
+        "gpadjust.rl.DynaOptions",
+        "stable_baselines3.SAC",
+    )
     known: ClassVar[Mapping[str, Scenario]]
     """all learners"""
     rmses: ClassVar[Mapping[str, str]]
@@ -137,10 +142,10 @@ class Control(Experiment):
         return self.seeds[: self.known[kind[0]].max_runs]
 
     def describe(self, *kind: Any) -> dict[str, Any]:
-        """Settings, all options of the learner in force, and what its dynamics are."""
-        from paper.cartpole.control import described
-
-        return described(self, kind[0])
+        """The settings of the learner, and the task with its dynamics, if it has a model."""
+        name, settings = kind[0], asdict(self.settings_of(kind[0]))
+        model_free = self.known[name].kind == "none"
+        return settings if model_free else {**settings, "task": self.setup(name, 0).task.describe()}
 
     def run(self, *case: Any) -> dict[str, Any]:
         """Learn, or go on with it."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,14 +12,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
 from gpadjust.control import EpisodeCheckpoint, Task, resume
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
-from gpadjust.rl import Dyna, DynaCallback, DynaOptions, DynaSAC
+from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, ControlSettings, Scenario
 from paper.common.experiment import Run
@@ -30,7 +27,6 @@ from paper.common.runs import differences, versions
 from paper.common.tables import markdown, number, numbers
 from paper.common.verdicts import Curves, interquartile_mean
 
-_SAID = ("task", "options", "seed", "verbose", "tensorboard_log", "_init_setup_model")
 PARTS = ("fit", "rollout", "update")
 
 
@@ -72,23 +68,6 @@ def make_agent(experiment: Control, name: str, seed: int) -> DynaSAC:
     return DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
 
 
-def described(experiment: Control, name: str) -> dict[str, Any]:
-    """Settings, all options of the learner in force, and what its dynamics are."""
-    setup, settings = experiment.setup(name, 0), asdict(experiment.settings_of(name))
-    learner = {**_defaults(SAC), **_defaults(Dyna), **_arguments(experiment, name)}
-    options = asdict(_options(experiment, name))
-    found = {
-        **settings,
-        "learner": {key: learner[key] for key in learner if key not in {*settings, *_SAID}},
-        "options": {key: options[key] for key in options if key not in settings},
-        "task": setup.task.describe(),
-    }
-    if experiment.known[name].kind == "none":
-        del found["task"]
-    plain: dict[str, Any] = json.loads(json.dumps(found, default=repr))
-    return plain
-
-
 def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallback] = ()) -> Run:
     """Learn, or go on with it.
 
@@ -97,7 +76,11 @@ def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallb
     """
     checkpoint = Path(f"{experiment.unfinished(name, seed)}.ckpt")
     settings, setup = experiment.settings_of(name), experiment.setup(name, seed)
-    now = {"settings": described(experiment, name), "versions": versions(experiment.packages)}
+    now = {
+        "settings": json.loads(json.dumps(experiment.describe(name))),
+        "defaults": experiment.defaults(),
+        "versions": versions(experiment.packages),
+    }
     if checkpoint.exists():
         agent: Any = resume(checkpoint, setup.env, setup.task)
         differ = differences(agent.notes["made"], now)
@@ -144,12 +127,6 @@ def _arguments(experiment: Control, name: str) -> dict[str, Any]:
         "policy_kwargs": policy,
         "device": "cpu",
     }
-
-
-def _defaults(kind: Any) -> dict[str, Any]:
-    """The arguments of a learner that have a default."""
-    parameters = inspect.signature(kind.__init__).parameters.values()
-    return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
 
 
 class Recorder(DynaCallback):
@@ -318,20 +295,6 @@ def summary(
     header += [f"{first}-{last}, less {other}'s" for first, last in windows]
     header += [f"first at {threshold:g}" for threshold in thresholds]
     return markdown([*header, *texts], rows)
-
-
-def short_summary(
-    curves: Curves, labels: Mapping[str, str], columns: Mapping[str, Callable[[str], float]],
-    heading: str, level: float, unit: str, digits: int,
-) -> str:  # fmt: skip
-    """A row for each of some learners: a few numbers, and when a level is reached first."""
-    rows = []
-    for name, label in labels.items():
-        if name in curves.names:
-            first = curves.first_below(name, level)
-            cells = [number(value(name), f".{digits}f") for value in columns.values()]
-            rows.append([label, *cells, "never" if first is None else f"trial {first}"])
-    return markdown([heading, *columns, f"first at {level:g}{unit}"], rows)
 
 
 def seconds_of_a_run(rows: pd.DataFrame, parts: Sequence[str]) -> pd.DataFrame:
