@@ -116,7 +116,7 @@ def _spread(curves: Curves, name: str) -> float:
 
 
 def _memory(every: Curves, experiment: Control) -> str:
-    """What the previous action as an input brings, of the seeds that both forms have."""
+    """Errors with and without the previous action as an input, of the seeds that both have."""
     header, rows = ["", "runs"], []
     for first, last in WINDOWS:
         header += [f"{first}-{last} without", "with", "difference"]

@@ -160,7 +160,7 @@ def bounds(spec: StateSpec) -> Tensor:
 
 
 def dynamics(settings: ReachingSettings, system: str, learner: str) -> Dynamics:
-    """What the policy is trained in, at its start."""
+    """The model in which the policy is trained, at its start."""
     arm = system_of(system, settings, unknowns=learner == "fitted")
     spec, physics = arm.spec, as_physics(arm.physics)
     if learner in ("phy", "fitted"):

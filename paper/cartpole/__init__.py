@@ -18,7 +18,7 @@ NUM_STARTS = 20  # of the evaluation
 
 @dataclass(frozen=True, kw_only=True)
 class ControlSettings:
-    """What decides the numbers, for all learners, unless one says otherwise.
+    """Settings that decide the numbers, for all learners, unless one says otherwise.
 
     SAC's were tuned on the cart-pole with its true dynamics as the model.
     """
@@ -156,7 +156,7 @@ class Control(Experiment):
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(ControlSettings):
-    """What decides the numbers, for all learners, unless one says otherwise."""
+    """Settings that decide the numbers, for all learners, unless one says otherwise."""
 
     episodes: int = 50
     episode_length: int = 25
@@ -242,7 +242,7 @@ _OF_A_SEARCH = ("updates", "starts", "learning_rate", "guides")
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningSettings:
-    """What decides the numbers; found with the true system and other seeds (100 to 111)."""
+    """Settings that decide the numbers; found with the true system and other seeds (100 to 111)."""
 
     trials: int = 5
     """real trials of a run, the first of which goes by f_p"""
@@ -337,7 +337,7 @@ class Planning(Experiment):
 
 @dataclass(frozen=True, kw_only=True)
 class FloorSettings:
-    """What decides the numbers."""
+    """Settings that decide the numbers."""
 
     sequences: int = 1000
     """of actions, that each round of the cross-entropy method looks at"""

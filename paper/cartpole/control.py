@@ -31,7 +31,7 @@ PARTS = ("fit", "rollout", "update")
 
 
 class Setup(NamedTuple):
-    """What a run is about.
+    """The parts of a run.
 
     Args:
         env: The real system; an environment that can be pickled.
@@ -153,11 +153,11 @@ class Recorder(DynaCallback):
         self._begun = 0.0  # of this process's time
 
     def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
-        """What is recorded of an episode's transitions."""
+        """Entries of the record by an episode's transitions."""
         return {}
 
     def of_policy(self, episode: int) -> dict[str, Any]:
-        """What is recorded of the policy after the updates that follow an episode (from 1)."""
+        """Entries by the policy after the updates that follow an episode (from 1)."""
         return {}
 
     def found(self) -> dict[str, Any]:
@@ -171,7 +171,7 @@ class Recorder(DynaCallback):
         return records
 
     def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """How well the model foresaw the episode; rmse for each state, once it can predict."""
+        """Record the scores of the model on the episode, once it can predict."""
         if self._record is not None and "nlpd" in metrics:
             errors = [value for name, value in metrics.items() if name.startswith("rmse/")]
             self._record |= {name: metrics[name] for name in ("nlpd", "coverage")}
@@ -237,7 +237,7 @@ def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
 
 
 def updates_table(experiment: Control) -> str:
-    """How many gradient steps each scenario makes after an episode."""
+    """Gradient steps of each scenario after an episode."""
     until = experiment.settings.last_model_episode
     starts = [1, until + 1] if until < experiment.settings.episodes else [1]
     rows = []
@@ -318,7 +318,7 @@ def cost_of_a_run(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
-    """How well the models foresaw episodes, from the second: the first that a learnt one can."""
+    """Scores of the models on episodes before they had them, from the second on."""
     errors = [f"rmse_{state}" for state in experiment.rmses]
     scored = episodes[episodes["episode"] > 1].groupby("scenario", sort=False)
     table = scored[["nlpd", *errors]].median()

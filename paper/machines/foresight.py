@@ -92,7 +92,7 @@ def _replay(
 def _scores(
     dynamics: LearnedDynamics, unseen: Trajectories, settings: ForesightSettings
 ) -> dict[str, Any]:
-    """Of the next states, and of trajectories by their number of steps; an entry for each state."""
+    """Scores of next states, and of free runs by their number of steps; an entry for each state."""
     near = dynamics.score(*unseen)
     found: dict[str, Any] = {"coverage": near.coverage.tolist(), "nlpd": near.nlpd.tolist()}
     for steps in settings.horizons:
