@@ -75,7 +75,7 @@ _ROOMS = (
     "control",
 )
 # Rooms that are not searched for names; most need an extra.
-_OTHER_ROOMS = ("ax", "envs", "records", "report", "rl", "sklearn")
+_OTHER_ROOMS = ("ax", "records", "report", "rl", "sklearn", "systems")
 
 
 def __getattr__(name: str) -> Any:

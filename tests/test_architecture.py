@@ -35,6 +35,8 @@ FLOORS = [
 
 
 CSV_TO_FREE_RUN = 46  # files that a log passes on the way to a judged free run
+TRIAL, ITERATION = 54, 52  # that a planned trial and an iteration of Dyna pass, fits included
+OF_CONTROL, OF_CONTROL_AND_RL = 9, 7  # of these
 FILES, CLASSES, FUNCTIONS = 32, 36, 256  # that the ten lines of the README pass; fewer are better
 REPORT, WITH_A_REPORT = 13, 34  # of report and validation, and of what is below, by a point fit
 
@@ -124,6 +126,41 @@ def test_a_report_passes_few_files(tmp_path, monkeypatch):
     own = {file for file in files if file.startswith(("report", "validation"))}
     assert len(own) <= REPORT, sorted(own)
     assert len(files) <= REPORT + WITH_A_REPORT, sorted(files)
+
+
+@pytest.fixture
+def swing_up():
+    """The cart-pole, and a task whose dynamics learn in moments."""
+    from gpadjust.systems import cart_pole
+
+    system = cart_pole()
+    quick = {"method": "map", "num_starts": 1, "num_screened": 0}
+    dynamics = LearnedDynamics(system.spec, system.physics, fit_options=quick)
+    return system.make(), system.task(dynamics)
+
+
+@pytest.mark.filterwarnings("ignore:A step of the last real episode")
+def test_a_planned_trial_passes_few_files(swing_up):
+    from gpadjust.control import CrossEntropy, MPCAgent, Planner
+
+    plan = Planner(search=CrossEntropy(1), horizon=3, num_random=8)
+    agent = MPCAgent(*swing_up, plan, first=plan, seed=0).learn(25)
+    files, _, _ = passed(lambda: agent.learn(25))  # the second, in dynamics that have learnt
+    own = {file for file in files if file.startswith("control/")}
+    assert len(own) <= OF_CONTROL, sorted(own)
+    assert len(files) <= TRIAL, sorted(files)
+
+
+def test_an_iteration_of_dyna_passes_few_files(swing_up):
+    from gpadjust.rl import DynaOptions, DynaSAC
+
+    options = DynaOptions(model_episodes=2, updates_per_model_step=0.1)
+    small = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
+    agent = DynaSAC("MlpPolicy", *swing_up, options, **small).learn(25)
+    files, _, _ = passed(lambda: agent.learn(25, reset_num_timesteps=False))
+    own = {file for file in files if file.startswith(("control/", "rl/"))}
+    assert len(own) <= OF_CONTROL_AND_RL, sorted(own)
+    assert len(files) <= ITERATION, sorted(files)
 
 
 def test_a_formula_is_called_through_few_functions():

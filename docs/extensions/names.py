@@ -12,6 +12,7 @@ from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.pycode import ModuleAnalyzer
+from sphinx.util import inspect
 from sphinx.util.logging import getLogger
 
 REFERENCE = Path(__file__).parents[1] / "reference"
@@ -70,6 +71,19 @@ def link_other_names(
     return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", entry, node, content)
 
 
+def sign(
+    app: Sphinx, what: str, name: str, found: Any, options: Any, signature: str, returns: str
+) -> tuple[str, None] | None:
+    """Sign a class by its ``__init__`` where autodoc does by a ``__new__`` of any arguments."""
+    if what != "class" or not signature or not signature.startswith("(*args"):
+        return None
+    arguments = inspect.signature(found.__init__, bound_method=True)
+    signed = inspect.stringify_signature(
+        arguments, show_return_annotation=False, unqualified_typehints=True
+    )
+    return re.sub(r"<class '[\w.]*?(\w+)'>", r"\1", signed), None
+
+
 def skip_field_aliases(
     app: Sphinx, what: str, name: str, member: Any, skip: bool, options: Any
 ) -> bool | None:
@@ -104,6 +118,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Register the hooks."""
     app.connect("doctree-read", link_literals)
     app.connect("missing-reference", link_other_names)
+    app.connect("autodoc-process-signature", sign)
     app.connect("autodoc-skip-member", skip_field_aliases)
     app.connect("env-check-consistency", check_complete)
     app.connect("html-page-context", mend_ways_back)

@@ -1,4 +1,4 @@
-"""Asking for measurements and being told them, from the first to the last."""
+"""A collection of measurements, by asking and telling or by a loop."""
 
 from __future__ import annotations
 
@@ -444,7 +444,7 @@ class Collection(Measurements):
             raise CollectionError(
                 f"The oracle returned no measured values of the points {X.tolist()}: {error} It is "
                 f"in this error's `.result`; {self._place()}. The points are still pending: tell() "
-                "`.collection` their values, mend the oracle, and run it again. To say that a "
+                "`.collection` their values, correct the oracle, and run it again. To say that a "
                 "measurement failed, it may raise an exception or return NaN.",
                 self,
                 X,

@@ -35,7 +35,7 @@ def sobol_points(bounds: Tensor, q: int, known: Tensor, seed: int) -> Tensor:
 
 
 def among(points: Tensor, others: Tensor) -> Tensor:
-    """Whether each of ``n x d`` points is one of the others, ``n``."""
+    """Mark each of ``n x d`` points that is one of the others, ``n``."""
     return (points.unsqueeze(-2) == others).all(-1).any(-1)
 
 
@@ -89,7 +89,7 @@ def best_points(
 
 
 def _near(points: Tensor, others: Tensor, bounds: Tensor) -> Tensor:
-    """Whether each of ``n x d`` points is near one of the others, ``n``."""
+    """Mark each of ``n x d`` points near one of the others, ``n``."""
     return (distances(points, others, bounds) < NEAR).any(-1)
 
 

@@ -52,7 +52,7 @@ def load_parameter_values(model: Any, values: dict[str, Any]) -> bool:
 
 
 def _alike(model: Any, previous: Any) -> bool:
-    """Whether a warm start of one model from another makes sense."""
+    """True if a warm start of one model from another makes sense."""
     if type(model) is not type(previous) or not isinstance(model, TermsGP):
         return False
     if model.num_samples is not None or previous.num_samples is not None:

@@ -103,7 +103,7 @@ class ParameterPhysics:
         return f"{type(self).__name__}({self.path or self.name!r})"
 
     def __eq__(self, other: object) -> bool:
-        """Whether it is of the same physics."""
+        """True if it is of the same physics."""
         return isinstance(other, ParameterPhysics) and (
             self.physics is other.physics or (self.path is not None and self.path == other.path)
         )

@@ -212,7 +212,7 @@ def no_numbers(names: Sequence[str]) -> ValueError:
 
 
 def are_numbers(values: Sequence[Any]) -> bool:
-    """Whether values of a parameter are numbers, as a physics reads them."""
+    """True if values of a parameter are numbers, as a physics reads them."""
     return all(isinstance(value, bool | int | float) for value in values)
 
 

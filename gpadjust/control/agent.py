@@ -132,7 +132,7 @@ class Agent(TaskAgent):
             checked_number("reward_tolerance", reward_tolerance, least=0)
         self.task = task
         self.env = env
-        check_spaces(task, env.observation_space, env.action_space)
+        task.check_spaces(env.observation_space, env.action_space)
         self.action_noise = action_noise
         self.random_steps = random_steps
         self.reward_tolerance = reward_tolerance
@@ -474,19 +474,3 @@ def print_progress(agent: Agent, event: str, values: dict[str, float]) -> None:
     if event in ("plan", "fit", "update", "search"):
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
         print(f"{agent.num_timesteps} steps, {event}: {numbers}")
-
-
-def check_spaces(task: Task, observation_space: Any, action_space: Any) -> None:
-    """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
-    spec = task.dynamics.spec
-    for name, space, size in (
-        ("observation", observation_space, spec.observation_dim),
-        ("action", action_space, spec.action_dim),
-    ):
-        if not hasattr(space, "high") or space.shape != (size,):
-            raise ValueError(
-                f"The spec of the dynamics says that the {name} has {size} entries, so a Box of "
-                f"shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, of "
-                f"which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
-                f"{tuple(spec.actions)}."
-            )

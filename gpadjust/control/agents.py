@@ -44,17 +44,11 @@ class MPCAgent(Agent):
         ValueError: As :class:`Agent`.
 
     Example:
-        >>> import gymnasium
-        >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner, Task
-        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.control import CrossEntropy, MPCAgent, Planner
         >>> from gpadjust.systems import cart_pole
-        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> task = Task(
-        ...     LearnedDynamics(CART_POLE_SPEC, cart_pole().physics), cart_pole_reward
-        ... )
+        >>> system = cart_pole()
         >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
-        >>> agent = MPCAgent(env, task, quick, first=quick, seed=0)
+        >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
         >>> agent.learn(total_timesteps=2 * 25)
         MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps)
     """
@@ -151,21 +145,15 @@ class PolicySearchAgent(Agent):
         ValueError: As :class:`Agent`.
 
     Example:
-        >>> import gymnasium
+        >>> from dataclasses import replace
         >>> import torch
-        >>> from gpadjust.control import PolicySearch, PolicySearchAgent, Task, linear_policy
-        >>> from gpadjust.dynamics import LearnedDynamics
+        >>> from gpadjust.control import PolicySearch, PolicySearchAgent, linear_policy
         >>> from gpadjust.systems import cart_pole
-        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
-        >>> from gpadjust.systems.cart_pole import cart_pole_start
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole().physics)
-        >>> bounds = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
-        >>> task = Task(
-        ...     dynamics, cart_pole_reward, initial_states=cart_pole_start, state_bounds=bounds
-        ... )
+        >>> wide = torch.tensor([[-50.0] * 4, [50.0] * 4])  # far beyond what is ever seen
+        >>> system = replace(cart_pole(), state_bounds=wide)
         >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
-        >>> PolicySearchAgent(env, task, linear_policy, search, seed=0).learn(total_timesteps=25)
+        >>> agent = PolicySearchAgent(system.make(), system.task(), linear_policy, search, seed=0)
+        >>> agent.learn(total_timesteps=25)
         PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps)
     """
 

@@ -118,6 +118,21 @@ class Task:
         self.terminations(states)
         self.dynamics.try_physics(states, actions)
 
+    def check_spaces(self, observation_space: Any, action_space: Any) -> None:
+        """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
+        spec = self.dynamics.spec
+        for name, space, size in (
+            ("observation", observation_space, spec.observation_dim),
+            ("action", action_space, spec.action_dim),
+        ):
+            if not hasattr(space, "high") or space.shape != (size,):
+                raise ValueError(
+                    f"The spec of the dynamics says that the {name} has {size} entries, so a Box "
+                    f"of shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, "
+                    f"of which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
+                    f"{tuple(spec.actions)}."
+                )
+
     def draw_initial_states(self, n: int) -> Tensor:
         """Draw ``n x state_dim`` states at which episodes start.
 

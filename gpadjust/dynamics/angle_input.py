@@ -65,5 +65,5 @@ class AngleInput(InputTransform):
         return found
 
     def equals(self, other: InputTransform) -> bool:
-        """Whether ``other`` replaces the same columns."""
+        """True if ``other`` replaces the same columns."""
         return isinstance(other, AngleInput) and self.columns == other.columns

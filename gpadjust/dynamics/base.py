@@ -45,7 +45,7 @@ class Dynamics(ABC):
     @property
     @abstractmethod
     def is_fitted(self) -> bool:
-        """Whether it can predict already."""
+        """True once it can predict."""
 
     @abstractmethod
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
@@ -80,7 +80,7 @@ class Dynamics(ABC):
         return lambda states, actions: self.predict(states, actions).mean
 
     def before_data(self) -> Dynamics | None:
-        """What is known of the system before there are transitions; None if that is nothing."""
+        """Dynamics to use before there are transitions; None if nothing is known of the system."""
         return self if self.is_fitted else None
 
     def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Scores:
@@ -191,7 +191,7 @@ class Dynamics(ABC):
         )
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
-        """How far measured next states scatter about a sampled function, ``N x state_dim``.
+        """Variance of measured next states about a sampled function, ``N x state_dim``.
 
         It is what variances of :meth:`predict` have beside those of the functions; zero unless
         dynamics say something else.
@@ -205,7 +205,7 @@ class Dynamics(ABC):
     def _varied(
         self, variation: Tensor | float
     ) -> Callable[[int, int | None], TransitionFunctions]:
-        """As `sample_functions`, each function with parameters of its own."""
+        """Like `sample_functions`, each function with parameters of its own."""
         raise ValueError(
             "Expected dynamics that learnt unknown parameters of one physics, which are to differ "
             f"by variation={variation!r}; {type(self).__name__} has none, or several physics."
@@ -226,7 +226,7 @@ class Dynamics(ABC):
             self.predict(states, actions)
 
     def describe(self) -> dict[str, str]:
-        """What these dynamics are, each setting as a text: unless they say more, class and spec."""
+        """Each setting of these dynamics as a text; by default, class and spec."""
         return fingerprint(type(self), self.spec)
 
     def state_dict(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from gpadjust.checks import check_columns, check_finite, check_level, checked_whole
 from gpadjust.dynamics.particles import (
     Move,
-    about_centre,
+    about_center,
     central_interval,
     check_enough,
     measurement_noise,
@@ -27,7 +27,7 @@ _CERTAIN = 1e-9  # of how far the means range: a spread that is one of rounding 
 
 
 class FreeRun(NamedTuple):
-    r"""Where dynamics say that ``w`` sequences of ``T`` actions lead, each from its own state.
+    r"""Predicted states along ``w`` sequences of ``T`` actions, each from its own state.
 
     Step t is the state after t + 1 actions. Each of the ``K`` particles follows one function drawn
     from the dynamics, and nothing that was measured on the way. Noise is added to what is reported
@@ -224,7 +224,7 @@ def free_run(
             if not isinstance(process_noise, str):
                 added = process_noise
             else:
-                middle = about_centre(spec, particles)[0]
+                middle = about_center(spec, particles)[0]
                 added = step_or_nan(noise_variance, middle, each).nan_to_num(nan=0.0).sqrt()
             particles, lost = move_on(functions, particles, lost, each, state_bounds)
             if added is not None:
@@ -238,24 +238,24 @@ def free_run(
                     particles = torch.where(lost.unsqueeze(-1), before, particles)
             path.append(particles)
             lost_by_then.append(lost.double().mean(0))
-        centre, cloud = about_centre(spec, torch.stack(path, dim=2))
-        centre = _without_jumps(spec, initial_states, centre)
-        mean = centre + cloud.mean(0)
+        center, cloud = about_center(spec, torch.stack(path, dim=2))
+        center = _without_jumps(spec, initial_states, center)
+        mean = center + cloud.mean(0)
         if isinstance(sensors, Tensor):
-            error = sensors.expand_as(centre)
+            error = sensors.expand_as(center)
             cloud = cloud + measurement_noise(spec, error, num_functions, generator)
         elif noise:
             before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
             rows = before.flatten(0, 1).split(_ROWS), actions.flatten(0, 1).split(_ROWS)
             variances = [step_or_nan(noise_variance, *part) for part in zip(*rows, strict=True)]
-            scatter = _with_lags(spec, torch.cat(variances).sqrt().view_as(centre))
+            scatter = _with_lags(spec, torch.cat(variances).sqrt().view_as(center))
             cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
     low, high = central_interval(cloud, level)
     return FreeRun(
         mean=mean,
-        lower=centre + low,
-        upper=centre + high,
-        particles=centre + cloud,
+        lower=center + low,
+        upper=center + high,
+        particles=center + cloud,
         lost=torch.stack(lost_by_then, 1),
         spec=spec,
         level=level,

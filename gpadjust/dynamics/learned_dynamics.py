@@ -112,7 +112,7 @@ class LearnedDynamics(Dynamics):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether it has learnt from any transitions."""
+        """True once it has learnt from transitions."""
         return self._learnt is not None
 
     @property
@@ -128,7 +128,7 @@ class LearnedDynamics(Dynamics):
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Learn from further transitions, beside the earlier ones.
 
-        The hyper-parameters are searched for anew at first and whenever the number of transitions
+        The hyper-parameters are searched for at first and again whenever the number of transitions
         has doubled since the last search; else they are fitted again from where they were. If this
         raises an error, what was learnt before stands; so it does in all methods below.
 
@@ -277,7 +277,7 @@ class LearnedDynamics(Dynamics):
         return self.spec.complete_variance((noisy - without).clamp_min(0.0))
 
     def describe(self) -> dict[str, str]:
-        """What these dynamics are, each setting as a text; of objects, the class."""
+        """Each setting of these dynamics as a text; of objects, the class."""
         parts = [*self._recipe.parts]
         several: dict[str, Any] = {"physics": parts} if len(parts) > 1 else {}
         if self.physics is not None and self.physics.unknowns:
@@ -339,7 +339,7 @@ class LearnedDynamics(Dynamics):
     def _varied(
         self, variation: Tensor | float
     ) -> Callable[[int, int | None], TransitionFunctions]:
-        """As `sample_functions`, each function with parameters of its own."""
+        """Like `sample_functions`, each function with parameters of its own."""
         learnt = self._known_so_far()
         if self.physics is None or not self.physics.unknowns or len(self._recipe.parts) > 1:
             return super()._varied(variation)

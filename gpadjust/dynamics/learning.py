@@ -118,7 +118,7 @@ class Recipe:
             return model.condition_on_observations(*self._rows(data))
 
     def physics_at(self, states: Tensor, actions: Tensor) -> Tensor | None:
-        """What the physics says of the targets, those of its parts side by side."""
+        """Targets by the physics, those of its parts side by side."""
         if self.physics is None:
             return None
         with torch.no_grad():
@@ -143,8 +143,10 @@ class Recipe:
         spec, columns = self.targets.spec, self.targets.spec.predicted
         for part, own in self._of_parts(known):
             probes = PhysicsProbes.of(data.states, data.actions, own, columns)
+            inputs = self.targets.inputs(probes.states, probes.actions)
+            guess = part.unknowns.guess.expand(len(inputs), -1)
             with torch.no_grad():
-                found = part.anew(self.targets.inputs(probes.states, probes.actions))
+                found = part.fresh_rows(torch.cat([inputs, guess], dim=-1))
             probes.check(found, part.name, spec, columns)
 
     @contextmanager
@@ -157,7 +159,7 @@ class Recipe:
 
     @property
     def physics_learns(self) -> bool:
-        """Whether the physics has parameters to learn, so that what it says changes with a fit."""
+        """True if the physics has parameters to learn, so that its values change with a fit."""
         return any(p.requires_grad for part in self.parts.values() for p in part.parameters())
 
     def fit(
@@ -263,7 +265,7 @@ def made_by(make: Any) -> Any:
 
 
 def _own_modules(make: ModelFactory) -> ModelFactory:
-    """What makes a model, with copies of the modules (kernels) that a partial holds."""
+    """The factory, with copies of the modules (kernels) that a partial holds."""
     if not isinstance(make, partial):
         return make
     return partial(make.func, *make.args, **_copied(make.keywords))

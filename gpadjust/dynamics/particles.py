@@ -84,17 +84,17 @@ def move_on(
     return torch.where(lost.unsqueeze(-1), particles, after), lost
 
 
-def about_centre(spec: StateSpec, particles: Tensor) -> tuple[Tensor, Tensor]:
-    """The centre ``... x state_dim`` of particles ``K x ... x state_dim``, and how far they are.
+def about_center(spec: StateSpec, particles: Tensor) -> tuple[Tensor, Tensor]:
+    """The center ``... x state_dim`` of particles ``K x ... x state_dim``, and how far they are.
 
-    Where angles went round different ways, their centre is the mean on the circle, and how far each
+    Where angles went round different ways, their center is the mean on the circle, and how far each
     is from it is the shortest way round.
     """
-    centre = particles.mean(0)
+    center = particles.mean(0)
     for i in spec.angle_columns:
         angle = particles[..., i]
-        centre[..., i] = torch.atan2(angle.sin().mean(0), angle.cos().mean(0))
-    return centre, spec.change(centre.expand_as(particles), particles)
+        center[..., i] = torch.atan2(angle.sin().mean(0), angle.cos().mean(0))
+    return center, spec.change(center.expand_as(particles), particles)
 
 
 def measurement_noise(
@@ -111,7 +111,7 @@ def measurement_noise(
 
 
 def central_interval(sample: Tensor, level: float) -> tuple[Tensor, Tensor]:
-    """What a further draw lies between with this probability, from ``K x ...``: ``...`` each."""
+    """Ends between which a further draw lies with this probability, from ``K x ...``."""
     low, high = (_order_statistic(sample, p) for p in ((1 - level) / 2, (1 + level) / 2))
     return low, high
 
@@ -128,7 +128,7 @@ def check_enough(num_functions: int, level: float) -> None:
 
 
 def _order_statistic(sample: Tensor, level: float) -> Tensor:
-    """What a further draw is below with this probability, from ``K x ...``: ``...``.
+    """The value that a further draw is below with this probability, from ``K x ...``: ``...``.
 
     The i-th smallest of K draws is so with probability i / (K + 1); between them it is a line.
     """

@@ -168,7 +168,7 @@ def going_on(values: Tensor, is_angle: bool) -> Tensor:
 
 
 def labels(spec: StateSpec, units: Mapping[str, str] | None) -> dict[str, str]:
-    """What axes are called, by the names of states and actions and "time"."""
+    """Labels of axes, by the names of states and actions and "time"."""
     names = (*spec.states, *spec.actions, "time")
     units = {"time": "s", **dict.fromkeys(spec.angles, "rad"), **(units or {})}
     check_names("units", units, names)

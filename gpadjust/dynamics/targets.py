@@ -139,35 +139,26 @@ class TargetPhysics(Physics):
         known.store([*keys], values[list(keys.values())])
         self._known = known
 
-    def anew(self, X: Tensor) -> Tensor:
-        """The values at ``N x d`` as the physics says them, whatever was given."""
-        known, self._known = self._known, RowMemo(self._known.capacity)
-        try:
-            values: Tensor = self(X)
-            return values
-        finally:
-            self._known = known
-
     def forget(self) -> None:
         """Forget what was given, and what the physics remembers."""
         self._known = RowMemo(self._known.capacity)
         self.physics.forget()
 
     def of_rows(self, rows: Tensor) -> Tensor:
-        """As the base class, by the values that were given as far as they are."""
+        """Like the base class; values that were given are not asked for again."""
         asks = torch.is_grad_enabled() and rows.requires_grad
         if asks or not len(self._known) or self.unknowns or self._state():
             return super().of_rows(rows)
         return self._known.recall(rows, super().of_rows, learn=False)
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
-        """As :meth:`of_rows`, as the physics says it whatever was given or is remembered."""
+        """Like :meth:`of_rows`, evaluated whatever was given or is remembered."""
         d = rows.shape[-1] - len(self.unknowns)
         given = [self.unknowns.named(rows[:, d:])] if self.unknowns else []
         return self._targets_of(self.physics.fresh_rows, rows[:, :d], *given)
 
     def _state(self) -> list[Tensor]:
-        """What the physics depends on besides X, as far as torch knows."""
+        """Tensors that the physics depends on besides X, as far as torch knows."""
         return [*self.parameters(), *self.buffers()]
 
     @contextmanager
@@ -220,7 +211,7 @@ def parts_of(physics: Physics) -> dict[str, Physics]:
 def next_values(
     physics: Physics, inputs: Tensor, num_states: int, parameters: Tensor | None = None
 ) -> Tensor:
-    """What the physics says, ``... x num_states``, from ``... x (num_states + a)``."""
+    """Next states by the physics, ``... x num_states``, from ``... x (num_states + a)``."""
     Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0), parameters)
     check_next_values(physics, Y, num_states)
     return Y

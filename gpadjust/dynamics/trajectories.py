@@ -49,7 +49,7 @@ class Windows(NamedTuple):
         return Windows(*(part[rows] for part in self))
 
     def spread(self, number: int, seed: int = 0) -> Windows:
-        """So many of the windows, drawn evenly, as by :meth:`Trajectories.spread`."""
+        """Draw a number of the windows evenly, as by :meth:`Trajectories.spread`."""
         return self.some(spread_rows(len(self.states), number, seed, "windows"))
 
 
@@ -157,7 +157,7 @@ class Trajectories:
     def some(self, rows: Tensor | slice) -> Trajectories:
         """The rows of these numbers, a slice, or those where ``N`` booleans are true.
 
-        Episodes are numbered anew: one ends wherever the row after it is left out.
+        Episodes are numbered again: one ends wherever the row after it is left out.
         """
         numbers = torch.arange(len(self.states))[rows]
         old = self.episode[numbers]
@@ -167,7 +167,7 @@ class Trajectories:
         return Trajectories(states, actions, next_states, new)
 
     def spread(self, number: int, seed: int = 0) -> Trajectories:
-        """So many of the rows, drawn evenly: one of each of as many parts of the same length.
+        """Draw a number of the rows evenly: one of each of as many parts of the same length.
 
         Args:
             number: How many rows.
@@ -229,7 +229,7 @@ class Trajectories:
 
 
 def spread_rows(total: int, number: int, seed: int, what: str) -> Tensor:
-    """So many of the numbers below ``total``, one of each of as many parts of the same length.
+    """Draw from the numbers below ``total``, one of each of ``number`` parts of the same length.
 
     Raises:
         ValueError: If there are fewer, or ``number`` is no positive whole number.

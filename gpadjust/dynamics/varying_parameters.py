@@ -1,4 +1,4 @@
-"""What a physics with other parameters changes in the next states."""
+"""Changes of the next states by other parameters of a physics."""
 
 from __future__ import annotations
 

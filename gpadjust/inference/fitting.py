@@ -28,7 +28,10 @@ Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA
 
 
 class FitOptions(TypedDict, total=False):
-    """The options of :func:`fit`."""
+    """The options of :func:`fit`, by name.
+
+    ``num_samples`` and ``num_draws`` are of ``"bayes"`` alone; :func:`fit` says what each does.
+    """
 
     num_starts: int | None
     num_screened: int | None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
-from inspect import signature
 from typing import Any, ClassVar, Self
 
 import torch
@@ -32,7 +31,7 @@ from gpadjust.models.hyperparameter_samples import (
 )
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.parameters import learnt_noise, set_initial_values
-from gpadjust.models.term_builder import ModelOptions, TermBuilder
+from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
 
@@ -420,25 +419,3 @@ class TermsGP(TermsModel, SingleTaskGP):
         # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
         with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
             return super(TermsGP, shell).condition_on_observations(X, Y, **kwargs)
-
-
-def arguments_of(model: type) -> dict[str, bool]:
-    """The arguments of a model by name, and whether they are needed.
-
-    Where it passes on whatever else it is given, those of its base class are among them, and at
-    last the :class:`~gpadjust.models.term_builder.ModelOptions` that all structures share.
-    """
-    found: dict[str, bool] = {}
-    for owner in model.__mro__:
-        if owner in (TermsGP, TermsModel):
-            return {**dict.fromkeys(ModelOptions.__annotations__, False), **found}
-        if "__init__" not in vars(owner):
-            continue
-        own = [*signature(vars(owner)["__init__"]).parameters.values()][1:]
-        needed = not found  # what a base class needs is given by the class
-        for each in own:
-            if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY):
-                found.setdefault(each.name, needed and each.default is each.empty)
-        if not any(each.kind is each.VAR_KEYWORD for each in own):
-            break
-    return found

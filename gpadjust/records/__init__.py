@@ -1,9 +1,8 @@
 """Records of machines: read, resampled, smoothed, and cut into windows."""
 
-from gpadjust.dynamics import Windows
 from gpadjust.records.record import Record
 from gpadjust.records.records import Records
 from gpadjust.records.smoothed_records import SmoothedRecords, smooth
 from gpadjust.records.smoothing import SmoothingWarning
 
-__all__ = ["Record", "Records", "SmoothedRecords", "SmoothingWarning", "Windows", "smooth"]
+__all__ = ["Record", "Records", "SmoothedRecords", "SmoothingWarning", "smooth"]

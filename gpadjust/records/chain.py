@@ -25,7 +25,7 @@ _BETTER = 0.01  # what a worse path may cost more, by rounding
 
 
 class Known(NamedTuple):
-    """What is known beforehand, of the ``d`` states that move.
+    """Prior knowledge of the ``d`` states that move.
 
     Args:
         noise: Variances of the errors of what is measured; NaN where they are learnt.
@@ -47,7 +47,7 @@ class Path(NamedTuple):
 
 
 class Move(NamedTuple):
-    """Where a search goes from a path.
+    """Step of a search from a path.
 
     Args:
         path: The next one.
@@ -113,7 +113,7 @@ class Chain:
         return Path(states, parameters, self._following(everything, self.actions, parameters))
 
     def first_variances(self, path: Path) -> tuple[Array, Array]:
-        """Of both noises, by f_p's errors in single steps, whatever is known of them."""
+        """First variances of both noises, by f_p's errors in single steps."""
         ends = np.concatenate([m[1:] for m in self.measured])
         begins = np.concatenate([x[:-1] for x in path.states])
         change = ((path.following - begins) ** 2).mean(0)
@@ -181,7 +181,7 @@ class Chain:
     def likely_variances(
         self, links: Sequence[Link], found: Sequence[Smoothed]
     ) -> tuple[Array, Array]:
-        """Of noise and process_noise, most likely given what is known of the states."""
+        """Variances of noise and process_noise, most likely given the states' distribution."""
         d = len(self.spread)
         errors, added = [], []
         for link, (states, crossed) in zip(links, found, strict=True):
@@ -213,7 +213,7 @@ class Chain:
         return float(off.sum() + added.sum() + begins + (path.parameters**2).sum())
 
     def _following(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
-        """What f_p says, ``n x d``; an error if that is nothing."""
+        """Next states by f_p, ``n x d``; an error where it fails."""
         found = self.asked(states, actions, parameters)
         if not np.isfinite(found).all():
             failed = np.flatnonzero(~np.isfinite(found).all(1))

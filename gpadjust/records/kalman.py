@@ -46,7 +46,7 @@ class Filtered(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """What is known of the states of a stretch by all that was measured.
+    """Distribution of the states of a stretch by all that was measured.
 
     Args:
         states: Their moments.
@@ -62,7 +62,7 @@ def smooth_chain(
 ) -> tuple[list[Smoothed], float]:
     """All stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
 
-    The last entries of a state, beyond those that a stretch starts anew with, are constants that
+    The last entries of a state, beyond those that a stretch starts again with, are constants that
     all stretches share.
 
     Args:

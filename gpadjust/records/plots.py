@@ -35,7 +35,7 @@ def plot_record(
     """Draw a record over time, a panel for each state and each action.
 
     Lines end where a stretch does: gaps are grey, and a dotted line is where a segment begins.
-    Segments whose clock starts anew lie over each other. Angles go on without jumps, from within
+    Segments whose clock starts again lie over each other. Angles go on without jumps, from within
     half a turn at the beginning of a stretch.
 
     Args:

@@ -125,7 +125,7 @@ class Record:
 
     @cached_property
     def _breaks(self) -> Tensor:
-        """Of each row but the first, whether it begins a segment: ``N - 1`` booleans."""
+        """True for each row but the first that begins a segment: ``N - 1`` booleans."""
         if self.segments is None:
             return torch.zeros(len(self.times) - 1, dtype=torch.bool)
         changes = [label != following for label, following in pairwise(self.segments)]
@@ -192,7 +192,7 @@ class Record:
             raise ValueError(
                 f"{self._called}, row {row}: expected times that rise, found {time:.10g} after "
                 f"{before:.10g}. Leave out rows that were written twice; where the clock was set "
-                "anew, begin a new segment by `segments`."
+                "again, begin a new segment by `segments`."
             )
 
 
@@ -248,7 +248,7 @@ def in_control_steps(
 
 
 def _rows_a_step(records: Sequence[Record], spec: StateSpec, step: float | None) -> int:
-    """How many rows of the records make a control step."""
+    """The number of rows of the records that make a control step."""
     for record in records:
         record.check_even()
     fast, *_, slow = sorted((records[0], *records), key=lambda record: record.sampling_step)

@@ -268,7 +268,7 @@ class Records:
         return Trajectories(states, actions, following, episode), stretches
 
     def _hidden(self, data: Trajectories) -> str:
-        """What to do about states that were never measured; empty if there are none."""
+        """The way out if states were never measured; empty if there are none."""
         never = data.states.isnan().all(0).nonzero().flatten().tolist()
         if not never:
             return ""

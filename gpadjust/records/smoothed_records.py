@@ -1,4 +1,4 @@
-"""What a machine did while it was recorded, by noisy and incomplete records."""
+"""States of a machine while it was recorded, from noisy and incomplete records."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class SmoothedRecords:
 
     @cached_property
     def variation(self) -> Tensor:
-        """By how much the parameters differ from one stretch of the records to another, ``p``.
+        """Variation of the parameters from one stretch of the records to another, ``p``.
 
         Standard deviations, in those of each parameter's prior: with 0.1, and a prior of a factor
         of 1.5, by some 4 %. Stretches of which each has parameters of its own are explained by
@@ -299,7 +299,7 @@ def _variances(given: Tensor | None, name: str, records: Records) -> Array:
 def _starts(
     given: Mapping[str, tuple[float, float]] | None, records: Records
 ) -> dict[int, tuple[float, float]]:
-    """What is known of the first states, by their number among those that move."""
+    """Prior knowledge of the first states, by their number among those that move."""
     spec = records.spec
     if given is not None and not isinstance(given, Mapping):
         raise TypeError(

@@ -52,7 +52,7 @@ class Estimate(NamedTuple):
 
 
 class _End(NamedTuple):
-    """What a search found, and by how much the log density still changed, 0 if it arrived."""
+    """Result of a search, and by how much the log density still changed, 0 if it arrived."""
 
     estimate: Estimate
     gained: float
@@ -134,7 +134,7 @@ def _starts(chain: Chain, number: int) -> Iterator[tuple[Array, bool]]:
 def _search(
     chain: Chain, coordinates: Array, known_at_once: bool, max_rounds: int, bar: tqdm[Any]
 ) -> _End:
-    """What is found from parameters."""
+    """Search from these parameters."""
     path = chain.first_path(coordinates)
     noise, process_noise = chain.first_variances(path)
     if known_at_once:
@@ -162,7 +162,7 @@ def _search(
 
 
 class _Likelihood(NamedTuple):
-    """What stretches say of their parameters, each of its own: log Gaussians about one place.
+    """Likelihood of the parameters of each stretch: log Gaussians about one place.
 
     Args:
         precision: ``S x p x p``.
@@ -174,7 +174,7 @@ class _Likelihood(NamedTuple):
 
 
 def variation(chain: Chain, found: Estimate) -> Tensor:
-    r"""How far stretches' parameters lie from those of the machine, ``p``, in priors' deviations.
+    r"""Standard deviations of stretches' parameters, ``p``, in those of the priors.
 
     With :math:`\theta_s = \theta + \eta_s` in the coordinates in which priors are standard normal,
     :math:`\eta_s \sim N(0, \operatorname{diag}(v^2))` for stretch s, and the noises as they were
@@ -223,7 +223,7 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
 
 
 def _told(chain: Chain, found: Estimate) -> _Likelihood:
-    """By smoothing each stretch alone, with a standard normal prior about what all say."""
+    """Smooth each stretch alone, with a standard normal prior about the estimate by all."""
     d, p = len(found.noise), chain.num_parameters
     parameters = found.stretches[0].states.means[0, d:]
     path = _path(chain, [s.states.means[:, :d] for s in found.stretches], parameters)

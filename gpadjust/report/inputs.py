@@ -314,7 +314,7 @@ def _check(physics: Physics, data: CsvData) -> None:
         (
             f"values between {-LARGEST:.0e} and {LARGEST:.0e}",
             Y.abs() > LARGEST,
-            "Mend the physics there, or keep such inputs out:",
+            "Correct the physics there, or exclude such inputs:",
         ),
         (
             "the same values whenever it is called",

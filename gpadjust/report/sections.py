@@ -459,7 +459,7 @@ def parameters(subject: Subject) -> Markup:
     words = (
         "A bias that is free to vary leaves open which values are the true ones: these describe "
         "the system best together with it. Compare 'known before' with the interval: where they "
-        "are alike, the data have told next to nothing."
+        "are alike, the data say next to nothing."
     )
     return join([*parts, tag("p", words)])
 

@@ -86,7 +86,7 @@ class Subject:
 
     @property
     def is_sampled(self) -> bool:
-        """Whether the physics is known through samples alone, as AR1 has it."""
+        """True if the physics is known through samples alone, as AR1 has it."""
         return any(isinstance(model, AR1) for model in self._models())
 
     @property

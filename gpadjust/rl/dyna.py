@@ -30,7 +30,6 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.vec_env import VecEnv
 
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
-from gpadjust.control.agent import check_spaces
 from gpadjust.control.checkpoint import RandomState, TaskAgent, packed, unpacked
 from gpadjust.control.recorded_episodes import learn_dynamics
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
@@ -436,7 +435,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         if self.task is not None:
-            check_spaces(self.task, self.observation_space, self.action_space)
+            self.task.check_spaces(self.observation_space, self.action_space)
         self.replay_buffer_kwargs |= {
             "real_fraction": self.options.real_fraction,
             "model_buffer_size": self.options.model_buffer_size,
@@ -590,16 +589,10 @@ class DynaSAC(Dyna, SAC):
     ``SAC``, bit for bit.
 
     Example:
-        >>> import gymnasium
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import LearnedDynamics
-        >>> from gpadjust.systems import cart_pole
-        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> from gpadjust.rl import DynaOptions, DynaSAC
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = LearnedDynamics(CART_POLE_SPEC, cart_pole().physics)
-        >>> task = Task(dynamics, cart_pole_reward)
-        >>> agent = DynaSAC("MlpPolicy", env, task, DynaOptions(model_episodes=2), seed=0)
+        >>> from gpadjust.systems import cart_pole
+        >>> system, options = cart_pole(), DynaOptions(model_episodes=2)
+        >>> agent = DynaSAC("MlpPolicy", system.make(), system.task(), options, seed=0)
         >>> agent.learn(total_timesteps=25).num_episodes
         1
     """
@@ -612,20 +605,13 @@ class DynaTD3(Dyna, TD3):
     system nor the model. Particles have noise of their own.
 
     Example:
-        >>> import gymnasium
         >>> import numpy as np
         >>> from stable_baselines3.common.noise import NormalActionNoise
-        >>> from gpadjust.control import Task
-        >>> from gpadjust.dynamics import PhysicsDynamics
-        >>> from gpadjust.systems import cart_pole
-        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
         >>> from gpadjust.rl import DynaOptions, DynaTD3
-        >>> env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-        >>> dynamics = PhysicsDynamics(CART_POLE_SPEC, cart_pole().physics)
-        >>> task = Task(dynamics, cart_pole_reward)
-        >>> noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
-        >>> options = DynaOptions(model_episodes=2)
-        >>> agent = DynaTD3("MlpPolicy", env, task, options, action_noise=noise, seed=0)
+        >>> from gpadjust.systems import cart_pole
+        >>> system, options = cart_pole(), DynaOptions(model_episodes=2)
+        >>> noise = {"action_noise": NormalActionNoise(np.zeros(1), 0.2 * np.ones(1)), "seed": 0}
+        >>> agent = DynaTD3("MlpPolicy", system.make(), system.task(), options, **noise)
         >>> agent.learn(total_timesteps=25).num_episodes
         1
     """

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from gpadjust.checks import check_choice
 from gpadjust.control import Step, Task
-from gpadjust.control.agent import check_spaces
 from gpadjust.dynamics import TransitionFunctions
 from gpadjust.physics import PhysicsError
 from gpadjust.rl.buffer import CompactReplayBuffer
@@ -89,7 +88,7 @@ class ModelVecEnv(VecEnv):
         worst_reward: float = np.inf,
     ) -> None:
         spec = task.dynamics.spec
-        check_spaces(task, observation_space, action_space)
+        task.check_spaces(observation_space, action_space)
         if not task.dynamics.is_fitted:
             raise RuntimeError(
                 f"{type(task.dynamics).__name__} has not learnt from transitions yet; call "

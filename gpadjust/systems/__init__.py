@@ -18,7 +18,7 @@ except ImportError as error:
 from gpadjust.systems.arm import arm
 from gpadjust.systems.cart_pole import CartPoleEquation, cart_pole
 from gpadjust.systems.muscle_arm import MuscleArmEnv
-from gpadjust.systems.reaching import hand_distance_cm
+from gpadjust.systems.reaching import hand_distance_cm, hand_position
 from gpadjust.systems.swing_up import CartPoleSwingUpEnv
 from gpadjust.systems.system import System
 from gpadjust.systems.torque_arm import ArmEquation
@@ -46,4 +46,5 @@ __all__ = [
     "arm",
     "cart_pole",
     "hand_distance_cm",
+    "hand_position",
 ]

@@ -18,7 +18,7 @@ from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
 from gpadjust.models import CalibratedPhysics, StackedGP, TermsGP
-from gpadjust.models.factory import make_model
+from gpadjust.models.factory import ModelFactory, make_model
 from gpadjust.models.hyperparameter_samples import take_samples
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
@@ -157,7 +157,7 @@ def compare(
     train_Yvar: ArrayLike = None,
     *,
     input_transform: InputTransform | None = None,
-    structures: Sequence[str | Structure] | None = None,
+    structures: Sequence[str | Structure | ModelFactory] | None = None,
     num_starts: int | None = None,
     num_screened: int | None = None,
     seed: int = 0,
@@ -189,7 +189,7 @@ def compare(
     structure with too many unknown constants for the points is left out of models and tables,
     unless there is no other.
 
-    Beneath each table is ``"physics alone"``, f_p as it is, whose noise is told by the other
+    Beneath each table is ``"physics alone"``, f_p as it is, whose noise is estimated from the other
     observations: no candidate, but what an adjustment has to be better than. The text begins with
     the errors of the physics alone, adjusted, and of the data alone
     (:meth:`Comparison.errors`).
@@ -209,7 +209,9 @@ def compare(
             its own, where it has parameters.
         train_Yvar: Known observation variances, as in :class:`~gpadjust.CKA`.
         input_transform: As in :class:`~gpadjust.CKA`; each model has a copy of its own.
-        structures: Which to fit: names, or a :class:`Structure` of your own. Default: those above.
+        structures: Which to fit: names; callables that make a model of X, Y and ``physics``, such
+            as ``RRA`` or ``functools.partial(CKA, rho_mean=2.0)``; or a :class:`Structure`, which
+            says more of one. Default: those above.
         num_starts: As in :func:`~gpadjust.fit`.
         num_screened: As in :func:`~gpadjust.fit`.
         seed: Seed of the fits.

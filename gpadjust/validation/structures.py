@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -59,15 +59,19 @@ STRUCTURES = (
 """The structures that :func:`gpadjust.compare` knows; add your own to them."""
 
 
-def known_structures(structures: Sequence[str | Structure]) -> list[Structure]:
+def known_structures(
+    structures: str | Structure | ModelFactory | Sequence[str | Structure | ModelFactory],
+) -> list[Structure]:
     """The structures that are asked for, each once."""
     names = {structure.name: structure for structure in STRUCTURES}
-    given = [structures] if isinstance(structures, str | Structure) else [*structures]
+    one = isinstance(structures, str | Structure) or callable(structures)
+    asked: Any = [structures] if one else [*structures]  # type: ignore[misc]
+    given = [_of_factory(each) if callable(each) else each for each in asked]
     unknown = [s for s in given if not isinstance(s, Structure) and s not in names]
     if unknown or not given:
         raise ValueError(
             f"Unknown structures {unknown}; expected some of {', '.join(map(repr, names))}, or a "
-            "Structure of your own."
+            "Structure of your own, or what makes a model: a class, or functools.partial of one."
         )
     found = [s if isinstance(s, Structure) else names[s] for s in given]
     named = {structure.name: structure for structure in found}
@@ -79,6 +83,15 @@ def known_structures(structures: Sequence[str | Structure]) -> list[Structure]:
             "own."
         )
     return list(named.values())
+
+
+def _of_factory(factory: Any) -> Structure:
+    """The structure of what makes a model, named by its class and arguments."""
+    function = getattr(factory, "func", factory)
+    given = getattr(factory, "keywords", {})
+    told = ", ".join(f"{name}={value!r}" for name, value in given.items())
+    name = getattr(function, "__name__", type(function).__name__)
+    return Structure(f"{name}({told})" if told else name, factory)
 
 
 def candidates(

@@ -153,6 +153,7 @@ def verdicts(runs: pd.DataFrame, most: int, learner: str = "cka") -> list[Judged
         if part.empty:
             continue
         text = f"{name}: {LABELS[learner]} needs at most half the trials of Ax's default"
+        text += ", which has five (unequal designs)" if learner == "cka-few" else ""
         by_seed = part.pivot(index="seed", columns="learner", values="trials")
         both = by_seed.reindex(columns=[learner, REFERENCE]).dropna()
         if len(both) < FEWEST:

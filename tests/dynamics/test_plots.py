@@ -1,4 +1,4 @@
-"""Figures over time: what was recorded, and free runs beside it."""
+"""Figures of free runs beside what was measured."""
 
 import math
 
@@ -10,8 +10,6 @@ import torch
 
 from gpadjust.dynamics import PhysicsDynamics, StateSpec, Windows
 from gpadjust.dynamics.plots import plot_free_run
-from gpadjust.records import Record
-from gpadjust.records.plots import plot_record
 
 mpl.use("Agg")
 SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
@@ -21,39 +19,6 @@ SPEC = StateSpec(["theta", "v"], ["u"], angles=["theta"])
 def close():
     yield
     plt.close("all")
-
-
-def turning(num_rows=31, first=7.0, **options):
-    """A record of an angle that turns at a rate of 7, from -pi to pi, and v of which none is."""
-    times = 0.1 * torch.arange(num_rows, dtype=torch.float64)
-    angle = first + 7 * times
-    states = torch.stack([torch.atan2(angle.sin(), angle.cos()), torch.full_like(times, torch.nan)])
-    return Record(times, states.T, torch.ones(num_rows, 1).double(), **options)
-
-
-def test_a_record_shows_its_gaps_and_segments():
-    record = turning(segments=["a"] * 12 + ["b"] * 19)
-    record.states[::3, 1] = 2.0
-    rows = torch.tensor([i for i in range(31) if i not in (20, 21)])
-    labels = [record.segments[i] for i in rows]
-    record = Record(record.times[rows], record.states[rows], record.actions[rows], labels)
-    axes = plot_record(record, SPEC, units={"u": "N m", "time": "min"})
-    assert [ax.get_ylabel() for ax in axes] == ["theta in rad", "v", "u in N m"]
-    assert axes[-1].get_xlabel() == "time in min"
-    spans = [(p.get_x(), p.get_x() + p.get_width()) for p in axes[0].patches]
-    np.testing.assert_allclose(spans, [(1.1, 1.2), (1.9, 2.2)])
-    lines = [line for line in axes[0].lines if line.get_linestyle() != ":"]
-    (edge,) = [line for line in axes[0].lines if line.get_linestyle() == ":"]
-    assert list(edge.get_xdata()) == pytest.approx([1.2, 1.2])
-    starts = [0, 1.2, 2.2]
-    for line, start in zip(lines, starts, strict=True):
-        path, times = line.get_ydata(), line.get_xdata()
-        assert times[0] == pytest.approx(start)
-        assert abs(path[0]) <= math.pi
-        np.testing.assert_allclose(np.diff(path), 0.7)
-    dots = [line for line in axes[1].lines if line.get_marker() == "."]
-    assert sum(len(line.get_xdata()) for line in dots) == int((~record.states[:, 1].isnan()).sum())
-    assert axes[2].lines[0].get_drawstyle() == "steps-post"
 
 
 def turns(num_windows=4, num_steps=20):
@@ -129,16 +94,3 @@ def test_what_is_no_free_run_of_these_windows(options, error, says):
     windows, run = turns()
     with pytest.raises(error, match=says):
         plot_free_run(**{"run": run, "windows": windows, **options})
-
-
-@pytest.mark.parametrize(
-    ("record", "spec", "error", "says"),
-    [
-        ([turning()], SPEC, TypeError, "record as a Record, got list; of `records` draw each"),
-        (turning(), "theta", TypeError, "spec as a StateSpec, got str"),
-        (turning(), StateSpec(["x"], ["u"]), ValueError, "states, x, and .* found 2 and 1 columns"),
-    ],
-)
-def test_what_is_no_record_of_this_machine(record, spec, error, says):
-    with pytest.raises(error, match=says):
-        plot_record(record, spec)

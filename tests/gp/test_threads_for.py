@@ -132,7 +132,7 @@ def test_fits_in_two_threads(uniform):
         begun.wait()
 
     with ThreadPoolExecutor(2, initializer=begin) as pool:
-        assert set(pool.map(work, range(6))) == {2}
+        assert set(pool.map(work, range(4))) == {2}
 
 
 def test_predictions_leave_threads_alone(uniform, monkeypatch):

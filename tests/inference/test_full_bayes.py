@@ -342,7 +342,9 @@ def test_constraints_hold(XY, lengths, noises, options):
 class TestBeforeAndAfter:
     """A fit does not depend on what the model did before."""
 
-    @pytest.mark.parametrize("before", ["predicted", "fitted"])
+    @pytest.mark.parametrize(
+        "before", [pytest.param("predicted", marks=pytest.mark.slow), "fitted"]
+    )
     def test_a_physics_that_learns(self, before):
         X = line(8)
         Y = 2 * (6 * X).sin() + X

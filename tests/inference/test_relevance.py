@@ -370,7 +370,7 @@ class TestPartlyOff:
         mean, _ = model.components(Z, False)
         torch.testing.assert_close(model.mean_functions()(Z), mean)
         torch.manual_seed(0)
-        values = model.sample_functions(200)(Z)
+        values = model.sample_functions(200, num_features=256)(Z)
         assert values.isfinite().all()
         found = model.predict(Z)
         sd = found.variance.sqrt()

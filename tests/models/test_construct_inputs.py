@@ -1,12 +1,13 @@
 """Models from BoTorch's datasets."""
 
 import sys
+from inspect import signature
 
 import pytest
 import torch
 from botorch.utils.datasets import SupervisedDataset
 
-from gpadjust.models.terms_gp import arguments_of
+from gpadjust.models.term_builder import ModelOptions
 from tests.systems import crude
 
 
@@ -44,7 +45,7 @@ def test_every_option_is_taken(data, build, kind):
     X, Y = data()
     model, names = build(kind, X, Y), {"feature_names": ["a", "b"], "outcome_names": ["y"]}
     dataset = SupervisedDataset(X, Y, **names)
-    data_names = {"self", "train_X", "train_Y", "train_Yvar"}
-    options = dict.fromkeys(arguments_of(type(model)).keys() - data_names)
+    names = {*signature(type(model)).parameters, *ModelOptions.__annotations__}
+    options = dict.fromkeys(names - {"options", "train_X", "train_Y", "train_Yvar"})
     arguments = type(model).construct_inputs(dataset, **options)
     assert arguments.keys() == options.keys() | {"train_X", "train_Y"}

@@ -134,9 +134,9 @@ FAULTS = (
         "Terminations count as time limits and the other way round: wrong targets of the critics.",
     ),
     Fault(
-        "gpadjust/rl/checkpoint.py",
-        'agent._random_state = RandomState.from_arrays(_unpacked(parts["random.npz"]))',
-        'RandomState.from_arrays(_unpacked(parts["random.npz"])).restore()',
+        "gpadjust/control/checkpoint.py",
+        "agent._random_state = random_state",
+        "random_state.restore()",
         "The generators are restored when the agent is read, not when it goes on to learn.",
     ),
     Fault(

@@ -181,7 +181,7 @@ class TestUnknownParameters:
     def test_that_contradict_each_other(self):
         parts = self.parts()
         parts[2] = FunctionPhysics(push, unknowns={"mass": Unknown(1.0, sd=0.1)})
-        message = "parameter 'mass', which is then one.*factor=1.5.*sd=0.1.*or give it another name"
+        message = "parameter 'mass', which is then one.*factor=1.5.*sd=0.1.*or different names"
         with pytest.raises(ValueError, match=message):
             JoinedPhysics(parts)
 

@@ -203,7 +203,7 @@ def test_where_a_physics_fails_is_told_in_a_line():
         FunctionPhysics(lambda X: (1.5 - X).sqrt(), name="root")(X)
     told = failure(error.value)
     assert told.startswith("Physics 'root' returned NaN or inf in 4 of 6 row(s)")
-    assert told.endswith("keep such inputs out: at inputs (2), (3), (4) and 1 more.")
+    assert told.endswith("such inputs: at inputs (2), (3), (4) and 1 more.")
     assert failure(PhysicsError("It fails.")) == "It fails."
 
 

@@ -4,6 +4,7 @@ from dataclasses import fields
 
 import gymnasium
 import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from gpadjust.control import Task
 from gpadjust.dynamics import PhysicsDynamics
@@ -76,3 +77,14 @@ def tensors_of():
 def assert_same(tensors_of):
     """Asserts that two agents have learnt the same, bit by bit."""
     return lambda one, other: assert_equal(tensors_of(one), tensors_of(other))
+
+
+@pytest.fixture
+def normalised(point_env):
+    """Makes normalised environments of the point."""
+    return lambda n=1: VecNormalize(DummyVecEnv([point_env] * n))
+
+
+def model_rows(agent):
+    """The number of transitions of the model."""
+    return agent.replay_buffer.model_buffer.size()

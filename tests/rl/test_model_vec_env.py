@@ -400,3 +400,23 @@ def test_bad_starts_are_refused(point_particles):
 def test_bad_arguments_are_refused(point_particles, options, message):
     with pytest.raises(ValueError, match=message):
         point_particles(**options)
+
+
+def test_functions_are_drawn_once_for_what_is_refreshed_and_the_episodes_after(
+    point_particles, point_env, unsure_dynamics, monkeypatch, rise
+):
+    drawn = []
+    draw = unsure_dynamics.sample_functions
+    monkeypatch.setattr(
+        unsure_dynamics, "sample_functions", lambda n, *seed: drawn.append(n) or draw(n, *seed)
+    )
+    env = point_particles(dynamics=unsure_dynamics, sampling="trajectory")
+    buffer = CompactReplayBuffer(5, env.observation_space, env.action_space, "cpu")
+    zeros = np.zeros(2)
+    buffer.add_rows(np.ones((2, 1)), np.ones((2, 1)), np.ones((2, 1)), zeros, zeros, zeros)
+    env.refresh(buffer)
+    env.reset()
+    assert drawn == [3]
+    env.step(rise(3))
+    env.reset()  # other functions for other episodes
+    assert drawn == [3, 3]

@@ -1,14 +1,11 @@
 """What a buffer tells of the real episodes."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 
-from gpadjust.control import Task
-from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.dynamics import StateSpec
 from gpadjust.rl import MixedReplayBuffer
 
 SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
@@ -40,15 +37,6 @@ def recorded():
 
 def observe(x):
     return np.stack([x, np.sin(x), np.cos(x)], axis=-1)
-
-
-def reward(states, actions, next_states):
-    return -states[:, 0]
-
-
-def task(reward=reward, terminated=None):
-    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :2])
-    return Task(dynamics, reward, terminated=terminated)
 
 
 def test_rows_are_states_and_actions_in_the_users_units(recorded):
@@ -96,40 +84,3 @@ def test_the_oldest_row_of_a_full_buffer_may_be_no_start(recorded):
 
 def test_without_a_start_in_the_buffer_the_oldest_row_serves(recorded):
     assert starts_of(recorded(8, capacity=4, episode_length=20)) == [4]
-
-
-def test_bounds_are_far_beyond_what_was_seen(recorded):
-    assert recorded(2).bounds() is None  # nobody knows yet how far an episode goes
-    low, high = recorded(4).bounds()
-    assert low[0] == pytest.approx(1.25 - 12.5)  # of the first three rows, a whole episode
-    assert high[0] == pytest.approx(1.25 + 12.5)
-    assert (low[1], high[1]) == (-math.inf, math.inf)
-
-
-def test_the_environments_functions_pass(recorded):
-    recorded(6).check(task())
-    recorded(6, terminal=True).check(task(terminated=lambda states: (states[:, 0] % 3) > 2))
-
-
-def test_a_wrong_reward_is_shown_by_its_worst_transition(recorded):
-    def wrong(states, actions, next_states):
-        return torch.where(states[:, 0] == 2, 5.0, -states[:, 0])
-
-    with pytest.raises(ValueError, match=r"transition 2 gave -2, but the function says 5") as error:
-        recorded(4).check(task(wrong))
-    assert "actions[2] = [1.0]" in str(error.value)
-
-
-def test_a_reward_of_another_shape_is_refused(recorded):
-    with pytest.raises(ValueError, match=r"reward must return one value per row, shape \(4,\)"):
-        recorded(4).check(task(lambda states, actions, next_states: states))
-
-
-def test_terminations_that_were_not_told_are_refused(recorded):
-    with pytest.raises(ValueError, match=r"transition 2 .*terminated=True, but none was given"):
-        recorded(4, terminal=True).check(task())
-
-
-def test_wrong_terminations_are_refused(recorded):
-    with pytest.raises(ValueError, match=r"transition 1 .*terminated=False, but the function says"):
-        recorded(4).check(task(terminated=lambda states: states[:, 0] == 1.5))

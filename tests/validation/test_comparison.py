@@ -3,6 +3,7 @@
 import math
 import sys
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from botorch.models.transforms import Normalize
 from gpadjust import (
     CKA,
     FunctionPhysics,
+    PhysicsMeanGP,
     PhysicsWarning,
     StackedGP,
     Unknown,
@@ -390,6 +392,16 @@ def test_a_structure_of_the_users(scaled):
     assert comparison.chosen == "mine"
     assert comparison.recommended is comparison.models["mine"]
     assert comparison.recommended.term_mean("rho") == 3.0
+
+
+def test_what_makes_a_model_is_a_structure(scaled):
+    made = [partial(CKA, rho_mean=3.0), PhysicsMeanGP]
+    comparison = compare(*scaled, crude, structures=["zero mean", *made], **QUICK)
+    assert [*comparison.models] == ["zero mean", "CKA(rho_mean=3.0)", "PhysicsMeanGP"]
+    assert comparison.models["CKA(rho_mean=3.0)"].term_mean("rho") == 3.0
+    assert comparison.gain["y"].answer == "Yes"
+    with pytest.raises(ValueError, match=r"or functools\.partial of one"):
+        compare(*scaled, crude, structures=[3.0])
 
 
 def test_few_points():

@@ -1,4 +1,4 @@
-"""Parts of all figures: colors, axes, names, bands, and one output of a posterior."""
+"""Parts of all figures: colours, axes, names, bands, and one output of a posterior."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
 
-BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the color-blind, too
+BLUE, RED, GREY = "#0072B2", "#D55E00", "0.45"  # told apart by the colour-blind, too
 BAND: dict[str, Any] = {"color": BLUE, "alpha": 0.2, "lw": 0}
 DOTS: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": "white", "mew": 0.6}
 

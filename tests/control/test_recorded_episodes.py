@@ -1,0 +1,184 @@
+"""What real episodes tell, and how dynamics learn them."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gpadjust.control import RecordedEpisodes, Task
+from gpadjust.control.recorded_episodes import learn_dynamics
+from gpadjust.dynamics import Dynamics, PhysicsDynamics, StateSpec
+from gpadjust.models import Prediction
+from gpadjust.physics import PhysicsError
+from tests.point import POINT_SPEC
+
+SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
+
+
+@pytest.fixture
+def recorded():
+    """Records steps 0, 1, ... of episodes of three; `x` is the step, the last episode goes on."""
+
+    def record(num_steps, terminal=False):
+        x = torch.arange(float(num_steps)).double()
+        states, ends = torch.stack([x, x], -1), x % 3 == 2
+        return RecordedEpisodes(
+            SPEC,
+            states,
+            torch.ones(num_steps, 1).double(),
+            states + 0.5,
+            rewards=-x,
+            terminated=ends & terminal,
+            episode=(x // 3).long(),
+            begins=x % 3 == 0,
+            whole=x < num_steps // 3 * 3,
+        )
+
+    return record
+
+
+@pytest.fixture
+def moved():
+    """Ten steps of the point, which moves by half the action, in two episodes."""
+    x = torch.tensor([1.0, 0.5, 0.2, 0.4, 0.9, 1.2, 0.7, 0.6, 0.1, 0.3]).double().unsqueeze(-1)
+    v = torch.cat([x[1:] - x[:-1], x[:1]]) * 2
+    v[4] = -0.3  # the first episode ends there
+    begins = torch.arange(10) % 5 == 0
+    flags = torch.ones(10).bool()
+    number = begins.cumsum(0)
+    return RecordedEpisodes(POINT_SPEC, x, v, x + 0.5 * v, -x[:, 0], ~flags, number, begins, flags)
+
+
+def reward(states, actions, next_states):
+    return -states[:, 0]
+
+
+def task(reward=reward, terminated=None):
+    return Task(PhysicsDynamics(SPEC, lambda X: X[:, :2]), reward, terminated=terminated)
+
+
+def test_starts_are_those_of_episodes(recorded):
+    starts = recorded(8).draw_starts(200)
+    assert sorted({*starts[:, 0].tolist()}) == [0, 3, 6]
+    assert starts.shape == (200, 2)
+
+
+def test_bounds_are_far_beyond_what_was_seen(recorded):
+    assert recorded(2).bounds() is None  # nobody knows yet how far an episode goes
+    low, high = recorded(4).bounds()
+    assert low[0] == pytest.approx(1.25 - 12.5)  # of the first three rows, a whole episode
+    assert high[0] == pytest.approx(1.25 + 12.5)
+    assert (low[1], high[1]) == (-math.inf, math.inf)
+
+
+def test_a_task_is_completed_where_it_says_nothing(recorded):
+    whole = recorded(6).complete(task(), 3)
+    assert whole.episode_length == 3
+    assert torch.equal(whole.state_bounds, recorded(6).bounds())
+    assert recorded(6).complete(replace(whole, episode_length=9), 3).episode_length == 9
+    assert recorded(0).complete(task(), 3).initial_states is None
+
+
+def test_the_environments_functions_pass(recorded):
+    recorded(6).check(task())
+    recorded(6, terminal=True).check(task(terminated=lambda states: (states[:, 0] % 3) > 2))
+
+
+@pytest.mark.parametrize(
+    ("terminal", "known", "message"),
+    [
+        (False, {"reward": lambda s, a, n: torch.where(s[:, 0] == 2, 5.0, -s[:, 0])},
+         r"transition 2 gave -2, but the function says 5.* actions\[2\] = \[1.0\]"),
+        (False, {"reward": lambda s, a, n: s}, r"one value per row, shape \(4,\)"),
+        (True, {}, r"transition 2 .*terminated=True, but none was given"),
+        (False, {"terminated": lambda s: s[:, 0] == 1.5},
+         r"transition 1 .*terminated=False, but the function says"),
+    ],
+)  # fmt: skip
+def test_other_functions_are_refused_by_their_worst_transition(recorded, terminal, known, message):
+    with pytest.raises(ValueError, match=message):
+        recorded(4, terminal).check(task(**known))
+
+
+def test_transitions_at_which_the_physics_fails_are_left_out(moved, crude_dynamics):
+    def physics(X):
+        bad = (X[:, 0] < 0.4).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError("not below .4", bad)
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    with pytest.warns(UserWarning, match="fails at 3 of 10 new transitions"):
+        kept = moved.learnable(crude_dynamics(physics))
+    assert torch.equal(kept.states, moved.states[moved.states[:, 0] >= 0.4])
+
+    def always(X):
+        raise PhysicsError("broken", range(len(X)))
+
+    with pytest.raises(PhysicsError, match="broken"):
+        moved.learnable(PhysicsDynamics(POINT_SPEC, always))
+
+
+class Own(Dynamics):
+    """Dynamics of a user's, that know the point but for a shift."""
+
+    is_fitted = True
+
+    def predict(self, states, actions):
+        mean = states + 0.5 * actions + 0.1
+        return Prediction(mean, torch.full_like(mean, 0.2**2))
+
+    def sample_functions(self, num_functions, seed=None):
+        return lambda states, actions: self.predict(states, actions).mean
+
+    def update(self, states, actions, next_states):
+        self.learnt = states
+
+
+class Stiff(Own):
+    """Dynamics that have no functions."""
+
+    def sample_functions(self, num_functions, seed=None):
+        raise NotImplementedError("No features of this kernel.")
+
+
+def scores(dynamics, moved, horizons=()):
+    known = moved.complete(Task(dynamics, reward), 5)
+    return learn_dynamics(known, moved, moved, horizons)
+
+
+def test_scores_are_of_what_was_predicted_before(moved):
+    dynamics = Own(POINT_SPEC)
+    found = scores(dynamics, moved)
+    assert found["rmse/x"] == pytest.approx(0.1)
+    assert found["coverage"] == 1
+    nlpd = 0.5 * math.log(2 * math.pi * 0.2**2) + 0.1**2 / (2 * 0.2**2)
+    assert found["nlpd"] == pytest.approx(nlpd)
+    assert torch.equal(dynamics.learnt, moved.states)
+    assert "overrides" not in found  # it has no physics
+    assert found.keys() >= {"fit_seconds", "score_seconds"}
+
+
+def test_trajectories_are_scored_as_far_as_episodes_go(moved, learnt_dynamics):
+    dynamics, state = learnt_dynamics(), torch.get_rng_state()
+    assert {*scores(dynamics, moved, (2, 4, 9))} == {"fit_seconds"}  # it knew nothing
+    found = scores(dynamics, moved, (2, 4, 9))
+    names = {name for name in found if name[-1].isdigit()}
+    assert names == {f"{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (2, 4)}
+    assert 0 <= found["coverage_4"] <= 1
+    assert found["energy_2"] > 0
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_what_has_no_doubt_has_energies_alone(moved, point_dynamics):
+    found = scores(point_dynamics, moved, (1, 5))
+    assert found.keys() >= {"energy_1", "energy_5"}
+    assert not any("nlpd" in name or "coverage" in name for name in found)
+
+
+def test_dynamics_without_functions_are_learnt_without_scores_of_trajectories(moved):
+    with pytest.warns(UserWarning, match=r"No features of this kernel\. Pass score_horizons"):
+        found = scores(Stiff(POINT_SPEC), moved, (1, 5))
+    assert "coverage" in found
+    assert "energy_1" not in found
+    assert "coverage" in scores(Stiff(POINT_SPEC), moved)

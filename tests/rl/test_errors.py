@@ -1,0 +1,188 @@
+"""Errors on the way lose nothing."""
+
+import gymnasium
+import pytest
+import torch
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+)
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from gpadjust.dynamics import LearnedDynamics, StateSpec
+from gpadjust.physics import PhysicsError
+from gpadjust.rl import ModelVecEnv
+from tests.rl.conftest import model_rows
+
+
+def test_a_wrong_reward_is_mended_and_nothing_is_lost(point_agent, point_task, learnt_dynamics):
+    dynamics = learnt_dynamics()
+    wrong = point_task(dynamics=dynamics, reward=lambda states, actions, following: states[:, 0])
+    agent = point_agent(task=wrong)
+    before = [p.clone() for p in agent.policy.parameters()]
+    with pytest.raises(ValueError, match="is not the environment's"):
+        agent.learn(5)
+    assert all(torch.equal(*pair) for pair in zip(before, agent.policy.parameters(), strict=True))
+    agent.task = point_task(dynamics=dynamics)
+    agent.learn(5, reset_num_timesteps=False)
+    assert torch.equal(
+        dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
+    )
+    assert agent.num_episodes == 2
+    assert model_rows(agent) == 2 * 2 * 5
+
+
+@pytest.mark.parametrize("fails", ["fit", "rollout"])
+def test_a_physics_that_fails_for_a_while_loses_no_transition(
+    point_agent, crude_dynamics, fails, monkeypatch
+):
+    """Where the dynamics learn, or after that, where particles move."""
+    broken = []
+
+    def physics(X):
+        if broken:
+            raise PhysicsError("the simulator's licence has expired")
+        return X[:, :1] + 0.4 * X[:, 1:]
+
+    dynamics = crude_dynamics(physics)
+    agent = point_agent(dynamics=dynamics)
+    agent.learn(5)
+    if fails == "rollout":
+        monkeypatch.setattr(ModelVecEnv, "reset", lambda env: broken.append(1) or env._states)
+    breaks = BreaksAt(8, broken) if fails == "fit" else None
+    with pytest.raises(PhysicsError, match="licence"):
+        agent.learn(5, breaks, reset_num_timesteps=False)
+    assert dynamics.num_transitions == (5 if fails == "fit" else 10)
+    broken.clear()
+    monkeypatch.undo()
+    agent.learn(5, reset_num_timesteps=False)
+    assert torch.equal(
+        dynamics.state_dict()["transitions"]["states"], agent.recorded_episodes().states
+    )
+    assert agent.num_episodes == 3
+
+
+def test_other_dynamics_learn_all_that_there_is(point_agent, point_task, learnt_dynamics):
+    agent = point_agent(dynamics=learnt_dynamics()).learn(10)
+    other = learnt_dynamics()
+    agent.task = point_task(dynamics=other)
+    agent.learn(5, reset_num_timesteps=False)
+    assert other.num_transitions == 15
+
+
+def test_a_buffer_that_holds_no_episode_is_refused(point_agent):
+    with pytest.raises(ValueError, match="buffer_size must hold an episode of 5 steps"):
+        point_agent(buffer_size=3).learn(5)
+
+
+class Falls(gymnasium.Wrapper):
+    """A robot that has to be set up again after its eighth step."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 8:
+            raise OSError("the robot fell")
+        return super().step(action)
+
+
+def test_an_environment_that_fails_within_an_episode(point_agent, point_env, learnt_dynamics):
+    dynamics = learnt_dynamics()
+    agent = point_agent(Falls(point_env()), dynamics=dynamics)
+    with pytest.raises(OSError, match="fell"):
+        agent.learn(10)
+    agent.learn(5, reset_num_timesteps=False)
+    recorded = agent.recorded_episodes()
+    assert dynamics.num_transitions == recorded.num_transitions == 5 + 2 + 5
+    follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
+    assert follows.logical_not().nonzero().flatten().tolist() == [4, 6]
+    starts = recorded.draw_starts(100).unique().tolist()
+    assert starts == recorded.states[[0, 5, 7], 0].sort().values.tolist()
+
+
+class BreaksAt(BaseCallback):
+    """At a step, what was empty is not any more."""
+
+    def __init__(self, step, broken):
+        super().__init__()
+        self.step, self.broken = step, broken
+
+    def _on_step(self):
+        self.broken += [True] * (self.num_timesteps == self.step)
+        return True
+
+
+class Jams(gymnasium.Wrapper):
+    """At some steps the system does not move, and says so."""
+
+    def __init__(self, env, jams):
+        super().__init__(env)
+        self.jams, self.steps = jams, 0
+
+    def step(self, action):
+        before = self.env.unwrapped.x.copy()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        failed = self.steps in self.jams
+        self.steps += 1
+        if failed:
+            self.env.unwrapped.x = observation = before
+        return observation, reward, terminated, truncated or failed, info | {"step_failed": failed}
+
+
+@pytest.mark.parametrize("jams", [(0,), (3,), (5, 6), (4, 9)])
+def test_a_step_that_failed_is_no_data(point_agent, point_env, learnt_dynamics, jams):
+    dynamics = learnt_dynamics()
+    agent = point_agent(Jams(point_env(), jams), dynamics=dynamics, reward_tolerance=None)
+    agent.learn(15)
+    assert agent.replay_buffer.size() == agent.num_timesteps - len(jams)
+    recorded = agent.recorded_episodes()
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+    follows = (recorded.states[1:] == recorded.next_states[:-1]).all(-1)
+    starts = [0, *(1 + follows.logical_not().nonzero().flatten()).tolist()]
+    assert recorded.begins.nonzero().flatten().tolist() == starts
+    assert (recorded.episode.diff() > 0).nonzero().flatten().add(1).tolist() == starts[1:]
+    assert dynamics.num_transitions <= recorded.num_transitions
+
+
+def test_of_several_environments_one_may_fail(point_agent, point_env):
+    env = DummyVecEnv([lambda: Jams(point_env(), (3,)), point_env])
+    agent = point_agent(env, train_freq=(5, "step"), reward_tolerance=None).learn(20)
+    recorded = agent.recorded_episodes()
+    assert recorded.num_transitions == 19
+    moved = recorded.next_states - recorded.states
+    torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+    batch = agent.replay_buffer.sample(200)
+    moved = batch.next_observations - batch.observations
+    torch.testing.assert_close(moved, batch.actions, atol=0.1, rtol=0)
+
+
+class Counts(gymnasium.Wrapper):
+    num_steps = 0
+
+    def step(self, action):
+        Counts.num_steps += 1
+        return super().step(action)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"initial_states": lambda n: torch.ones(n)}, r"initial_states\(2\) must return .* 2 x 1"),
+        ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
+        ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
+        ({"terminated": lambda s: s}, r"terminated must return one value per row"),
+        (
+            {"dynamics": LearnedDynamics(StateSpec(["x"], ["v"]), lambda X: X)},
+            "next values of the 1 states .* got 2 columns",
+        ),
+    ],
+)
+def test_wrong_functions_are_found_before_the_first_real_step(
+    point_agent, point_env, parts, message
+):
+    Counts.num_steps = 0
+    agent = point_agent(Counts(point_env()), **parts)
+    with pytest.raises((ValueError, PhysicsError), match=message):
+        agent.learn(5)
+    assert Counts.num_steps == 0

@@ -1,0 +1,90 @@
+"""A family: SAC and TD3 with a model."""
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+
+from gpadjust.control import Task
+from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
+from gpadjust.rl.buffer import CompactReplayBuffer
+from gpadjust.systems.cart_pole import cart_pole_reward, cart_pole_start
+from tests.rl.conftest import model_rows
+
+
+def test_one_that_never_uses_its_model_is_the_learner(point_agent, point_env, normalised):
+    for algorithm, learner, noisy in [(DynaSAC, SAC, False), (DynaTD3, TD3, True)]:
+        noise = NormalActionNoise(np.zeros(1), np.full(1, 0.3)) if noisy else None
+        shared = {
+            "batch_size": 8,
+            "buffer_size": 500,
+            "learning_starts": 3,
+            "train_freq": (1, "episode"),
+            "gradient_steps": -1,
+            "policy_kwargs": {"net_arch": [8]},
+            "action_noise": noise,
+            "device": "cpu",
+            "seed": 0,
+        }
+        ours = point_agent(normalised(), algorithm, last_model_episode=0, **shared).learn(25)
+        theirs = learner("MlpPolicy", normalised(), **shared).learn(25)
+        assert ours._n_updates == theirs._n_updates == 25
+        pairs = zip(
+            ours.policy.state_dict().items(), theirs.policy.state_dict().items(), strict=True
+        )
+        for (name, weights), (other, expected) in pairs:
+            assert name == other
+            assert torch.equal(weights, expected), name
+        for name in CompactReplayBuffer.rows:
+            one, other = (getattr(agent.replay_buffer, name) for agent in (ours, theirs))
+            np.testing.assert_array_equal(one, other)
+        assert model_rows(ours) == 0
+
+
+@pytest.mark.slow
+def test_td3_swings_up_the_cart_pole(cart_pole, cart_pole_dynamics):
+    """In the known system, after 12 episodes; to hang costs .95, to swing up some .3."""
+    agent = DynaTD3(
+        "MlpPolicy",
+        cart_pole(),
+        Task(cart_pole_dynamics, cart_pole_reward, initial_states=cart_pole_start),
+        DynaOptions(model_episodes=20, num_particles=5),
+        action_noise=NormalActionNoise(np.zeros(1), np.full(1, 0.2)),
+        learning_rate=1e-3,
+        gamma=0.95,
+        tau=0.02,
+        policy_kwargs={"net_arch": [128, 128]},
+        device="cpu",
+        seed=0,
+    ).learn(12 * 25)
+    torch.manual_seed(1)
+    env = agent.model_env(20)
+    obs, costs = env.reset(), []
+    for _ in range(25):
+        obs, rewards, _, _ = env.step(agent.predict(obs, deterministic=True)[0])
+        costs.append(-rewards.mean())
+    assert np.mean(costs) < 0.6
+
+
+def test_particles_have_action_noise_of_their_own(point_agent):
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
+    agent = point_agent(algorithm=DynaTD3, action_noise=noise, model_episodes=3)
+    agent.learn(5)
+    first = agent.replay_buffer.model_buffer.actions[:3, 0, 0]  # at the same start
+    assert len(set(first.tolist())) == 3
+    assert (np.abs(first) <= 1).all()
+    silent = point_agent(algorithm=DynaTD3, model_episodes=3).learn(5)
+    assert len(set(silent.replay_buffer.model_buffer.actions[:3, 0, 0].tolist())) == 1
+
+
+def test_target_networks_are_updated_as_seldom_as_told(point_agent, monkeypatch):
+    """Steps of 2 particles in the model owe 2 updates; 10 of them are made together."""
+    chunks = []
+    train = SAC.train
+    monkeypatch.setattr(
+        SAC, "train", lambda agent, n, batch: chunks.append(n) or train(agent, n, batch)
+    )
+    agent = point_agent(target_update_interval=10, updates_per_model_step=1).learn(10)
+    assert chunks == [5, 10, 5, 10]
+    assert agent.owed_updates == 0

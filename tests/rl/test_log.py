@@ -1,0 +1,149 @@
+"""What callbacks and the logger are told."""
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import (
+    CheckpointCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
+
+from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.rl import DynaCallback
+from tests.rl.conftest import model_rows
+
+
+def test_metrics_of_the_model_are_logged(point_agent, learnt_dynamics, tmp_path):
+    agent = point_agent(dynamics=learnt_dynamics())
+    agent.set_logger(configure(str(tmp_path), ["csv"]))
+    agent.learn(20, log_interval=1)
+    agent.logger.close()
+    with open(tmp_path / "progress.csv") as file:
+        last = [*csv.DictReader(file)][-1]
+    shares = [float(last[f"model/share_{part}"]) for part in ("fit", "rollout", "update")]
+    assert sum(shares) == pytest.approx(1, abs=1e-3)
+    for name in ("nlpd", "coverage", "rmse/x", "fit_seconds", "ep_rew_mean"):
+        assert np.isfinite(float(last[f"model/{name}"]))
+    assert float(last["model/left_bounds"]) == 0
+
+
+def test_particles_that_left_the_bounds_are_logged_once(point_agent, point_dynamics):
+    runaway = PhysicsDynamics(
+        point_dynamics.spec, lambda X: X[:, :1] + torch.where(X[:, :1] > 1.0, 1e6, 0.0)
+    )
+    starts = torch.tensor([[0.6], [1.4], [0.8]])
+    agent = point_agent(
+        dynamics=runaway,
+        model_episodes=3,
+        initial_states=lambda n: starts[:n],
+        updates_per_model_step=1,
+    )
+    agent.learn(5)
+    assert agent.logger.name_to_value["model/left_bounds"] == 1
+    assert model_rows(agent) == 1 + 2 * 5
+    assert agent._n_updates == 5 + 1 + 2 * 5
+
+
+def test_callbacks_of_stable_baselines(point_agent, normalised, point_env, tmp_path):
+    evaluated = VecNormalize(make_vec_env(point_env), training=False)
+    evaluation = EvalCallback(
+        evaluated, n_eval_episodes=1, eval_freq=10, log_path=str(tmp_path), verbose=0
+    )
+    saving = CheckpointCallback(
+        10, str(tmp_path), "agent", save_replay_buffer=True, save_vecnormalize=True
+    )
+    agent = point_agent(normalised())
+    agent.learn(100, [evaluation, saving, StopTrainingOnMaxEpisodes(4)])
+    assert agent.num_timesteps == 20
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [10, 20]
+    names = {file.name for file in tmp_path.iterdir()}
+    assert {
+        "agent_10_steps.zip",
+        "agent_replay_buffer_20_steps.pkl",
+        "agent_vecnormalize_20_steps.pkl",
+    } <= names
+
+
+def test_progress_bar(point_agent, capsys):
+    with pytest.warns(match="rich is experimental"):
+        point_agent().learn(10, progress_bar=True)
+    assert "10/10" in capsys.readouterr().out
+
+
+class Watch(DynaCallback):
+    def __init__(self):
+        super().__init__()
+        self.fits, self.returns = [], []
+
+    def on_model_fit(self, metrics):
+        self.fits.append(metrics)
+
+    def on_model_episodes(self, returns):
+        self.returns.append(returns)
+
+
+def test_hooks_of_the_model(point_agent, learnt_dynamics):
+    watch = Watch()
+    agent = point_agent(
+        dynamics=learnt_dynamics(), model_episodes=3, num_particles=2, refresh_model_data=False
+    )
+    agent.learn(10, [watch])
+    assert [*watch.fits[0]] == ["fit_seconds"]
+    assert watch.fits[1].keys() >= {"fit_seconds", "nlpd", "coverage"}
+    assert all(np.isfinite([*metrics.values()]).all() for metrics in watch.fits)
+    assert [len(returns) for returns in watch.returns] == [2, 1, 2, 1]
+    rewards = agent.replay_buffer.model_buffer.rewards[: 5 * 6, 0]
+    assert np.concatenate(watch.returns).sum() == pytest.approx(rewards.sum(), rel=1e-5)
+    agent.learn(5, reset_num_timesteps=False)
+    assert len(watch.fits) == 2
+
+
+def test_hooks_are_for_dyna_only(point_env):
+    agent = SAC("MlpPolicy", point_env(), policy_kwargs={"net_arch": [8]})
+    with pytest.raises(TypeError, match=r"Watch is for Dyna agents.*found SAC"):
+        agent.learn(5, Watch())
+
+
+def test_hooks_inside_another_callback(point_agent):
+    watch = Watch()
+    point_agent().learn(10, EveryNTimesteps(5, watch))
+    assert len(watch.fits) == 2
+
+
+def test_a_callback_that_overrides_nothing(point_agent):
+    assert point_agent().learn(10, DynaCallback()).num_episodes == 2
+
+
+def test_a_hook_that_raises_lets_nothing_be_learnt_twice(point_agent, learnt_dynamics):
+    class Raises(DynaCallback):
+        def on_model_fit(self, metrics):
+            raise OSError("full")
+
+    dynamics = learnt_dynamics()
+    agent = point_agent(dynamics=dynamics)
+    with pytest.raises(OSError, match="full"):
+        agent.learn(5, Raises())
+    agent.learn(5, reset_num_timesteps=False)
+    assert dynamics.num_transitions == 10
+
+
+def test_scores_of_trajectories_are_logged_and_change_nothing(
+    point_agent, sampled_dynamics, assert_same
+):
+    one, other = (
+        point_agent(dynamics=sampled_dynamics(), score_horizons=horizons).learn(15, log_interval=9)
+        for horizons in ((1, 5), ())
+    )
+    found, without = (agent.logger.name_to_value for agent in (one, other))
+    assert {*found} - {*without} == {
+        f"model/{name}_{k}" for name in ("nlpd", "coverage", "energy") for k in (1, 5)
+    }
+    assert_same(one, other)

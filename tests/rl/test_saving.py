@@ -1,0 +1,197 @@
+"""Dyna agents in files, and their parameters."""
+
+import threading
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.models import ZeroMeanGP
+from gpadjust.rl import DynaCallback, DynaSAC
+
+
+@pytest.fixture(scope="module")
+def once():
+    """What is made once for several tests, none of which changes it."""
+    return {}
+
+
+@pytest.fixture
+def saved(once, point_agent, learnt_dynamics, tmp_path_factory):
+    """An agent after two episodes, and its file."""
+    if not once:
+        agent = point_agent(dynamics=learnt_dynamics()).learn(10)
+        path = tmp_path_factory.mktemp("saved") / "agent.zip"
+        agent.save(path)
+        once["saved"] = agent, path
+    return once["saved"]
+
+
+def test_a_loaded_agent_predicts_the_same(saved):
+    agent, path = saved
+    obs = np.linspace(-1, 1, 7, dtype=np.float32)[:, None]
+    loaded = DynaSAC.load(path)
+    np.testing.assert_array_equal(
+        loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
+    )
+
+
+def test_without_dynamics_a_loaded_agent_only_predicts(saved, point_env):
+    _, path = saved
+    with pytest.raises(ValueError, match=r"needs a task to learn.*DynaSAC.load"):
+        DynaSAC.load(path, env=point_env()).learn(5)
+    with pytest.raises(ValueError, match=r"needs a task to learn"):
+        DynaSAC.load(path).learn(5)
+
+
+def test_with_dynamics_but_no_environment_it_says_so(saved, learnt_dynamics, point_task):
+    _, path = saved
+    loaded = DynaSAC.load(path, task=point_task(dynamics=learnt_dynamics()))
+    with pytest.raises(ValueError, match="env"):
+        loaded.learn(5)
+
+
+def test_with_dynamics_a_loaded_agent_goes_on(
+    point_agent, point_env, sampled_dynamics, point_task, tmp_path
+):
+    agent, path = point_agent(dynamics=sampled_dynamics()).learn(10), tmp_path / "agent.zip"
+    agent.save(path)
+    dynamics = sampled_dynamics()
+    loaded = DynaSAC.load(path, env=point_env(), task=point_task(dynamics=dynamics))
+    x = torch.linspace(0, 1, 5).double()[:, None]
+    for one, other in zip(dynamics.predict(x, x), agent.task.dynamics.predict(x, x), strict=True):
+        assert torch.equal(one, other)
+    assert loaded.num_episodes == 2
+    loaded.learn(5, reset_num_timesteps=False)
+    assert dynamics.num_transitions == 15
+    assert loaded.num_timesteps == 15
+    assert loaded.num_episodes == 3
+
+
+def test_what_the_dynamics_learnt_outlives_an_agent_without_them(
+    saved, tmp_path, learnt_dynamics, point_task
+):
+    agent, path = saved
+    again = tmp_path / "again.zip"
+    DynaSAC.load(path).save(again)
+    dynamics = learnt_dynamics()
+    DynaSAC.load(again, task=point_task(dynamics=dynamics))
+    assert dynamics.num_transitions == agent.task.dynamics.num_transitions
+
+
+def test_dynamics_of_another_kind_are_not_loaded(saved, point_task):
+    _, path = saved
+    other = LearnedDynamics(StateSpec(["x"], ["v"]), model=ZeroMeanGP)
+    with pytest.raises(RuntimeError, match=r"model is .*CKA.* in the state, .*ZeroMeanGP.* here"):
+        DynaSAC.load(path, task=point_task(dynamics=other))
+
+
+def test_a_wrong_reward_is_found_after_loading_too(saved, point_env, learnt_dynamics, point_task):
+    _, path = saved
+    task = point_task(dynamics=learnt_dynamics(), reward=lambda s, a, n: s[:, 0])
+    loaded = DynaSAC.load(path, env=point_env(), task=task)
+    with pytest.raises(ValueError, match="is not the environment's"):
+        loaded.learn(5)
+
+
+def test_the_file_holds_neither_physics_nor_functions_nor_environment(
+    point_agent, point_env, tmp_path
+):
+    class Unpicklable:
+        """A physics, reward and so on that no pickler can take."""
+
+        def __init__(self, function):
+            self.function, self.lock = function, threading.Lock()
+
+        def __call__(self, *args):
+            return self.function(*args)
+
+        def __reduce__(self):
+            raise AssertionError("pickled")
+
+    env = point_env()
+    env.unwrapped.robot = threading.Lock()
+    spec = StateSpec(["x"], ["v"])
+    agent = point_agent(
+        env,
+        dynamics=PhysicsDynamics(spec, Unpicklable(lambda X: X[:, :1] + 0.5 * X[:, 1:])),
+        reward=Unpicklable(lambda states, actions, next_states: -next_states[:, 0].square()),
+        terminated=Unpicklable(lambda states: states[:, 0] > 99),
+        initial_states=Unpicklable(lambda n: torch.ones(n, 1)),
+    )
+    agent.learn(5, DynaCallback())
+    agent.save(tmp_path / "agent.zip")
+    with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
+        data = archive.read("data").decode()
+    for name in ("task", "dynamics", "env", "model_hooks"):
+        assert f'"{name}":' not in data
+
+
+def test_both_buffers_are_saved_together(point_agent, tmp_path):
+    agent = point_agent().learn(10)
+    agent.replay_buffer.model_buffer.device = torch.device("meta")  # as if saved on another machine
+    agent.save_replay_buffer(tmp_path / "buffer.pkl")
+    other = point_agent(seed=1)
+    other.load_replay_buffer(tmp_path / "buffer.pkl")
+    for one, again in [
+        (agent.replay_buffer, other.replay_buffer),
+        (agent.replay_buffer.model_buffer, other.replay_buffer.model_buffer),
+    ]:
+        np.testing.assert_array_equal(one.observations, again.observations)
+        assert again.size() == one.size() > 0
+        assert again.device == other.device
+
+
+def test_parameters_can_be_moved(saved, point_agent, learnt_dynamics):
+    agent, path = saved
+    for source in (agent.get_parameters(), str(path)):
+        other = point_agent(dynamics=learnt_dynamics(), seed=9)
+        other.set_parameters(source)
+        assert other.task.dynamics.num_transitions == 10
+        obs = np.zeros((1, 1), dtype=np.float32)
+        np.testing.assert_array_equal(
+            other.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
+        )
+
+
+def test_parameters_without_dynamics_are_refused_unless_told(saved, point_agent, learnt_dynamics):
+    agent, _ = saved
+    networks = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
+    other = point_agent(dynamics=learnt_dynamics(), seed=9)
+    with pytest.raises(
+        ValueError, match=r"with the state of the dynamics, 'dynamics'; found \['act"
+    ):
+        other.set_parameters(networks)
+    other.set_parameters(networks, exact_match=False)
+    assert not other.task.dynamics.is_fitted
+
+
+def test_a_task_that_is_given_after_loading_knows_what_was_learnt(
+    saved, point_env, point_task, crude_dynamics
+):
+    agent, path = saved
+    loaded = DynaSAC.load(path, env=point_env())
+    known = {k: v for k, v in agent.get_parameters().items() if k != "dynamics"}
+    loaded.set_parameters(known, exact_match=False)
+    loaded.task = point_task(dynamics=crude_dynamics(agent.task.dynamics.physics))
+    loaded.learn(5, reset_num_timesteps=False)
+    assert loaded.task.dynamics.num_transitions == 15
+
+
+def test_parameters_are_taken_as_a_whole(saved, point_agent, learnt_dynamics, tensors_of):
+    agent, _ = saved
+    broken = agent.get_parameters()
+    broken["policy"] = {}
+    other = point_agent(dynamics=learnt_dynamics(), seed=9).learn(5)
+    with pytest.raises(RuntimeError, match="Missing key"):
+        other.set_parameters(broken)
+    assert other.task.dynamics.num_transitions == 5
+
+
+def test_another_physics_is_not_loaded(saved, point_task, crude_dynamics):
+    _, path = saved
+    other = crude_dynamics(lambda X: X[:, :1] + 0.1 * X[:, 1:])
+    with pytest.raises(RuntimeError, match="physics"):
+        DynaSAC.load(path, task=point_task(dynamics=other))

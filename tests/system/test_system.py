@@ -1,0 +1,231 @@
+"""A system in one object: its environment, its task, its physics with and without unknowns."""
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from gpadjust import systems
+from gpadjust.control import Task
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
+from gpadjust.systems import NoisySensors, System
+from gpadjust.systems.cart_pole import REAL_CART_POLE, believed_cart_pole, equation_physics
+from gpadjust.systems.reaching import ARM_MEMORY_SPEC
+from gpadjust.systems.torque_arm import torque_arm
+
+SPEC = StateSpec(["x", "v"], ["force"])
+arm_needs_opensim = pytest.mark.skipif(
+    not __import__("importlib.util").util.find_spec("opensim"), reason="OpenSim is not installed"
+)
+
+
+class Cart(gym.Env):
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def __init__(self, mass=1.0):
+        self.mass = mass
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.zeros(2)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        x, v = self.state
+        self.state = np.array([x + 0.1 * v, v + 0.1 * action[0] / self.mass])
+        return self.state.copy(), -abs(self.state[0]), False, False, {}
+
+
+def coast(X):
+    x, v, force = X.split(1, -1)
+    return torch.cat([x + 0.1 * v, v + 0.1 * force], -1)
+
+
+def reward(states, actions, next_states):
+    return -next_states[:, 0].abs()
+
+
+def cart(**options):
+    return System(Cart, SPEC, coast, reward, **options)
+
+
+def states_and_actions(num_actions, n=20):
+    generator = torch.Generator().manual_seed(0)
+    states = torch.randn(n, 4, generator=generator, dtype=torch.float64)
+    return states, torch.rand(n, num_actions, generator=generator, dtype=torch.float64)
+
+
+def test_the_environment_ends_where_the_system_says():
+    env = cart(episode_length=3).make(mass=2.0)
+    assert env.unwrapped.mass == 2.0
+    env.reset(seed=0)
+    assert [env.step(np.ones(1))[3] for _ in range(3)] == [False, False, True]
+    assert not isinstance(cart().make(), gym.wrappers.TimeLimit)
+    limited = System(lambda: gym.make("Pendulum-v1"), SPEC, coast, reward, episode_length=7).make()
+    assert limited.spec.max_episode_steps == 200  # the environment's own
+
+
+def test_the_task_has_what_the_system_knows():
+    bounds = torch.tensor([[-1.0, -1.0], [1.0, 1.0]], dtype=torch.float64)
+    given = {"terminated": lambda states: states[:, 0] > 1, "state_bounds": bounds}
+    start = lambda n: torch.zeros(n, 2, dtype=torch.float64)  # noqa: E731
+    system = cart(start=start, episode_length=9, **given)
+    dynamics = PhysicsDynamics(SPEC, coast)
+    task = system.task(dynamics)
+    assert isinstance(task, Task)
+    assert task.dynamics is dynamics
+    assert (task.reward, task.terminated) == (reward, given["terminated"])
+    assert (task.initial_states, task.episode_length) == (start, 9)
+    assert torch.equal(task.state_bounds, bounds)
+    first, second = system.task().dynamics, system.task().dynamics
+    assert isinstance(first, LearnedDynamics)
+    assert first is not second
+
+
+def test_what_is_no_part_of_a_system_is_refused():
+    for parts, message in (
+        ((Cart(), SPEC, coast, reward), "env must be a function, its class or `lambda: env`"),
+        ((Cart, "x", coast, reward), "spec must be a StateSpec"),
+        ((Cart, SPEC, coast, None), "reward must be a function"),
+        ((Cart, SPEC, 3.0, reward), "callable"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            System(*parts)
+
+
+def test_the_cart_pole_is_that_of_its_id():
+    ours, known = systems.cart_pole().make(), gym.make("gpadjust/CartPoleSwingUp-v0")
+    push = np.array([3.0], dtype=np.float32)
+    steps = []
+    for env in (ours, known):
+        env.reset(seed=4)
+        steps.append([env.step(push) for _ in range(25)])
+    for (seen, paid, *_), (expected, cost, *_) in zip(*steps, strict=True):
+        assert np.array_equal(seen, expected)
+        assert paid == cost
+    assert steps[0][-1][3]
+    assert ours.unwrapped.equation == REAL_CART_POLE
+    system = systems.cart_pole(3, dry=0.5, drag=0.01, time_step=0.05, encode_angle=False)
+    env = system.make()
+    assert (env.unwrapped.equation.dry, env.unwrapped.equation.drag) == (0.5, 0.01)
+    assert env.observation_space.shape == (4,)
+    assert (system.physics.rhs, system.physics.step) == (believed_cart_pole(3), 0.05)
+    assert (system.physics.rhs.dry, system.physics.rhs.drag) == (0, 0)
+
+
+def test_environment_and_task_agree():
+    system = systems.cart_pole()
+    env, task = system.make(), system.task()
+    env.reset(seed=0)
+    before = torch.from_numpy(env.unwrapped.state).unsqueeze(0)
+    _, paid, *_ = env.step(np.array([2.0], dtype=np.float32))
+    after = torch.from_numpy(env.unwrapped.state).unsqueeze(0)
+    assert task.rewards(before, torch.tensor([[2.0]]).double(), after).item() == pytest.approx(paid)
+
+
+@pytest.mark.parametrize("make", [systems.cart_pole, systems.arm])
+def test_unknown_parameters_make_the_same_physics_of_their_guesses(make):
+    known, unknown = make(), make(unknowns=True)
+    assert not known.unknowns
+    X = torch.cat(states_and_actions(len(known.spec.actions)), -1)
+    values = {name: u.guess for name, u in unknown.unknowns.items()}
+    if "cart_mass" in values:
+        values["damping"] = 0.0
+    found = unknown.physics(X, torch.tensor([*values.values()], dtype=torch.float64))
+    torch.testing.assert_close(found, known.physics(X), rtol=1e-12, atol=1e-12)
+
+
+def test_each_row_has_the_parameters_that_it_is_given():
+    """Of the cart-pole against equations made with them, of the arm against scaled masses."""
+    X = torch.cat(states_and_actions(1), -1)
+    physics = systems.cart_pole(unknowns=True).physics
+    several = torch.tensor([[0.5, 0.5, 0.6, 0.1], [0.4, 0.7, 0.5, 0.3]], dtype=torch.float64)
+    for values, found in zip(several, physics(X, several), strict=True):
+        equation = systems.CartPoleEquation(*values.tolist())
+        torch.testing.assert_close(found, equation_physics(equation)(X), rtol=1e-12, atol=1e-12)
+    states, actions = states_and_actions(4)
+    crude = torque_arm()
+    factor = {"masses": (crude.masses[0], 1.3 * crude.masses[1])}
+    factor["inertias"] = (crude.inertias[0], 1.3 * crude.inertias[1])
+    heavier = systems.ArmEquation(
+        **factor, lengths=crude.lengths, centres=crude.centres, damping=0.7, gains=(5.0, 3.0)
+    )
+    one = torch.ones(20, dtype=torch.float64)
+    values = {"forearm": 1.3, "damping": 0.7, "shoulder_gain": 5.0, "elbow_gain": 3.0}
+    found = crude(states, actions, {name: value * one for name, value in values.items()})
+    torch.testing.assert_close(found, heavier(states, actions), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [systems.cart_pole, systems.arm])
+def test_its_parameters_are_found_by_least_squares(make):
+    system = make(unknowns=True)
+    generator = torch.Generator().manual_seed(1)
+    width = system.spec.state_dim
+    states = torch.randn(40, width, generator=generator, dtype=torch.float64)
+    actions = torch.rand(40, system.spec.action_dim, generator=generator, dtype=torch.float64)
+    actions = actions * (10 if width == 4 else 1)
+    truth = {name: 1.2 * u.guess for name, u in system.unknowns.items()}
+    moving = system.spec.moving
+    following = states.clone()
+    following[:, moving] = system.physics(
+        torch.cat([states[:, moving], actions], -1),
+        torch.tensor([*truth.values()], dtype=torch.float64),
+    )
+    dynamics = PhysicsDynamics(system.spec, system.physics)
+    dynamics.update(states, actions, following)
+    found = dynamics.physics_parameters
+    assert {n: found[n].median().item() for n in found} == pytest.approx(truth, rel=1e-4)
+
+
+def test_noise_of_sensors_has_its_size_and_leaves_rewards_alone():
+    noise = {"theta": 0.1, "x_dot": 0.5}
+    seen, true = systems.cart_pole(noise=noise).make(), systems.cart_pole().make()
+    spec, errors = systems.cart_pole().spec, []
+    push = np.zeros(1, dtype=np.float32)
+    for seed in range(40):
+        for env in (seen, true):
+            env.reset(seed=seed)
+        for _ in range(25):
+            (observed, paid, *_), (_, cost, *_) = seen.step(push), true.step(push)
+            assert paid == cost
+            assert observed.dtype == np.float32
+            state = spec.decode(torch.from_numpy(observed).double())
+            errors.append(spec.change(torch.from_numpy(true.unwrapped.state), state))
+    sd = torch.stack(errors).std(0)
+    torch.testing.assert_close(sd, torch.tensor([0, 0.1, 0.5, 0]).double(), rtol=0.06, atol=1e-5)
+
+
+def test_noise_of_what_is_no_state_is_refused():
+    env, spec = systems.cart_pole().make(), systems.cart_pole().spec
+    with pytest.raises(ValueError, match="no state 'angle'; the states are"):
+        NoisySensors(env, spec, {"angle": 0.1})
+    with pytest.raises(ValueError, match="noise of 'x' must be finite and at least 0"):
+        NoisySensors(env, spec, {"x": -0.1})
+
+
+@arm_needs_opensim
+def test_the_arm_with_memory_and_noise():
+    system = systems.arm(memory=True, noise={"theta_s": 0.01}, strength=0.3)
+    assert system.spec is ARM_MEMORY_SPEC
+    env = system.make()
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (10,)
+    assert system.start(3).shape == (3, 10)
+    assert (system.start(3)[:, 6:] == 0).all()
+    system.task().draw_initial_states(2)
+    excite = np.array([0.0, 0.0, 0.5, 0.0], dtype=np.float32)
+    assert env.step(excite)[0][6:].tolist() == [0.0, 0.0, 0.5, 0.0]
+
+
+def test_the_physics_by_opensim_has_no_unknowns():
+    with pytest.raises(ValueError, match="no unknown parameters"):
+        systems.arm(opensim=True, unknowns=True)
+
+
+def test_a_system_can_be_pickled():
+    system = pickle.loads(pickle.dumps(systems.cart_pole(2, noise={"x": 0.1}, unknowns=True)))
+    system.make().reset(seed=0)
+    assert system.unknowns["pole_length"].unit == "m"
