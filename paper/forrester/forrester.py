@@ -282,7 +282,8 @@ def judge(
     f6, f6_text = below(change("CKA"), 0.2, 0.4), change("CKA").text(".1%")
     if other is not None and len(other):
         each = _other_settings(other)
-        f6_text += "; with other steps and noise " + ", ".join(d.text(".0%") for d in each.values())
+        means = [difference.mean for difference in each.values()]
+        f6_text += f"; {max(means):+.0%} to {min(means):+.0%} with other steps and noise"
         if any(below(difference, 0.2, 0.4) != f6 for difference in each.values()):
             f6 = "undetermined"
     zero, scaled = change("Zero-mean GP", "f_p"), change("GP-scale", "Zero-mean GP")
