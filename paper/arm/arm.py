@@ -198,7 +198,8 @@ def draw_maps(
     for ax, errors in zip(axes, parts.values(), strict=True):
         ax.plot(*np.stack([[0, 0], elbow, start]).T, color="0.7", lw=4, marker="o", ms=5, zorder=1)
         dots = ax.scatter(
-            *targets.T,
+            targets[:, 0],
+            targets[:, 1],
             c=errors.mean(),
             s=6 + 6 * errors.std().fillna(0).clip(upper=10),
             cmap="viridis_r",
