@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpadjust.checks import checked_number
 from gpadjust.physics import BlackBoxPhysics
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, ArmEquation, torque_arm
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, ArmEquation, believed_arm
 
 JOINTS = ("shoulder", "elbow")
 LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow
@@ -329,7 +329,7 @@ def opensim_arm_physics(
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
-    step = _TorqueStep(torque_arm(gains), accuracy)
+    step = _TorqueStep(believed_arm(gains), accuracy)
     return BlackBoxPhysics(step, batched=False, fd_step=FD_STEP, name="opensim_arm")
 
 

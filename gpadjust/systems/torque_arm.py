@@ -138,7 +138,7 @@ REAL_ARM = ArmEquation()
 """The links of the muscle arm; segments after Nijhof and Kouwenhoven (2000). No torques."""
 
 
-def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
+def believed_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
     """The arm as someone may believe it to be, who has no model of its muscles.
 
     Its links are a tenth too heavy, its joints damped twice as much as the real ones; the torques
@@ -152,7 +152,7 @@ def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
         ValueError: If the gains are not two finite numbers that are not negative.
 
     Example:
-        >>> torque_arm().damping
+        >>> believed_arm().damping
         1.0
     """
     return replace(

@@ -108,7 +108,7 @@ SCRIPT = """
     from gpadjust.control import CrossEntropy, EpisodeCheckpoint, MPCAgent, Planner, Task, resume
     from gpadjust.dynamics import LearnedDynamics
     from gpadjust.systems import cart_pole
-    from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+    from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 
     path = Path(sys.argv[1])
     env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")

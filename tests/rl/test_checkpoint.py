@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from gpadjust.control import EpisodeCheckpoint, Task, resume
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
-from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 
 TOTAL = 20  # four episodes of the point
 
@@ -153,7 +153,7 @@ SCRIPT = """
     from gpadjust.control import EpisodeCheckpoint, Task, resume
     from gpadjust.dynamics import LearnedDynamics
     from gpadjust.systems import cart_pole
-    from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+    from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
     from gpadjust.rl import DynaOptions, DynaSAC, EpisodeCheckpoint, resume
 
     class Tells(BaseCallback):
