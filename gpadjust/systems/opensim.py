@@ -310,8 +310,7 @@ def opensim_arm_physics(
     take turns.
 
     Args:
-        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
-            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
+        gains: As of :func:`~gpadjust.systems.arm`.
         accuracy: The relative accuracy of the integrator.
 
     Returns:

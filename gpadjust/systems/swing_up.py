@@ -24,7 +24,7 @@ from gpadjust.checks import (
 )
 from gpadjust.physics import ODEPhysics, Unknown
 from gpadjust.states import StateSpec
-from gpadjust.systems.cart_pole_view import CartPoleView
+from gpadjust.systems.cart_pole_view import SIZE, draw_cart_pole
 from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
 from gpadjust.systems.system import System
 from gpadjust.systems.wrappers import NoisySensors
@@ -194,8 +194,8 @@ def equation_physics(
 def believed_cart_pole(seed: int) -> CartPoleEquation:
     """The cart-pole as someone may believe it to be, who has not measured it.
 
-    The masses are drawn from U(0.4, 0.6) kg for the cart and U(0.5, 0.7) kg for the pole, the
-    length from U(0.5, 0.7) m; there is no friction.
+    :func:`~gpadjust.systems.cart_pole` says from where masses and length are drawn; there is no
+    friction.
 
     Raises:
         TypeError: If ``seed`` is no whole number.
@@ -245,7 +245,7 @@ def cart_pole_start(n: int) -> Tensor:
     return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)
 
 
-class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
+class CartPoleSwingUpEnv(ViewedEnv):
     r"""Swing up the pole of a cart-pole and balance it, by pushing the cart.
 
     The pole hangs at first. The action, a force in [-10, 10] N, is held for a time step; stronger
@@ -285,6 +285,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         -0.004
     """
 
+    caption, size = "Cart-pole", SIZE
     metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / TIME_STEP)}  # noqa: RUF012
 
     def __init__(
@@ -378,11 +379,10 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         self._show()
         return self._observe(self.state), -cost, False, False, {"cost": cost}
 
-    def _open_view(self, frames_per_second: int | None) -> CartPoleView:
-        return CartPoleView(self.equation.pole_length, MAX_FORCE, frames_per_second)
-
-    def _draw(self, view: CartPoleView, state: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        return view.draw(state[0], state[1], self._force)
+    def _draw(self, canvas: Any, state: NDArray[np.float64]) -> None:
+        x, theta = map(float, state[:2])
+        reach = 0.6 * self._force / MAX_FORCE
+        draw_cart_pole(canvas, x, theta, self.equation.pole_length, reach)
 
     def _observe(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
         return self.state_spec.observe(torch.from_numpy(state)).numpy().astype(np.float32)
