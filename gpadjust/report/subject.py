@@ -33,6 +33,11 @@ class Adjusted(NamedTuple):
     output: int
     weight: float
 
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """The names of rho and delta, as far as the model has them."""
+        return tuple(name for name in self.model.term_names if name != "f")
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -65,6 +70,12 @@ class Subject:
     def outputs(self) -> tuple[str, ...]:
         """The names of the outputs."""
         return tuple(self.model.output_names)
+
+    @property
+    def counts(self) -> list[int]:
+        """The number of observations of each output."""
+        counts: list[int] = (~self.Y.isnan()).sum(0).tolist()
+        return counts
 
     @property
     def base(self) -> Tensor:
