@@ -86,9 +86,7 @@ class Origin:
 def verdicts(subject: Subject, how: str = COMPARE) -> Markup:
     """The verdict on each output, below the errors of formula, adjustment and data.
 
-    Args:
-        subject: The subject of the page.
-        how: Code or a command that compares, for a subject that was not compared.
+    A subject that was not compared is told ``how``, code or a command that compares.
     """
     cards = []
     for j, name in enumerate(subject.outputs):
@@ -259,8 +257,7 @@ def where_wrong(subject: Subject) -> Markup:
         parts.append(drawn(partial(figures.slices, subject, j, inputs)))
         parts.append(drawn(partial(figures.pairs, subject, j)))
     held = figures.held(subject, inputs)
-    notes = [tag("p", held, class_="note")] if held else []
-    return join([*notes, *parts])
+    return join([tag("p", held, class_="note") if held else Markup(), *parts])
 
 
 def trusted(subject: Subject) -> Markup:
@@ -519,13 +516,7 @@ def settings(subject: Subject, origin: Origin) -> Markup:
 
 
 def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
-    """Code that loads the model beside the page, and predicts.
-
-    Args:
-        subject: The subject of the page.
-        saved: The model's file; or why there is none.
-        origin: The origin of the physics.
-    """
+    """Code that loads the model beside the page and predicts; or why no model was saved."""
     if isinstance(saved, str):
         return tag("p", f"The model could not be saved: {saved}", class_="caution")
     file, missing = saved.path.name, saved.missing
@@ -547,9 +538,8 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
                 "model was built with as f_p."
             )
         elif saved.physics:
-            words.append(
-                f"The physics is found by its name: Python has to find {', '.join(saved.physics)}."
-            )
+            by = ", ".join(saved.physics)
+            words.append(f"The physics is found by its name: Python has to find {by}.")
     arguments += [f"{name}={'f_p' if name == 'physics' else name}" for name in missing]
     call = ", ".join([repr(file), *arguments])
     point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())

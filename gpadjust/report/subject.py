@@ -91,8 +91,9 @@ class Subject:
             if isinstance(transform, PhysicsInput):
                 given: Any = transform.physics
                 several = isinstance(given, JoinedPhysics)
-                parts = zip(given.names, given.parts, strict=True) if several else ()
-                found |= dict(parts) if several else {given.name: given}
+                found |= (
+                    zip(given.names, given.parts, strict=True) if several else {given.name: given}
+                )
         return found
 
     @property
