@@ -80,7 +80,7 @@ class NetworkDynamics(Dynamics):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether there were transitions."""
+        """True once there were transitions."""
         return self._networks is not None
 
     def before_data(self) -> Dynamics | None:
