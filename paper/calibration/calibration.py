@@ -144,10 +144,9 @@ def fitted(data: Data, method: str) -> tuple[TermsGP | StackedGP, bool]:
         return compare(data.X, data.Y, data.physics).recommended, False
     center: Any = 0.0 if method in (_MAP, "literal") else "learn"
     model = CKA(data.X, data.Y, physics=data.physics, center=center)
-    options: dict[str, Any] = {
-        _MAP: {"method": "map"},
-        "long": {"num_draws": 16_384, "num_samples": 128},
-    }.get(method, {})
+    options: Any = {"method": "map"} if method == _MAP else {}
+    if method == "long":
+        options = {"num_draws": 16_384, "num_samples": 128}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         fit(model, **options)

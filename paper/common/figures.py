@@ -91,7 +91,7 @@ def curves(
     size: tuple[float, float] = (4.2, 3.0),
     share: bool = True,
     logarithmic: bool = False,
-    finish: Callable[[Axes, str, pd.DataFrame], None] | None = None,
+    finish: Callable[[Axes, str, pd.DataFrame], object] | None = None,
 ) -> Path:
     """Draw median and quartiles of a measure over trials, a panel for each part of the runs.
 

@@ -92,11 +92,11 @@ def _pair(name: str) -> Callable[[int], Problem]:
 
 def _cart_pole(seed: int) -> Problem:
     upper = torch.tensor(CART_POLE_LIMITS, dtype=torch.float64)
-    believed = cart_pole(seed).physics.rhs
+    believed: Any = cart_pole(seed).physics
     return Problem(
         torch.stack([-upper, upper]),
         _change(REAL_CART_POLE),
-        _change(believed),
+        _change(believed.rhs),
         angles=(1,),
     )
 

@@ -169,7 +169,7 @@ def tables(runs: Sequence[Run], experiment: Structures) -> dict[str, Table]:
         ),
         "coverage": Table("Mean coverage of 95 %", _by_model(found, "coverage", ".2f")),
         "seconds": Table("Median seconds of a fit", _by_model(found, "seconds", ".2g")),
-        "rho": Table("CKA beside its delta alone, on the same data sets", rho(experiment)),
+        "rho": Table("CKA beside its delta alone, on the same data sets", rho(runs, experiment)),
     }
 
 
@@ -276,18 +276,18 @@ def _by_model(found: pd.DataFrame, column: str, form: str, most: float | None = 
     return table(rows, {label: cell(model) for model, label in MODELS.items()})
 
 
-def rho(experiment: Structures) -> str:
+def rho(runs: Sequence[Run], experiment: Structures) -> str:
     """Whether CKA is better than the physics mean, its delta alone, over all kinds of data sets.
 
-    Errors are compared on the same data sets; a cell is one problem with one number of data. The
-    runs are those of this experiment and of others whose results lie beside its own.
+    Errors are compared on the same data sets; a cell is one problem with one number of data. Other
+    experiments count whose results lie beside this one's.
     """
 
     def beside(kind: type[Experiment]) -> list[Run]:
         folder = experiment.out.parent / kind.name
         return list(RunsFile(folder / "runs.jsonl", kind.key).read().values())
 
-    own = frame(beside(Structures)).assign(group=lambda r: r["problem"].map(GROUPS))
+    own = frame(runs).assign(group=lambda r: r["problem"].map(GROUPS))
     groups = {
         f"{name}, default fit": part.assign(error=part["nrmse"], cell=_cell_of(part, _CELL))
         for name, part in own.groupby("group", sort=False)

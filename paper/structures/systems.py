@@ -61,7 +61,7 @@ def system(name: str, n: int, num_test: int, seed: int) -> System:
         ValueError: If the records have fewer.
     """
     if name in SIMULATED:
-        physics = arm().physics if name == ARM else cart_pole(seed).physics
+        physics: Any = arm().physics if name == ARM else cart_pole(seed).physics
         spec = ARM_SPEC if name == ARM else CART_POLE_SPEC
         return System(spec, physics, episodes(name, n, seed), episodes(name, num_test, _TEST_SEED))
     known = recorded(name, _TRAIN[name])
