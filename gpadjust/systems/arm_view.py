@@ -86,12 +86,12 @@ class ArmView(View):
         pygame.draw.polygon(self.canvas, colour, [_pixel(corner) for corner in corners])
 
     def _circle(
-        self, centre: tuple[float, float], colour: Colour, radius: float, ring: bool = False
+        self, center: tuple[float, float], colour: Colour, radius: float, ring: bool = False
     ) -> None:
         import pygame
 
         width = round(0.008 * SMOOTH * METRE) if ring else 0
-        pygame.draw.circle(self.canvas, colour, _pixel(centre), radius * SMOOTH * METRE, width)
+        pygame.draw.circle(self.canvas, colour, _pixel(center), radius * SMOOTH * METRE, width)
 
 
 LinkPose = tuple[float, float, float]  # where the link's joint is, in m, and its direction
