@@ -424,7 +424,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         return self.policy.unscale_action(scaled).astype(actions.dtype)
 
     def _model_noise(self, num_envs: int) -> ActionNoise | None:
-        """Action noise as the real steps have it, begun anew for each particle."""
+        """Action noise as the real steps have it, begun again for each particle."""
         noise = self.action_noise
         if noise is None:
             return None

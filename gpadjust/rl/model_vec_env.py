@@ -170,7 +170,7 @@ class ModelVecEnv(VecEnv):
         return self.episode_length - self._steps.numpy()
 
     def refresh(self, buffer: CompactReplayBuffer) -> None:
-        """Let the transitions in a buffer end anew, as the model now has it.
+        """Predict the next states in a buffer again, by the model as it is now.
 
         The states and actions stay, and with them the time limits.
 
