@@ -15,6 +15,8 @@ from sphinx.application import Sphinx
 TUTORIALS = Path(__file__).parents[2] / "tutorials"
 THUMBNAILS = {"1": 1, "2": 1, "4": 2, "6": 2, "7": 1, "9": 3}  # which picture; else the first
 
+NO_BREAK = "\N{NO-BREAK SPACE}"
+
 CARD = """:::{{grid-item-card}} {number}. {title}
 :link: {stem}
 :link-type: doc
@@ -26,8 +28,10 @@ CARD = """:::{{grid-item-card}} {number}. {title}
 
 def prepare(app: Sphinx, page: str, source: list[str]) -> None:
     """Change the text of a page that is about to be read."""
-    if page.startswith("paper/"):
-        source[0] = source[0].replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")  # in cells
+    if (app.srcdir / f"{page}.md").exists():
+        parts = source[0].split("```")  # code stays as it is
+        parts[::2] = [re.sub(r"(?<=\d) (?=[%±])|(?<=±) ", NO_BREAK, part) for part in parts[::2]]
+        source[0] = "```".join(parts)
     if page.startswith("paper/results/"):
         source[0] = anchored(page.split("/")[2], source[0])
     elif page == "tutorials/README":

@@ -191,7 +191,8 @@ def believed_cart_pole(seed: int) -> CartPoleEquation:
     """
     random = np.random.default_rng(checked_whole("seed", seed, 0))
     drawn = random.uniform([0.4, 0.5, 0.5], [0.6, 0.7, 0.7])
-    return CartPoleEquation(*map(float, drawn), damping=0.0)
+    cart_mass, pole_mass, pole_length = map(float, drawn)
+    return CartPoleEquation(cart_mass, pole_mass, pole_length, damping=0.0)
 
 
 def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_length) -> Tensor:

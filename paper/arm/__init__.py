@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(ControlSettings):
-    """What decides the numbers, for all learners, unless one says otherwise."""
+    """Settings that decide the numbers, for all learners, unless one says otherwise."""
 
     episodes: int = 30
     episode_length: int = 15
@@ -97,7 +97,7 @@ filtered."""
 
 @dataclass(frozen=True, kw_only=True)
 class ReachingSettings:
-    """What decides the numbers; found with other seeds, of 20 and more."""
+    """Settings that decide the numbers; found with other seeds, of 20 and more."""
 
     trials: int = 4
     """real trials of a run"""
@@ -154,7 +154,7 @@ class Reaching(Experiment):
         _check_opensim()
 
     def trials(self, system: str, learner: str) -> int:
-        """How many trials a run has."""
+        """The number of trials of a run."""
         is_long = (system, learner) == ("plain", "cka")
         return self.settings.long_trials if is_long else self.settings.trials
 

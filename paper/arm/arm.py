@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from torch import Tensor
 
 from gpadjust.systems.reaching import START_MEAN, arm_targets, hand_position
 from gpadjust.systems.torque_arm import REAL_ARM
-from paper.arm import SCENARIOS
+from paper.arm import PAPER, SCENARIOS
 from paper.arm.claims import LAST, MAP_AFTER, claims, targets
 from paper.cartpole import Control
 from paper.cartpole.control import (
@@ -22,27 +23,18 @@ from paper.cartpole.control import (
     foresight,
     load,
     seconds_of_a_run,
-    short_summary,
     summary,
     updates_table,
 )
 from paper.common.experiment import Run, Table
-from paper.common.figures import draw_quartiles, one_legend, panels, save
-from paper.common.tables import claims_table, markdown, numbers
+from paper.common.figures import curves as draw_curves
+from paper.common.figures import panels, save
+from paper.common.tables import claims_table, groups, markdown, numbers
 from paper.common.verdicts import Curves, judge
 
 MEASURES = {"all_steps": "all steps", "last_five": "last five steps"}
 WINDOWS = ((3, 9), (24, 30))
 _SHOWN = (3, 6, 9, 12, 18, 24, 30)  # episodes
-_SHORT = (
-    "mf",
-    "mf-best",
-    "phy",
-    "gp",
-    "cka",
-    "rra",
-    "cka-memory",
-)  # the learners of the main README
 
 
 def load_maps(runs: Sequence[Run], experiment: Control) -> pd.DataFrame:
@@ -101,10 +93,6 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
             digits=1,
         )
         found[name] = Table(f"Hand's error in cm, {MEASURES[measure]}", text)
-    labels = {n: f"{SCENARIOS[n].label} ({len(every.seeds(n))})" for n in _SHORT}
-    few = {f"at {episode}": partial(_at, every, episode) for episode in (3, 6, 12, LAST)}
-    short = short_summary(every, labels, few, "hand's error, cm", 8, " cm", 1)
-    found["short"] = Table("Hand's error in cm, all steps", short)
     found["memory"] = Table("With and without the previous action, cm", _memory(every, experiment))
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
     parts = {
@@ -131,7 +119,7 @@ def _spread(curves: Curves, name: str) -> float:
 
 
 def _memory(every: Curves, experiment: Control) -> str:
-    """What the previous action as an input brings, of the seeds that both forms have."""
+    """Errors with and without the previous action as an input, of the seeds that both have."""
     header, rows = ["", "runs"], []
     for first, last in WINDOWS:
         header += [f"{first}-{last} without", "with", "difference"]
@@ -150,85 +138,81 @@ def _memory(every: Curves, experiment: Control) -> str:
 
 
 BOUND = 4.1  # cm, all steps: python -m paper floor
-BOUND_LABEL = "1,000 trials of SAC on the true arm, all steps"
-HELD = 34.0  # cm, all steps
-BACKDROP = "mf"  # in every panel, for comparison
-_COLUMNS = 4
-_WORST = 60  # cm, the end of the colours
-_WIDEST = 10  # cm, the end of the sizes
+_LINES = {name: (SCENARIOS[name].label, SCENARIOS[name].color) for name in PAPER} | {
+    "mf-best": (SCENARIOS["mf-best"].label, "black"),
+    "cka-memory": (SCENARIOS["cka-memory"].label, "tab:cyan"),
+}
 
 
 def draw(runs: Sequence[Run], experiment: Control) -> list[Path]:
-    """Draw curves and maps; return their files."""
-    maps = load_maps(runs, experiment)
+    """Draw the error over the trials, and the errors at each target after some of them."""
+    errors, maps = load(runs, "evaluations", experiment), load_maps(runs, experiment)
+    counts = errors.groupby("scenario")["seed"].nunique()
+    lines = {n: (f"{label} ({counts.get(n, 0)})", color) for n, (label, color) in _LINES.items()}
+
+    def finish(ax: Axes, title: str, own: pd.DataFrame) -> None:
+        ax.axhline(34, color="0.5", lw=0.8, ls=":", label="start pose held, all steps")
+        ax.axhline(BOUND, color="tab:green", lw=1, ls="--", label="1,000 trials of SAC, all steps")
+        ax.set_ylim(0, 70)
+
+    found = [
+        draw_curves(
+            experiment.out / "curves.png",
+            {what: errors.assign(error=errors[measure]) for measure, what in MEASURES.items()},
+            "error",
+            lines,
+            by="scenario",
+            labels=("trial", "hand's RMSE over targets, cm: median, quartiles"),
+            size=(5.5, 4),
+            finish=finish,
+        )
+    ]
     maps = maps[maps["episode"] == MAP_AFTER]
-    found = [_curves(load(runs, "evaluations", experiment), experiment)]
-    return found if maps.empty else [*found, _map(maps, experiment)]
+    if maps.empty:
+        return found
+    by_title = {
+        f"{label} ({part['seed'].nunique()})": part.pivot(
+            index="seed", columns="target", values="all_steps"
+        )
+        for label, part in groups(maps, "scenario", experiment.labels).items()
+    }
+    label = f"RMSE after trial {MAP_AFTER}, cm"
+    return [*found, draw_maps(experiment.out / "map.png", by_title, label, 60, 4)]
 
 
-def _titles(rows: pd.DataFrame, experiment: Control) -> dict[str, str]:
-    """The title of the panel of each scenario, with the number of its runs."""
-    runs = rows.groupby("scenario", sort=False)["seed"].nunique()
-    return {str(name): f"{experiment.labels[str(name)]} ({n})" for name, n in runs.items()}
+def draw_maps(
+    path: Path, parts: Mapping[str, pd.DataFrame], label: str, worst: float, columns: int = 3
+) -> Path:
+    """Draw errors at each target: color for the mean over runs, size for their spread.
 
-
-def _curves(evaluations: pd.DataFrame, experiment: Control) -> Path:
-    """The hand's error over the episodes, median and quartiles of each scenario."""
-    titles = _titles(evaluations, experiment)
-    figure, axes = panels([*titles.values()], _COLUMNS, (2.9, 2.5), width=9)
-    backdrop = evaluations[evaluations["scenario"] == BACKDROP]
-    for name, ax in zip(titles, axes, strict=True):
-        own = evaluations[evaluations["scenario"] == name]
-        if name != BACKDROP and len(backdrop):
-            label = f"{experiment.labels[BACKDROP]}, all steps, median"
-            draw_quartiles(ax, backdrop, "all_steps", color="0.55", label=label, band=False)
-        for measure, color in (("last_five", "tab:red"), ("all_steps", "navy")):
-            label = f"{MEASURES[measure]}: median, quartiles"
-            draw_quartiles(ax, own, measure, color=color, label=label)
-        ax.axhline(HELD, color="0.5", lw=0.8, ls=":", label="start pose held, all steps")
-        ax.axhline(BOUND, color="tab:green", lw=1, ls="--", label=BOUND_LABEL)
-        ax.set_ylim(bottom=0)
-    figure.supxlabel("trial", fontsize="medium")
-    figure.supylabel("hand's RMSE over targets, cm", fontsize="medium")
-    one_legend(figure, axes)
-    return save(figure, experiment.out / "curves.png")
-
-
-def _map(maps: pd.DataFrame, experiment: Control) -> Path:
-    """The error at each target after some episodes: colour for the mean, size for its spread."""
-    titles = _titles(maps, experiment)
-    figure, axes = panels([*titles.values()], _COLUMNS, (2.9, 2.0))
-    targets = 100 * hand_position(arm_targets()).numpy()
-    for name, ax in zip(titles, axes, strict=True):
-        by_target = maps[maps["scenario"] == name].groupby("target")["all_steps"]
-        mean, sd = by_target.mean().to_numpy(), by_target.std().fillna(0).to_numpy()
-        draw_arm(ax)
+    Args:
+        path: The file.
+        parts: By the title of the panel, a row for each run, a column for each target.
+        label: Of the colors.
+        worst: The end of the colors, in cm.
+        columns: Panels in a row.
+    """
+    figure, axes = panels([*parts], columns, (2.9, 2.1))
+    targets, start = (100 * hand_position(at).numpy() for at in (arm_targets(), _start()))
+    elbow = 100 * REAL_ARM.lengths[0] * np.array([math.cos(START_MEAN[0]), math.sin(START_MEAN[0])])
+    for ax, errors in zip(axes, parts.values(), strict=True):
+        ax.plot(*np.stack([[0, 0], elbow, start]).T, color="0.7", lw=4, marker="o", ms=5, zorder=1)
         dots = ax.scatter(
             targets[:, 0],
             targets[:, 1],
-            c=mean,
-            s=6 + 6 * sd.clip(max=_WIDEST),
+            c=errors.mean(),
+            s=6 + 6 * errors.std().fillna(0).clip(upper=10),
             cmap="viridis_r",
             vmin=0,
-            vmax=_WORST,
+            vmax=worst,
             zorder=2,
         )
         ax.set_aspect("equal")
-    figure.supxlabel("along the upper arm at 0°, cm", fontsize="medium")
-    figure.supylabel("across, cm", fontsize="medium")
-    label = f"RMSE after trial {MAP_AFTER}, cm"
+    figure.supxlabel("along the upper arm at 0°, cm; size: sd of runs, 0 to 10 cm or more")
+    figure.supylabel("across, cm")
     figure.colorbar(dots, ax=axes, label=label, shrink=0.9, extend="max")
-    sizes = [
-        ax.scatter([], [], s=6 + 6 * sd, color="0.4", label=f"sd of runs {sd} cm{more}")
-        for sd, more in ((0, ""), (5, ""), (_WIDEST, " or more"))
-    ]
-    figure.legend(handles=sizes, loc="outside upper center", ncols=3)
-    return save(figure, experiment.out / "map.png")
+    return save(figure, path)
 
 
-def draw_arm(ax: Axes) -> None:
-    """The arm where episodes start."""
-    upper = REAL_ARM.lengths[0]
-    elbow = 100 * upper * np.array([math.cos(START_MEAN[0]), math.sin(START_MEAN[0])])
-    hand = 100 * hand_position(arm_targets().new_tensor(START_MEAN)).numpy()
-    ax.plot(*np.stack([[0, 0], elbow, hand]).T, color="0.7", lw=4, marker="o", ms=5, zorder=1)
+def _start() -> Tensor:
+    return arm_targets().new_tensor(START_MEAN)

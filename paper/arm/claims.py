@@ -48,7 +48,7 @@ LAST, MAP_AFTER = Settings().episodes, Settings().map_after
 
 
 def distance_from_start() -> np.ndarray:
-    """How far each target is from the hand at the start, in cm: ``121``."""
+    """Distances of the targets from the hand at the start, in cm: ``121``."""
     start = hand_position(arm_targets().new_tensor(START_MEAN))
     gap = hand_position(arm_targets()) - start
     return 100 * gap.square().sum(-1).sqrt().numpy()
@@ -104,7 +104,7 @@ def _cka(curves: Curves) -> Finding:
 
 
 def _less_spread(curves: Curves, name: str, other: str) -> Verdict:
-    """Whether runs of one learner differ less than those of another, by a bootstrap of seeds."""
+    """Verdict: runs of one learner differ less than those of another, by a bootstrap of seeds."""
     values = [
         own[own["episode"] >= 3].pivot(index="seed", columns="episode", values=curves.measure)
         for own in (curves.of(name), curves.of(other))
@@ -183,7 +183,7 @@ def _gp_map(maps: pd.DataFrame, curves: Curves) -> Finding:
 
 
 def _best_of_all(rank: int, curves: Curves) -> Finding:
-    """Whether CKA (rank 0), or RRA behind it (1), ends better than all others of the paper."""
+    """Verdict: CKA (rank 0), or RRA behind it (1), ends better than all others of the paper."""
     name = ("cka", "rra")[rank]
     others = [other for other in PAPER if other not in ("cka", "rra")[: rank + 1]]
     gaps = {o: curves.paired_difference(o, 24, LAST, reference=name) for o in others}

@@ -23,18 +23,13 @@ from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.physics import as_physics
 from gpadjust.states import StateSpec
 from gpadjust.systems import System, arm
-from gpadjust.systems.reaching import (
-    arm_targets,
-    hand_position,
-)
 from paper.arm import BOUNDS, SENSORS, Reaching, ReachingSettings
 from paper.arm import Settings as ArmSettings
-from paper.arm.arm import BOUND, draw_arm
+from paper.arm.arm import BOUND, draw_maps
 from paper.arm.system import reach, score
 from paper.cartpole.planning import trials_table
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
-from paper.common.figures import panels, save
 from paper.common.learners import LEARNERS
 from paper.common.tables import claims_table, frame, groups, of, table
 from paper.common.verdicts import Claim, Curves, Finding, judge, met
@@ -160,7 +155,7 @@ def bounds(spec: StateSpec) -> Tensor:
 
 
 def dynamics(settings: ReachingSettings, system: str, learner: str) -> Dynamics:
-    """What the policy is trained in, at its start."""
+    """The model in which the policy is trained, at its start."""
     arm = system_of(system, settings, unknowns=learner == "fitted")
     spec, physics = arm.spec, as_physics(arm.physics)
     if learner in ("phy", "fitted"):
@@ -244,21 +239,12 @@ def draw(runs: Sequence[Run], experiment: Reaching) -> list[Path]:
         )
     ]
     own = [each for each in runs if (each["system"], each["learner"]) == ("plain", "cka")]
-    return [*found, _maps(own, experiment)] if own else found
-
-
-def _maps(runs: Sequence[Run], experiment: Reaching) -> Path:
-    """The error at each target after some trials, the mean over the runs of CKA."""
-    shown = [trial for trial in MAPPED if any(f"{trial}" in each["maps"] for each in runs)]
-    figure, axes = panels([f"after trial {trial}" for trial in shown], 3, (2.9, 2.3))
-    targets = 100 * hand_position(arm_targets()).numpy()
-    for trial, ax in zip(shown, axes, strict=True):
-        maps = [each["maps"][f"{trial}"] for each in runs if f"{trial}" in each["maps"]]
-        draw_arm(ax)
-        color = {"c": np.mean(maps, axis=0), "cmap": "viridis_r", "vmin": 0, "vmax": 30}
-        dots = ax.scatter(targets[:, 0], targets[:, 1], s=18, zorder=2, **color)
-        ax.set_aspect("equal")
-    figure.supxlabel("along the upper arm at 0°, cm", fontsize="medium")
-    figure.supylabel("across, cm", fontsize="medium")
-    figure.colorbar(dots, ax=axes, label="RMSE, cm", shrink=0.9, extend="max")
-    return save(figure, experiment.out / "map.png")
+    maps = {
+        f"CKA, after trial {trial}": pd.DataFrame(
+            [each["maps"][f"{trial}"] for each in own if f"{trial}" in each["maps"]]
+        )
+        for trial in MAPPED
+    }
+    maps = {title: errors for title, errors in maps.items() if len(errors)}
+    path = experiment.out / "map.png"
+    return [*found, draw_maps(path, maps, "RMSE, cm", 30)] if maps else found

@@ -1,4 +1,4 @@
-"""The arm that is learnt, how well a policy reaches with it, and what is written down."""
+"""The arm, the errors of a policy that reaches with it, and the records of episodes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def setup(scenario: Scenario, settings: Settings) -> Setup:
 
 
 class Policy(Protocol):
-    """What is evaluated."""
+    """A policy that is evaluated."""
 
     def predict(
         self, observation: NDArray[np.float32], *, deterministic: bool

@@ -18,7 +18,7 @@ NUM_STARTS = 20  # of the evaluation
 
 @dataclass(frozen=True, kw_only=True)
 class ControlSettings:
-    """What decides the numbers, for all learners, unless one says otherwise.
+    """Settings that decide the numbers, for all learners, unless one says otherwise.
 
     SAC's were tuned on the cart-pole with its true dynamics as the model.
     """
@@ -113,7 +113,12 @@ class Control(Experiment):
     settings: ControlSettings
 
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3")
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.dynamics.LearnedDynamics",)
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.rl.Dyna",
+        "gpadjust.rl.DynaOptions",
+        "stable_baselines3.SAC",
+    )
     known: ClassVar[Mapping[str, Scenario]]
     """all learners"""
     rmses: ClassVar[Mapping[str, str]]
@@ -137,10 +142,10 @@ class Control(Experiment):
         return self.seeds[: self.known[kind[0]].max_runs]
 
     def describe(self, *kind: Any) -> dict[str, Any]:
-        """Settings, all options of the learner in force, and what its dynamics are."""
-        from paper.cartpole.control import described
-
-        return described(self, kind[0])
+        """The settings of the learner, and the task with its dynamics, if it has a model."""
+        name, settings = kind[0], asdict(self.settings_of(kind[0]))
+        model_free = self.known[name].kind == "none"
+        return settings if model_free else {**settings, "task": self.setup(name, 0).task.describe()}
 
     def run(self, *case: Any) -> dict[str, Any]:
         """Learn, or go on with it."""
@@ -151,7 +156,7 @@ class Control(Experiment):
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(ControlSettings):
-    """What decides the numbers, for all learners, unless one says otherwise."""
+    """Settings that decide the numbers, for all learners, unless one says otherwise."""
 
     episodes: int = 50
     episode_length: int = 25
@@ -237,7 +242,7 @@ _OF_A_SEARCH = ("updates", "starts", "learning_rate", "guides")
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningSettings:
-    """What decides the numbers; found with the true system and other seeds (100 to 111)."""
+    """Settings that decide the numbers; found with the true system and other seeds (100 to 111)."""
 
     trials: int = 5
     """real trials of a run, the first of which goes by f_p"""
@@ -332,7 +337,7 @@ class Planning(Experiment):
 
 @dataclass(frozen=True, kw_only=True)
 class FloorSettings:
-    """What decides the numbers."""
+    """Settings that decide the numbers."""
 
     sequences: int = 1000
     """of actions, that each round of the cross-entropy method looks at"""

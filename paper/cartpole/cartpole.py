@@ -15,7 +15,6 @@ from paper.cartpole.control import (
     cost_of_a_run,
     foresight,
     load,
-    short_summary,
     summary,
     updates_table,
 )
@@ -27,7 +26,6 @@ from paper.common.verdicts import Curves, judge
 FLOOR = 0.289  # python -m paper floor
 MEASURES = {"cost": "sampled", "evaluation": "deterministic"}
 WINDOWS = ((1, 6), (13, 25), (41, 50))
-_SHORT = ("mf-best", "phy", "gp", "cka", "rra", "oracle")  # the learners of the short table
 _PANELS = {
     "In the paper's form; CKA in ours": ("mf", "phy", "gp-paper", "cka", "rra-paper"),
     "In our form": ("mf-best", "phy", "gp", "cka", "rra", "oracle"),
@@ -55,9 +53,6 @@ def tables(runs: Sequence[Run], experiment: Control) -> dict[str, Table]:
             texts={"holds 0.5 from": partial(_holds, of[measure], experiment)},
         )
         found[actions] = Table(f"Cost, {actions} actions", text)
-    labels = {name: SCENARIOS[name].label for name in _SHORT}
-    short = short_summary(of["cost"], labels, _columns(of["cost"]), "mean cost", 0.5, "", 2)
-    found["short"] = Table("Cost, sampled actions", short)
     found["model"] = Table("How well models foresaw trials", foresight(episodes, experiment))
     parts = {
         "fit_seconds": "fits, s",

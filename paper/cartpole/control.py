@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,14 +12,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
 from gpadjust.control import EpisodeCheckpoint, Task, resume
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import Physics
-from gpadjust.rl import Dyna, DynaCallback, DynaOptions, DynaSAC
+from gpadjust.rl import DynaCallback, DynaOptions, DynaSAC
 from gpadjust.states import StateSpec
 from paper.cartpole import Control, ControlSettings, Scenario
 from paper.common.experiment import Run
@@ -30,12 +27,11 @@ from paper.common.runs import differences, versions
 from paper.common.tables import markdown, number, numbers
 from paper.common.verdicts import Curves, interquartile_mean
 
-_SAID = ("task", "options", "seed", "verbose", "tensorboard_log", "_init_setup_model")
 PARTS = ("fit", "rollout", "update")
 
 
 class Setup(NamedTuple):
-    """What a run is about.
+    """The parts of a run.
 
     Args:
         env: The real system; an environment that can be pickled.
@@ -72,23 +68,6 @@ def make_agent(experiment: Control, name: str, seed: int) -> DynaSAC:
     return DynaSAC("MlpPolicy", setup.env, setup.task, options, **arguments, seed=seed)
 
 
-def described(experiment: Control, name: str) -> dict[str, Any]:
-    """Settings, all options of the learner in force, and what its dynamics are."""
-    setup, settings = experiment.setup(name, 0), asdict(experiment.settings_of(name))
-    learner = {**_defaults(SAC), **_defaults(Dyna), **_arguments(experiment, name)}
-    options = asdict(_options(experiment, name))
-    found = {
-        **settings,
-        "learner": {key: learner[key] for key in learner if key not in {*settings, *_SAID}},
-        "options": {key: options[key] for key in options if key not in settings},
-        "task": setup.task.describe(),
-    }
-    if experiment.known[name].kind == "none":
-        del found["task"]
-    plain: dict[str, Any] = json.loads(json.dumps(found, default=repr))
-    return plain
-
-
 def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallback] = ()) -> Run:
     """Learn, or go on with it.
 
@@ -97,7 +76,11 @@ def run(experiment: Control, name: str, seed: int, callbacks: Sequence[BaseCallb
     """
     checkpoint = Path(f"{experiment.unfinished(name, seed)}.ckpt")
     settings, setup = experiment.settings_of(name), experiment.setup(name, seed)
-    now = {"settings": described(experiment, name), "versions": versions(experiment.packages)}
+    now = {
+        "settings": json.loads(json.dumps(experiment.describe(name))),
+        "defaults": experiment.defaults(),
+        "versions": versions(experiment.packages),
+    }
     if checkpoint.exists():
         agent: Any = resume(checkpoint, setup.env, setup.task)
         differ = differences(agent.notes["made"], now)
@@ -146,12 +129,6 @@ def _arguments(experiment: Control, name: str) -> dict[str, Any]:
     }
 
 
-def _defaults(kind: Any) -> dict[str, Any]:
-    """The arguments of a learner that have a default."""
-    parameters = inspect.signature(kind.__init__).parameters.values()
-    return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
-
-
 class Recorder(DynaCallback):
     """Records each episode, and sets the number of updates that follows it.
 
@@ -176,11 +153,11 @@ class Recorder(DynaCallback):
         self._begun = 0.0  # of this process's time
 
     def of_episode(self, states: Tensor, actions: Tensor, next_states: Tensor) -> dict[str, Any]:
-        """What is recorded of an episode's transitions."""
+        """Entries of the record by an episode's transitions."""
         return {}
 
     def of_policy(self, episode: int) -> dict[str, Any]:
-        """What is recorded of the policy after the updates that follow an episode (from 1)."""
+        """Entries by the policy after the updates that follow an episode (from 1)."""
         return {}
 
     def found(self) -> dict[str, Any]:
@@ -194,7 +171,7 @@ class Recorder(DynaCallback):
         return records
 
     def on_model_fit(self, metrics: dict[str, float]) -> None:
-        """How well the model foresaw the episode; rmse for each state, once it can predict."""
+        """Record the scores of the model on the episode, once it can predict."""
         if self._record is not None and "nlpd" in metrics:
             errors = [value for name, value in metrics.items() if name.startswith("rmse/")]
             self._record |= {name: metrics[name] for name in ("nlpd", "coverage")}
@@ -260,7 +237,7 @@ def load(runs: Sequence[Run], entry: str, experiment: Control) -> pd.DataFrame:
 
 
 def updates_table(experiment: Control) -> str:
-    """How many gradient steps each scenario makes after an episode."""
+    """Gradient steps of each scenario after an episode."""
     until = experiment.settings.last_model_episode
     starts = [1, until + 1] if until < experiment.settings.episodes else [1]
     rows = []
@@ -320,20 +297,6 @@ def summary(
     return markdown([*header, *texts], rows)
 
 
-def short_summary(
-    curves: Curves, labels: Mapping[str, str], columns: Mapping[str, Callable[[str], float]],
-    heading: str, level: float, unit: str, digits: int,
-) -> str:  # fmt: skip
-    """A row for each of some learners: a few numbers, and when a level is reached first."""
-    rows = []
-    for name, label in labels.items():
-        if name in curves.names:
-            first = curves.first_below(name, level)
-            cells = [number(value(name), f".{digits}f") for value in columns.values()]
-            rows.append([label, *cells, "never" if first is None else f"trial {first}"])
-    return markdown([heading, *columns, f"first at {level:g}{unit}"], rows)
-
-
 def seconds_of_a_run(rows: pd.DataFrame, parts: Sequence[str]) -> pd.DataFrame:
     """Medians over the runs of the seconds in each part that there is: a row for each scenario."""
     columns = [f"{part}_seconds" for part in parts if f"{part}_seconds" in rows]
@@ -355,7 +318,7 @@ def cost_of_a_run(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def foresight(episodes: pd.DataFrame, experiment: Control) -> str:
-    """How well the models foresaw episodes, from the second: the first that a learnt one can."""
+    """Scores of the models on episodes before they had them, from the second on."""
     errors = [f"rmse_{state}" for state in experiment.rmses]
     scored = episodes[episodes["episode"] > 1].groupby("scenario", sort=False)
     table = scored[["nlpd", *errors]].median()

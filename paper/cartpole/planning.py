@@ -144,7 +144,7 @@ def system_of(name: str, settings: PlanningSettings, seed: int = 0, **options: A
 
 
 def dynamics(settings: PlanningSettings, system: str, learner: str, seed: int) -> Dynamics:
-    """What is planned in, at its start."""
+    """The model that is planned in, at its start."""
     if learner == "oracle":
         dry, drag = FRICTIONS.get(system, (0.0, 0.0))
         real = replace(REAL_CART_POLE, dry=dry, drag=drag)
@@ -274,12 +274,12 @@ def _of_dyna(experiment: Planning, last: int) -> str:
 
 
 def succeeded(trials: pd.DataFrame) -> pd.Series[bool]:
-    """Whether pole and cart stay within 10 degrees and 0.1 m of the goal in the last second."""
+    """Trials whose pole and cart stay within 10 degrees and 0.1 m of the goal for a second."""
     return (trials["last_lean"] <= 10) & (trials["last_offset"] <= 0.1)
 
 
 def _successes(own: pd.DataFrame) -> str:
-    """Of how many runs each trial succeeds; the first one is random."""
+    """The number of runs of which each trial succeeds, but the first, which is random."""
     own = own.assign(success=succeeded(own), episode=own["episode"] - 1)
     own = own[own["episode"] >= 1]
     columns: dict[str, Any] = {"runs": lambda part: part["seed"].nunique()}
@@ -332,7 +332,7 @@ def _never_above(curves: Curves) -> Finding:
 
 
 def _all_stand(trial: int, curves: Curves) -> Finding:
-    """Whether all runs succeed in a trial after the random one."""
+    """Verdict: all runs succeed in a trial after the random one."""
     own = curves.of("cka")
     good = succeeded(own[own["episode"] == trial + 1])
     later = succeeded(own[own["episode"] > 1])

@@ -1,4 +1,4 @@
-"""The cart-pole that is learnt, and what is written down of each episode."""
+"""The cart-pole, the evaluation of a policy, and the records of episodes."""
 
 from __future__ import annotations
 

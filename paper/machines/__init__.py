@@ -69,13 +69,13 @@ REAL_LEARNERS = {
     "network": RealLearner("network", "0.55", "network", physics="none"),
     "residual": RealLearner("f_p and a network", "tab:pink", "network"),
 }
-UNTAUGHT = ("phy", "phy-identified")
+UNTRAINED = ("phy", "phy-identified")
 """Learners that learn nothing: one run each, of 0 transitions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RealSettings:
-    """What decides the numbers, fixed before the first run."""
+    """Settings that decide the numbers, fixed before the first run."""
 
     windows: int = 80
     """free runs of a test, from evenly spread states, the same for all learners"""
@@ -109,8 +109,8 @@ class Real(Experiment):
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """One run of what learns nothing; the pendulums' records have 300 transitions at most."""
         system, n, learner = kind
-        if learner in UNTAUGHT or n == 0:
-            return self.seeds[:1] if learner in UNTAUGHT and n == 0 else ()
+        if learner in UNTRAINED or n == 0:
+            return self.seeds[:1] if learner in UNTRAINED and n == 0 else ()
         return () if n == (400 if system.startswith("pendulum") else 300) else self.seeds
 
     def describe(self, *kind: Any) -> dict[str, Any]:
@@ -134,7 +134,7 @@ ANOTHER = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class ElsewhereSettings:
-    """What decides the numbers."""
+    """Settings that decide the numbers."""
 
     n: int = 100
     """transitions that are learnt from, in stretches of ten"""
@@ -192,7 +192,7 @@ STRUCTURES = {
     "sensor": "overflow, root sensor",
     "kink": "overflow, kinked sensor",
 }
-"""What f_p knows of the tanks, by name (``tanks_systems.py``)."""
+"""Structures of the tanks' f_p, by name (``tanks_systems.py``)."""
 
 PROCESS_NOISE = {
     "small": (0.003, 0.001),
@@ -200,7 +200,7 @@ PROCESS_NOISE = {
     "large": (0.03, 0.015),
     "learnt": None,
 }
-"""What a step of 4 s adds to the levels of the upper and the lower tank, in V, as of the fits."""
+"""Process noise of a step of 4 s in the levels of the upper and the lower tank, in V."""
 
 CANDIDATES = {
     f"{structure}-{noise}": f"f_p: {label}; process noise "
@@ -223,7 +223,7 @@ GPS = {
     "overflow-delta": "f_p of a linear sensor + delta",
     "overflow-cka": "CKA of f_p of a linear sensor",
 }
-"""What GPs learn beside an f_p whose parameters are those of its fit, by name."""
+"""GPs beside an f_p whose parameters are those of its fit, by name."""
 
 CHOSEN = {"": "kink-small", "overflow": "overflow-middle"}
 """The candidates, of all and of those with a linear sensor, that the cross-validated errors of the
@@ -232,7 +232,7 @@ committed runs choose: f_p of the learners that have one. The tables say so if o
 
 @dataclass(frozen=True, kw_only=True)
 class TanksSettings:
-    """What decides the numbers, fixed before the first run."""
+    """Settings that decide the numbers, fixed before the first run."""
 
     samples: int = 1024
     """of each record, the first ones"""
@@ -300,7 +300,7 @@ SENSORS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ForesightSettings:
-    """What decides the numbers."""
+    """Settings that decide the numbers."""
 
     trials: int = 7
     """real trials of an agent; dynamics learn from all but the last"""
@@ -373,7 +373,7 @@ SMOOTH = {
 
 @dataclass(frozen=True, kw_only=True)
 class KinksSettings:
-    """What decides the numbers."""
+    """Settings that decide the numbers."""
 
     held_out: int = 400
     """transitions that are predicted"""

@@ -16,7 +16,7 @@ from paper.common.experiment import Run, Table
 from paper.common.tables import claims_table, markdown
 from paper.common.verdicts import Judged, met
 from paper.machines import ANOTHER, HORIZONS, TRAININGS, Elsewhere
-from paper.machines.learners import learnt
+from paper.machines.learners import train
 from paper.machines.pendulums import STEP
 from paper.machines.real import follow
 from paper.machines.records import ELSEWHERE
@@ -31,7 +31,7 @@ def run(experiment: Elsewhere, training: str, learner: str, seed: int) -> Run:
     settings, known = experiment.settings, ELSEWHERE[training]
     records, smoothed = known.stretches(settings.n, seed), learner == "smoothed"
     begin = time.perf_counter()
-    made = learnt("smoothed-cka" if smoothed else learner, known.machine, records, seed)
+    made = train("smoothed-cka" if smoothed else learner, known.machine, records, seed)
     seconds, tests = time.perf_counter() - begin, dict[str, Any]()
     given: dict[str, Any] = {"start_noise": "learnt"}
     variations: dict[str, Any] = {"none": None}
@@ -130,7 +130,7 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
         before = own[(own["kind"] == kind) & (own["variation"] == "none")]
         for column, text in (
             ("held", f"95 % hold at least {_LEAST}"),
-            ("width", f"widths at most {_WIDEST} times what holds .95"),
+            ("width", f"widths at most {_WIDEST} times what holds 0.95"),
         ):
             count += 1
             if mine.empty:

@@ -40,7 +40,7 @@ def run(experiment: Foresight, system: str, seed: int) -> Run:
     seconds = time.process_time() - start
     made = agent.recorded_episodes()
     parts: Any = (part.split(length) for part in (made.states, made.actions, made.next_states))
-    trials = [Trajectories(*rows, torch.zeros(length)) for rows in zip(*parts, strict=True)]
+    trials = [Trajectories(*rows, episode=torch.zeros(length)) for rows in zip(*parts, strict=True)]
     rewards = [each.mean().item() for each in made.rewards.split(length)]
     found: dict[str, Any] = {"agent_seconds": seconds, "rewards": rewards}
     for noise in NOISES:
@@ -92,7 +92,7 @@ def _replay(
 def _scores(
     dynamics: LearnedDynamics, unseen: Trajectories, settings: ForesightSettings
 ) -> dict[str, Any]:
-    """Of the next states, and of trajectories by their number of steps; an entry for each state."""
+    """Scores of next states, and of free runs by their number of steps; an entry for each state."""
     near = dynamics.score(*unseen)
     found: dict[str, Any] = {"coverage": near.coverage.tolist(), "nlpd": near.nlpd.tolist()}
     for steps in settings.horizons:

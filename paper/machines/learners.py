@@ -1,4 +1,4 @@
-"""What a learner makes of a machine's transitions."""
+"""Learners of machines: from transitions or records to dynamics."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.models import PhysicsParameters, orthogonal_rbf
 from gpadjust.records import Records, smooth
-from paper.machines import REAL_LEARNERS, UNTAUGHT
+from paper.machines import REAL_LEARNERS, UNTRAINED
 from paper.machines.networks import NetworkDynamics
 from paper.machines.pendulums import Machine
 
 
-class Learnt(NamedTuple):
+class Trained(NamedTuple):
     """The result of a learner.
 
     Args:
@@ -32,7 +32,7 @@ class Learnt(NamedTuple):
     variation: Tensor | None = None
 
 
-def learnt(name: str, machine: Machine, data: Any, seed: int) -> Learnt:
+def train(name: str, machine: Machine, data: Any, seed: int) -> Trained:
     """Learn from transitions of a machine, or from records of stretches.
 
     Args:
@@ -48,13 +48,13 @@ def learnt(name: str, machine: Machine, data: Any, seed: int) -> Learnt:
         data = found.draw(seed)
     data = data.trajectories() if isinstance(data, Records) else data
     dynamics = _dynamics(name, machine, data, seed)
-    if name not in UNTAUGHT:
+    if name not in UNTRAINED:
         dynamics.update(*data)
     if found is not None:
-        return Learnt(dynamics, found.noise, found.physics_parameters, found.variation)
+        return Trained(dynamics, found.noise, found.physics_parameters, found.variation)
     if isinstance(dynamics, LearnedDynamics) and dynamics.model.has_unknowns:
-        return Learnt(dynamics, parameters=dynamics.model.physics_parameters)
-    return Learnt(dynamics)
+        return Trained(dynamics, parameters=dynamics.model.physics_parameters)
+    return Trained(dynamics)
 
 
 def _dynamics(name: str, machine: Machine, data: Any, seed: int) -> Dynamics:

@@ -80,7 +80,7 @@ class NetworkDynamics(Dynamics):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether there were transitions."""
+        """True once there were transitions."""
         return self._networks is not None
 
     def before_data(self) -> Dynamics | None:
@@ -142,18 +142,6 @@ class NetworkDynamics(Dynamics):
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
         """The mean square of the errors at the rows that were held out."""
         return self.spec.complete_variance(self._noise.expand(*states.shape[:-1], -1))
-
-    def describe(self) -> dict[str, str]:
-        """The class."""
-        return {"class": type(self).__name__}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Not there: runs are short."""
-        raise NotImplementedError
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Not there, either."""
-        raise NotImplementedError
 
     def _train(self, networks: Networks, X: Tensor, Y: Tensor, shares: Tensor) -> Tensor:
         """Train all networks at once; return the mean square of the errors, held out."""

@@ -24,7 +24,7 @@ FRICTION = {
     "viscous": Unknown(0.01, factor=5.0, unit="N m s"),
     "coulomb": Unknown(0.1, factor=3.0, unit="N m"),
 }
-"""What is known beforehand of friction in drives of this size."""
+"""Prior knowledge of friction in drives of this size."""
 
 Parameters = Mapping[str, float]
 Rates = Callable[[Tensor, Tensor, Mapping[str, Any]], Tensor]

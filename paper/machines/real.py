@@ -20,8 +20,8 @@ from paper.common.experiment import Run, Table
 from paper.common.figures import curves, one_legend, panels, save
 from paper.common.tables import Cell, across, claims_table, groups, number, table
 from paper.common.verdicts import Difference, paired
-from paper.machines import HORIZONS, REAL_LEARNERS, UNTAUGHT, Real, RealSettings
-from paper.machines.learners import Learnt, learnt
+from paper.machines import HORIZONS, REAL_LEARNERS, UNTRAINED, Real, RealSettings
+from paper.machines.learners import Trained, train
 from paper.machines.pendulums import STEP
 from paper.machines.records import REAL, System
 from paper.machines.targets import verdicts
@@ -43,7 +43,7 @@ def run(experiment: Real, name: str, n: int, learner: str, seed: int) -> Run:
     alone = REAL_LEARNERS[learner].states == "transitions"
     data = known.drawn(n, seed) if alone else known.stretches(n, seed)
     begin = time.perf_counter()
-    made = learnt(learner, known.machine, data, seed)
+    made = train(learner, known.machine, data, seed)
     fitted = time.perf_counter()
     tests = {test: _scores(made, known, test, settings) for test in known.tests}
     found: Run = {
@@ -54,13 +54,13 @@ def run(experiment: Real, name: str, n: int, learner: str, seed: int) -> Run:
     if made.parameters is not None:
         ends = torch.stack(made.parameters.interval(), -1).tolist()
         found["parameters"] = dict(zip(made.parameters, ends, strict=True))
-    if learner in UNTAUGHT or (n == settings.drawn and seed == 0):
+    if learner in UNTRAINED or (n == settings.drawn and seed == 0):
         found["paths"] = {test: _paths(known, free) for test, (_, free) in tests.items()}
     return found
 
 
 def _scores(
-    made: Learnt, known: System, test: str, settings: RealSettings
+    made: Trained, known: System, test: str, settings: RealSettings
 ) -> tuple[dict[str, Any], FreeRun]:
     """Scores by name and steps ahead, and the free runs of which they are.
 
@@ -127,7 +127,7 @@ def load(runs: Sequence[Run]) -> pd.DataFrame:
             shown = {k: v[angle] if k.startswith("rmse") else v.mean() for k, v in values.items()}
             rows.append({**own, "test": test, **shown})
     found = pd.DataFrame(rows)
-    untaught = found["learner"].isin(UNTAUGHT)
+    untaught = found["learner"].isin(UNTRAINED)
     sizes = found.loc[~untaught, ["system", "n"]].drop_duplicates()
     everywhere = found[untaught].drop(columns="n").merge(sizes, on="system", how="left")
     everywhere = everywhere.fillna({"n": 0}).astype({"n": int})  # where no other was run
@@ -205,12 +205,12 @@ def _restricted(own: pd.DataFrame, show: Any, column: str) -> Cell:
 
 def _with_draws(own: pd.DataFrame, learner: str, column: str) -> str:
     values = own.loc[own["learner"] == learner, column]
-    draws = "" if learner in UNTAUGHT or values.empty else f" ({len(values)})"
+    draws = "" if learner in UNTRAINED or values.empty else f" ({len(values)})"
     return number(values.mean(), ".3f") + draws
 
 
 def _ratio(own: pd.DataFrame, learner: str, column: str) -> str:
-    if learner in UNTAUGHT:  # one run, beside all draws
+    if learner in UNTRAINED:  # one run, beside all draws
         value = own.loc[own["learner"] == learner, column]
         draws = own[own["learner"] == "fitted"]
         rows = draws.assign(learner=learner, **{column: value.iloc[0] if len(value) else np.nan})

@@ -110,7 +110,7 @@ class System:
         return found.some(rows[places])
 
     def _fast(self, states: Tensor) -> Tensor:
-        """Where a rate is above the threshold: the rates are the second half of the states."""
+        """Mask of states with a rate above the threshold; rates are the second half of a state."""
         rates = states[..., states.shape[-1] // 2 :]
         return (rates.abs() >= self.moves).any(-1)
 

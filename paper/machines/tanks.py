@@ -221,7 +221,7 @@ def _of_fit(fitted: Fitted) -> Run:
 
 
 def _scores_of_fit(fitted: Fitted, settings: TanksSettings) -> Run:
-    """Of an f_p: by the path without noise, in intervals with all noise, but for parameters'."""
+    """Scores of an f_p: its path without noise; intervals with all noise but of parameters."""
     actions, lower = measured("Val", settings.samples)
     dynamics = PhysicsDynamics(SPEC, fitted.physics)
     noise = {"noise": fitted.noise, "process_noise": fitted.process_noise}
@@ -244,7 +244,7 @@ def smoothed(candidate: str, settings: TanksSettings) -> Any:
 def _scores_of_gp(
     learner: str, by: str, known: Fitted, n: int, seed: int, settings: TanksSettings
 ) -> Run:
-    """Of a GP beside an f_p whose parameters are those of a candidate."""
+    """Scores of a GP beside an f_p whose parameters are those of a candidate."""
     found = smoothed(by, settings)
     model = LEARNERS["phymean" if learner.endswith("delta") else "cka"].make
     dynamics = LearnedDynamics(SPEC, known.physics, model=model)

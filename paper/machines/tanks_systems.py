@@ -33,7 +33,7 @@ UNKNOWNS = {
     "place": Unknown(5.3, sd=0.5),
     "width": Unknown(0.5, factor=1.65),
 }
-"""What is known beforehand of the parameters, levels in V.
+"""Priors of the parameters, levels in V.
 
 Of the upper tank its brim, and the share of its overflow that the lower tank gets; of the sensor
 what it says of an empty tank, and its form.
@@ -52,7 +52,7 @@ _BRIM = 10.1  # V, of the lower tank
 
 
 def rates(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
-    r"""How fast the levels change, in V/s: Torricelli's outflow, and overflow.
+    r"""Rates of the levels in V/s: Torricelli's outflow, and overflow.
 
     The sensor says y of the lower level :math:`h = 5 s^r - d \tanh((y - c) / w)` with
     :math:`s = (y - e) / (5 - e)`, in a unit in which both are 5 near the middle.
@@ -119,6 +119,6 @@ def outputs(actions: Tensor, lower: Tensor, lags: int) -> Records:
 
 
 def describe() -> dict[str, Any]:
-    """What decides the fits of all structures, in plain values."""
+    """Priors and fixed values of all structures, in plain values."""
     priors = {name: known.prior_text for name, known in UNKNOWNS.items()}
     return {"priors": priors, "fixed": {name: FIXED[name] for name in STRUCTURES}}

@@ -42,7 +42,7 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
         most: float,
         column: str = "rmse-20",
     ) -> Judged:
-        """Whether the best of some learners is low enough, of 100 transitions."""
+        """Verdict: the best of some learners is low enough, of 100 transitions."""
         values = {
             learner: float(means.loc[(system, test, learner, n), column])
             for system, test, learner, n in means.index

@@ -70,6 +70,7 @@ class TestMeasuring:
         torch.testing.assert_close(result.Y, truth(result.X))
         assert result.model.train_targets.shape == (7,)
 
+    @pytest.mark.slow
     def test_it_teaches_more_than_chance(self, laboratory, bounds):
         options = {"num_restarts": 2, "raw_samples": 16}
         result = collect(**laboratory(budget=10, fit=None, optimizer_options=options))

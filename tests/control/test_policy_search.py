@@ -93,7 +93,11 @@ def test_an_episode_that_runs_away_does_not_outweigh_the_others():
 
 @pytest.mark.parametrize(
     "kind",
-    ["physics", "black box", pytest.param("learnt", marks=pytest.mark.slow), "mean of learnt"],
+    [
+        "physics",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("black box", "learnt")),
+        "mean of learnt",
+    ],
 )
 def test_the_optimum_is_found(learnt, kind):
     """To bring x to 0 in steps of v / 2: -2 x, within the bounds."""

@@ -244,7 +244,7 @@ def test_damaged_probes_are_refused(probes):
 # Transitions
 
 
-@pytest.mark.parametrize("where", ["physics", "model", "fit"])
+@pytest.mark.parametrize("where", [pytest.param("physics", marks=pytest.mark.slow), "model", "fit"])
 def test_an_error_while_learning_changes_nothing(learnt, monkeypatch, where):
     broken = False
 

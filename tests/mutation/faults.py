@@ -135,8 +135,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/control/checkpoint.py",
-        "agent._random_state = random_state",
-        "random_state.restore()",
+        "    agent._random_state = random_state\n",
+        "    random_state.restore()\n",
         "The generators are restored when the agent is read, not when it goes on to learn.",
     ),
     Fault(

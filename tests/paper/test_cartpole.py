@@ -25,7 +25,7 @@ from paper.cartpole import (
 )
 from paper.cartpole.cartpole import holds_from
 from paper.cartpole.claims import CLAIMS, TARGETS
-from paper.cartpole.control import described, make_agent, run
+from paper.cartpole.control import make_agent, run
 from paper.cartpole.planning import dynamics, environment, mc_pilco_reward
 from paper.cartpole.system import evaluate, fixed_starts
 from paper.common.runner import Refused, main, runs_file
@@ -116,13 +116,15 @@ def test_an_unfinished_run_of_other_settings_is_refused(tmp_path):
         run(other, "mf", 0)
 
 
-def test_a_fingerprint_holds_what_the_settings_do_not_say():
-    found = described(CartPole(settings=TINY), "cka-4")
+def test_what_identifies_a_run_holds_what_the_settings_do_not_say():
+    experiment = CartPole(settings=TINY)
+    found = experiment.describe("cka-4")
     assert found["updates_per_model_step"] == 4
-    assert found["options"]["real_fraction"] == pytest.approx(1 / 11)
-    assert found["learner"]["buffer_size"] == 100_000
     assert found["task"]["dynamics.model"] == "CKA"
-    assert "task" not in described(CartPole(), "mf")
+    assert "task" not in experiment.describe("mf")
+    defaults = experiment.defaults()
+    assert defaults["gpadjust.rl.DynaOptions"]["real_fraction"] == pytest.approx(1 / 11)
+    assert defaults["stable_baselines3.SAC"]["buffer_size"] == 1_000_000
 
 
 class TestCartPole:

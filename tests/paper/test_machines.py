@@ -20,7 +20,7 @@ from paper.machines import (
     SMOOTH,
     STRUCTURES,
     TENTH,
-    UNTAUGHT,
+    UNTRAINED,
     Elsewhere,
     ElsewhereSettings,
     Foresight,
@@ -36,7 +36,7 @@ from paper.machines.foresight import measured as noisy
 from paper.machines.kinks import drawn
 from paper.machines.kinks import tables as kinks_tables
 from paper.machines.kinks_systems import SYSTEMS
-from paper.machines.learners import learnt
+from paper.machines.learners import train
 from paper.machines.networks import NetworkDynamics
 from paper.machines.pendulums import DESIGN_C, DOUBLE_PENDULUM, PENDULUM, design_c, loaded_pendulum
 from paper.machines.real import load
@@ -86,8 +86,8 @@ def test_runs_and_their_tables(tmp_path):
 def test_cases_are_the_sizes_that_there_are():
     cases = Real(runs=2).cases()
     assert len(cases) == len({*cases})
-    taught = len(REAL_LEARNERS) - len(UNTAUGHT)
-    assert len(cases) == len(UNTAUGHT) * 4 + taught * 2 * 4 * 5
+    taught = len(REAL_LEARNERS) - len(UNTRAINED)
+    assert len(cases) == len(UNTRAINED) * 4 + taught * 2 * 4 * 5
     for name, system in REAL.items():
         most = max(n for own, n, *_ in cases if own == name)
         assert most == (300 if name.startswith("pendulum") else 400)
@@ -154,7 +154,7 @@ def test_least_squares_finds_the_parameters(name):
     real = PhysicsDynamics(machine.spec, machine.physics("identified"))
     following = real.sample(states, actions)
     noise = 1e-3 * torch.randn(following.shape, generator=generator).double()
-    fitted = learnt("fitted", machine, Trajectories(states, actions, following + noise), 0).dynamics
+    fitted = train("fitted", machine, Trajectories(states, actions, following + noise), 0).dynamics
     mean, variance = fitted.predict(states, actions)
     assert_close(mean, following, rtol=0, atol=2e-3)
     assert_close(variance.sqrt(), torch.full_like(mean, 1e-3), rtol=0.3, atol=0)
