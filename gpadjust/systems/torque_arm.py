@@ -138,21 +138,16 @@ REAL_ARM = ArmEquation()
 """The links of the muscle arm; segments after Nijhof and Kouwenhoven (2000). No torques."""
 
 
-def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
+def believed_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
     """The arm as someone may believe it to be, who has no model of its muscles.
 
-    Its links are a tenth too heavy, its joints damped twice as much as the real ones; the torques
-    follow the actions at once, whatever the angles, and nothing limits the joints.
-
-    Args:
-        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
-            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
+    :func:`~gpadjust.systems.arm` says where it errs, and what the gains are.
 
     Raises:
         ValueError: If the gains are not two finite numbers that are not negative.
 
     Example:
-        >>> torque_arm().damping
+        >>> believed_arm().damping
         1.0
     """
     return replace(
