@@ -70,7 +70,7 @@ class _Body(nn.Module):
         self.actor = actor
 
     def forward(self, observations: Tensor) -> Tensor:
-        """What the actor's tanh takes, ``N x action_dim``."""
+        """Return the arguments of the actor's tanh, ``N x action_dim``."""
         actor = self.actor
         features = actor.extract_features(observations.float(), actor.features_extractor)
         if hasattr(actor, "latent_pi"):  # SAC

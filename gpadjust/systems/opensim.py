@@ -227,7 +227,7 @@ class ArmSimulation:
     """The arm in OpenSim, integrated for 0.2 s at a time by Runge-Kutta-Merson.
 
     A step depends on its arguments alone. The simulation can be pickled and copied: the model is
-    built anew.
+    built again.
 
     Args:
         build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` and

@@ -259,7 +259,7 @@ class CartPoleSwingUpEnv(ViewedEnv):
     ``reset(options={"state": [x, theta, x_dot, theta_dot]})`` starts from this state.
 
     Environments can be pickled at any time and go on as they were, with their random state; the
-    window of a copy opens anew.
+    window of a copy opens again.
 
     Args:
         render_mode: ``"human"`` shows a window, ``"rgb_array"`` lets ``render`` return a frame.

@@ -22,8 +22,8 @@ class ArmEquation:
 
     The plane is level, so there is no gravity. With the angles :math:`q = (\theta_s, \theta_e)` of
     shoulder and elbow (the elbow's relative to the upper arm; both grow with flexion), the masses
-    :math:`m_i`, lengths :math:`l_i`, distances :math:`c_i` of the centres of mass from the proximal
-    joints and moments of inertia :math:`I_i` about those centres,
+    :math:`m_i`, lengths :math:`l_i`, distances :math:`c_i` of the centers of mass from the proximal
+    joints and moments of inertia :math:`I_i` about those centers,
 
     .. math::
         M(q)\, \ddot{q} &= \tau - d\, \dot{q} - b \sin\theta_e
@@ -40,8 +40,8 @@ class ArmEquation:
     Args:
         masses: The masses of upper arm and forearm with hand, in kg.
         lengths: Their lengths, in m.
-        centres: The distances of their centres of mass from shoulder and elbow, in m.
-        inertias: Their moments of inertia about the centres of mass, in kg m².
+        centres: The distances of their centers of mass from shoulder and elbow, in m.
+        inertias: Their moments of inertia about the centers of mass, in kg m².
         damping: The damping :math:`d` of each joint, in N m s/rad.
         gains: The torques :math:`(g_s, g_e)` of a full action, in N m.
 

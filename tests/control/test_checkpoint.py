@@ -102,17 +102,17 @@ SCRIPT = """
     import hashlib, sys
     from pathlib import Path
 
-    import gymnasium, torch
+    import torch
 
     torch.set_num_threads(1)
-    from gpadjust.control import CrossEntropy, EpisodeCheckpoint, MPCAgent, Planner, Task, resume
+    from gpadjust.control import CrossEntropy, EpisodeCheckpoint, MPCAgent, Planner, resume
     from gpadjust.dynamics import LearnedDynamics
     from gpadjust.systems import cart_pole
-    from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 
-    path = Path(sys.argv[1])
-    env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    task = Task(LearnedDynamics(CART_POLE_SPEC, cart_pole().physics), cart_pole_reward)
+    path, system = Path(sys.argv[1]), cart_pole()
+    quick = {"method": "map", "num_starts": 1, "num_screened": 0}
+    env, dynamics = system.make(), LearnedDynamics(system.spec, system.physics, fit_options=quick)
+    task = system.task(dynamics)
     if path.exists():
         agent = resume(path, env, task)
     else:

@@ -20,10 +20,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from gpadjust.control import EpisodeCheckpoint, Task, resume
-from gpadjust.dynamics import LearnedDynamics
+from gpadjust import systems
+from gpadjust.control import EpisodeCheckpoint, resume
 from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
-from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 
 TOTAL = 20  # four episodes of the point
 
@@ -146,15 +145,13 @@ SCRIPT = """
     import hashlib, sys
     from pathlib import Path
 
-    import gymnasium, torch
+    import torch
     from stable_baselines3.common.callbacks import BaseCallback
 
     torch.set_num_threads(1)
-    from gpadjust.control import EpisodeCheckpoint, Task, resume
-    from gpadjust.dynamics import LearnedDynamics
+    from gpadjust.control import EpisodeCheckpoint, resume
     from gpadjust.systems import cart_pole
-    from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
-    from gpadjust.rl import DynaOptions, DynaSAC, EpisodeCheckpoint, resume
+    from gpadjust.rl import DynaOptions, DynaSAC
 
     class Tells(BaseCallback):
         def _on_step(self):
@@ -164,8 +161,7 @@ SCRIPT = """
             print("written", flush=True)
 
     path = Path(sys.argv[1])
-    env = gymnasium.make("gpadjust/CartPoleSwingUp-v0")
-    task = Task(LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics), cart_pole_reward)
+    env, task = cart_pole().make(), cart_pole().task()
     if path.exists():
         agent = resume(path, env, task)
     else:
@@ -399,7 +395,7 @@ def test_cart_pole_of_co_kriging(sampling, cart_pole, assert_same, tmp_path):
     path = tmp_path / "run.ckpt"
 
     def task():
-        return Task(LearnedDynamics(CART_POLE_SPEC, cart_pole(0).physics), cart_pole_reward)
+        return systems.cart_pole().task()
 
     def agent():
         return DynaSAC(
