@@ -16,7 +16,7 @@ from gpadjust.physics import Physics, Unknown
 from gpadjust.states import StateSpec
 from gpadjust.systems.system import System
 from gpadjust.systems.torque_arm import REAL_ARM, SUBSTEPS, believed_arm, torque_arm_physics
-from gpadjust.systems.wrappers import NoisySensors, RememberAction
+from gpadjust.systems.wrappers import RememberAction
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)
@@ -202,24 +202,17 @@ def arm(
             believed, substeps=substeps, gradient=gradient, unknowns=named if unknowns else None
         )
     return System(
-        partial(_make, strength, memory, noise, episode_length),
+        partial(_make, memory, strength=strength, max_episode_steps=episode_length),
         spec,
         physics,
         arm_reward,
         start=partial(arm_start, spec=spec),
         episode_length=episode_length,
+        noise=noise,
     )
 
 
-def _make(
-    strength: float,
-    memory: bool,
-    noise: Mapping[str, float] | None,
-    episode_length: int,
-    **options: Any,
-) -> gym.Env[Any, Any]:
+def _make(memory: bool, **options: Any) -> gym.Env[Any, Any]:
     """The environment."""
-    name = "gpadjust/MuscleArm-v0"
-    env = gym.make(name, max_episode_steps=episode_length, strength=strength, **options)
-    env = RememberAction(env) if memory else env
-    return NoisySensors(env, ARM_MEMORY_SPEC if memory else ARM_SPEC, noise) if noise else env
+    env = gym.make("gpadjust/MuscleArm-v0", **options)
+    return RememberAction(env) if memory else env

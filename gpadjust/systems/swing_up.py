@@ -27,7 +27,6 @@ from gpadjust.states import StateSpec
 from gpadjust.systems.cart_pole_view import SIZE, draw_cart_pole
 from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
 from gpadjust.systems.system import System
-from gpadjust.systems.wrappers import NoisySensors
 
 TIME_STEP = 0.1
 SUBSTEP = 0.02  # s, the longest: a single Euler step of 0.1 s errs by 0.3 rad/s
@@ -430,18 +429,12 @@ def cart_pole(
         }
     real: dict[str, Any] = {"encode_angle": encode_angle, "time_step": time_step}
     real["equation"] = replace(REAL_CART_POLE, dry=dry, drag=drag)
-    spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
     return System(
-        partial(_make, spec, noise, max_episode_steps=episode_length, **real),
-        spec,
+        partial(gym.make, "gpadjust/CartPoleSwingUp-v0", max_episode_steps=episode_length, **real),
+        CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC,
         equation_physics(believed, time_step, named),
         cart_pole_reward,
         start=cart_pole_start,
         episode_length=episode_length,
+        noise=noise,
     )
-
-
-def _make(spec: StateSpec, noise: Mapping[str, float] | None, **options: Any) -> gym.Env[Any, Any]:
-    """The environment."""
-    env = gym.make("gpadjust/CartPoleSwingUp-v0", **options)
-    return NoisySensors(env, spec, noise) if noise else env

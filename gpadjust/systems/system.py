@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gpadjust.physics import Physics, Unknown, as_physics
 from gpadjust.states import StateSpec
+from gpadjust.systems.wrappers import NoisySensors
 
 if TYPE_CHECKING:
     from gpadjust.control import Task
@@ -35,6 +36,8 @@ class System:
         episode_length: Steps after which an episode is truncated. Default: the time limit of the
             environment.
         state_bounds: As of a :class:`~gpadjust.control.Task`.
+        noise: Standard deviations of the sensors' noise, by the name of the state, which
+            :class:`NoisySensors` adds to what the environment observes.
 
     Raises:
         TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec`` no
@@ -57,6 +60,7 @@ class System:
     terminated: Callable[[Tensor], Tensor] | None = None
     episode_length: int | None = None
     state_bounds: Tensor | None = None
+    noise: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         """Check the parts that a task does not check."""
@@ -80,9 +84,9 @@ class System:
             options: Keyword arguments of ``env``, such as ``render_mode="human"``.
         """
         env = self.env(**options)
-        if self.episode_length is None or (env.spec and env.spec.max_episode_steps):
-            return env
-        return gym.wrappers.TimeLimit(env, self.episode_length)
+        if self.episode_length is not None and not (env.spec and env.spec.max_episode_steps):
+            env = gym.wrappers.TimeLimit(env, self.episode_length)
+        return NoisySensors(env, self.spec, self.noise) if self.noise else env
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
         """The task that agents and planners take.

@@ -1,5 +1,6 @@
 """A system in one object: its environment, its task, its physics with and without unknowns."""
 
+import functools
 import pickle
 from pathlib import Path
 from types import ModuleType
@@ -126,6 +127,15 @@ def test_environment_and_task_agree():
     _, paid, *_ = env.step(np.array([2.0], dtype=np.float32))
     after = torch.from_numpy(env.unwrapped.state).unsqueeze(0)
     assert task.rewards(before, torch.tensor([[2.0]]).double(), after).item() == pytest.approx(paid)
+
+
+def test_sensors_of_any_system_can_be_noisy():
+    make = functools.partial(System, Cart, SPEC, lambda X: X[:, :2], lambda s, a, n: n[:, 0])
+    (true, _), (seen, _) = (make(noise=n).make().reset(seed=0) for n in (None, {"v": 0.1}))
+    assert seen[0] == true[0]
+    assert 0 < abs(seen[1] - true[1]) < 0.5
+    with pytest.raises(ValueError, match="no state 'y'"):
+        make(noise={"y": 0.1}).make()
 
 
 def test_no_system_hides_a_module():
