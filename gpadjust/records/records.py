@@ -12,9 +12,9 @@ import torch
 
 from gpadjust.checks import checked_number
 from gpadjust.dynamics import Trajectories, Windows
+from gpadjust.dynamics.targets import check_spec
 from gpadjust.files import CsvColumns
-from gpadjust.records.record import Record, Stretch, in_control_steps
-from gpadjust.records.resampling import resampled
+from gpadjust.records.record import Record, Stretch, in_control_steps, resampled
 from gpadjust.states import StateSpec
 
 Column = TypeVar("Column", bound=str | None)
@@ -53,7 +53,7 @@ class Records:
     """
 
     def __init__(self, records: Iterable[Record], spec: StateSpec) -> None:
-        _check_spec(spec)
+        check_spec(spec)
         if isinstance(records, Record):
             records = [records]
         self.records, self.spec = tuple(records), spec
@@ -134,7 +134,7 @@ class Records:
             tensor([[0.1000, 0.0000],
                     [0.2000, 0.4000]], dtype=torch.float64)
         """
-        _check_spec(spec)
+        check_spec(spec)
         columns = (
             _columns(states, spec.states, "states"),
             _columns(actions, spec.actions, "actions"),
@@ -145,13 +145,7 @@ class Records:
 
     @classmethod
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
-        """A record of each window, such as to :func:`smooth` them.
-
-        Args:
-            windows: The windows.
-            spec: What the entries of states and actions are.
-            step: The control step.
-        """
+        """A record of each window, in control steps, such as to :func:`smooth` them."""
         times = checked_number("step", step, above=0) * torch.arange(
             windows.states.shape[1], dtype=torch.float64
         )
@@ -279,14 +273,6 @@ class Records:
         )
 
 
-def _check_spec(spec: StateSpec) -> None:
-    if not isinstance(spec, StateSpec):
-        raise TypeError(
-            f"Expected spec as a StateSpec, such as StateSpec(['x', 'v'], ['force']); found "
-            f"{spec!r}."
-        )
-
-
 def _read(
     file: str | Path,
     spec: StateSpec,
@@ -320,12 +306,7 @@ def _read(
 def _columns(
     given: Mapping[str, Column] | None, names: Iterable[str], argument: str
 ) -> dict[str, Column | str]:
-    """The column of each name: the one given, or else that of the same name.
-
-    Raises:
-        TypeError: If it is no mapping.
-        ValueError: If it has another name.
-    """
+    """The column of each name: the one given, or else that of the same name."""
     given, names = {} if given is None else given, tuple(names)
     if not isinstance(given, Mapping):
         raise TypeError(
