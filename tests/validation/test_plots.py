@@ -201,7 +201,7 @@ def test_given_axes_are_drawn_on(line, forrester):
     ax, axes = Figure().subplots(), Figure().subplots(2)
     assert plot_prediction(line, forrester.test_X, ax=ax) is ax
     assert plot_adjustment(line, axes=axes)[0, 0] is axes[0]
-    with pytest.raises(ValueError, match="Expected 2 axes, got 1"):
+    with pytest.raises(ValueError, match="Expected 1 x 2 axes, got 1"):
         plot_leave_one_out(leave_one_out(line), axes=ax)
 
 
