@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import checked_tensor, checked_whole
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 
@@ -136,16 +136,8 @@ def even_normal(number: int, p: int, seed: int) -> Tensor:
 
 
 def of_states(values: Tensor, name: str, shape: tuple[int, ...]) -> Tensor:
-    """The user's numbers, one or more for each state, in float64.
-
-    Raises:
-        TypeError: If they are no numbers.
-        ValueError: If they are not of that shape.
-    """
-    try:
-        values = torch.as_tensor(values, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"Expected {name} as a tensor of numbers, got {values!r}.") from error
+    """The user's numbers, one or more for each state, in float64; an error if they are none."""
+    values = checked_tensor(name, values)
     if values.shape != shape:
         raise ValueError(
             f"Expected {name} of shape {' x '.join(map(str, shape))}, an entry for each state, got "

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_tensor
 from gpadjust.dynamics.particles import even_normal
 from gpadjust.models import PhysicsParameters
 from gpadjust.physics import Physics
@@ -39,12 +40,7 @@ def varying_parameters(
         ValueError: If it is not one of 0 or more, or one for each parameter.
     """
     unknowns, moving, p = physics.unknowns, spec.moving, len(physics.unknowns.names)
-    try:
-        sd = torch.as_tensor(variation, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(
-            f"Expected variation as a number or a tensor of numbers, got {variation!r}."
-        ) from error
+    sd = checked_tensor("variation", variation)
     if sd.shape not in ((), (p,)) or not (sd.isfinite() & (sd >= 0)).all():
         raise ValueError(
             f"Expected variation as one number of 0 or more, or one for each of "

@@ -47,14 +47,8 @@ def smooth_chain(
     """All stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
 
     The last entries of a state, beyond those that a stretch starts again with, are constants that
-    all stretches share.
-
-    Args:
-        links: The stretches.
-        starts: Means ``d`` and variances ``d`` of the first state of each; of the first stretch
-            of all ``D`` entries.
-        noise: Variances ``d`` of the errors of what is measured.
-        process_noise: Variances ``d`` of what a step adds to the first entries.
+    all stretches share. Starts are means and variances ``d`` of the first state of each stretch, of
+    the first one of all ``D`` entries; noises are variances ``d``.
 
     Returns:
         What is known of each stretch, and the log density of what was measured.

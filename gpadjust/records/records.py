@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import torch
 
@@ -16,8 +16,6 @@ from gpadjust.dynamics.targets import check_spec
 from gpadjust.files import CsvColumns
 from gpadjust.records.record import Record, Stretch, in_control_steps, resampled
 from gpadjust.states import StateSpec
-
-Column = TypeVar("Column", bound=str | None)
 
 
 class Records:
@@ -135,13 +133,30 @@ class Records:
                     [0.2000, 0.4000]], dtype=torch.float64)
         """
         check_spec(spec)
-        columns = (
-            _columns(states, spec.states, "states"),
-            _columns(actions, spec.actions, "actions"),
-        )
+        state_columns = _columns(states, spec.states, "states")
+        action_columns = _columns(actions, spec.actions, "actions")
+
+        def read(file: str | Path) -> Record:
+            table = CsvColumns(file, delimiter, decimal=decimal)
+            if isinstance(time, str):
+                times = table.numbers(time)
+            else:
+                rows = torch.arange(len(table), dtype=torch.float64)
+                times = checked_number("time", time, above=0) * rows
+            measured = []
+            for name, column in state_columns.items():
+                filled_in = name in spec.previous and name == column and name not in table.names
+                if column is None or filled_in:
+                    measured.append(torch.full_like(times, math.nan))
+                else:
+                    measured.append(table.numbers(column, may_miss=True))
+            taken = [table.numbers(column) for column in action_columns.values()]
+            labels = None if segment is None else table.texts(segment)
+            columns = torch.stack(measured, -1), torch.stack(taken, -1)
+            return Record(times, *columns, labels, str(file))
+
         several = [files] if isinstance(files, str | Path) else files
-        records = [_read(f, spec, *columns, time, segment, delimiter, decimal) for f in several]
-        return cls(records, spec)
+        return cls([read(file) for file in several], spec)
 
     @classmethod
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
@@ -273,41 +288,9 @@ class Records:
         )
 
 
-def _read(
-    file: str | Path,
-    spec: StateSpec,
-    states: Mapping[str, str | None],
-    actions: Mapping[str, str],
-    time: str | float,
-    segment: str | None,
-    delimiter: str,
-    decimal: str,
-) -> Record:
-    """The record in a file; for the arguments see :meth:`Records.read_csv`."""
-    table = CsvColumns(file, delimiter, decimal=decimal)
-    if isinstance(time, str):
-        times = table.numbers(time)
-    else:
-        times = checked_number("time", time, above=0) * torch.arange(
-            len(table), dtype=torch.float64
-        )
-    measured = []
-    for name, column in states.items():
-        filled_in = name in spec.previous and name == column and name not in table.names
-        if column is None or filled_in:
-            measured.append(torch.full_like(times, math.nan))
-        else:
-            measured.append(table.numbers(column, may_miss=True))
-    taken = [table.numbers(column) for column in actions.values()]
-    labels = None if segment is None else table.texts(segment)
-    return Record(times, torch.stack(measured, -1), torch.stack(taken, -1), labels, str(file))
-
-
-def _columns(
-    given: Mapping[str, Column] | None, names: Iterable[str], argument: str
-) -> dict[str, Column | str]:
+def _columns(given: Any, names: tuple[str, ...], argument: str) -> dict[str, Any]:
     """The column of each name: the one given, or else that of the same name."""
-    given, names = {} if given is None else given, tuple(names)
+    given = {} if given is None else given
     if not isinstance(given, Mapping):
         raise TypeError(
             f"Expected {argument} as a dictionary from names of the spec to columns, such as "

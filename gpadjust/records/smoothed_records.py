@@ -23,6 +23,7 @@ from gpadjust.records.kalman import Array, draw_paths
 from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.records import Records
 from gpadjust.records.smoothing import Estimate, estimate, variation
+from gpadjust.states import StateSpec
 
 _DRAWS = 256  # of the parameters
 _SAME = 0.01  # of a step, by which another one may differ from it
@@ -199,22 +200,17 @@ def smooth(
         )
         stretches = [stretch for stretch in stretches if len(stretch.actions)]
     whole = _checked_physics(physics, records, stretches[0])
-    known = Known(
-        _variances(noise, "noise", records),
-        _variances(process_noise, "process_noise", records),
-        _starts(start, records),
-    )
-    _check_hidden(stretches, known, records)
-    measured = torch.cat([stretch.states for stretch in stretches])
-    hidden = [i for i in spec.moving if measured[:, i].isnan().all()]
+    variances = _variances(noise, "noise", spec), _variances(process_noise, "process_noise", spec)
+    known = Known(*variances, _starts(start, spec))
+    hidden = _hidden(stretches, known, spec)
     if num_starts is None:
         num_starts = 4 if hidden and whole.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
     chain = Chain(whole, spec, stretches, known)
     found = estimate(chain, max_rounds, num_starts, progress)
-    variances = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
+    squares = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
     still = [each._replace(states=torch.zeros_like(each.states)) for each in stretches]
-    sd = _by_record(records, still, [np.sqrt(v.clip(0)) for v in variances], remember=False)
+    sd = _by_record(records, still, [np.sqrt(v.clip(0)) for v in squares], remember=False)
     sizes = torch.zeros(2, spec.state_dim, dtype=torch.float64)
     sizes[:, spec.moving] = torch.from_numpy(np.sqrt([found.noise, found.process_noise]))
     sizes[0, hidden] = torch.nan
@@ -270,9 +266,8 @@ def _checked_physics(
     return whole
 
 
-def _variances(given: Tensor | None, name: str, records: Records) -> Array:
+def _variances(given: Tensor | None, name: str, spec: StateSpec) -> Array:
     """Variances of the states that move, NaN where they are to be learnt."""
-    spec = records.spec
     sd = torch.full((spec.state_dim,), math.nan, dtype=torch.float64)
     if given is not None:
         sd = of_states(given, name, (spec.state_dim,))
@@ -286,10 +281,9 @@ def _variances(given: Tensor | None, name: str, records: Records) -> Array:
 
 
 def _starts(
-    given: Mapping[str, tuple[float, float]] | None, records: Records
+    given: Mapping[str, tuple[float, float]] | None, spec: StateSpec
 ) -> dict[int, tuple[float, float]]:
     """Prior knowledge of the first states, by their number among those that move."""
-    spec = records.spec
     if given is not None and not isinstance(given, Mapping):
         raise TypeError(
             f"Expected start as a dictionary, such as {{{spec.states[0]!r}: (0.0, 1.0)}}: mean and "
@@ -309,16 +303,17 @@ def _starts(
     return found
 
 
-def _check_hidden(stretches: Sequence[Stretch], known: Known, records: Records) -> None:
-    """Raise a ValueError unless something is measured, and states that never are have a start."""
-    spec = records.spec
+def _hidden(stretches: Sequence[Stretch], known: Known, spec: StateSpec) -> list[int]:
+    """The states that were never measured; a ValueError if they are all, or have no start."""
     names = [spec.states[i] for i in spec.moving]
     measured = torch.cat([~stretch.states[:, spec.moving].isnan() for stretch in stretches])
     if not measured.any():
         raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")
-    for i in (~measured.any(0)).nonzero().flatten().tolist():
+    hidden: list[int] = (~measured.any(0)).nonzero().flatten().tolist()
+    for i in hidden:
         if i not in known.start:
             raise ValueError(
                 f"State {names[i]!r} was never measured; say where it may be at the beginning of a "
                 f"stretch, such as start={{{names[i]!r}: (0.0, 1.0)}}: mean and standard deviation."
             )
+    return [spec.moving[i] for i in hidden]

@@ -175,12 +175,8 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
 
     What stretch s says of its parameters is
     :math:`\exp(h_s^\top \theta_s - \theta_s^\top \Lambda_s \theta_s / 2)`; :math:`\eta_s`, and then
-    :math:`\theta \sim N(0, I)`, are integrated out.
-
-    Args:
-        precision: The :math:`\Lambda_s`, ``S x p x p``.
-        pull: The :math:`h_s`, ``S x p``.
-        v: Standard deviations of the :math:`\eta_s`, ``p``.
+    :math:`\theta \sim N(0, I)`, are integrated out. Precisions :math:`\Lambda_s` are
+    ``S x p x p``, pulls :math:`h_s` ``S x p``, standard deviations v of the :math:`\eta_s` ``p``.
     """
     eye = torch.eye(len(v), dtype=v.dtype)
     scaled, h = precision * v, pull * v  # Lambda_s V, V h_s

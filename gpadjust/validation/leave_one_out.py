@@ -185,8 +185,8 @@ def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
 def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
     """The predictions by a mixture of ``K`` models with weights ``K x 1 x m``, 1 in all."""
     parts = ((loo.mean, loo.variance, loo.log_density) for loo in each)
-    stacked = [torch.stack(part, MCMC_DIM) for part in zip(*parts, strict=True)]
-    mean, variance, density = _mixture_of(*stacked, weight=weight)
+    mean, variance, density = (torch.stack(p, MCMC_DIM) for p in zip(*parts, strict=True))
+    mean, variance, density = _mixture_of(mean, variance, density, weight)
     return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 
@@ -260,5 +260,6 @@ def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
                 "not belong to the same points; call `leave_one_out` on each of `model.models`."
             )
     columns = ((part.Y, part.mean, part.variance, part.log_density) for part in parts)
-    joined = [torch.cat(each, dim=-1) for each in zip(*columns, strict=True)]
-    return LeaveOneOut(X, *joined, tuple(name for part in parts for name in part.output_names))
+    Y, mean, variance, density = (torch.cat(each, dim=-1) for each in zip(*columns, strict=True))
+    names = tuple(name for part in parts for name in part.output_names)
+    return LeaveOneOut(X, Y, mean, variance, density, names)

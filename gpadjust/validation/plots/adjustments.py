@@ -9,7 +9,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import checked_bounds, checked_tensor, checked_whole
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     BLUE,
@@ -201,25 +201,12 @@ def _domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Te
         # An input that never changed is drawn around its value.
         pad = torch.where(lower == upper, 0.5 * lower.abs().clamp_min(1.0), torch.zeros_like(lower))
         bounds = torch.stack([lower - pad, upper + pad])
-    bounds = _numbers(bounds, "bounds", X)
-    if bounds.shape != (2, d) or not (bounds[0] < bounds[1]).all() or bounds.isinf().any():
-        raise ValueError(
-            f"Expected bounds of shape (2, {d}), finite, lower below upper, got {bounds.tolist()}."
-        )
-    base = X.median(0).values if base is None else _numbers(base, "base", X)
+    bounds = checked_bounds("bounds", bounds, d).to(X)
+    base = X.median(0).values if base is None else checked_tensor("base", base).to(X)
     if base.shape != (d,) or not base.isfinite().all():
         raise ValueError(f"Expected a base point of {d} inputs, finite, got {base.tolist()}.")
     suffix = f"\nfor {labels(model, 'output', num_outputs)[output]}" if num_outputs > 1 else ""
     return X[seen], bounds, base, suffix
-
-
-def _numbers(values: Any, name: str, like: Tensor) -> Tensor:
-    try:
-        return torch.as_tensor(values, dtype=like.dtype, device=like.device).detach()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(
-            f"Expected {name} as a tensor or lists of numbers, got {values!r}."
-        ) from error
 
 
 _COLORS = dict(zip(SIDES, (BLUE, RED, "0.85"), strict=True))
