@@ -12,9 +12,8 @@ import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import cloudpickle
 import numpy as np
@@ -25,8 +24,7 @@ from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.task import Task
 from gpadjust.files import sync_folder
 
-_FORMAT = "gpadjust episode checkpoint, version 3"
-_OWN = ("manifest.json", "random.npz")
+_FORMAT = "gpadjust episode checkpoint, version 4"
 
 
 class TaskAgent(ABC):
@@ -73,6 +71,22 @@ class TaskAgent(ABC):
             )
         return int(length)
 
+    def try_task(self, observations: np.ndarray, action_space: Any) -> None:
+        """Call the functions of the task at the start, before a real step is made.
+
+        Args:
+            observations: ``N x observation_dim``.
+            action_space: A box, whose middle is tried.
+        """
+        before, task = RandomState.capture(), self.ready_task()
+        seen = torch.from_numpy(observations.astype(np.float64))
+        task.dynamics.spec.check_observations(seen)
+        # Of a single state much would look right that is not.
+        twice = task.dynamics.spec.decode(seen).repeat(2, 1)
+        middle = torch.from_numpy((action_space.low + action_space.high) / 2).double()
+        task.try_functions(twice, middle.expand(len(twice), -1))
+        before.restore()
+
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
         """Add what is done inside to a part of ``wall_time``."""
@@ -96,9 +110,13 @@ class TaskAgent(ABC):
         return env
 
     @classmethod
-    @abstractmethod
     def described(cls, env: Any) -> dict[str, Any]:
         """The environment in plain values, which are compared before anything is unpickled."""
+        return {
+            "wrappers": " of ".join(layer_names(env)),
+            "observation_space": str(env.observation_space),
+            "action_space": str(env.action_space),
+        }
 
     @abstractmethod
     def saved_parts(self) -> dict[str, bytes]:
@@ -107,7 +125,7 @@ class TaskAgent(ABC):
     @classmethod
     @abstractmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
-        """The agent of these files; a missing one is a KeyError."""
+        """The agent of these files."""
 
 
 class EpisodeCheckpoint:
@@ -190,7 +208,7 @@ class EpisodeCheckpoint:
         }
         parts = {
             "manifest.json": json.dumps(manifest, default=_plain).encode(),
-            "random.npz": packed((agent._random_state or RandomState.capture()).as_arrays()),
+            "random.pt": packed(tuple(agent._random_state or RandomState.capture())),
             **agent.saved_parts(),
         }
         temporary = self.path.with_name(f".{self.path.name}.part")  # a killed process's goes
@@ -247,11 +265,8 @@ def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | 
     }
     for part, here in own.items():
         _compare(path, part, manifest[part], here)
-    random_state = RandomState.from_arrays(unpacked(parts["random.npz"]))
-    try:
-        agent = algorithm.from_parts(parts, env, task)
-    except KeyError as error:
-        raise ValueError(f"{path} is not a checkpoint of EpisodeCheckpoint: no {error}.") from error
+    random_state = RandomState(*unpacked(parts["random.pt"]))
+    agent = algorithm.from_parts(parts, env, task)
     agent._random_state = random_state
     return agent
 
@@ -289,18 +304,26 @@ def _known(name: str) -> type[TaskAgent]:
     return known[name]
 
 
-def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The manifest of a checkpoint and its other parts, as they are on the disk."""
-    try:
+class _Parts(dict[str, bytes]):
+    """The files of a checkpoint; a missing one is a ValueError, not the KeyError of a user's."""
+
+    def __init__(self, path: str | Path) -> None:
         with zipfile.ZipFile(path) as archive:
-            parts = {name: archive.read(name) for name in archive.namelist()}
-        missing = {*_OWN} - {*parts}
-        if missing:
-            raise ValueError(f"it has no {min(missing)}")
-        manifest = json.loads(parts["manifest.json"])
-        if manifest["format"] != _FORMAT:
-            raise ValueError(f"its format is {manifest['format']!r}, expected {_FORMAT!r}")
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+            super().__init__({name: archive.read(name) for name in archive.namelist()})
+        self.path = path
+
+    def __missing__(self, name: str) -> bytes:
+        raise ValueError(f"{self.path} is not a checkpoint of EpisodeCheckpoint: it has no {name}.")
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], _Parts]:
+    """The manifest of a checkpoint, and all its parts, as they are on the disk."""
+    try:
+        parts = _Parts(path)
+        manifest = json.loads(parts.get("manifest.json", "{}"))
+        if manifest.get("format") != _FORMAT:
+            raise ValueError(f"its format is {manifest.get('format')!r}, expected {_FORMAT!r}")
+    except (zipfile.BadZipFile, AttributeError, ValueError) as error:
         raise ValueError(
             f"{path} is not a checkpoint of EpisodeCheckpoint ({error}). An agent that was saved "
             "by agent.save of DynaSAC is read by DynaSAC.load."
@@ -308,17 +331,16 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     return manifest, parts
 
 
-def packed(arrays: dict[str, Any]) -> bytes:
-    """Arrays as the bytes of an ``.npz`` file."""
+def packed(values: Any) -> bytes:
+    """Tensors and plain values in bytes, which :func:`unpacked` reads without pickle."""
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **arrays)
+    torch.save(values, file)
     return file.getvalue()
 
 
-def unpacked(content: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file, which must hold no pickle."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        return dict(arrays)
+def unpacked(content: bytes) -> Any:
+    """What :func:`packed` put in bytes; an error if it holds anything but tensors and values."""
+    return torch.load(io.BytesIO(content), weights_only=True)
 
 
 def pickled_environment(env: Any) -> bytes | None:
@@ -344,9 +366,10 @@ def warn_unsaved(problem: str) -> None:
 def layer_names(env: Any) -> list[str]:
     """The classes of an environment and of what it wraps, from the outside."""
     names = [type(env).__name__]
-    while hasattr(env, "env"):
-        env = env.env
-        names.append(type(env).__name__)
+    for holder in ("venv", "envs", "env"):
+        inner = getattr(env, holder, None)
+        if inner is not None:
+            return names + layer_names(inner[0] if holder == "envs" else inner)
     return names
 
 
@@ -355,8 +378,7 @@ def _plain(value: Any) -> Any:
     return value.tolist()
 
 
-@dataclass(frozen=True)
-class RandomState:
+class RandomState(NamedTuple):
     """The state of the global generators of Python, NumPy and PyTorch, from which a run draws."""
 
     python: Any
@@ -373,10 +395,11 @@ class RandomState:
 
     @classmethod
     def capture(cls) -> Self:
-        """Return the present state."""
+        """Return the present state, in tensors and plain values."""
+        name, keys, *others = np.random.get_state()  # noqa: NPY002
         return cls(
             random.getstate(),
-            np.random.get_state(),  # noqa: NPY002
+            (name, np.asarray(keys).tolist(), *others),
             torch.get_rng_state(),
             torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         )
@@ -388,31 +411,3 @@ class RandomState:
         torch.set_rng_state(self.torch)
         if self.cuda and torch.cuda.is_available():
             torch.cuda.set_rng_state_all(self.cuda)
-
-    def as_arrays(self) -> dict[str, np.ndarray]:
-        """The state in arrays of numbers."""
-        version, python, python_gauss = self.python
-        _, keys, pos, has_gauss, gauss = self.numpy
-        arrays = {
-            "python": np.array([version, *python], dtype=np.uint64),
-            "python_gauss": np.array([] if python_gauss is None else [python_gauss]),
-            "numpy": np.array([*keys, pos, has_gauss], dtype=np.uint64),
-            "numpy_gauss": np.array(gauss),
-            "torch": self.torch.numpy(),
-        }
-        return arrays | {f"cuda{i}": state.numpy() for i, state in enumerate(self.cuda)}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Self:
-        """The state of which :meth:`as_arrays` made arrays."""
-        version, *python = map(int, arrays["python"])
-        *keys, pos, has_gauss = map(int, arrays["numpy"])
-        legacy = (np.array(keys, dtype=np.uint32), pos, has_gauss, float(arrays["numpy_gauss"]))
-        gauss = arrays["python_gauss"].tolist()
-        cuda = (f"cuda{i}" for i in range(len(arrays)))
-        return cls(
-            (version, tuple(python), gauss[0] if gauss else None),
-            ("MT19937", *legacy),
-            torch.from_numpy(arrays["torch"]),
-            [torch.from_numpy(arrays[name]) for name in cuda if name in arrays],
-        )

@@ -57,12 +57,12 @@ class CompactReplayBuffer(ReplayBuffer):
         self.full = self.full or self.pos + n >= self.buffer_size
         self.pos = (self.pos + n) % self.buffer_size
 
-    def filled(self) -> dict[str, np.ndarray]:
-        """The rows that are filled and where the next one goes, as arrays."""
-        rows = {name: getattr(self, name)[: self.size()] for name in self.rows}
-        return {**rows, "next": np.array([self.pos, self.full])}
+    def filled(self) -> dict[str, Any]:
+        """The rows that are filled, and where the next one goes."""
+        rows = {name: torch.from_numpy(getattr(self, name)[: self.size()]) for name in self.rows}
+        return {**rows, "pos": self.pos, "full": self.full}
 
-    def fill(self, content: Mapping[str, np.ndarray]) -> None:
+    def fill(self, content: Mapping[str, Any]) -> None:
         """Take back what :meth:`filled` gave, with space for the other rows.
 
         Raises:
@@ -73,23 +73,19 @@ class CompactReplayBuffer(ReplayBuffer):
             if found.shape[1:] != own.shape[1:] or len(found) > len(own):
                 raise ValueError(
                     f"Expected {name} of at most {len(own)} rows of shape {own.shape[1:]}, found "
-                    f"{found.shape}."
+                    f"{tuple(found.shape)}."
                 )
-        for name in self.rows:
-            rows = np.zeros_like(getattr(self, name))
-            rows[: len(content[name])] = content[name]
-            setattr(self, name, rows)
-        self.pos, self.full = int(content["next"][0]), bool(content["next"][1])
+        self.__setstate__(dict(content))
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, of the rows those that are filled."""
-        return {**self.__dict__, **{name: getattr(self, name)[: self.size()] for name in self.rows}}
+        return {**self.__dict__, **self.filled()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the attributes back, with space for the other rows."""
         self.__dict__.update(state)
         for name in self.rows:
-            filled = state[name]
+            filled = state[name].numpy()
             rows = np.zeros((self.buffer_size, *filled.shape[1:]), dtype=filled.dtype)
             rows[: len(filled)] = filled
             setattr(self, name, rows)

@@ -30,15 +30,10 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.vec_env import VecEnv
 
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
-from gpadjust.control.checkpoint import RandomState, TaskAgent, packed, unpacked
+from gpadjust.control.checkpoint import TaskAgent, packed, unpacked
 from gpadjust.control.recorded_episodes import learn_dynamics
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
-from gpadjust.rl.checkpoint import (
-    CheckpointCallback,
-    described,
-    environment_state,
-    restore_environment,
-)
+from gpadjust.rl.checkpoint import CheckpointCallback, environment_state, restore_environment
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
@@ -324,16 +319,9 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         self.model_hooks = []  # callbacks that have some add themselves
         noise = deepcopy(self.action_noise)  # which SB3 resets
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
-        before = RandomState.capture()
         seen = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         assert isinstance(seen, np.ndarray), "observations are boxes"
-        observations = torch.from_numpy(seen.astype(np.float64))
-        task.dynamics.spec.check_observations(observations)
-        # Of a single state much would look right that is not.
-        twice = task.dynamics.spec.decode(observations).repeat(2, 1)
-        middle = torch.from_numpy((self.action_space.low + self.action_space.high) / 2).double()
-        task.try_functions(twice, middle.expand(len(twice), -1))
-        before.restore()
+        self.try_task(seen, self.action_space)
         if self._random_state is not None:  # a run that goes on
             self._random_state.restore()
             self._random_state, self.action_noise = None, noise
@@ -506,7 +494,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     @classmethod
     def described(cls, env: VecEnv) -> dict[str, Any]:
         """Number, wrappers and spaces of the environments."""
-        return described(env)
+        return {**super().described(env), "num_envs": env.num_envs}
 
     def saved_parts(self) -> dict[str, bytes]:
         """SB3's file of the agent, both buffers, and the environments."""
@@ -533,7 +521,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _buffers(self) -> dict[str, CompactReplayBuffer]:
         buffer = self.replay_buffer
-        return {"replay_buffer.npz": buffer, "model_buffer.npz": buffer.model_buffer}
+        return {"replay_buffer.pt": buffer, "model_buffer.pt": buffer.model_buffer}
 
     @property
     def _action_generator(self) -> Any:
