@@ -7,7 +7,6 @@ import pickle
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
@@ -18,12 +17,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.checks import checked_number, checked_whole
+from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
     RandomState,
     TaskAgent,
     layer_names,
+    locked,
     packed,
     pickled_environment,
     unpacked,
@@ -177,7 +177,7 @@ class Agent(TaskAgent):
         return True
 
     def promise(self, state: Any) -> dict[str, float]:
-        """Say of an episode that begins what the model promises, such as its ``promised_reward``.
+        """What the model promises of an episode, such as its ``promised_reward``.
 
         Args:
             state: What :meth:`predict` returned with its first action.
@@ -198,10 +198,7 @@ class Agent(TaskAgent):
         """
         given = [] if callback is None else [callback] if callable(callback) else [*callback]
         end = self.num_timesteps + total_timesteps
-        with ExitStack() as held:
-            for each in given:
-                if isinstance(each, EpisodeCheckpoint):
-                    held.enter_context(each.locked())
+        with locked(given):
             self._callbacks = given
             self._begin()
             while self.num_timesteps < end:
@@ -290,11 +287,8 @@ class Agent(TaskAgent):
 
     @task.setter
     def task(self, task: Task) -> None:
-        if not isinstance(task, Task):
-            raise TypeError(
-                f"{type(self).__name__} needs a task to learn, as Task(dynamics, reward, ...); "
-                f"found {task!r}."
-            )
+        told = "a Task(dynamics, reward, ...), which an agent needs to learn"
+        check_kind("task", task, Task, told)
         self._task = task
         self.model = None
 
@@ -351,9 +345,7 @@ class Agent(TaskAgent):
         if self._random_state is not None:  # a run that goes on
             self._random_state.restore()
             self._random_state = None
-        seen = np.atleast_2d(self._reset())
-        self.episode_length()
-        self.try_task(seen, self.env.action_space)
+        self.try_task(np.atleast_2d(self._reset()), self.env.action_space)
         if self.model is None:
             self._improve()
 

@@ -10,8 +10,8 @@ import time
 import warnings
 import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
 
+from gpadjust.checks import check_kind, checked_whole
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.task import Task
 from gpadjust.files import sync_folder
@@ -66,18 +67,14 @@ class TaskAgent(ABC):
                 length = self.env_attribute("_max_episode_steps")
         if length is None:
             raise ValueError(
-                "The environment has no time limit that could be read; give the task an "
-                "episode_length, the number of steps of an episode."
+                "There is no environment, or no time limit that could be read of it; give the task "
+                "an episode_length, the number of steps of an episode."
             )
         return int(length)
 
     def try_task(self, observations: np.ndarray, action_space: Any) -> None:
-        """Call the functions of the task at the start, before a real step is made.
-
-        Args:
-            observations: ``N x observation_dim``.
-            action_space: A box, whose middle is tried.
-        """
+        """Call the task's functions at observations ``N x observation_dim`` and a middle action."""
+        self.episode_length()
         before, task = RandomState.capture(), self.ready_task()
         seen = torch.from_numpy(observations.astype(np.float64))
         task.dynamics.spec.check_observations(seen)
@@ -159,10 +156,8 @@ class EpisodeCheckpoint:
     """
 
     def __init__(self, path: str | Path, every: int = 1) -> None:
-        if every < 1:
-            raise ValueError(f"every must be at least 1; found {every}.")
         self.path = Path(path).absolute()
-        self.every = every
+        self.every = checked_whole("every", every, 1)
         self._episodes = 0
 
     def locked(self) -> AcquireReturnProxy[Any]:
@@ -226,6 +221,16 @@ class EpisodeCheckpoint:
             raise
 
 
+@contextmanager
+def locked(callbacks: Iterable[Any]) -> Iterator[None]:
+    """Hold the locks of all checkpoints among some callbacks."""
+    with ExitStack() as held:
+        for each in callbacks:
+            if isinstance(each, EpisodeCheckpoint):
+                held.enter_context(each.locked())
+        yield
+
+
 def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | None = None) -> Any:
     """Read the agent of a run that :class:`EpisodeCheckpoint` wrote, ready to go on.
 
@@ -253,8 +258,7 @@ def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | 
         ValueError: If the file is no checkpoint, or is of another algorithm, environment or task.
         RuntimeError: If the run had other dynamics, or another physics.
     """
-    if not isinstance(task, Task):
-        raise TypeError(f"task must be a Task(dynamics, reward, ...); found {task!r}.")
+    check_kind("task", task, Task, "a Task(dynamics, reward, ...)")
     manifest, parts = _read(path)
     algorithm = _known(manifest["algorithm"]) if algorithm is None else algorithm
     env = algorithm.wrapped(env)

@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from gpadjust.checks import checked_number, checked_whole
 from gpadjust.control import RecordedEpisodes
 from gpadjust.states import StateSpec
 
@@ -142,10 +143,9 @@ class MixedReplayBuffer(CompactReplayBuffer):
         real_fraction: float = 1 / 11,
         model_buffer_size: int | None = None,
     ) -> None:
-        if not 0 <= real_fraction <= 1:
-            raise ValueError(f"real_fraction must lie in [0, 1]; found {real_fraction}.")
-        if model_buffer_size is not None and model_buffer_size < 1:
-            raise ValueError(f"model_buffer_size must be at least 1; found {model_buffer_size}.")
+        checked_number("real_fraction", real_fraction, least=0, most=1)
+        if model_buffer_size is not None:
+            checked_whole("model_buffer_size", model_buffer_size, 1)
         if optimize_memory_usage:
             raise ValueError(
                 "MixedReplayBuffer does not support optimize_memory_usage=True: model transitions "
