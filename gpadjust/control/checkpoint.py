@@ -29,7 +29,7 @@ _FORMAT = "gpadjust episode checkpoint, version 4"
 
 
 class TaskAgent(ABC):
-    """What all agents share: a task, which real episodes complete, and the parts of a checkpoint.
+    """Base of all agents: a task, which real episodes complete, and the parts of a checkpoint.
 
     Attributes:
         task: The task; not saved.
@@ -343,7 +343,7 @@ def packed(values: Any) -> bytes:
 
 
 def unpacked(content: bytes) -> Any:
-    """What :func:`packed` put in bytes; an error if it holds anything but tensors and values."""
+    """Return the values of :func:`packed`; an error if there are others than these."""
     return torch.load(io.BytesIO(content), weights_only=True)
 
 

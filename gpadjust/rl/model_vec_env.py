@@ -162,11 +162,11 @@ class ModelVecEnv(VecEnv):
         )
 
     def steps_ahead(self) -> np.ndarray:
-        """How many steps each particle has before the time limit, ``num_envs``."""
+        """The steps of each particle before the time limit, ``num_envs``."""
         return self.episode_length - self._steps.numpy()
 
     def refresh(self, buffer: CompactReplayBuffer) -> None:
-        """Let transitions of an earlier model in a buffer end as the model now has it.
+        """Predict the transitions of an earlier model in a buffer again, by the model as it is now.
 
         The states and actions stay, and with them the time limits.
         """
