@@ -33,7 +33,7 @@ from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.free_run import checked_horizons
 
-_MAX_HOLD = 5  # steps of a random action
+MAX_HOLD = 5  # steps of a random action
 
 Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
@@ -360,7 +360,7 @@ class Agent(TaskAgent):
         """Random actions, held for some steps, for the episode and, if it is longer, beyond."""
         num_steps, bounds = self.episode_length(), self.action_bounds()
         while True:
-            for action in random_sequences(1, num_steps, bounds, _MAX_HOLD)[0]:
+            for action in random_sequences(1, num_steps, bounds, MAX_HOLD)[0]:
                 yield action.numpy().astype(self.env.action_space.dtype)
             num_steps = 1
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gpadjust.checks import check_kind
-from gpadjust.control.agent import Agent
+from gpadjust.control.agent import MAX_HOLD, Agent
 from gpadjust.control.mpc import MPC, PlanState
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
@@ -23,7 +23,7 @@ from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
-_EPISODES, _MAX_HOLD = 128, 5  # of random actions, by which the policy's inputs are scaled
+_EPISODES = 128  # of random actions, by which the policy's inputs are scaled
 
 
 class MPCAgent(Agent):
@@ -221,7 +221,7 @@ class PolicySearchAgent(Agent):
     def _random_states(self, task: Task) -> Tensor:
         """States ``N x state_dim`` of episodes of random actions in a model."""
         length = self.episode_length()
-        steps = random_sequences(_EPISODES, length, self.action_bounds(), _MAX_HOLD).unbind(1)
+        steps = random_sequences(_EPISODES, length, self.action_bounds(), MAX_HOLD).unbind(1)
         taken = iter(steps)
         with torch.no_grad():
             starts = task.draw_initial_states(_EPISODES)
