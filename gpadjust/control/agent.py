@@ -442,7 +442,7 @@ class Agent(TaskAgent):
         return agent
 
 
-class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
+class _Pickler(cloudpickle.Pickler):
     """Pickles attributes of an agent, in which names stand for task, model and dynamics."""
 
     def __init__(self, file: io.BytesIO, agent: Agent) -> None:

@@ -145,8 +145,12 @@ class PolicySearch:
         before = {name: t.detach().clone() for name, t in policy.state_dict().items()}
         try:
             if guided and self.guide is not None:
-                told = "a BoundedPolicy, such as mlp_policy(...), for a guide to plan in its bounds"
-                check_kind("policy", policy, BoundedPolicy, told)
+                if not isinstance(policy, BoundedPolicy):
+                    raise TypeError(
+                        "A guide plans within the bounds of the actions, which only a "
+                        "BoundedPolicy says, such as mlp_policy(...); found "
+                        f"{type(policy).__name__}."
+                    )
                 imitate(policy, *self.plans(task, policy.action_bounds))
             return self._improve(policy, task, task.episode_length, progress)
         except BaseException:

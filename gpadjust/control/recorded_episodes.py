@@ -196,10 +196,10 @@ def _scores(
     found = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
     names = [spec.states[i] for i in spec.moving]
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
-    model = dynamics.model if isinstance(dynamics, LearnedDynamics) else None
-    if isinstance(model, TermsModel) and model.rho_names:
-        inputs = dynamics.targets.inputs(new.states, new.actions)
-        found["overrides"] = float(trust(model, inputs).data.mean())
+    if isinstance(dynamics, LearnedDynamics):
+        model, inputs = dynamics.model, dynamics.targets.inputs(new.states, new.actions)
+        if isinstance(model, TermsModel) and model.rho_names:
+            found["overrides"] = float(trust(model, inputs).data.mean())
     possible = [k for k in horizons if k <= new.longest]
     if not possible:
         return found

@@ -382,9 +382,9 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             noise: Added to the actions, in their scale of [-1, 1]. Default: none.
         """
         self.policy.set_training_mode(False)
-        if self._vec_normalize_env is not None:
-            observations = self._vec_normalize_env.normalize_obs(observations)
-        actions = self.predict(observations, deterministic=False)[0]
+        normalizer = self._vec_normalize_env
+        seen = observations if normalizer is None else normalizer.normalize_obs(observations)
+        actions = self.predict(seen, deterministic=False)[0]
         if noise is None:
             return actions
         scaled = np.clip(self.policy.scale_action(actions) + noise(), -1, 1)
