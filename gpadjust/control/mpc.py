@@ -146,16 +146,10 @@ class MPC:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], PlanState]:
-        """Plan actions.
+        """Plan actions; arguments and result are those of :meth:`~gpadjust.control.Agent.predict`.
 
-        Args:
-            observation: ``observation_dim`` of the spec, or ``n x observation_dim``.
-            state: What the last call returned; None at the start.
-            episode_start: Which episodes begin, ``n``. Default: all without ``state``, none with.
-            deterministic: Whether the search is always the same.
-
-        Returns:
-            Actions, ``action_dim`` or ``n x action_dim``, and the state for the next call.
+        The state is the plan. Without one all episodes begin. If ``deterministic``, the search is
+        always the same.
         """
         spec = self.task.dynamics.spec
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -107,14 +106,11 @@ class MixedReplayBuffer(CompactReplayBuffer):
 
     Args:
         buffer_size: Capacity of the real buffer.
-        observation_space: A one-dimensional ``Box``.
-        action_space: A ``Box``.
-        device: Device of the samples.
-        n_envs: Number of real environments.
-        optimize_memory_usage: Must be False.
-        handle_timeout_termination: See Stable-Baselines3.
+        args: As of Stable-Baselines3's ``ReplayBuffer``: a one-dimensional ``Box`` of observations,
+            a ``Box`` of actions, and the device, for example.
         real_fraction: Share of real samples in a batch, in [0, 1].
         model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
+        options: As of ``ReplayBuffer``; ``optimize_memory_usage`` must be False.
 
     Attributes:
         model_buffer: The model's transitions.
@@ -133,42 +129,27 @@ class MixedReplayBuffer(CompactReplayBuffer):
     def __init__(
         self,
         buffer_size: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        device: torch.device | str = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        handle_timeout_termination: bool = True,
-        *,
+        *args: Any,
         real_fraction: float = 1 / 11,
         model_buffer_size: int | None = None,
+        **options: Any,
     ) -> None:
         checked_number("real_fraction", real_fraction, least=0, most=1)
         if model_buffer_size is not None:
             checked_whole("model_buffer_size", model_buffer_size, 1)
-        if optimize_memory_usage:
+        if options.get("optimize_memory_usage"):
             raise ValueError(
                 "MixedReplayBuffer does not support optimize_memory_usage=True: model transitions "
                 "do not lie in the order of a trajectory."
             )
-        super().__init__(
-            buffer_size,
-            observation_space,
-            action_space,
-            device,
-            n_envs,
-            handle_timeout_termination=handle_timeout_termination,
-        )
+        super().__init__(buffer_size, *args, **options)
         self.real_fraction = real_fraction
         self.mix = True
-        self.failed = np.zeros((self.buffer_size, n_envs), dtype=bool)
+        self.failed = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         self.learnt = np.zeros_like(self.failed)
-        self.model_buffer = CompactReplayBuffer(
-            buffer_size if model_buffer_size is None else model_buffer_size,
-            observation_space,
-            action_space,
-            device,
-        )
+        size = buffer_size if model_buffer_size is None else model_buffer_size
+        spaces = (self.observation_space, self.action_space)
+        self.model_buffer = CompactReplayBuffer(size, *spaces, self.device)
 
     def add(
         self,

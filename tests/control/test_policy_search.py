@@ -225,7 +225,7 @@ def test_bad_arguments_are_refused(change, error, message):
 
 def test_a_guide_needs_bounds():
     policy, task = torch.nn.Linear(1, 1).double(), task_of(PhysicsDynamics(SPEC, step))
-    with pytest.raises(TypeError, match="which only a BoundedPolicy says, .* found Linear"):
+    with pytest.raises(TypeError, match=r"which only a BoundedPolicy says, .* found Linear"):
         PolicySearch(updates=1, guide=Planner()).improve(policy, task)
 
 
