@@ -98,6 +98,12 @@ def check_switch(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be True or False; found {value!r}.")
 
 
+def check_kind(name: str, value: Any, kind: Any, expected: str) -> None:
+    """Raise a TypeError unless an option is an object of a class, which is told as expected."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be {expected}; found {value!r}.")
+
+
 def check_choice(name: str, value: Any, known: Sequence[str]) -> None:
     """Raise a ValueError unless an option is one of these words."""
     if value not in known:
