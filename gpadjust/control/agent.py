@@ -337,7 +337,7 @@ class Agent(TaskAgent):
         return torch.from_numpy(np.stack([space.low, space.high]).astype(np.float64))
 
     def __repr__(self) -> str:
-        """What acts where, in which dynamics, and after how many episodes."""
+        """Name the agent, its environment, its dynamics and the number of its episodes."""
         return (
             f"{type(self).__name__}({layer_names(self.env)[-1]}, "
             f"{type(self.task.dynamics).__name__}, {self.num_episodes} episodes learnt, "

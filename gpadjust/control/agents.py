@@ -102,7 +102,7 @@ class MPCAgent(Agent):
         return self.mpc.predict(observation, state, episode_start, deterministic)
 
     def promise(self, state: PlanState) -> dict[str, float]:
-        """What the plan of an episode promises of a step, if it is of the whole episode."""
+        """Return the promised reward of a step by the plan of a whole episode."""
         (plan,) = state
         if plan.left_bounds > 0.1:
             warnings.warn(

@@ -30,7 +30,7 @@ _OWN = ("manifest.json", "random.npz")
 
 
 class TaskAgent(ABC):
-    """What all agents share: a task, which real episodes complete, and the parts of a checkpoint.
+    """Base of all agents: a task, which real episodes complete, and the parts of a checkpoint.
 
     Attributes:
         task: The task; not saved.

@@ -36,7 +36,7 @@ FIRST = Planner(
 
 
 class Planned(NamedTuple):
-    """What is planned in an episode.
+    """The plan of an episode.
 
     Args:
         actions: Those of the steps ahead, ``T x action_dim``.
@@ -198,7 +198,7 @@ class MPC:
         return Planned(plan.actions, promised, steps_done, plan.left_bounds, reward)
 
     def _disappoints(self, plan: Plan, earlier: Planned) -> bool:
-        """Whether a plan is worth much less than what was promised of its steps."""
+        """Return whether a plan is worth much less than its steps had promised."""
         if self.tolerance is None:
             return False
         if plan.left_bounds > earlier.left_bounds:

@@ -18,7 +18,7 @@ from gpadjust.control.task import Task
 
 
 class Plan(NamedTuple):
-    """What to do in an episode, or in the rest of it.
+    """Actions for an episode, or for the rest of it.
 
     Args:
         actions: ``T x action_dim``.
@@ -182,7 +182,7 @@ class Planner:
         return torch.cat([known.unsqueeze(0), torch.clamp(drawn, bounds[0], bounds[1])])
 
     def _checked_scores(self, scores: Tensor, n: int) -> Tensor:
-        """What the objective says of ``n`` sequences; -inf is a score, too."""
+        """Return the scores of ``n`` sequences by the objective, which may be -inf."""
         if scores.shape != (n,) or scores.isnan().any():
             name = type(self.objective).__name__
             found = "nan" if scores.shape == (n,) else f"shape {tuple(scores.shape)}"
@@ -193,7 +193,7 @@ class Planner:
         return scores
 
     def _checked_steps(self, task: Task, state: Tensor, num_steps: int | None) -> int:
-        """How many steps to plan, once what is given is found to be right."""
+        """Check the arguments, and return the number of steps to plan."""
         spec = task.dynamics.spec
         if state.shape != (spec.state_dim,):
             raise ValueError(

@@ -111,7 +111,7 @@ def linear_policy(
 
 
 def _before_tanh(actions: Sequence[float] | None, action_bounds: ArrayLike, dim: int) -> Tensor:
-    """What the tanh of a policy makes these actions of, ``action_dim``; 0 for None."""
+    """Return the arguments of a policy's tanh for these actions, ``action_dim``; 0 for None."""
     low, high = checked_bounds("action_bounds", action_bounds, dim)
     if actions is None:
         return torch.zeros_like(low)

@@ -19,7 +19,7 @@ from gpadjust.control.task import Task
 
 
 class SearchResult(NamedTuple):
-    """What a search has reached.
+    """Result of a search.
 
     Args:
         values: What the objective said in each update, ``updates``; of drawn functions and starts.

@@ -12,7 +12,8 @@ from torch import Tensor
 from gpadjust.checks import check_columns
 from gpadjust.dynamics.free_run import FreeRun, free_run
 from gpadjust.dynamics.state import fingerprint
-from gpadjust.dynamics.trajectories import Trajectories
+from gpadjust.dynamics.targets import check_spec
+from gpadjust.dynamics.trajectories import Trajectories, check_doubles
 from gpadjust.models import Prediction
 from gpadjust.states import StateSpec
 from gpadjust.validation import Scores
@@ -35,11 +36,7 @@ class Dynamics(ABC):
     """
 
     def __init__(self, spec: StateSpec) -> None:
-        if not isinstance(spec, StateSpec):
-            raise TypeError(
-                f"Expected spec as a StateSpec, such as StateSpec(['x', 'v'], ['force']); found "
-                f"{spec!r}."
-            )
+        check_spec(spec)
         self.spec = spec
 
     @property
@@ -59,9 +56,14 @@ class Dynamics(ABC):
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Draw transition *functions*, so that particles stay consistent along a trajectory.
 
+        Args:
+            num_functions: Number ``k`` of functions.
+            seed: Seed of the draw. Default: go on with PyTorch's generator.
+
         Returns:
             A deterministic function of states ``k x N x state_dim`` and actions
-            ``k x N x action_dim`` to next states, each of the ``k`` blocks by its own draw.
+            ``k x N x action_dim`` to next states, each of the ``k`` blocks by its own draw. Later
+            updates leave it as it is.
         """
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
@@ -102,10 +104,8 @@ class Dynamics(ABC):
             TypeError: If they are not float64 tensors.
             ValueError: If shapes disagree or values are not finite.
         """
-        data, moving = (
-            Trajectories.checked(self.spec, states, actions, next_states),
-            self.spec.moving,
-        )
+        data = Trajectories.checked(self.spec, states, actions, next_states)
+        moving = self.spec.moving
         mean, variance = self.predict(data.states, data.actions)
         # Angles the shortest way round.
         found = (mean + self.spec.change(mean, data.next_states))[:, moving]
@@ -259,12 +259,8 @@ class Dynamics(ABC):
         return data
 
     def _check_pair(self, states: Tensor, actions: Tensor) -> None:
-        check_columns("states", states, self.spec.state_dim)
+        check_doubles("states", states, self.spec.state_dim)
         check_columns("actions", actions, self.spec.action_dim)
-        if states.dtype != torch.float64:
-            raise TypeError(
-                f"Expected states in float64, got {states.dtype}; use `states.double()`."
-            )
         lead = zip(reversed(actions.shape[:-1]), reversed(states.shape[:-1]), strict=False)
         if actions.dim() > states.dim() or any(own not in (1, other) for own, other in lead):
             raise ValueError(

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_columns, check_finite, check_level, checked_whole
+from gpadjust.checks import check_finite, check_level, checked_whole
 from gpadjust.dynamics.particles import (
     Move,
     about_center,
@@ -19,6 +19,7 @@ from gpadjust.dynamics.particles import (
     of_states,
     step_or_nan,
 )
+from gpadjust.dynamics.trajectories import check_doubles
 from gpadjust.states import StateSpec
 from gpadjust.validation import Scores, energy_score
 
@@ -104,11 +105,7 @@ class FreeRun(NamedTuple):
             >>> dynamics.free_run(x, v).score(measured).rmse.flatten()
             tensor([0.0000, 0.7071, 1.0000], dtype=torch.float64)
         """
-        check_columns("measured", measured, self.spec.state_dim)
-        if measured.dtype != torch.float64:
-            raise TypeError(
-                f"Expected measured in float64, got {measured.dtype}; use `measured.double()`."
-            )
+        check_doubles("measured", measured, self.spec.state_dim)
         if measured.shape != self.mean.shape:
             raise ValueError(
                 f"Expected measured of shape w x T x state_dim {tuple(self.mean.shape)}, that of "
@@ -306,13 +303,8 @@ def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Ten
 
 def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> None:
     """Raise an error unless each state has a sequence of actions, all of them finite."""
-    check_columns("initial_states", initial_states, spec.state_dim)
-    check_columns("actions", actions, spec.action_dim)
-    for name, tensor in (("initial_states", initial_states), ("actions", actions)):
-        if tensor.dtype != torch.float64:
-            raise TypeError(
-                f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`."
-            )
+    check_doubles("initial_states", initial_states, spec.state_dim)
+    check_doubles("actions", actions, spec.action_dim)
     shapes = tuple(initial_states.shape), tuple(actions.shape)
     fits = initial_states.dim() == 2 and actions.dim() == 3 and len(initial_states) == len(actions)
     if not fits or not actions.numel():

@@ -20,7 +20,7 @@ from gpadjust.dynamics.learning import (
     made_by,
 )
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
-from gpadjust.dynamics.state import LearntState, check_fingerprint, fingerprint
+from gpadjust.dynamics.state import check_fingerprint, fingerprint
 from gpadjust.dynamics.targets import Target, Targets, check_physics
 from gpadjust.dynamics.varying_parameters import varying_parameters
 from gpadjust.inference import FitResult, SampleResult
@@ -169,10 +169,7 @@ class LearnedDynamics(Dynamics):
         """Condition on further transitions with the hyper-parameters as they are.
 
         In :math:`O(n^2 N)` for ``N`` new transitions beside ``n``; the arguments and errors are
-        those of :meth:`update`.
-
-        Raises:
-            RuntimeError: If nothing was learnt yet.
+        those of :meth:`update`, and a RuntimeError if nothing was learnt yet.
         """
         before = self._known_so_far()
         new = self._checked(states, actions, next_states)
@@ -220,15 +217,7 @@ class LearnedDynamics(Dynamics):
         return self.spec.complete(states, actions, mean + variance.sqrt() * torch.randn_like(mean))
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
-        """Draw transition functions from the posterior; without noise.
-
-        Args:
-            num_functions: Number ``k`` of functions.
-            seed: Seed of the draw. Default: go on with PyTorch's generator.
-
-        Returns:
-            A function of states ``k x N x state_dim`` and actions ``k x N x action_dim`` to next
-            states. Later updates leave it as it is.
+        """Draw transition functions from the posterior, without noise; see :class:`Dynamics`.
 
         Raises:
             ValueError: If ``num_functions`` is no positive whole number.
@@ -238,8 +227,7 @@ class LearnedDynamics(Dynamics):
 
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_blocks(states, actions, num_functions)
-            values = functions.each(self.targets.inputs(states, actions))
-            return self.spec.complete(states, actions, self.targets.decode(states, values))
+            return self._following(states, actions, functions.each)
 
         return step
 
@@ -258,11 +246,13 @@ class LearnedDynamics(Dynamics):
             self._means = model, model.mean_functions(most)
         _, functions = self._means
 
+        def mean(inputs: Tensor) -> Tensor:
+            values: Tensor = functions(inputs.flatten(0, -2)).mean(0)
+            return values.unflatten(0, inputs.shape[:-1])
+
         def step(states: Tensor, actions: Tensor) -> Tensor:
             self._check_pair(states, actions)
-            inputs = self.targets.inputs(states, actions)
-            values = functions(inputs.flatten(0, -2)).mean(0).unflatten(0, inputs.shape[:-1])
-            return self.spec.complete(states, actions, self.targets.decode(states, values))
+            return self._following(states, actions, mean)
 
         return step
 
@@ -307,9 +297,6 @@ class LearnedDynamics(Dynamics):
         asked about at most three of the transitions, whether it is the one that they were learnt
         with; a physics that is costly runs for these.
 
-        Args:
-            state: Of dynamics of the same class, options, spec and physics.
-
         Raises:
             TypeError: If it is no dictionary.
             RuntimeError: If it is of dynamics of another class, spec, target, model, options or
@@ -320,21 +307,7 @@ class LearnedDynamics(Dynamics):
         if not state:
             self._learnt = self.fit_result = None
             return
-        num_known = len(self._recipe.parts) * len(self.spec.predicted)
-        data, known, chunks, searched_at, parameters = LearntState.checked(
-            state, self.spec, num_known
-        )
-        with self._recipe.restored_on_error():
-            self._recipe.tell_physics(data, known)
-            model = self._recipe.build(data.some(slice(chunks[0])), quiet=True)
-            model.load_state_dict(parameters)
-            self._recipe.check_same_physics(data, known)
-            fitted, start = model.eval(), chunks[0]
-            for size in chunks[1:]:
-                model = self._recipe.condition(model, data.some(slice(start, start + size)))
-                start += size
-        self._learnt = Learnt(data, known, chunks, searched_at, fitted, model)
-        self.fit_result = None
+        self._learnt, self.fit_result = Learnt.loaded(state, self._recipe), None
 
     def _varied(
         self, variation: Tensor | float
@@ -363,6 +336,13 @@ class LearnedDynamics(Dynamics):
                 f"{type(self).__name__} has not learnt from transitions yet; call `update`."
             )
         return self._learnt
+
+    def _following(
+        self, states: Tensor, actions: Tensor, learnt: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """The next states by what was learnt of their inputs."""
+        values = learnt(self.targets.inputs(states, actions))
+        return self.spec.complete(states, actions, self.targets.decode(states, values))
 
     def _predict(
         self, states: Tensor, actions: Tensor, observation_noise: bool

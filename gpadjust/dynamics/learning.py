@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from gpadjust.dynamics.angle_input import AngleInput
-from gpadjust.dynamics.state import COLUMNS, PhysicsProbes
+from gpadjust.dynamics.state import PhysicsProbes, copies, expect, loaded, saved
 from gpadjust.dynamics.targets import TargetPhysics, Targets, parts_of, warn_of_differences
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.inference import FitOptions, FitResult, SampleResult, fit
@@ -65,25 +65,55 @@ class Learnt(NamedTuple):
     def state_dict(self) -> dict[str, Any]:
         """All of it in tensors and plain values."""
         return {
-            "transitions": {name: t.clone() for name, t in zip(COLUMNS, self.data, strict=True)},
+            "transitions": saved(self.data),
             "physics": None if self.known is None else self.known.clone(),
             "chunks": [*self.chunks],
             "searched_at": self.searched_at,
             "model": {name: t.clone() for name, t in self.fitted.state_dict().items()},
         }
 
+    @staticmethod
+    def loaded(state: Mapping[str, Any], recipe: Recipe) -> Learnt:
+        """What a state holds, copied; a RuntimeError if something is missing, or not right."""
+        for name in ("transitions", "physics", "chunks", "searched_at", "model"):
+            if name not in state:
+                raise RuntimeError(f"The state is damaged: it lacks {name!r}.")
+        data, known = loaded(state["transitions"], recipe.targets.spec), state["physics"]
+        n, num_known = len(data.states), len(recipe.parts) * len(recipe.targets.predicted)
+        if (known is None) != (num_known == 0):
+            there, here = ("out", "one") if known is None else ("", "none")
+            raise RuntimeError(
+                f"The state is of dynamics with{there} a physics, but there is {here} here. Load "
+                "it into dynamics built as they were."
+            )
+        if known is not None:
+            (known,) = copies([known], "physics", (n, num_known))
+        chunks, searched_at, parameters = (state[k] for k in ("chunks", "searched_at", "model"))
+        sizes = [*chunks] if isinstance(chunks, list | tuple) else [None]
+        whole = all(isinstance(size, int) and 1 <= size <= n for size in sizes)
+        expect(whole and sum(sizes) == n, "chunks", f"numbers of transitions, {n} in all")
+        whole = isinstance(searched_at, int) and 1 <= searched_at <= n
+        expect(whole, "searched_at", f"a number of transitions, at most {n}")
+        whole = isinstance(parameters, Mapping) and all(map(torch.is_tensor, parameters.values()))
+        whole = whole and not any(tensor.isnan().any() for tensor in parameters.values())
+        expect(whole, "model", "a dictionary of tensors without NaN")
+        parts = [data.some(rows) for rows in torch.arange(n).split(sizes)]
+        with recipe.restored_on_error():
+            recipe.tell_physics(data, known)
+            fitted = recipe.build(parts[0], quiet=True)
+            fitted.load_state_dict(dict(parameters))
+            recipe.check_same_physics(data, known)
+            model = fitted.eval()
+            for part in parts[1:]:
+                model = recipe.condition(model, part)
+        return Learnt(data, known, tuple(sizes), searched_at, fitted, model)
+
 
 class Recipe:
     """Makes the models of dynamics, and asks their physics about transitions.
 
-    Args:
-        targets: What the models learn.
-        physics: The physics of next states, or None.
-        make: Makes a model.
-        encode_angles: Whether the models read the sine and cosine of angles.
-
     Raises:
-        TypeError: If ``make`` does not take these arguments, or lacks one.
+        TypeError: If ``make`` does not take the arguments of a model, or lacks one.
     """
 
     def __init__(
@@ -133,9 +163,8 @@ class Recipe:
     def compare_physics(self, data: Trajectories, known: Tensor | None) -> None:
         """Warn of a physics that returns differences."""
         predicted = self.targets.spec.predicted
-        for part, own in self._of_parts(known):
+        for name, (_, own) in zip(self.parts, self._of_parts(known), strict=False):
             change = self.targets.decode(data.states, own) - data.states[:, predicted]
-            name = next(name for name, each in self.parts.items() if each is part)
             warn_of_differences(name, self.targets.spec, data, predicted, change)
 
     def check_same_physics(self, data: Trajectories, known: Tensor | None) -> None:
@@ -165,12 +194,7 @@ class Recipe:
     def fit(
         self, data: Trajectories, previous: Learnt | None, options: DynamicsFitOptions
     ) -> tuple[TermsModel, FitResult | SampleResult, int]:
-        """Fit a model of all transitions, from where the one before it was.
-
-        Args:
-            data: All transitions, earlier ones first.
-            previous: What was learnt from earlier ones, or None for a full search.
-            options: Of this search; of later ones the method and what it holds.
+        """Fit a model of all transitions, from where the one of earlier ones was, if there is one.
 
         Returns:
             The model, what the fit has reached, and the number of transitions at the last search

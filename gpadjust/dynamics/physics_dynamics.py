@@ -11,8 +11,16 @@ from torch import Tensor
 
 from gpadjust.checks import checked_whole
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
-from gpadjust.dynamics.state import COLUMNS, PhysicsProbes, check_fingerprint, fingerprint
-from gpadjust.dynamics.targets import check_physics, next_values, parts_of, warn_of_differences
+from gpadjust.dynamics.state import (
+    PhysicsProbes,
+    check_fingerprint,
+    copies,
+    expect,
+    fingerprint,
+    loaded,
+    saved,
+)
+from gpadjust.dynamics.targets import next_values, one_physics, warn_of_differences
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.inference.calibrate import warn_of_parameters
 from gpadjust.inference.calibration import Misfit, or_infinite
@@ -68,13 +76,7 @@ class PhysicsDynamics(Dynamics):
 
     def __init__(self, spec: StateSpec, physics: Physics | Callable[[Tensor], Tensor]) -> None:
         super().__init__(spec)
-        self.physics = check_physics(physics, spec)
-        if len(parts_of(self.physics)) > 1:
-            raise ValueError(
-                "Expected one physics to follow, got "
-                f"{', '.join(map(repr, parts_of(self.physics)))}; LearnedDynamics learns their "
-                "weights."
-            )
+        self.physics = one_physics(physics, spec, "LearnedDynamics learns the weights of several")
         self._probes: PhysicsProbes | None = None
         self._compared = False  # with transitions
         self._fitted: _Fitted | None = None
@@ -111,9 +113,8 @@ class PhysicsDynamics(Dynamics):
         The first transitions show whether the physics returns next states.
 
         Raises:
-            TypeError: If they are not float64 tensors.
-            ValueError: If shapes disagree, there are no rows, values are not finite, or states are
-                not what the spec says (:meth:`StateSpec.check_transitions`).
+            TypeError: As :meth:`LearnedDynamics.update`.
+            ValueError: As :meth:`LearnedDynamics.update`, but a single row will do.
             PhysicsError: If the physics fails at the guesses.
 
         Warns:
@@ -225,45 +226,28 @@ class PhysicsDynamics(Dynamics):
 
 
 class _Fitted(NamedTuple):
-    """Parameters that were fitted.
-
-    Args:
-        data: The transitions that they were fitted to.
-        point: Their coordinates, ``p``.
-        precision: What the transitions say of these, ``p x p``, without the prior.
-        noise: Mean squares of the errors, ``state_dim``, 0 of states that do not move.
-    """
+    """Parameters, and the transitions that they were fitted to."""
 
     data: Trajectories
-    point: Tensor
-    precision: Tensor
-    noise: Tensor
+    point: Tensor  # coordinates, p
+    precision: Tensor  # what the transitions say of these, p x p, without the prior
+    noise: Tensor  # mean squares of the errors, state_dim, 0 of states that do not move
 
     def state_dict(self) -> dict[str, Any]:
         """All of it, in tensors; of the transitions their columns."""
-        columns = {name: getattr(self.data, name).clone() for name in COLUMNS}
         tensors = {name: getattr(self, name).clone() for name in self._fields[1:]}
-        return {"transitions": columns, **tensors}
+        return {"transitions": saved(self.data), **tensors}
 
     @classmethod
     def checked(cls, state: Any, spec: StateSpec, p: int) -> _Fitted | None:
         """Take a state; a RuntimeError if it is damaged."""
         if state is None:
             return None
-        shapes = {"point": (p,), "precision": (p, p), "noise": (spec.state_dim,)}
-        try:
-            data = Trajectories.checked(spec, **state["transitions"])
-            tensors = [state[name].clone() for name in shapes]
-            whole = [tuple(t.shape) for t in tensors] == [*shapes.values()]
-            whole = whole and all(t.dtype == torch.float64 and t.isfinite().all() for t in tensors)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise RuntimeError(f"The state is damaged in its fitted parameters. {error}") from error
-        if not whole:
-            raise RuntimeError(
-                "The state is damaged: expected fitted parameters as finite float64 tensors, "
-                f"{', '.join(f'{name} of shape {shape}' for name, shape in shapes.items())}."
-            )
-        return cls(data, *tensors)
+        names = ("transitions", *cls._fields[1:])
+        whole = isinstance(state, dict) and {*names} <= {*state}
+        expect(whole, "fitted", f"a dictionary of {', '.join(names)}")
+        data, tensors = loaded(state["transitions"], spec), [state[name] for name in names[1:]]
+        return cls(data, *copies(tensors, "fitted", (p,), (p, p), (spec.state_dim,)))
 
 
 class _Steps(Misfit):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from types import FunctionType
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from torch import Tensor
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.states import StateSpec
 
-COLUMNS = ("states", "actions", "next_states")  # of transitions in a state
+_COLUMNS = ("states", "actions", "next_states")  # of transitions in a state
 _PROBES = 3
 _OF_SPREAD = 1e-4  # of what the physics says, by which another machine's may differ
 _OF_SIZE = 1e-6  # of the states that it is computed from
@@ -81,11 +81,7 @@ class PhysicsProbes(NamedTuple):
     ) -> PhysicsProbes:
         """At most 3 of ``N`` rows: of each third that where the physics says what is least usual.
 
-        Args:
-            states: ``N x state_dim``.
-            actions: ``N x action_dim``.
-            values: What the physics says of some states, ``N x m``.
-            columns: Which states, ``m``.
+        It says values, ``N x m``, of the states in these columns.
         """
         departure = (values - values.mean(0)).abs()
         spread = departure.square().mean(0).sqrt()
@@ -98,30 +94,20 @@ class PhysicsProbes(NamedTuple):
 
     @classmethod
     def checked(cls, given: Any, spec: StateSpec, num_values: int) -> PhysicsProbes:
-        """Take probes from a state.
-
-        Raises:
-            RuntimeError: If they are none.
-        """
+        """Take probes from a state; a RuntimeError if they are none."""
+        expect(
+            isinstance(given, list | tuple) and len(given) > 0,
+            "probes",
+            "a list of float64 tensors",
+        )
+        k = len(given[0]) if torch.is_tensor(given[0]) and given[0].dim() else 0
         widths = (spec.state_dim, spec.action_dim, num_values)
-        whole = isinstance(given, list | tuple) and all(map(torch.is_tensor, given))
-        k = given[0].shape[:1] if whole and given else ()
-        expected = [*((*k, width) for width in widths), (num_values,)]
-        if not whole or expected != [tuple(t.shape) for t in given if t.dtype == torch.float64]:
-            raise RuntimeError(
-                "The state is damaged: expected 'probes' as float64 tensors of k rows each, with "
-                f"{widths} columns, and {num_values} tolerances."
-            )
-        return cls(*(tensor.clone() for tensor in given))
+        return cls(*copies(given, "probes", *((k, width) for width in widths), (num_values,)))
 
     def check(self, found: Tensor, physics: str, spec: StateSpec, columns: list[int]) -> None:
-        """Raise a RuntimeError, as PyTorch does of a state, if a physics says something else.
+        """Raise a RuntimeError, as PyTorch does of a state, if a physics found something else.
 
-        Args:
-            found: What it says, ``k x m``.
-            physics: Its name.
-            spec: What the entries of the state are.
-            columns: Which states these are, ``m``.
+        It is ``k x m``, of the states in these columns.
         """
         names = [spec.states[i] for i in columns]
         gap = found - self.values
@@ -141,65 +127,35 @@ class PhysicsProbes(NamedTuple):
         )
 
 
-class LearntState(NamedTuple):
-    """State of :class:`LearnedDynamics`: as :class:`Learnt`, with that of the fitted model."""
+def expect(right: bool, name: str, expected: str) -> None:
+    """Raise a RuntimeError, as PyTorch does, unless a part of a state is right."""
+    if not right:
+        raise RuntimeError(f"The state is damaged: expected {name!r} as {expected}.")
 
-    data: Trajectories
-    known: Tensor | None
-    chunks: tuple[int, ...]
-    searched_at: int
-    parameters: dict[str, Tensor]
 
-    @classmethod
-    def checked(cls, state: Mapping[str, Any], spec: StateSpec, num_known: int) -> LearntState:
-        """Take a state, whose tensors are copied.
+def copies(given: Sequence[Any], name: str, *shapes: tuple[int, ...]) -> list[Tensor]:
+    """Copies of finite float64 tensors of these shapes; a RuntimeError if they are none."""
+    found = [tuple(t.shape) for t in given if torch.is_tensor(t) and t.dtype == torch.float64]
+    whole = (
+        len(found) == len(given) and found == [*shapes] and all(t.isfinite().all() for t in given)
+    )
+    expect(whole, name, f"finite float64 values of shape {' and '.join(map(str, shapes))}")
+    return [tensor.clone() for tensor in given]
 
-        Args:
-            state: The state.
-            spec: What the entries of states and actions are.
-            num_known: The number of columns of what the physics says, 0 without one.
 
-        Raises:
-            RuntimeError: If something is missing, or not what it should be.
-        """
-        for name in ("transitions", "physics", "chunks", "searched_at", "model"):
-            if name not in state:
-                raise RuntimeError(f"The state is damaged: it lacks {name!r}.")
-        given, known, parameters = state["transitions"], state["physics"], state["model"]
+def saved(data: Trajectories) -> dict[str, Tensor]:
+    """Transitions as a state has them, without episodes."""
+    return {name: tensor.clone() for name, tensor in zip(_COLUMNS, data, strict=True)}
 
-        def expect(right: bool, name: str, expected: str) -> None:
-            if not right:
-                raise RuntimeError(f"The state is damaged: expected {name!r} as {expected}.")
 
-        whole = isinstance(given, Mapping) and {*given} == {*COLUMNS}
-        expect(whole, "transitions", f"a dictionary of {', '.join(COLUMNS)}")
-        try:
-            data = Trajectories.checked(spec, **given)
-        except (TypeError, ValueError) as error:
-            raise RuntimeError(f"The state is damaged in its transitions. {error}") from error
-        n = len(data.states)
-        if (known is None) != (num_known == 0):
-            there, here = ("out", "one") if known is None else ("", "none")
-            raise RuntimeError(
-                f"The state is of dynamics with{there} a physics, but there is {here} here. Load "
-                "it into dynamics built as they were."
-            )
-        if known is not None:
-            whole = torch.is_tensor(known) and known.dtype == torch.float64
-            whole = whole and known.shape == (n, num_known) and bool(known.isfinite().all())
-            expect(whole, "physics", f"finite float64 values of shape {(n, num_known)}")
-            known = known.clone()
-        chunks, searched_at = state["chunks"], state["searched_at"]
-        for size in [*chunks] if isinstance(chunks, list | tuple) else [None]:
-            whole = isinstance(size, int) and 1 <= size <= n
-            expect(whole, "chunks", f"numbers of transitions, {n} in all")
-        expect(sum(chunks) == n, "chunks", f"numbers of transitions, {n} in all")
-        whole = isinstance(searched_at, int) and 1 <= searched_at <= n
-        expect(whole, "searched_at", f"a number of transitions, at most {n}")
-        whole = isinstance(parameters, Mapping) and all(map(torch.is_tensor, parameters.values()))
-        whole = whole and not any(tensor.isnan().any() for tensor in parameters.values())
-        expect(whole, "model", "a dictionary of tensors without NaN")
-        return cls(data, known, tuple(chunks), searched_at, dict(parameters))
+def loaded(given: Any, spec: StateSpec) -> Trajectories:
+    """Copies of the transitions of a state; a RuntimeError if they are damaged."""
+    whole = isinstance(given, Mapping) and {*given} == {*_COLUMNS}
+    expect(whole, "transitions", f"a dictionary of {', '.join(_COLUMNS)}")
+    try:
+        return Trajectories.checked(spec, **given)
+    except (TypeError, ValueError) as error:
+        raise RuntimeError(f"The state is damaged in its transitions. {error}") from error
 
 
 def _text(value: Any) -> str:

@@ -6,11 +6,12 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import torch
 from torch import Tensor
 
+from gpadjust.checks import check_choice
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.physics import (
@@ -25,6 +26,7 @@ from gpadjust.physics.memo import RowMemo, row_keys
 from gpadjust.states import StateSpec
 
 Target = Literal["difference", "absolute"]
+_ALL = 2**62  # rows that a memo holds
 
 
 class Targets:
@@ -34,17 +36,12 @@ class Targets:
     round; or with ``"absolute"`` its next value :math:`s + (s' - s)`, which is continuous along a
     trajectory even where angles come wrapped.
 
-    Args:
-        spec: What the entries of states and actions are.
-        target: ``"difference"`` or ``"absolute"``.
-
     Raises:
         ValueError: If ``target`` is neither.
     """
 
     def __init__(self, spec: StateSpec, target: Target) -> None:
-        if target not in ("difference", "absolute"):
-            raise ValueError(f"Unknown target {target!r}; expected 'difference' or 'absolute'.")
+        check_choice("target", target, get_args(Target))
         self.spec = spec
         self.target = target
         moving = spec.moving
@@ -92,10 +89,6 @@ class TargetPhysics(Physics):
 
     Memory, batching and gradients are those of the physics itself. The values at the training
     inputs can be given, so that a simulator need not run again when a model is loaded.
-
-    Args:
-        physics: Next values of the states that move, from these and the actions.
-        targets: What the models learn.
     """
 
     def __init__(self, physics: Physics, targets: Targets) -> None:
@@ -103,7 +96,7 @@ class TargetPhysics(Physics):
         self.physics = physics
         self.targets = targets
         self.num_outputs = len(targets.predicted)
-        self._known = RowMemo(2**62)
+        self._known = RowMemo(_ALL)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The targets that the physics stands for, ``N x m``."""
@@ -134,14 +127,12 @@ class TargetPhysics(Physics):
 
     def know(self, X: Tensor, values: Tensor) -> None:
         """Take the values at inputs ``N x d`` as given; they replace those known so far."""
-        keys = dict(zip(row_keys(X), range(len(X)), strict=True))
-        known = RowMemo(self._known.capacity)
-        known.store([*keys], values[list(keys.values())])
-        self._known = known
+        self._known = RowMemo(_ALL)
+        self._known.store(row_keys(X), values)
 
     def forget(self) -> None:
         """Forget what was given, and what the physics remembers."""
-        self._known = RowMemo(self._known.capacity)
+        self._known = RowMemo(_ALL)
         self.physics.forget()
 
     def of_rows(self, rows: Tensor) -> Tensor:
@@ -153,9 +144,7 @@ class TargetPhysics(Physics):
 
     def fresh_rows(self, rows: Tensor) -> Tensor:
         """Like :meth:`of_rows`, evaluated whatever was given or is remembered."""
-        d = rows.shape[-1] - len(self.unknowns)
-        given = [self.unknowns.named(rows[:, d:])] if self.unknowns else []
-        return self._targets_of(self.physics.fresh_rows, rows[:, :d], *given)
+        return self._targets_of(self.physics.fresh_rows, *self._arguments(rows))
 
     def _state(self) -> list[Tensor]:
         """Tensors that the physics depends on besides X, as far as torch knows."""
@@ -180,7 +169,16 @@ class TargetPhysics(Physics):
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is known, which belongs to the data."""
-        return {**self.__dict__, "_known": RowMemo(self._known.capacity)}
+        return {**self.__dict__, "_known": RowMemo(_ALL)}
+
+
+def check_spec(spec: StateSpec) -> None:
+    """Raise a TypeError unless it is one."""
+    if not isinstance(spec, StateSpec):
+        raise TypeError(
+            f"Expected spec as a StateSpec, such as StateSpec(['x', 'v'], ['force']); found "
+            f"{spec!r}."
+        )
 
 
 def check_physics(physics: PhysicsLike, spec: StateSpec) -> Physics:
@@ -198,6 +196,15 @@ def check_physics(physics: PhysicsLike, spec: StateSpec) -> Physics:
                 f"Physics {part.name!r} makes steps of {step:g}, but the spec says {spec.step:g}; "
                 f"build it with step={spec.step:g}, or correct the spec."
             )
+    return whole
+
+
+def one_physics(physics: PhysicsLike, spec: StateSpec, otherwise: str) -> Physics:
+    """A physics of next states; a ValueError, with the way out, if there are several."""
+    whole = check_physics(physics, spec)
+    if len(parts := parts_of(whole)) > 1:
+        names = ", ".join(map(repr, parts))
+        raise ValueError(f"Expected one physics to follow, got {names}; {otherwise}.")
     return whole
 
 
@@ -232,14 +239,8 @@ def warn_of_differences(
     """Warn if the physics seems to return the change of the state instead of the next state.
 
     It does if the state plus what it returned errs by less than a third, in units of the root mean
-    square of each state's true change.
-
-    Args:
-        name: The name of the physics.
-        spec: What the entries of the state are.
-        data: Trajectories of the system.
-        columns: The states that were compared.
-        change: Their change in the transitions, if the physics returns next states: ``N x m``.
+    square of each state's true change. ``change``, ``N x m``, is that of the states in ``columns``
+    if the physics returns next states.
     """
     truth = spec.change(data.states, data.next_states)
     scale = truth.square().nanmean(0).sqrt()[columns]

@@ -86,9 +86,8 @@ class Trajectories:
     ) -> None:
         episode = torch.arange(len(states)) if episode is None else torch.as_tensor(episode)
         rows = {"states": states, "actions": actions, "next_states": next_states}
-        for name, tensor in {**rows, "episode": episode.long()}.items():
-            object.__setattr__(self, name, tensor)
-        found = {name: len(tensor) for name, tensor in {**rows, "episode": self.episode}.items()}
+        vars(self).update(rows, episode=episode.long())
+        found = {name: len(tensor) for name, tensor in vars(self).items()}
         if len({*found.values()}) > 1 or self.episode.dim() != 1:
             raise ValueError(
                 "Expected states, actions, next_states and episode with as many rows each, found "
@@ -118,12 +117,7 @@ class Trajectories:
         """
         named = {"states": states, "actions": actions, "next_states": next_states}
         for name, tensor in named.items():
-            columns = spec.action_dim if name == "actions" else spec.state_dim
-            check_columns(name, tensor, columns)
-            if tensor.dtype != torch.float64:
-                raise TypeError(
-                    f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`."
-                )
+            check_doubles(name, tensor, spec.action_dim if name == "actions" else spec.state_dim)
             if tensor.dim() != 2 or len(tensor) != len(states) or not len(tensor):
                 raise ValueError(
                     "Expected states, actions and next_states with as many rows each, and at least "
@@ -144,7 +138,12 @@ class Trajectories:
     @property
     def longest(self) -> int:
         """Number of steps of the longest episode."""
-        return max(self.episode.unique_consecutive(return_counts=True)[1].tolist(), default=0)
+        return max(self._lengths, default=0)
+
+    @property
+    def _lengths(self) -> list[int]:
+        found: list[int] = self.episode.unique_consecutive(return_counts=True)[1].tolist()
+        return found
 
     def append(self, other: Trajectories) -> Trajectories:
         """These trajectories, then others; no episode goes on in them."""
@@ -169,9 +168,7 @@ class Trajectories:
     def spread(self, number: int, seed: int = 0) -> Trajectories:
         """Draw a number of the rows evenly: one of each of as many parts of the same length.
 
-        Args:
-            number: How many rows.
-            seed: Seed of the draw; PyTorch's generator is left as it is.
+        PyTorch's generator is left as it is.
 
         Raises:
             ValueError: If there are fewer, or ``number`` is no positive whole number.
@@ -212,8 +209,7 @@ class Trajectories:
         stride = length if stride is None else stride
         checked_whole("stride", stride, 1)
         complete, starts, end = (~self.states.isnan().any(-1)).tolist(), [], 0
-        lengths = self.episode.unique_consecutive(return_counts=True)[1].tolist()
-        for steps in lengths:
+        for steps in self._lengths:
             row, end = end, end + steps
             while row + length <= end:
                 if complete[row]:
@@ -226,6 +222,13 @@ class Trajectories:
             )
         rows = torch.tensor(starts).unsqueeze(-1) + torch.arange(length)
         return Windows(self.states[rows[:, 0]], self.actions[rows], self.next_states[rows])
+
+
+def check_doubles(name: str, tensor: Tensor, columns: int) -> None:
+    """Raise an error unless a tensor is ``... x columns``, in float64."""
+    check_columns(name, tensor, columns)
+    if tensor.dtype != torch.float64:
+        raise TypeError(f"Expected {name} in float64, got {tensor.dtype}; use `{name}.double()`.")
 
 
 def spread_rows(total: int, number: int, seed: int, what: str) -> Tensor:

@@ -29,7 +29,7 @@ def actor_policy(agent: SAC | TD3, spec: StateSpec) -> BoundedPolicy:
         >>> import torch
         >>> from gpadjust.control import PolicySearch, Task
         >>> from gpadjust.dynamics import PhysicsDynamics
-        >>> from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward, cart_pole_start
+        >>> from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward, cart_pole_start
         >>> from gpadjust.systems import cart_pole
         >>> from gpadjust.rl import actor_policy
         >>> from stable_baselines3 import SAC
@@ -70,7 +70,7 @@ class _Body(nn.Module):
         self.actor = actor
 
     def forward(self, observations: Tensor) -> Tensor:
-        """What the actor's tanh takes, ``N x action_dim``."""
+        """Return the arguments of the actor's tanh, ``N x action_dim``."""
         actor = self.actor
         features = actor.extract_features(observations.float(), actor.features_extractor)
         if hasattr(actor, "latent_pi"):  # SAC

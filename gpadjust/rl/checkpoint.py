@@ -35,7 +35,7 @@ class CheckpointCallback(BaseCallback):
 
 
 def described(env: VecEnv) -> dict[str, Any]:
-    """What an environment is, in plain values."""
+    """Return a description of an environment in plain values."""
     layers = _layers(env)
     inner: list[Any] = getattr(layers[-1], "envs", [])
     names = [type(layer).__name__ for layer in layers] + (layer_names(inner[0]) if inner else [])

@@ -44,7 +44,7 @@ from gpadjust.rl.options import DynaOptions
 
 
 class Dyna(TaskAgent, OffPolicyAlgorithm):
-    r"""What an off-policy learner needs to learn from real episodes and from those in a model.
+    r"""A base for off-policy learners, which then train on real episodes and in a model.
 
     After each real episode it updates on what it has, as the learner does; teaches the real
     transitions to the dynamics of its task; and runs ``model_episodes`` episodes of particles in
@@ -264,7 +264,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     # Real episodes
 
     def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
-        """As in SB3; callbacks may be or hold an :class:`~gpadjust.control.EpisodeCheckpoint`."""
+        """Learn; a callback may be or hold an :class:`~gpadjust.control.EpisodeCheckpoint`."""
         several = isinstance(callback, list)
         given = callback if several else [callback]
         checkpoints = [each for each in given if isinstance(each, EpisodeCheckpoint)]
@@ -280,7 +280,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             return super().learn(total_timesteps, known if several else known[0], *args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As in SB3; if it ends within an episode, the next `learn` resets the environments."""
+        """Collect; if it ends within an episode, the next `learn` resets the environments."""
         try:
             result = super().collect_rollouts(*args, **kwargs)
         except BaseException:
@@ -424,7 +424,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         return self.policy.unscale_action(scaled).astype(actions.dtype)
 
     def _model_noise(self, num_envs: int) -> ActionNoise | None:
-        """Action noise as the real steps have it, begun anew for each particle."""
+        """Action noise as the real steps have it, begun again for each particle."""
         noise = self.action_noise
         if noise is None:
             return None
@@ -445,7 +445,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     # Saving
 
     def get_parameters(self) -> dict[str, dict[str, Any]]:
-        """As in SB3, with the state of the dynamics."""
+        """Return SB3's parameters, with the state of the dynamics."""
         learnt = self._unread_dynamics
         if self.task is not None and not learnt:
             learnt = self.task.dynamics.state_dict()
@@ -457,7 +457,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         exact_match: bool = True,
         device: torch.device | str = "auto",
     ) -> None:
-        """As in SB3; without a task, the state of the dynamics is kept for the next ``save``.
+        """Set parameters; without a task, the dynamics' state is kept for the next ``save``.
 
         Raises:
             ValueError: As in SB3, if something is missing, unless ``exact_match`` is False.
@@ -492,7 +492,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     def load_replay_buffer(
         self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True
     ) -> None:
-        """As in SB3, for both buffers; the file is a pickle: open only one that you trust."""
+        """Load both buffers; the file is a pickle: open only one that you trust."""
         super().load_replay_buffer(path, truncate_last_traj)
         self.replay_buffer.model_buffer.device = self.device
 
@@ -537,7 +537,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     @property
     def _action_generator(self) -> Any:
-        """What draws the first actions, with ``learning_starts``."""
+        """The generator of the first actions, with ``learning_starts``."""
         return self.action_space.np_random.bit_generator
 
 

@@ -24,7 +24,7 @@ Sampling = Literal["step", "trajectory"]
 
 
 class ModelStep(NamedTuple):
-    """What a step of all particles gave.
+    """Result of a step of all particles.
 
     Args:
         observations: ``num_envs x observation_dim``.
@@ -166,11 +166,11 @@ class ModelVecEnv(VecEnv):
         )
 
     def steps_ahead(self) -> np.ndarray:
-        """How many steps each particle has before the time limit, ``num_envs``."""
+        """The steps of each particle before the time limit, ``num_envs``."""
         return self.episode_length - self._steps.numpy()
 
     def refresh(self, buffer: CompactReplayBuffer) -> None:
-        """Let the transitions in a buffer end anew, as the model now has it.
+        """Predict the next states in a buffer again, by the model as it is now.
 
         The states and actions stay, and with them the time limits.
 

@@ -1,4 +1,4 @@
-"""How Dyna agents learn and use their models."""
+"""Options of Dyna agents."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpadjust.rl.model_vec_env import Sampling
 
 @dataclass(frozen=True, kw_only=True)
 class DynaOptions:
-    """How a Dyna agent learns and uses its model.
+    """Options of a Dyna agent's learning and of its model.
 
     Args:
         model_episodes: Model episodes for each real one.
@@ -71,5 +71,5 @@ class DynaOptions:
             object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
 
     def uses_model(self, num_episodes: int) -> bool:
-        """Whether the model serves after so many real episodes."""
+        """Return whether the model is used after so many real episodes."""
         return self.last_model_episode is None or num_episodes < self.last_model_episode

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gpadjust.checks import checked_number
 from gpadjust.physics import BlackBoxPhysics
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, ArmEquation, torque_arm
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, ArmEquation, believed_arm
 
 JOINTS = ("shoulder", "elbow")
 LIMITS = ((-20.0, 125.0), (-5.0, 145.0))  # degrees, of shoulder and elbow
@@ -227,7 +227,7 @@ class ArmSimulation:
     """The arm in OpenSim, integrated for 0.2 s at a time by Runge-Kutta-Merson.
 
     A step depends on its arguments alone. The simulation can be pickled and copied: the model is
-    built anew.
+    built again.
 
     Args:
         build: Returns the ``opensim.Model`` with its inputs, as :func:`build_muscle_arm` and
@@ -310,8 +310,7 @@ def opensim_arm_physics(
     take turns.
 
     Args:
-        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
-            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
+        gains: As of :func:`~gpadjust.systems.arm`.
         accuracy: The relative accuracy of the integrator.
 
     Returns:
@@ -329,7 +328,7 @@ def opensim_arm_physics(
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
-    step = _TorqueStep(torque_arm(gains), accuracy)
+    step = _TorqueStep(believed_arm(gains), accuracy)
     return BlackBoxPhysics(step, batched=False, fd_step=FD_STEP, name="opensim_arm")
 
 

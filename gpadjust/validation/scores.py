@@ -7,7 +7,7 @@ for an output that has none.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from botorch.posteriors.fully_bayesian import MCMC_DIM, GaussianMixturePosterior
 from torch import Tensor
 from torch.distributions import Normal
 
-from gpadjust.checks import check_level
+from gpadjust.checks import check_columns, check_level
 
 
 def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -258,6 +258,11 @@ class Scores:
         parts = {name: v[part] for name, v in given.items() if isinstance(v, Tensor)}
         return Scores(**{**given, **parts})
 
+    def __iter__(self) -> Iterator[Scores]:
+        """The scores of each part of the batch; an IndexError if there is none."""
+        whole = self[:]  # refused now: an error of the first part would end a loop in silence
+        return (whole[i] for i in range(len(whole.rmse)))
+
 
 def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
     """Judge a posterior by what was observed.
@@ -331,27 +336,14 @@ def energy_score(draws: Tensor, y: Tensor) -> Tensor:
 
 
 def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list[Tensor]:
-    """Check all, and bring the components of what was predicted to the front.
-
-    Args:
-        y: True values, ``... x n x m``.
-        mixture_dim: The dimension of the components, if any.
-        predicted: ``mean`` and, if need be, ``variance``.
-
-    Returns:
-        What was predicted, ``S x ... x n x m`` each.
-    """
-    for name, values in (*predicted.items(), ("y", y)):
-        if not isinstance(values, Tensor):
-            raise TypeError(
-                f"Expected {name} to be a torch tensor, got {type(values).__name__}; convert it "
-                f"with `torch.as_tensor({name}, dtype=torch.float64)`."
-            )
-        if name != "y" and not values.is_floating_point():
-            raise TypeError(
-                f"Expected {name} in floating point, got {values.dtype}; convert it with "
-                f"`{name}.double()`."
-            )
+    """Mean and variance, checked, their components in front: ``S x ... x n x m``."""
+    for name, values in predicted.items():
+        check_columns(name, values, 0, more=True)
+    if not isinstance(y, Tensor):
+        raise TypeError(
+            f"Expected y to be a torch tensor, got {type(y).__name__}; convert it with "
+            "`torch.as_tensor(y, dtype=torch.float64)`."
+        )
     if y.dim() < 2:
         raise ValueError(
             f"Expected y of shape ... x n x m, n points of m outputs, got {tuple(y.shape)}; give "
@@ -368,25 +360,22 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
     shapes = [tuple(values.shape) for values in predicted.values()]
     if shape != list(y.shape) or shapes[0] != shapes[-1]:
         raise ValueError(
-            f"Expected {' and '.join(predicted)} of y's shape {tuple(y.shape)} (and the "
-            "components' dimension `mixture_dim`, if any), got "
-            f"{' and '.join(map(str, shapes))} with mixture_dim={mixture_dim}."
+            f"Expected {' and '.join(predicted)} of y's shape {tuple(y.shape)}, beside the "
+            f"dimension mixture_dim={mixture_dim}, got {' and '.join(map(str, shapes))}."
         )
     for name, values in predicted.items():
         if values.isnan().any():
             raise ValueError(
                 f"Expected {name} without NaN, found {int(values.isnan().sum())} of "
-                f"{values.numel()}; only y may be NaN, where it was not observed. Remove these "
-                "points."
+                f"{values.numel()}; only y may be NaN, where it was not observed."
             )
         if name == "variance" and (values < 0).any():
             raise ValueError(
                 f"Expected variances of at least 0, got {values.min().item():.3g}; if they are "
                 "negative by rounding, pass `variance.clamp_min(0)`."
             )
-    if mixture_dim is None:
-        return [values.unsqueeze(0) for values in predicted.values()]
-    return [values.movedim(mixture_dim, 0) for values in predicted.values()]
+    one = mixture_dim is None
+    return [v.unsqueeze(0) if one else v.movedim(mixture_dim, 0) for v in predicted.values()]
 
 
 def _filled(y: Tensor) -> Tensor:

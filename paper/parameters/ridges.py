@@ -42,7 +42,7 @@ def run(experiment: Ridges, problem: str, model: str, seed: int) -> Run:
     seconds = time.process_time() - begin
     parameters = fitted.physics_parameters
     found: Run = {
-        "true": known.true.tolist(),
+        "true": [*known.true.values()],
         "interval": [end.tolist() for end in parameters.interval()],
         "size": result.effective_size.min().item(),
         "warned": any(issubclass(each.category, SamplingWarning) for each in caught),

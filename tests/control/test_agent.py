@@ -25,7 +25,7 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.models import ZeroMeanGP
 from gpadjust.physics import PhysicsError
 from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
-from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 from tests.control.conftest import PLAN
 
 pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")

@@ -8,7 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from gpadjust.control import MPC, CrossEntropy, PathIntegral, Planner, Return, Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.systems import CartPoleSwingUpEnv
-from gpadjust.systems.cart_pole import (
+from gpadjust.systems.swing_up import (
     CART_POLE_SPEC,
     REAL_CART_POLE,
     cart_pole_reward,

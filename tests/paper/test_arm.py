@@ -8,7 +8,7 @@ import torch
 
 from gpadjust.control.checkpoint import RandomState
 from gpadjust.physics import ODEPhysics
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, torque_arm
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, believed_arm
 from paper.arm import Arm, Reaching, ReachingSettings, Settings
 from paper.arm import system as arm_system
 from paper.arm.arm import load_maps
@@ -175,7 +175,7 @@ def test_all_models_are_known(system, learner):
 
 def physics(gains=None, **changes):
     """A time step of a torque arm."""
-    equation = replace(torque_arm(gains) if gains else torque_arm(), **changes)
+    equation = replace(believed_arm(gains) if gains else believed_arm(), **changes)
     return ODEPhysics(equation, step=ARM_TIME_STEP, state_dim=4, substeps=8)
 
 

@@ -367,4 +367,4 @@ def test_runs_on_ray(tmp_path):
     settings = Settings(steps=1, lengthscales=(0.5,), ridges=(0.01,))
     experiment = Forrester(out=tmp_path, runs=2, jobs=2, backend="ray", settings=settings)
     run_missing(experiment)
-    assert len(runs_file(experiment).read()) == 10
+    assert len(runs_file(experiment).read()) == 12

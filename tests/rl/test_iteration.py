@@ -15,7 +15,7 @@ from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
 from gpadjust.systems import cart_pole as swing_up
-from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 from tests.rl.conftest import model_rows
 
 

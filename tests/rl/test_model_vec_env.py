@@ -15,7 +15,7 @@ from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import ModelVecEnv
 from gpadjust.rl.buffer import CompactReplayBuffer
-from gpadjust.systems.cart_pole import cart_pole_reward, cart_pole_start
+from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
 
 
 @pytest.fixture

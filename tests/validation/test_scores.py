@@ -150,9 +150,13 @@ def test_bad_input(prediction, one):
     negative[0, 1, 2], nan[0, 1, 2] = -0.5, torch.nan
     for values, error, says in (
         ((mean.numpy(), variance, y), TypeError, r"got ndarray; convert .*as_tensor\(mean, "),
-        ((mean, variance.numpy(), y), TypeError, "variance to be a torch tensor, got ndarray"),
+        (
+            (mean, variance.numpy(), y),
+            TypeError,
+            r"variance as a .* tensor, got ndarray",
+        ),
         ((mean, variance, y.tolist()), TypeError, "y to be a torch tensor, got list"),
-        ((mean.long(), variance, y), TypeError, r"int64; convert it with `mean.double\(\)`"),
+        ((mean.long(), variance, y), TypeError, r"int64; convert with `torch.as_tensor\(mean"),
         ((mean, negative, y), ValueError, r"at least 0, got -0.5; .*`variance.clamp_min\(0\)`"),
         ((mean, nan, y), ValueError, "Expected variance without NaN, found 1 of 42"),
         ((nan, variance, y), ValueError, "Expected mean without NaN, found 1 of 42"),
@@ -218,6 +222,15 @@ def test_scores_of_a_batch_are_those_of_its_parts(prediction):
     assert (part.energy, part.output_names) == (2, ("a", "b", "c"))
     with pytest.raises(IndexError, match="no batch"):
         part[0]
+
+
+def test_scores_of_a_batch_are_walked_through_part_by_part(prediction):
+    whole = Scores.of(*prediction)
+    parts = [*whole]
+    assert len(parts) == len(whole.rmse) > 1
+    torch.testing.assert_close(torch.stack([part.rmse for part in parts]), whole.rmse)
+    with pytest.raises(IndexError, match="no batch"):
+        list(zip(parts[0], range(3), strict=False))  # which is not to end in silence
 
 
 def test_where_no_variance_is_said_only_errors_count(prediction):
