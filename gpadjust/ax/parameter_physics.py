@@ -111,7 +111,7 @@ class ParameterPhysics:
         )
 
     def __hash__(self) -> int:
-        """By its name, which may be that of another."""
+        """Return the hash of its name, which may be that of another."""
         return hash(self.name)
 
     def __deepcopy__(self, memo: Any) -> Self:

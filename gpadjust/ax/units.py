@@ -171,7 +171,7 @@ class PhysicsInUnits(Physics):
         return self.units.metric(Y, self.metric)
 
     def in_user_units(self, values: Tensor) -> Tensor:
-        """As the metric is."""
+        """Return values in the units of the metric."""
         return self.units.of_metric(values, self.metric)
 
 
