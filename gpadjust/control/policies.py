@@ -61,6 +61,11 @@ class BoundedPolicy(nn.Module):
         raw = self.body((observations - self.origin) / self.unit)
         return self.middle + self.reach * raw.tanh()
 
+    @property
+    def action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the actions, ``2 x action_dim``."""
+        return torch.stack([self.middle - self.reach, self.middle + self.reach])
+
     def look_at(self, states: Tensor) -> None:
         """Take the scale of what is seen from states ``N x state_dim``; once, before training."""
         seen = self.spec.observe(states)
@@ -111,7 +116,7 @@ def linear_policy(
 
 
 def _before_tanh(actions: Sequence[float] | None, action_bounds: ArrayLike, dim: int) -> Tensor:
-    """What the tanh of a policy makes these actions of, ``action_dim``; 0 for None."""
+    """Return the arguments of a policy's tanh for these actions, ``action_dim``; 0 for None."""
     low, high = checked_bounds("action_bounds", action_bounds, dim)
     if actions is None:
         return torch.zeros_like(low)

@@ -155,11 +155,11 @@ Score = Callable[[Rollout], Tensor]
 
 
 class Objective(ABC):
-    """What a planner looks for."""
+    """The goal of a planner."""
 
     @property
     def compares_functions(self) -> bool:
-        """Whether it matters that the functions are followed from the same starts."""
+        """True if the functions have to be followed from the same starts."""
         return True
 
     def check_functions(self, num_functions: int | None) -> None:  # noqa: B027 - most need nothing
@@ -212,7 +212,7 @@ class Return(Objective):
 
     @property
     def compares_functions(self) -> bool:
-        """Whether it matters that the functions are followed from the same starts."""
+        """True if the functions have to be followed from the same starts."""
         return self.quantile is not None
 
     def check_functions(self, num_functions: int | None) -> None:
@@ -250,7 +250,7 @@ class Return(Objective):
         return score
 
     def _at_the_end(self, rollout: Rollout) -> Tensor:
-        """What the last states are worth, ``k x n``; nothing where an episode has ended."""
+        """Return the worth of the last states, ``k x n``; 0 where an episode has ended."""
         last, made = rollout.next_states[:, :, -1], rollout.made[:, :, -1]
         if self.terminal_value is None:
             return torch.zeros(made.shape, dtype=torch.float64)

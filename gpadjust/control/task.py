@@ -1,4 +1,4 @@
-"""What is known of a system and of what it is to do."""
+"""A system's dynamics and its goal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import check_kind, checked_whole
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
 
@@ -25,7 +25,7 @@ InitialStates = Callable[[int], Tensor]
 
 
 class Step(NamedTuple):
-    """What a step from ``N`` states gave.
+    """Result of a step from ``N`` states.
 
     Args:
         next_states: ``N x state_dim``; the old state where the step left the bounds.
@@ -46,7 +46,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is known of a system and of what it is to do, said once.
+    """The dynamics of a system with its reward, bounds and starts.
 
     All tensors are float64, in the units of ``dynamics.spec``. What is left out a learner takes
     from its environment and the real episodes that it has seen. To change a part, make another one
@@ -87,8 +87,7 @@ class Task:
 
     def __post_init__(self) -> None:
         """Check what can be checked without a state."""
-        if not isinstance(self.dynamics, Dynamics):
-            raise TypeError(f"dynamics must be an object of a Dynamics; found {self.dynamics!r}.")
+        check_kind("dynamics", self.dynamics, Dynamics, "an object of a Dynamics")
         if self.reward is None:
             raise TypeError(
                 "reward must be a function of states, actions, next states; found None."
@@ -161,7 +160,7 @@ class Task:
         return rewards if next_states.requires_grad else rewards.detach()
 
     def terminations(self, states: Tensor) -> Tensor:
-        """Whether states ``N x state_dim`` end an episode, checked: ``N`` booleans."""
+        """Return the terminations in states ``N x state_dim``, checked: ``N`` booleans."""
         if self.terminated is None:
             return torch.zeros(len(states), dtype=torch.bool)
         return per_row(self.terminated(states.detach()), len(states), "terminated").bool()
@@ -218,7 +217,7 @@ class Task:
         return replace(self, state_bounds=torch.stack([low, high]))
 
     def describe(self) -> dict[str, Any]:
-        """What the task is, in plain values: of functions, whether there is one."""
+        """Return the task in plain values: of functions, whether there is one."""
         bounds = self.state_bounds
         return {
             **{f"dynamics.{name}": text for name, text in self.dynamics.describe().items()},

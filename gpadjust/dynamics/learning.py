@@ -65,7 +65,7 @@ class Learnt(NamedTuple):
 
     @staticmethod
     def loaded(state: Mapping[str, Any], recipe: Recipe) -> Learnt:
-        """What a state holds, copied; a RuntimeError if something is missing, or not right."""
+        """Return a copy of a state's entries; a RuntimeError if one is missing or wrong."""
         for name in ("transitions", "physics", "chunks", "searched_at", "model"):
             if name not in state:
                 raise RuntimeError(f"The state is damaged: it lacks {name!r}.")

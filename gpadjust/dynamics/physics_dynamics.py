@@ -170,12 +170,12 @@ class PhysicsDynamics(Dynamics):
         return step
 
     def describe(self) -> dict[str, str]:
-        """What these dynamics are, each setting as a text."""
+        """Return the settings, each as a text."""
         unknowns = {name: repr(u) for name, u in self.physics.unknowns.items()}
         return fingerprint(type(self), self.spec, **({"unknowns": unknowns} if unknowns else {}))
 
     def state_dict(self) -> dict[str, Any]:
-        """What these dynamics are, what was learnt, and what the physics said of some transitions.
+        """Return settings, fitted values, and the physics' outputs at some transitions.
 
         That is at the guesses of unknown parameters.
         """

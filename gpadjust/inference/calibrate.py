@@ -101,7 +101,7 @@ def _calibrate(calibration: Calibration, search: Search) -> Calibrated:
 
 
 def calibrate_roughly(model: TermsGP, search: Search) -> Calibrated:
-    """As :func:`calibrate`, of a model whose hyper-parameters are sampled afterwards."""
+    """Calibrate a model whose hyper-parameters are sampled afterwards."""
     search = search._replace(
         num_starts=search.num_starts or 4,
         num_screened=64 if search.num_screened is None else search.num_screened,

@@ -34,7 +34,7 @@ class LinearizedMean(NamedTuple):
 
 
 class Information(NamedTuple):
-    """What the targets of each output say of the parameters, if the mean is linear in them.
+    """Information of each output's targets on the parameters, if the mean is linear in them.
 
     Attributes:
         precision: :math:`J^T K^{-1} J`, ``... x B x p x p``.
@@ -77,7 +77,7 @@ class Misfit(ABC):
 
     @abstractmethod
     def residuals(self, points: Tensor) -> Tensor:
-        """As in :class:`LinearizedMean`, at points ``... x p``."""
+        """Return the residuals at points ``... x p``."""
 
     @torch.no_grad()
     def linearized(self, points: Tensor) -> LinearizedMean:
@@ -132,7 +132,7 @@ class Calibration(Misfit):
 
     @property
     def point(self) -> Tensor:
-        """Where the parameters are, ``p``."""
+        """The present point of the parameters, ``p``."""
         point: Tensor = self._transform.coordinates.detach().clone()
         return point
 
@@ -182,7 +182,7 @@ class Calibration(Misfit):
             )
 
     def information(self, near: LinearizedMean, chol: Tensor) -> Information:
-        """What targets say whose covariances have the factors ``... x B x n x n``."""
+        """Return the information of targets, by the factors ``... x B x n x n`` of covariances."""
         # What the slopes times the parameters are to make.
         target = near.residual.unsqueeze(-1) + near.slope @ near.point[..., None, :, None]
         columns = torch.cat([near.slope, target], dim=-1)
@@ -199,7 +199,7 @@ class Calibration(Misfit):
     def marginalized(
         self, near: LinearizedMean, information: Information
     ) -> MarginalizedParameters:
-        """What the parameters, by their prior and the other outputs, add to each output."""
+        """Return the contribution of the parameters to each output, given the others."""
         count = len(self.targets)
         mean, chol = information.posterior((1 - torch.eye(count)).to(near.point))
         root = torch.linalg.solve_triangular(chol, near.slope.mT, upper=False).mT
@@ -251,12 +251,12 @@ class Calibration(Misfit):
         return or_infinite(value.masked_fill(failed, math.inf) + 0.5 * z.square().sum(-1))
 
     def _inputs(self, points: Tensor) -> Tensor:
-        """What the terms read at points ``... x p``, ``... x (1) x n x d``; NaN if f_p fails."""
+        """Return the inputs of the terms at points ``... x p``; NaN where f_p fails."""
         inputs: Tensor = self._transform.at(self._raw, points)
         return inputs.unsqueeze(-3) if self.model.num_outputs > 1 else inputs
 
     def residuals(self, points: Tensor) -> Tensor:
-        """As in :class:`LinearizedMean`, at points ``... x p``."""
+        """Return the residuals at points ``... x p``."""
         mean = self.model.mean_module(self._inputs(points))
         mean = mean.reshape(*points.shape[:-1], *self.targets.shape)
         residual = self.targets - or_infinite(mean)

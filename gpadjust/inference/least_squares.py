@@ -27,7 +27,7 @@ _SILENT = 1e-14  # the mean square of residuals, relative to that of the targets
 
 
 class Optima(NamedTuple):
-    """Where least squares came to.
+    """Results of least squares.
 
     Attributes:
         points: Coordinates of all optima that count, the best first, ``k x p``.
@@ -107,7 +107,7 @@ def descend(misfit: Misfit, guesses: Tensor) -> tuple[Tensor, ...]:
 
 
 def _misfit(misfit: Misfit, z: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """What least squares minimise, ``k``, and the variances of residuals, ``k x B``."""
+    """Return the objective, ``k``, and the variances of residuals, ``k x B``."""
     count = misfit.observed.sum(-1).to(z)
     least = _SILENT * misfit.targets.square().nanmean(-1) + torch.finfo(z.dtype).tiny
     variances = (residual.square().sum(-1) / count).maximum(least)

@@ -20,13 +20,14 @@ _MANY = 0.25  # share of the draws, with which the parameter is
 
 
 def title(model: Any) -> str:
-    """One line: the structure, and of what data it is."""
+    """Return one line: the structure, its data, and whether it was fitted."""
     transform = getattr(model, "input_transform", None)
     of = f" of {transform.physics.name!r}" if isinstance(transform, PhysicsInput) else ""
     counts = [model.train_targets.shape[-1], len(model.input_names), model.num_outputs]
     counts += [] if model.num_samples is None else [model.num_samples]
     nouns = zip(counts, ("point", "input", "output", "sample"), strict=False)
     parts = [f"{n} {noun}" + ("" if n == 1 else "s") for n, noun in nouns]
+    parts += [] if getattr(model, "is_fitted", True) else ["not fitted"]
     return f"{type(model).__name__}{of}: {', '.join(parts)}"
 
 

@@ -101,7 +101,7 @@ class TermsGP(TermsModel, SingleTaskGP):
                 outcome_transform=None,
                 input_transform=made.input_transform,
             )
-        if made.units is not None:  # not earlier: BoTorch would estimate it anew
+        if made.units is not None:  # not earlier: BoTorch would estimate it again
             self.outcome_transform = made.units
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)

@@ -164,7 +164,7 @@ class Record:
         if len(self.times) < 2 or self._breaks.all():
             raise ValueError(
                 f"{self._called}: expected two rows or more of a segment, one after the other, "
-                f"found {len(self.times)} in all; leave the record out, or mend `segments`."
+                f"found {len(self.times)} in all; leave the record out, or correct `segments`."
             )
 
     def _check_values(self) -> None:

@@ -1,4 +1,4 @@
-"""How Dyna agents learn and use their models."""
+"""Options of Dyna agents."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpadjust.rl.model_vec_env import Sampling
 
 @dataclass(frozen=True, kw_only=True)
 class DynaOptions:
-    """How a Dyna agent learns and uses its model.
+    """Options of a Dyna agent's learning and of its model.
 
     Args:
         model_episodes: Model episodes for each real one.
@@ -54,13 +54,9 @@ class DynaOptions:
     def __post_init__(self) -> None:
         """Check them."""
         checked_whole("model_episodes", self.model_episodes, 0)
-        for name, least in (
-            ("last_model_episode", 0),
-            ("model_buffer_size", 1),
-            ("num_particles", 1),
-        ):
+        for name in ("last_model_episode", "model_buffer_size", "num_particles"):
             if getattr(self, name) is not None:
-                checked_whole(name, getattr(self, name), least)
+                checked_whole(name, getattr(self, name), 0 if name == "last_model_episode" else 1)
         checked_number("updates_per_model_step", self.updates_per_model_step, least=0)
         checked_number("real_fraction", self.real_fraction, least=0, most=1)
         check_switch("refresh_model_data", self.refresh_model_data)
@@ -71,5 +67,5 @@ class DynaOptions:
             object.__setattr__(self, "score_horizons", checked_horizons(self.score_horizons))
 
     def uses_model(self, num_episodes: int) -> bool:
-        """Whether the model serves after so many real episodes."""
+        """Return whether the model is used after so many real episodes."""
         return self.last_model_episode is None or num_episodes < self.last_model_episode

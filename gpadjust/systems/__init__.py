@@ -15,11 +15,9 @@ except ImportError as error:
         'gpadjust.systems needs Gymnasium; run `pip install "gpadjust[rl]"`.'
     ) from error
 
-from gpadjust.systems.arm import arm
-from gpadjust.systems.cart_pole import CartPoleEquation, cart_pole
 from gpadjust.systems.muscle_arm import MuscleArmEnv
-from gpadjust.systems.reaching import hand_distance_cm, hand_position
-from gpadjust.systems.swing_up import CartPoleSwingUpEnv
+from gpadjust.systems.reaching import arm, hand_distance_cm, hand_position
+from gpadjust.systems.swing_up import CartPoleEquation, CartPoleSwingUpEnv, cart_pole
 from gpadjust.systems.system import System
 from gpadjust.systems.torque_arm import ArmEquation
 from gpadjust.systems.wrappers import NoisySensors, RememberAction

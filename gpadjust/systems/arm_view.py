@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpadjust.systems.rendering import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, Colour, View
+from gpadjust.systems.rendering import BLUE, GREEN, GREY, LIGHT, RED, SMOOTH, WHITE, Color
 from gpadjust.systems.torque_arm import REAL_ARM
 
-WIDTH, HEIGHT = 480, 400
+if TYPE_CHECKING:
+    import pygame
+
+SIZE = WIDTH, HEIGHT = 480, 400
 METRE = 320.0  # pixels
+At = tuple[float, float]  # across and up, in m or pixels
 SHOULDER = (0.5, 0.62)  # of width and height
 
 # Where the muscles are drawn: for both ends the link (0: trunk, 1: upper arm, 2: forearm), the way
@@ -27,71 +32,59 @@ MUSCLE_LINES: tuple[tuple[Place, Place], ...] = (
 )
 
 
-class ArmView(View):
-    """Frames of the arm, its muscles blue at rest and red when active, and its target in green.
+def draw_arm(
+    canvas: pygame.Surface, state: NDArray[np.float64], activations: NDArray[np.float64]
+) -> None:
+    """Draw the arm, its muscles blue at rest and red when active, and its target in green.
 
     Args:
-        frames_per_second: The pace of the frames in a window; None for arrays without a window.
-
-    Raises:
-        gymnasium.error.DependencyNotInstalled: If ``pygame-ce`` is missing.
+        canvas: ``SMOOTH`` times as large as :data:`SIZE`.
+        state: Angles, velocities and target angles, in rad and s.
+        activations: Of the six muscles, in [0, 1].
     """
+    canvas.fill(WHITE)
+    _line(canvas, (0.0, -0.12), (0.0, 0.12), GREY, 0.012)
+    target = _poses(*state[4:])
+    _arm(canvas, target, LIGHT)
+    _circle(canvas, _place(target, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.03, ring=True)
+    links = _poses(*state[:2])
+    _arm(canvas, links, GREY)
+    for ends, activation in zip(MUSCLE_LINES, activations.clip(0, 1), strict=True):
+        start, end = (_place(links, place) for place in ends)
+        _line(canvas, start, end, _mixed(float(activation)), 0.008 + 0.012 * float(activation))
+    _circle(canvas, _place(links, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.016)
 
-    def __init__(self, frames_per_second: int | None = None) -> None:
-        super().__init__("Muscle arm", (WIDTH, HEIGHT), frames_per_second)
 
-    def draw(
-        self, state: NDArray[np.float64], activations: NDArray[np.float64]
-    ) -> NDArray[np.uint8] | None:
-        """Draw a frame; return it, ``height x width x 3``, if there is no window.
+def _arm(canvas: pygame.Surface, links: list[LinkPose], color: Color) -> None:
+    for link, length in zip((1, 2), REAL_ARM.lengths, strict=True):
+        start, end = _place(links, (link, 0.0, 0.0)), _place(links, (link, length, 0.0))
+        _line(canvas, start, end, color, 0.02)
+        _circle(canvas, start, color, 0.018)
 
-        Args:
-            state: Angles, velocities and target angles, in rad and s.
-            activations: Of the six muscles, in [0, 1].
-        """
-        self.canvas.fill(WHITE)
-        self._line((0.0, -0.12), (0.0, 0.12), GREY, 0.012)
-        target = _poses(*state[4:])
-        self._arm(target, LIGHT)
-        self._circle(_place(target, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.03, ring=True)
-        links = _poses(*state[:2])
-        self._arm(links, GREY)
-        for ends, activation in zip(MUSCLE_LINES, activations.clip(0, 1), strict=True):
-            start, end = (_place(links, place) for place in ends)
-            self._line(start, end, _mixed(float(activation)), 0.008 + 0.012 * float(activation))
-        self._circle(_place(links, (2, REAL_ARM.lengths[1], 0.0)), GREEN, 0.016)
-        return self.show()
 
-    def _arm(self, links: list[LinkPose], colour: Colour) -> None:
-        for link, length in zip((1, 2), REAL_ARM.lengths, strict=True):
-            start, end = _place(links, (link, 0.0, 0.0)), _place(links, (link, length, 0.0))
-            self._line(start, end, colour, 0.02)
-            self._circle(start, colour, 0.018)
+def _line(canvas: pygame.Surface, start: At, end: At, color: Color, width: float) -> None:
+    import pygame
 
-    def _line(
-        self, start: tuple[float, float], end: tuple[float, float], colour: Colour, width: float
-    ) -> None:
-        import pygame
+    # As a polygon: pygame's thick lines have slanted ends.
+    (x, y), (x_end, y_end) = start, end
+    length = math.hypot(x_end - x, y_end - y)
+    across, up = (y - y_end) * width / 2 / length, (x_end - x) * width / 2 / length
+    corners = [
+        (x + across, y + up),
+        (x_end + across, y_end + up),
+        (x_end - across, y_end - up),
+        (x - across, y - up),
+    ]
+    pygame.draw.polygon(canvas, color, [_pixel(corner) for corner in corners])
 
-        # As a polygon: pygame's thick lines have slanted ends.
-        (x, y), (x_end, y_end) = start, end
-        length = math.hypot(x_end - x, y_end - y)
-        across, up = (y - y_end) * width / 2 / length, (x_end - x) * width / 2 / length
-        corners = [
-            (x + across, y + up),
-            (x_end + across, y_end + up),
-            (x_end - across, y_end - up),
-            (x - across, y - up),
-        ]
-        pygame.draw.polygon(self.canvas, colour, [_pixel(corner) for corner in corners])
 
-    def _circle(
-        self, centre: tuple[float, float], colour: Colour, radius: float, ring: bool = False
-    ) -> None:
-        import pygame
+def _circle(
+    canvas: pygame.Surface, center: At, color: Color, radius: float, ring: bool = False
+) -> None:
+    import pygame
 
-        width = round(0.008 * SMOOTH * METRE) if ring else 0
-        pygame.draw.circle(self.canvas, colour, _pixel(centre), radius * SMOOTH * METRE, width)
+    width = round(0.008 * SMOOTH * METRE) if ring else 0
+    pygame.draw.circle(canvas, color, _pixel(center), radius * SMOOTH * METRE, width)
 
 
 LinkPose = tuple[float, float, float]  # where the link's joint is, in m, and its direction
@@ -103,18 +96,18 @@ def _poses(shoulder: float, elbow: float) -> list[LinkPose]:
     return [(0.0, 0.0, 0.0), (0.0, 0.0, shoulder), (*elbow_at, shoulder + elbow)]
 
 
-def _place(links: list[LinkPose], place: Place) -> tuple[float, float]:
+def _place(links: list[LinkPose], place: Place) -> At:
     link, along, aside = place
     x, y, direction = links[link]
     cos, sin = math.cos(direction), math.sin(direction)
     return x + along * cos - aside * sin, y + along * sin + aside * cos
 
 
-def _pixel(place: tuple[float, float]) -> tuple[float, float]:
+def _pixel(place: At) -> At:
     x = SHOULDER[0] * WIDTH + METRE * place[0]
     return SMOOTH * x, SMOOTH * (SHOULDER[1] * HEIGHT - METRE * place[1])
 
 
-def _mixed(share: float) -> Colour:
+def _mixed(share: float) -> Color:
     red, green, blue = (round(b + share * (r - b)) for b, r in zip(BLUE, RED, strict=True))
     return red, green, blue

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.checks import checked_options, finite_array
-from gpadjust.systems.arm_view import ArmView
+from gpadjust.systems.arm_view import SIZE, draw_arm
 from gpadjust.systems.opensim import (
     MUSCLES,
     NUM_EXCITED,
@@ -35,7 +35,7 @@ from gpadjust.systems.torque_arm import ARM_TIME_STEP, REAL_ARM
 HIGH = np.array([2 * math.pi, 2 * math.pi, 100, 100, 2 * math.pi, 2 * math.pi], dtype=np.float32)
 
 
-class MuscleArmEnv(ViewedEnv[ArmView]):
+class MuscleArmEnv(ViewedEnv):
     r"""Reach for targets with a planar arm, by exciting four of its six muscles.
 
     OpenSim computes the arm: Hill-type muscles with rigid tendons, joint damping and limits. The
@@ -87,6 +87,7 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
         True
     """
 
+    caption, size = "Muscle arm", SIZE
     metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / ARM_TIME_STEP)}  # noqa: RUF012
 
     def __init__(
@@ -108,9 +109,6 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
             seed: For the random start and target, and those that follow.
             options: ``"state"``, the two angles and velocities to start from, and ``"target"``, the
                 two angles to reach, in rad and s. Default of each: drawn.
-
-        Returns:
-            The observation and an empty ``info``.
 
         Raises:
             TypeError: If ``options`` is no dictionary.
@@ -181,11 +179,8 @@ class MuscleArmEnv(ViewedEnv[ArmView]):
         }
         return self.state.astype(np.float32), reward, False, self._failed, info
 
-    def _open_view(self, frames_per_second: int | None) -> ArmView:
-        return ArmView(frames_per_second)
-
-    def _draw(self, view: ArmView, state: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        return view.draw(state, self.activations)
+    def _draw(self, canvas: Any, state: NDArray[np.float64]) -> None:
+        draw_arm(canvas, state, self.activations)
 
 
 def _checked(value: Any, option: str, names: str, high: NDArray[np.float32]) -> NDArray[np.float64]:

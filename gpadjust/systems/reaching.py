@@ -1,15 +1,22 @@
-"""Reaching with the planar arm: its states, reward, starts and targets."""
+"""Reaching with the planar arm: its states, reward, starts and targets, and the system."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Literal
 
+import gymnasium as gym
 import torch
 from torch import Tensor
 
 from gpadjust.checks import check_columns, checked_whole
+from gpadjust.physics import Physics, Unknown
 from gpadjust.states import StateSpec
-from gpadjust.systems.torque_arm import REAL_ARM
+from gpadjust.systems.system import System
+from gpadjust.systems.torque_arm import REAL_ARM, SUBSTEPS, believed_arm, torque_arm_physics
+from gpadjust.systems.wrappers import NoisySensors, RememberAction
 
 START_MEAN = (math.radians(35), math.radians(65))
 START_STD = math.radians(5)
@@ -93,7 +100,7 @@ def arm_targets() -> Tensor:
 
 
 def hand_position(angles: Tensor) -> Tensor:
-    """Where the hand is, seen from the shoulder.
+    """Return the position of the hand, seen from the shoulder.
 
     Args:
         angles: ``... x 2``, of shoulder and elbow, in rad.
@@ -113,7 +120,7 @@ def hand_position(angles: Tensor) -> Tensor:
 
 
 def hand_distance_cm(states: Tensor) -> Tensor:
-    """How far the hand is from where it would be at the target angles, in cm.
+    """Return the distance of the hand from its place at the target angles, in cm.
 
     Args:
         states: ``... x 6``.
@@ -128,3 +135,91 @@ def hand_distance_cm(states: Tensor) -> Tensor:
     check_columns("states", states, 6, more=True)
     gap = hand_position(states[..., :2]) - hand_position(states[..., 4:6])
     return 100 * gap.square().sum(-1).sqrt()
+
+
+def arm(
+    *,
+    strength: float = 0.5,
+    gains: tuple[float, float] = (8.0, 4.0),
+    memory: bool = False,
+    noise: Mapping[str, float] | None = None,
+    unknowns: bool = False,
+    opensim: bool = False,
+    substeps: int = SUBSTEPS,
+    gradient: Literal["autograd", "finite-difference"] = "autograd",
+    episode_length: int = 15,
+) -> System:
+    """Reaching with an arm of six muscles; its physics has torques in their place.
+
+    Its environment is :class:`MuscleArmEnv`. In the physics the links are a tenth too heavy, the
+    joints damped twice as much as the real ones; torques follow the actions at once, whatever the
+    angles, and nothing limits the joints.
+
+    Args:
+        strength: The factor on the forces of the muscles, in (0, 2].
+        gains: The torques of full actions at shoulder and elbow that the physics has, in N m. The
+            default suits strength 0.5; (5, 2.5) suits 0.3.
+        memory: Whether the state has the previous action (:class:`RememberAction`), by which the
+            muscles' delay can be learnt.
+        noise: Standard deviations of the sensors' noise, by the name of the state.
+        unknowns: Whether the physics has four unknown parameters: ``forearm`` (a factor on its mass
+            and inertia), ``damping``, ``shoulder_gain``, ``elbow_gain``.
+        opensim: Whether OpenSim computes the physics, as a black box, a row at a time. The two
+            agree to 1e-5 rad.
+        substeps: Integration steps, of 5 ms by default. With 8 (which err by 2e-4 rad) and
+            ``gradient="finite-difference"`` a gradient along an episode takes a tenth of the time.
+        gradient: As of :class:`~gpadjust.physics.ODEPhysics`.
+        episode_length: In steps of 0.2 s.
+
+    Raises:
+        ImportError: If ``opensim`` is asked for and missing.
+        ValueError: If an option is out of range, or ``opensim`` is asked for with ``unknowns``.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust import systems
+        >>> physics = systems.arm().physics
+        >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
+        tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
+    """
+    spec = ARM_MEMORY_SPEC if memory else ARM_SPEC
+    physics: Physics
+    if opensim:
+        from gpadjust.systems.opensim import opensim_arm_physics
+
+        if unknowns:
+            raise ValueError("The physics by OpenSim has no unknown parameters; use opensim=False.")
+        physics = opensim_arm_physics(gains)
+    else:
+        believed = believed_arm(gains)
+        named = {
+            "forearm": Unknown(1.0, factor=1.5),
+            "damping": Unknown(believed.damping, factor=2.0, unit="N m s/rad"),
+            "shoulder_gain": Unknown(max(believed.gains[0], 0.1), factor=2.0, unit="N m"),
+            "elbow_gain": Unknown(max(believed.gains[1], 0.1), factor=2.0, unit="N m"),
+        }
+        physics = torque_arm_physics(
+            believed, substeps=substeps, gradient=gradient, unknowns=named if unknowns else None
+        )
+    return System(
+        partial(_make, strength, memory, noise, episode_length),
+        spec,
+        physics,
+        arm_reward,
+        start=partial(arm_start, spec=spec),
+        episode_length=episode_length,
+    )
+
+
+def _make(
+    strength: float,
+    memory: bool,
+    noise: Mapping[str, float] | None,
+    episode_length: int,
+    **options: Any,
+) -> gym.Env[Any, Any]:
+    """The environment."""
+    name = "gpadjust/MuscleArm-v0"
+    env = gym.make(name, max_episode_steps=episode_length, strength=strength, **options)
+    env = RememberAction(env) if memory else env
+    return NoisySensors(env, ARM_MEMORY_SPEC if memory else ARM_SPEC, noise) if noise else env

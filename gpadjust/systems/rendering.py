@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,13 +17,13 @@ SMOOTH = 2  # drawn so many times larger, then scaled down, for smooth edges
 RENDER_MODES = ["human", "rgb_array"]
 
 Array = NDArray[np.float32]
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 WHITE, BLACK, GREY, LIGHT = (255, 255, 255), (0, 0, 0), (110, 110, 110), (215, 215, 215)
 BLUE, RED, GREEN = (31, 79, 130), (204, 77, 77), (44, 140, 68)
 
 
 class View:
-    """Frames of a system. A subclass draws on ``canvas``, then calls :meth:`show`.
+    """Frames of a system: what is drawn on ``canvas``, in a window or as arrays.
 
     Args:
         caption: The title of the window.
@@ -73,13 +73,10 @@ class View:
             self._window = None
 
 
-V = TypeVar("V", bound=View)
+class ViewedEnv(gym.Env[Array, Array]):
+    """The base of environments whose ``state`` can be seen.
 
-
-class ViewedEnv(gym.Env[Array, Array], Generic[V]):
-    """The base of environments whose ``state`` a :class:`View` draws.
-
-    A subclass says in :meth:`_open_view` and :meth:`_draw` how, has ``metadata`` with
+    A subclass says in ``caption``, ``size`` and :meth:`_draw` how, has ``metadata`` with
     ``RENDER_MODES`` and ``"render_fps"``, and calls :meth:`_show` at the end of ``reset`` and
     ``step``.
 
@@ -90,6 +87,9 @@ class ViewedEnv(gym.Env[Array, Array], Generic[V]):
         ValueError: If it is another one.
     """
 
+    caption: str
+    size: tuple[int, int]
+
     def __init__(self, render_mode: str | None) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(
@@ -97,7 +97,7 @@ class ViewedEnv(gym.Env[Array, Array], Generic[V]):
             )
         self.render_mode = render_mode
         self.state: NDArray[np.float64] | None = None
-        self._view: V | None = None
+        self._view: View | None = None
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the system.
@@ -119,8 +119,9 @@ class ViewedEnv(gym.Env[Array, Array], Generic[V]):
             raise gym.error.ResetNeeded("Call reset before render.")
         if self._view is None:
             pace = self.metadata["render_fps"] if self.render_mode == "human" else None
-            self._view = self._open_view(pace)
-        return self._draw(self._view, self.state)
+            self._view = View(self.caption, self.size, pace)
+        self._draw(self._view.canvas, self.state)
+        return self._view.show()
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -132,12 +133,8 @@ class ViewedEnv(gym.Env[Array, Array], Generic[V]):
         # A window cannot be pickled; the copy opens its own when it is rendered.
         return {**self.__dict__, "_view": None}
 
-    def _open_view(self, frames_per_second: int | None) -> V:
-        """The view; of a window, the pace of its frames is given."""
-        raise NotImplementedError
-
-    def _draw(self, view: V, state: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        """Draw a state with the view."""
+    def _draw(self, canvas: pygame.Surface, state: NDArray[np.float64]) -> None:
+        """Draw a state."""
         raise NotImplementedError
 
     def _show(self) -> None:

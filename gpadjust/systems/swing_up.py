@@ -1,34 +1,251 @@
-"""Swinging up the pole of a cart-pole, as a Gymnasium environment."""
+"""The swing-up of a cart-pole: its equation of motion and physics, its environment, the system."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from gpadjust.checks import check_switch, checked_options, finite_array
-from gpadjust.systems.cart_pole import (
-    CART_POLE_RAW_SPEC,
-    CART_POLE_SPEC,
-    REAL_CART_POLE,
-    START_MEAN,
-    START_STD,
-    TIME_STEP,
-    CartPoleEquation,
-    cart_pole_cost,
-    equation_physics,
+from gpadjust.checks import (
+    check_columns,
+    check_switch,
+    checked_number,
+    checked_options,
+    checked_whole,
+    finite_array,
 )
-from gpadjust.systems.cart_pole_view import CartPoleView
+from gpadjust.physics import ODEPhysics, Unknown
+from gpadjust.states import StateSpec
+from gpadjust.systems.cart_pole_view import SIZE, draw_cart_pole
 from gpadjust.systems.rendering import RENDER_MODES, ViewedEnv
+from gpadjust.systems.system import System
+from gpadjust.systems.wrappers import NoisySensors
 
-MAX_FORCE = 10.0
+TIME_STEP = 0.1
+SUBSTEP = 0.02  # s, the longest: a single Euler step of 0.1 s errs by 0.3 rad/s
+START_MEAN = (0.0, math.pi, 0.0, 0.0)
+START_STD = 0.2
+MAX_FORCE = 10.0  # N
 MAX_START = 100.0  # far beyond what forces do; the equation can be integrated there
+_SOFT = 0.05  # m/s: the speed over which dry friction changes its sign
+
+CART_POLE_SPEC = StateSpec(
+    ["x", "theta", "x_dot", "theta_dot"], actions=["force"], angles=["theta"]
+)
+"""The state of the cart-pole; policy and model see sine and cosine of the angle."""
+
+CART_POLE_RAW_SPEC = StateSpec(["x", "theta", "x_dot", "theta_dot"], actions=["force"])
+"""The same state with the angle as it is, not wrapped: the observation is the state."""
 
 
-class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
+@dataclass(frozen=True)
+class CartPoleEquation:
+    r"""The equation of motion of a cart with a pole, a uniform rod on a hinge without friction.
+
+    With the position :math:`x` of the cart, the angle :math:`\theta` of the pole from *upright*,
+    counter-clockwise, the force :math:`a` on the cart and :math:`M = m_c + m_p`,
+
+    .. math::
+        \ddot{x} &= \frac{-2 m_p l \dot\theta^2 \sin\theta + 3 m_p g \sin\theta \cos\theta
+            + 4 (a - b \dot{x})}{4 M - 3 m_p \cos^2\theta} \\
+        \ddot\theta &= \frac{-3 m_p l \dot\theta^2 \sin\theta \cos\theta + 6 M g \sin\theta
+            + 6 (a - b \dot{x}) \cos\theta}{l (4 M - 3 m_p \cos^2\theta)}.
+
+    This is the system of Deisenroth, "Efficient Reinforcement Learning using Gaussian Processes",
+    2010, Appendix C, with the angle taken from upright. Its tip is at
+    :math:`(x - l \sin\theta, l \cos\theta)`. Dry friction takes :math:`d \tanh(\dot{x} / 0.05)`
+    from the force, drag turns the pole by :math:`-k \dot\theta |\dot\theta|`.
+
+    Args:
+        cart_mass: The mass :math:`m_c` of the cart, in kg.
+        pole_mass: The mass :math:`m_p` of the pole, in kg.
+        pole_length: The length :math:`l` of the pole, in m.
+        damping: The friction :math:`b` between cart and track, in N s/m.
+        gravity: The acceleration :math:`g` of gravity, in m/s²; as Deisenroth has it, 9.82.
+        dry: The dry friction d of the cart, in N.
+        drag: The drag k of the pole, in N m s²/rad².
+
+    Raises:
+        TypeError: If one of them is no number.
+        ValueError: If a mass, the length or the gravity is not positive, or another one negative.
+
+    Example:
+        >>> equation = CartPoleEquation(0.5, 0.5, 0.6, 0.1)
+        >>> equation(torch.zeros(1, 4), torch.ones(1, 1))  # at rest, upright, pushed with 1 N
+        tensor([[0.0000, 0.0000, 1.6000, 4.0000]])
+    """
+
+    cart_mass: float
+    pole_mass: float
+    pole_length: float
+    damping: float
+    gravity: float = 9.82
+    dry: float = 0.0
+    drag: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        for entry in fields(self):
+            friction = entry.name in ("damping", "dry", "drag")
+            limits = {"least": 0} if friction else {"above": 0}
+            checked_number(entry.name, getattr(self, entry.name), **limits)
+
+    def __call__(self, state: Tensor, action: Tensor, p: Mapping[str, Any] | None = None) -> Tensor:
+        """The time derivative of the state.
+
+        Args:
+            state: ``... x 4``: position, angle, velocity and angular velocity, in m, rad and s.
+            action: ``... x 1``, the force in N.
+            p: Other values of some parameters by name, ``...`` each.
+
+        Returns:
+            ``... x 4``.
+
+        Raises:
+            ValueError: If the last dimensions are not 4 and 1.
+        """
+        if state.shape[-1] != 4 or action.shape[-1] != 1:
+            raise ValueError(
+                "Expected states ... x 4 (x, theta, x_dot, theta_dot) and actions ... x 1 (force), "
+                f"got {tuple(state.shape)} and {tuple(action.shape)}."
+            )
+        _, theta, x_dot, theta_dot = state.unbind(-1)
+        own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        given = {**own, **(p or {})}
+        m, length, g = given["pole_mass"], given["pole_length"], given["gravity"]
+        M = given["cart_mass"] + m
+        sin, cos = theta.sin(), theta.cos()
+        push = action[..., 0]
+        if _is_there(given["dry"]):
+            push = push - given["dry"] * (x_dot / _SOFT).tanh()
+        force = push - given["damping"] * x_dot
+        swing = m * length * theta_dot.square() * sin
+        inertia = 4 * M - 3 * m * cos.square()
+        x_ddot = (-2 * swing + 3 * m * g * sin * cos + 4 * force) / inertia
+        theta_ddot = (-3 * swing * cos + 6 * M * g * sin + 6 * force * cos) / (length * inertia)
+        if _is_there(given["drag"]):
+            torque = -given["drag"] * theta_dot * theta_dot.abs()
+            x_ddot = x_ddot + 6 * cos * torque / (length * inertia)
+            theta_ddot = theta_ddot + 12 * M * torque / (m * length**2 * inertia)
+        return torch.stack([x_dot, theta_dot, x_ddot, theta_ddot], dim=-1)
+
+    def energy(self, state: Tensor) -> Tensor:
+        """The kinetic and the potential energy in J, ``...``, of states ``... x 4``.
+
+        The potential energy is zero when the pole is level.
+        """
+        _, theta, x_dot, theta_dot = state.unbind(-1)
+        m, length = self.pole_mass, self.pole_length
+        cos = theta.cos()
+        kinetic = (
+            (self.cart_mass + m) * x_dot.square() / 2
+            - m * length * x_dot * theta_dot * cos / 2
+            + m * length**2 * theta_dot.square() / 6
+        )
+        return kinetic + m * self.gravity * length * cos / 2
+
+
+REAL_CART_POLE = CartPoleEquation(cart_mass=0.5, pole_mass=0.5, pole_length=0.6, damping=0.1)
+"""The system to control."""
+
+
+def _is_there(friction: float | Tensor) -> bool:
+    return torch.is_tensor(friction) or friction != 0
+
+
+def equation_physics(
+    equation: Callable[..., Tensor],
+    time_step: float = TIME_STEP,
+    unknowns: Mapping[str, Unknown] | None = None,
+) -> ODEPhysics:
+    """The state of a cart-pole a time step later, under a force that is held.
+
+    It does not limit the force, as the environment does. It integrates by Runge-Kutta of order four
+    with substeps of at most 0.02 s.
+
+    Args:
+        equation: Such as a :class:`CartPoleEquation`.
+        time_step: In s.
+        unknowns: Parameters of the equation that are unknown.
+
+    Returns:
+        A physics of columns ``[x, theta, x_dot, theta_dot, force]``.
+
+    Example:
+        >>> physics = equation_physics(REAL_CART_POLE)
+        >>> physics(torch.tensor([[0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
+        tensor([[0.0081, 0.0206, 0.1627, 0.4233]], dtype=torch.float64)
+    """
+    checked_number("time_step", time_step, above=0)
+    substeps = math.ceil(round(time_step / SUBSTEP, 6))
+    return ODEPhysics(
+        equation, time_step, state_dim=4, substeps=substeps, unknowns=unknowns, name="cart_pole"
+    )
+
+
+def believed_cart_pole(seed: int) -> CartPoleEquation:
+    """The cart-pole as someone may believe it to be, who has not measured it.
+
+    :func:`~gpadjust.systems.cart_pole` says from where masses and length are drawn; there is no
+    friction.
+
+    Raises:
+        TypeError: If ``seed`` is no whole number.
+        ValueError: If it is negative.
+    """
+    random = np.random.default_rng(checked_whole("seed", seed, 0))
+    drawn = random.uniform([0.4, 0.5, 0.5], [0.6, 0.7, 0.7])
+    cart_mass, pole_mass, pole_length = map(float, drawn)
+    return CartPoleEquation(cart_mass, pole_mass, pole_length, damping=0.0)
+
+
+def cart_pole_cost(states: Tensor, pole_length: float = REAL_CART_POLE.pole_length) -> Tensor:
+    r"""The cost of states, in [0, 1].
+
+    With the distance :math:`d` of the pole's tip from where it is when the pole stands upright
+    over the origin,
+
+    .. math:: c = 1 - \exp(-2 d^2), \qquad
+        d^2 = (x - l \sin\theta)^2 + (l \cos\theta - l)^2.
+
+    Args:
+        states: ``... x 4``.
+        pole_length: The length :math:`l` of the pole, in m.
+
+    Returns:
+        ``...``.
+    """
+    check_columns("states", states, 4)
+    x, theta = states[..., 0], states[..., 1]
+    across = x - pole_length * theta.sin()
+    up = pole_length * (theta.cos() - 1)
+    return -torch.expm1(-2 * (across.square() + up.square()))
+
+
+def cart_pole_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """The reward ``...`` of transitions: minus the cost of the next states ``... x 4``."""
+    return -cart_pole_cost(next_states)
+
+
+def cart_pole_start(n: int) -> Tensor:
+    r"""Draw ``n x 4`` start states, hanging at rest but for a spread, from PyTorch's generator.
+
+    Each is from :math:`\mathcal{N}([0, \pi, 0, 0], 0.2^2 I)`.
+    """
+    checked_whole("n", n, 0)
+    mean = torch.tensor(START_MEAN, dtype=torch.float64)
+    return mean + START_STD * torch.randn(n, 4, dtype=torch.float64)
+
+
+class CartPoleSwingUpEnv(ViewedEnv):
     r"""Swing up the pole of a cart-pole and balance it, by pushing the cart.
 
     The pole hangs at first. The action, a force in [-10, 10] N, is held for a time step; stronger
@@ -42,7 +259,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
     ``reset(options={"state": [x, theta, x_dot, theta_dot]})`` starts from this state.
 
     Environments can be pickled at any time and go on as they were, with their random state; the
-    window of a copy opens anew.
+    window of a copy opens again.
 
     Args:
         render_mode: ``"human"`` shows a window, ``"rgb_array"`` lets ``render`` return a frame.
@@ -68,6 +285,7 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         -0.004
     """
 
+    caption, size = "Cart-pole", SIZE
     metadata = {"render_modes": RENDER_MODES, "render_fps": round(1 / TIME_STEP)}  # noqa: RUF012
 
     def __init__(
@@ -104,9 +322,6 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
             options: ``{"state": ...}``, the four entries of the state to start from, of magnitude
                 at most 100. Default: drawn around the hanging pole at rest, with standard
                 deviation 0.2.
-
-        Returns:
-            The observation and an empty ``info``.
 
         Raises:
             TypeError: If ``options`` is no dictionary.
@@ -161,11 +376,72 @@ class CartPoleSwingUpEnv(ViewedEnv[CartPoleView]):
         self._show()
         return self._observe(self.state), -cost, False, False, {"cost": cost}
 
-    def _open_view(self, frames_per_second: int | None) -> CartPoleView:
-        return CartPoleView(self.equation.pole_length, MAX_FORCE, frames_per_second)
-
-    def _draw(self, view: CartPoleView, state: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        return view.draw(state[0], state[1], self._force)
+    def _draw(self, canvas: Any, state: NDArray[np.float64]) -> None:
+        x, theta = map(float, state[:2])
+        reach = 0.6 * self._force / MAX_FORCE
+        draw_cart_pole(canvas, x, theta, self.equation.pole_length, reach)
 
     def _observe(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
         return self.state_spec.observe(torch.from_numpy(state)).numpy().astype(np.float32)
+
+
+def cart_pole(
+    seed: int = 0,
+    *,
+    dry: float = 0.0,
+    drag: float = 0.0,
+    noise: Mapping[str, float] | None = None,
+    unknowns: bool = False,
+    encode_angle: bool = True,
+    time_step: float = TIME_STEP,
+    episode_length: int = 25,
+) -> System:
+    """The swing-up of a cart-pole; its physics has other masses, another length and no friction.
+
+    Its environment is :class:`CartPoleSwingUpEnv`.
+
+    Args:
+        seed: Of the physics, whose masses are drawn from U(0.4, 0.6) kg for the cart and
+            U(0.5, 0.7) kg for the pole, the length from U(0.5, 0.7) m.
+        dry: Dry friction of the real cart, in N, which no parameter of the physics describes.
+        drag: Drag of the real pole, in N m s²/rad², likewise.
+        noise: Standard deviations of the sensors' noise, by the name of the state.
+        unknowns: Whether masses, length and damping of the physics are unknown parameters.
+        encode_angle: As of the environment.
+        time_step: In s.
+        episode_length: In steps.
+
+    Raises:
+        TypeError: If an option is of another kind.
+        ValueError: If it is out of range.
+
+    Example:
+        >>> from gpadjust import systems
+        >>> systems.cart_pole(seed=1, unknowns=True).unknowns["damping"].prior_text
+        '0 to 1'
+    """
+    believed, named = believed_cart_pole(seed), None
+    if unknowns:
+        named = {
+            "cart_mass": Unknown(believed.cart_mass, factor=1.5, unit="kg"),
+            "pole_mass": Unknown(believed.pole_mass, factor=1.5, unit="kg"),
+            "pole_length": Unknown(believed.pole_length, factor=1.5, unit="m"),
+            "damping": Unknown(0.05, bounds=(0.0, 1.0), unit="N s/m"),
+        }
+    real: dict[str, Any] = {"encode_angle": encode_angle, "time_step": time_step}
+    real["equation"] = replace(REAL_CART_POLE, dry=dry, drag=drag)
+    spec = CART_POLE_SPEC if encode_angle else CART_POLE_RAW_SPEC
+    return System(
+        partial(_make, spec, noise, max_episode_steps=episode_length, **real),
+        spec,
+        equation_physics(believed, time_step, named),
+        cart_pole_reward,
+        start=cart_pole_start,
+        episode_length=episode_length,
+    )
+
+
+def _make(spec: StateSpec, noise: Mapping[str, float] | None, **options: Any) -> gym.Env[Any, Any]:
+    """The environment."""
+    env = gym.make("gpadjust/CartPoleSwingUp-v0", **options)
+    return NoisySensors(env, spec, noise) if noise else env

@@ -22,8 +22,8 @@ class ArmEquation:
 
     The plane is level, so there is no gravity. With the angles :math:`q = (\theta_s, \theta_e)` of
     shoulder and elbow (the elbow's relative to the upper arm; both grow with flexion), the masses
-    :math:`m_i`, lengths :math:`l_i`, distances :math:`c_i` of the centres of mass from the proximal
-    joints and moments of inertia :math:`I_i` about those centres,
+    :math:`m_i`, lengths :math:`l_i`, distances :math:`c_i` of the centers of mass from the proximal
+    joints and moments of inertia :math:`I_i` about those centers,
 
     .. math::
         M(q)\, \ddot{q} &= \tau - d\, \dot{q} - b \sin\theta_e
@@ -40,8 +40,8 @@ class ArmEquation:
     Args:
         masses: The masses of upper arm and forearm with hand, in kg.
         lengths: Their lengths, in m.
-        centres: The distances of their centres of mass from shoulder and elbow, in m.
-        inertias: Their moments of inertia about the centres of mass, in kg m².
+        centres: The distances of their centers of mass from shoulder and elbow, in m.
+        inertias: Their moments of inertia about the centers of mass, in kg m².
         damping: The damping :math:`d` of each joint, in N m s/rad.
         gains: The torques :math:`(g_s, g_e)` of a full action, in N m.
 
@@ -138,21 +138,16 @@ REAL_ARM = ArmEquation()
 """The links of the muscle arm; segments after Nijhof and Kouwenhoven (2000). No torques."""
 
 
-def torque_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
+def believed_arm(gains: tuple[float, float] = (8.0, 4.0)) -> ArmEquation:
     """The arm as someone may believe it to be, who has no model of its muscles.
 
-    Its links are a tenth too heavy, its joints damped twice as much as the real ones; the torques
-    follow the actions at once, whatever the angles, and nothing limits the joints.
-
-    Args:
-        gains: The torques of full actions at shoulder and elbow, in N m. The default suits muscles
-            of strength 0.5, which is the environment's; (5, 2.5) suits 0.3.
+    :func:`~gpadjust.systems.arm` says where it errs, and what the gains are.
 
     Raises:
         ValueError: If the gains are not two finite numbers that are not negative.
 
     Example:
-        >>> torque_arm().damping
+        >>> believed_arm().damping
         1.0
     """
     return replace(

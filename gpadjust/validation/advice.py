@@ -22,7 +22,7 @@ _ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
 
 class Gain(NamedTuple):
-    """By how much an output is predicted better with the physics than without it: the verdict.
+    """The gain of predictions of an output by the physics, and the verdict on it.
 
     Attributes:
         elpd: The difference of expected log predictive densities, the sum over the observations, in

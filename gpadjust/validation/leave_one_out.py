@@ -151,7 +151,7 @@ def leave_one_out(
 
 
 def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:
-    """Of observations ``... x n x m`` by Gaussians ``... x S x n x m``; NaN where there is none."""
+    """Return log densities ``... x n x m`` by Gaussians ``... x S x n x m``; NaN if missing."""
     spread = (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2, keepdim=True).sqrt()
     sd = torch.maximum(variance.sqrt(), ROUNDING * spread.unsqueeze(MCMC_DIM))
     normal = torch.distributions.Normal(mean, sd, validate_args=False)
@@ -176,7 +176,7 @@ def _mixture_of(
 
 
 def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
-    """Of the mixture of several models of one output."""
+    """Return leave-one-out predictions by the mixture of several models of one output."""
     numbers = torch.tensor([part.number for part in parts], dtype=torch.float64)
     weight = (numbers / numbers.sum()).reshape(-1, 1, 1)
     return mixed([leave_one_out(part.model) for part in parts], weight)
@@ -213,7 +213,7 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
 
 
 def _targets(model: Any) -> tuple[Tensor, Tensor]:
-    """As :meth:`~gpadjust.models.TermsGP.left_out`, for models of other libraries."""
+    """Return left-out predictions of targets, for models of other libraries."""
     inputs, y = model.train_inputs[0], model.train_targets
     covariance = to_dense(model.covar_module(inputs))
     residual = y - model.mean_module(inputs).expand(covariance.shape[:-1])

@@ -19,7 +19,7 @@ from functools import partial
 
 from scipy import stats
 
-from gpadjust.systems.cart_pole import TIME_STEP
+from gpadjust.systems.swing_up import TIME_STEP
 from paper.cartpole import SCENARIOS, Settings
 from paper.cartpole.control import PARTS, seconds_of_a_run
 from paper.common.verdicts import (

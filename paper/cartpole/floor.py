@@ -10,8 +10,7 @@ import torch
 from gpadjust.control import CrossEntropy, Planner, Return, Task
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.models.sampled_functions import seeded
-from gpadjust.systems.cart_pole import CART_POLE_SPEC, START_MEAN, cart_pole_reward
-from gpadjust.systems.swing_up import MAX_FORCE
+from gpadjust.systems.swing_up import CART_POLE_SPEC, MAX_FORCE, START_MEAN, cart_pole_reward
 from paper.cartpole import Floor, Settings
 from paper.cartpole.system import fixed_starts, true_physics
 from paper.common.experiment import Run, Table

@@ -29,7 +29,7 @@ from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.physics import Unknown
 from gpadjust.systems import NoisySensors, System, cart_pole
-from gpadjust.systems.cart_pole import (
+from gpadjust.systems.swing_up import (
     CART_POLE_SPEC,
     REAL_CART_POLE,
     START_MEAN,

@@ -13,7 +13,7 @@ from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.physics import ODEPhysics
 from gpadjust.rl import DynaSAC, ModelVecEnv
 from gpadjust.systems import cart_pole
-from gpadjust.systems.cart_pole import (
+from gpadjust.systems.swing_up import (
     REAL_CART_POLE,
     START_MEAN,
     START_STD,

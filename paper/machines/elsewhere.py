@@ -130,7 +130,7 @@ def verdicts(means: pd.DataFrame) -> list[Judged]:
         before = own[(own["kind"] == kind) & (own["variation"] == "none")]
         for column, text in (
             ("held", f"95 % hold at least {_LEAST}"),
-            ("width", f"widths at most {_WIDEST} times what holds .95"),
+            ("width", f"widths at most {_WIDEST} times what holds 0.95"),
         ):
             count += 1
             if mine.empty:

@@ -117,7 +117,7 @@ def verdicts(found: pd.DataFrame) -> list[Judged]:
     means["width"] = np.exp(means["width"])
     judged = []
     for id, labels, column, text, kept in (
-        ("K1", KINKS, "held", "each system with kinks: 95 % hold at least .90", means >= 0.9),
+        ("K1", KINKS, "held", "each system with kinks: 95 % hold at least 0.90", means >= 0.9),
         (
             "K2",
             SMOOTH,

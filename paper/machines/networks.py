@@ -143,18 +143,6 @@ class NetworkDynamics(Dynamics):
         """The mean square of the errors at the rows that were held out."""
         return self.spec.complete_variance(self._noise.expand(*states.shape[:-1], -1))
 
-    def describe(self) -> dict[str, str]:
-        """The class."""
-        return {"class": type(self).__name__}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Not there: runs are short."""
-        raise NotImplementedError
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Not there, either."""
-        raise NotImplementedError
-
     def _train(self, networks: Networks, X: Tensor, Y: Tensor, shares: Tensor) -> Tensor:
         """Train all networks at once; return the mean square of the errors, held out."""
         Z, held_out = self._normalized(X).expand(self.number, -1, -1), shares == 0

@@ -14,7 +14,7 @@ from torch import Tensor
 from gpadjust.dynamics import AngleInput
 from gpadjust.physics import ODEPhysics
 from gpadjust.systems import CartPoleEquation, cart_pole
-from gpadjust.systems.cart_pole import REAL_CART_POLE, SUBSTEP, TIME_STEP
+from gpadjust.systems.swing_up import REAL_CART_POLE, SUBSTEP, TIME_STEP
 from paper.common.learners import LEARNERS
 from paper.forrester.problem import LOWER, UPPER, crude_b, truth
 from paper.pairs.functions import pair

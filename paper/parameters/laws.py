@@ -46,21 +46,37 @@ class Problem:
 
 @dataclass(frozen=True)
 class Case:
-    """Observations of a law whose parameters were drawn from their prior.
+    """Observations of a system, and a law of it.
 
     Attributes:
         X: Inputs, ``n x d``.
+        system: The system there without noise, ``n x 1``; it need not be the law's.
         Y: Observations, ``n x 1``.
         physics: The law.
-        true: Its parameters, ``p``.
+        true: The parameters that the system has, in so far as it has any.
         noise: The standard deviation of the noise.
     """
 
     X: Tensor
+    system: Tensor
     Y: Tensor
     physics: FunctionPhysics
-    true: Tensor
+    true: Mapping[str, float]
     noise: float
+
+    @property
+    def best(self) -> dict[str, float]:
+        """The parameters with which the physics describes the system best, by least squares."""
+        unknowns = self.physics.unknowns
+
+        def errors(values: Values) -> Values:
+            found = self.physics(self.X, torch.from_numpy(values))
+            error: Values = (found - self.system).flatten().numpy()
+            return error
+
+        start = unknowns.guess.numpy()
+        found = least_squares(errors, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        return dict(zip(unknowns.names, found.x.tolist(), strict=True))
 
 
 def case(name: str, seed: int) -> Case:
@@ -74,7 +90,9 @@ def case(name: str, seed: int) -> Case:
     z = torch.randn(len(problem.unknowns), generator=generator, dtype=torch.float64)
     true = physics.unknowns.at(z)
     noise = torch.randn(len(X), 1, generator=generator, dtype=torch.float64)
-    return Case(X, physics(X, true) + problem.noise * noise, physics, true, problem.noise)
+    system = physics(X, true)
+    named = dict(zip(problem.unknowns, true.tolist(), strict=True))
+    return Case(X, system, system + problem.noise * noise, physics, named, problem.noise)
 
 
 def _beam(X: Tensor, p: ParameterValues) -> Tensor:
@@ -191,128 +209,58 @@ PROBLEMS = {
 }
 
 
-@dataclass(frozen=True)
-class TextbookCase:
-    """A case of a problem.
-
-    Args:
-        law: The physics, of one input and one output.
-        unknowns: Its unknown parameters.
-        X: Inputs, ``n x 1``.
-        system: What the system does there, ``n x 1``, and what is observed but for noise.
-        noise: The standard deviation of that.
-        true: The parameters that the system has, in so far as it has any.
-        seed: Of the noise.
-    """
-
-    law: Callable[[Tensor, ParameterValues], Tensor]
-    unknowns: Mapping[str, Unknown]
-    X: Tensor
-    system: Tensor
-    noise: float
-    true: Mapping[str, float]
-    seed: int
-
-    @property
-    def physics(self) -> FunctionPhysics:
-        """The physics."""
-        return FunctionPhysics(self.law, unknowns=self.unknowns, name="law")
-
-    @property
-    def observations(self) -> Tensor:
-        """What is observed, ``n x 1``."""
-        generator = torch.Generator().manual_seed(1000 + self.seed)
-        noise = torch.randn(self.system.shape, generator=generator, dtype=torch.float64)
-        return self.system + self.noise * noise
-
-    @property
-    def best(self) -> dict[str, float]:
-        """The parameters with which the physics describes the system best, by least squares."""
-        physics, names = self.physics, [*self.unknowns]
-
-        def errors(values: Values) -> Values:
-            found = physics(self.X, torch.from_numpy(values))
-            error: Values = (found - self.system).flatten().numpy()
-            return error
-
-        start = physics.unknowns.guess.numpy()
-        found = least_squares(errors, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-        return dict(zip(names, found.x.tolist(), strict=True))
+def textbook_case(problem: str, seed: int) -> Case:
+    """The case of a textbook problem that a seed draws."""
+    draw = np.random.default_rng(seed)
+    law, unknowns, X, system, noise, true = _TEXTBOOK[problem](draw)
+    generator = torch.Generator().manual_seed(1000 + seed)
+    white = torch.randn(system.shape, generator=generator, dtype=torch.float64)
+    physics = FunctionPhysics(law, unknowns=unknowns, name="law")
+    return Case(X, system, system + noise * white, physics, true, noise)
 
 
-def textbook_case(problem: str, seed: int) -> TextbookCase:
-    """The case of a problem that a seed draws."""
-    return _TEXTBOOK[problem](np.random.default_rng(seed), seed)
+_Drawn = tuple[Law, dict[str, Unknown], Tensor, Tensor, float, dict[str, float]]
 
 
-def _right(draw: np.random.Generator, seed: int) -> TextbookCase:
+def _right(draw: np.random.Generator) -> _Drawn:
     size, rate = draw.normal(5, 1), math.exp(draw.normal(0, 0.3))
     unknowns = {"size": Unknown(5.0, sd=1.0), "rate": Unknown(1.0, factor=math.exp(0.3))}
-    X = _grid(0.1, 3, 15)
-    true = {"size": size, "rate": rate}
-    return TextbookCase(
-        lambda X, p: p.size * (1 - (-p.rate * X[:, 0]).exp()),
-        unknowns,
-        X,
-        size * (1 - (-rate * X).exp()),
-        0.1,
-        true,
-        seed,
-    )
+    X, true = _grid(0.1, 3, 15), {"size": size, "rate": rate}
+
+    def grown(X: Tensor, p: ParameterValues) -> Tensor:
+        return p.size * (1 - (-p.rate * X[:, 0]).exp())
+
+    return grown, unknowns, X, size * (1 - (-rate * X).exp()), 0.1, true
 
 
-def _smooth(draw: np.random.Generator, seed: int) -> TextbookCase:
+def _smooth(draw: np.random.Generator) -> _Drawn:
     slope, frequency = draw.uniform(2, 5), draw.uniform(4, 7)
-    X = _grid(0.02, 1, 17)
+    X, unknowns = _grid(0.02, 1, 17), {"slope": Unknown(3.0, sd=2.0)}
     system = slope * X + X * (frequency * X).sin()
-    return TextbookCase(
-        lambda X, p: p.slope * X[:, 0], {"slope": Unknown(3.0, sd=2.0)}, X, system, 0.02, {}, seed
-    )
+    return lambda X, p: p.slope * X[:, 0], unknowns, X, system, 0.02, {}
 
 
-def _confounded(draw: np.random.Generator, seed: int) -> TextbookCase:
+def _confounded(draw: np.random.Generator) -> _Drawn:
     rate, rest = draw.uniform(1.2, 2.2), draw.uniform(0.5, 2)
-    X = _grid(0.1, 3, 20)
+    X, unknowns = _grid(0.1, 3, 20), {"rate": Unknown(1.0, factor=2.0)}
     system = 3.5 * (-rate * X).exp() + rest
-    true = {"rate": rate}
-    return TextbookCase(
-        lambda X, p: 5 * (-p.rate * X[:, 0]).exp(),
-        {"rate": Unknown(1.0, factor=2.0)},
-        X,
-        system,
-        0.1,
-        true,
-        seed,
-    )
+    return lambda X, p: 5 * (-p.rate * X[:, 0]).exp(), unknowns, X, system, 0.1, {"rate": rate}
 
 
-def _ball(draw: np.random.Generator, seed: int) -> TextbookCase:
+def _ball(draw: np.random.Generator) -> _Drawn:
     height, drag = draw.uniform(40, 60), draw.uniform(0.002, 0.02)  # m, 1/m
-    X = _grid(0.05, 2, 20)
+    X, true = _grid(0.05, 2, 20), {"gravity": GRAVITY, "height": height}
     fallen = (math.sqrt(GRAVITY * drag) * X).cosh().log() / drag
-    unknowns = {
-        "gravity": Unknown(9.0, sd=2.0, unit="m/s²"),
-        "height": Unknown(50.0, sd=20.0, unit="m"),
-    }
-    true = {"gravity": GRAVITY, "height": height}
-    return TextbookCase(
-        lambda X, p: p.height - 0.5 * p.gravity * X[:, 0].square(),
-        unknowns,
-        X,
-        height - fallen,
-        0.05,
-        true,
-        seed,
-    )
+    gravity, start = Unknown(9.0, sd=2.0, unit="m/s²"), Unknown(50.0, sd=20.0, unit="m")
+
+    def fall(X: Tensor, p: ParameterValues) -> Tensor:
+        return p.height - 0.5 * p.gravity * X[:, 0].square()
+
+    return fall, {"gravity": gravity, "height": start}, X, height - fallen, 0.05, true
 
 
 def _grid(low: float, high: float, n: int) -> Tensor:
     return torch.linspace(low, high, n, dtype=torch.float64).unsqueeze(-1)
 
 
-_TEXTBOOK: dict[str, Callable[[np.random.Generator, int], TextbookCase]] = {
-    "right": _right,
-    "smooth": _smooth,
-    "confounded": _confounded,
-    "ball": _ball,
-}
+_TEXTBOOK = {"right": _right, "smooth": _smooth, "confounded": _confounded, "ball": _ball}

@@ -48,17 +48,18 @@ def run(experiment: Parameters, problem: str, model: str, seed: int) -> Run:
     warnings.simplefilter("ignore", SamplingWarning)
     warnings.simplefilter("ignore", ParameterWarning)
     known = textbook_case(problem, seed)
-    fitted: Any = MODELS[model](known.X, known.observations, physics=known.physics)
+    fitted: Any = MODELS[model](known.X, known.Y, physics=known.physics)
     begin = time.perf_counter()
     fit(fitted)
     seconds = time.perf_counter() - begin
     low, high = (end.tolist() for end in fitted.physics_parameters.interval())
+    best = known.best
     with torch.no_grad():
         mean = fitted.predict(known.X).mean
         lower, upper = fitted.interval(known.X)
     return {
-        "intervals": {name: [low[i], high[i]] for i, name in enumerate(known.unknowns)},
-        "best": known.best,
+        "intervals": {name: [low[i], high[i]] for i, name in enumerate(best)},
+        "best": best,
         "true": dict(known.true),
         "rmse": rmse(mean, known.system).item(),
         "coverage": _share((lower <= known.system) & (known.system <= upper)),

@@ -8,7 +8,7 @@ import torch
 from gpadjust.control import MPC, Planned, Task
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.systems import cart_pole
-from gpadjust.systems.cart_pole import (
+from gpadjust.systems.swing_up import (
     CART_POLE_SPEC,
     REAL_CART_POLE,
     cart_pole_reward,

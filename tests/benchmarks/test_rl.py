@@ -9,7 +9,7 @@ from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
 from gpadjust.systems import cart_pole
-from gpadjust.systems.cart_pole import CART_POLE_SPEC, cart_pole_reward
+from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import torch
 from gpadjust import CKA, CalibratedPhysics, PhysicsMeanGP, Unknown
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.systems import CartPoleSwingUpEnv
-from gpadjust.systems.cart_pole import CART_POLE_SPEC, CartPoleEquation, equation_physics
+from gpadjust.systems.swing_up import CART_POLE_SPEC, CartPoleEquation, equation_physics
 
 UNKNOWNS = {
     "cart_mass": Unknown(0.6, factor=1.5, unit="kg"),

@@ -41,7 +41,7 @@ def test_numbers_are_in_the_users_units(uniform):
     scale = model.outcome_transform.stdvs.item()
     text = model.summary()
     assert repr(model) in text
-    assert repr(model) == "CKA of 'crude': 8 points, 2 inputs, 1 output"
+    assert repr(model) == "CKA of 'crude': 8 points, 2 inputs, 1 output, not fitted"
     with torch.no_grad():
         ranges = (X.amax(0) - X.amin(0)).tolist()
         lengths = [f"lengthscale of x{i + 1}: {0.5 * ranges[i]:.4g}" for i in range(2)]

@@ -8,7 +8,7 @@ import torch
 
 from gpadjust.control.checkpoint import RandomState
 from gpadjust.physics import ODEPhysics
-from gpadjust.systems.torque_arm import ARM_TIME_STEP, torque_arm
+from gpadjust.systems.torque_arm import ARM_TIME_STEP, believed_arm
 from paper.arm import Arm, Reaching, ReachingSettings, Settings
 from paper.arm import system as arm_system
 from paper.arm.arm import load_maps
@@ -85,7 +85,7 @@ class TestArm:
         settings = replace(TINY_ARM, episodes=2, evaluate_every=2, map_after=9)
         experiment = Arm(out=tmp_path, runs=2, jobs=1, only=("cka", "mf"), settings=settings)
         main(experiment)
-        assert "A4  Dyna-CKA" in capsys.readouterr().out
+        assert "A4   Dyna-CKA" in capsys.readouterr().out
         assert (tmp_path / "curves.png").stat().st_size > 5_000
         record = runs_file(experiment).read()["cka", 1]
         assert record["evaluations"]["episode"] == [0, 2]
@@ -175,7 +175,7 @@ def test_all_models_are_known(system, learner):
 
 def physics(gains=None, **changes):
     """A time step of a torque arm."""
-    equation = replace(torque_arm(gains) if gains else torque_arm(), **changes)
+    equation = replace(believed_arm(gains) if gains else believed_arm(), **changes)
     return ODEPhysics(equation, step=ARM_TIME_STEP, state_dim=4, substeps=8)
 
 

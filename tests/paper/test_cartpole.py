@@ -9,7 +9,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gpadjust.control.checkpoint import RandomState
-from gpadjust.systems.cart_pole import REAL_CART_POLE, START_MEAN, equation_physics
+from gpadjust.systems.swing_up import REAL_CART_POLE, START_MEAN, equation_physics
 from paper.arm import Arm
 from paper.arm import Settings as ArmSettings
 from paper.arm import system as arm_system

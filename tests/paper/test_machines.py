@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from gpadjust.dynamics import PhysicsDynamics, Trajectories
-from gpadjust.systems.cart_pole import CART_POLE_SPEC
+from gpadjust.systems.swing_up import CART_POLE_SPEC
 from paper.common.runner import main, runs_file
 from paper.common.runs import rounded
 from paper.machines import (

@@ -22,7 +22,8 @@ def line(seed):
     law = FunctionPhysics(lambda X, p: p.a + p.b * X[:, 0], unknowns=unknowns)
     true = torch.tensor([0.4, -0.7], dtype=torch.float64)
     noise = torch.randn(12, 1, generator=generator, dtype=torch.float64)
-    return Case(X, law(X, true) + 0.1 * noise, law, true, 0.1)
+    system = law(X, true)
+    return Case(X, system, system + 0.1 * noise, law, {"a": 0.4, "b": -0.7}, 0.1)
 
 
 def test_references_agree_on_a_line():
@@ -53,7 +54,9 @@ def test_distance_of_distributions():
 def test_cases_are_of_their_law(name):
     known = case(name, 7)
     assert known.X.shape[0] == PROBLEMS[name].number
-    misfit = (known.Y - known.physics(known.X, known.true)).square().mean().sqrt()
+    true = torch.tensor([*known.true.values()], dtype=torch.float64)
+    torch.testing.assert_close(known.system, known.physics(known.X, true))
+    misfit = (known.Y - known.system).square().mean().sqrt()
     assert 0.4 < misfit / known.noise < 1.8
     assert name == NINE or name in RIDGES + FOLDS
 

@@ -29,7 +29,6 @@ class Toy(Experiment):
     jobs: int = 1
     scale: float = 1.0
 
-    name: ClassVar[str] = "toy"
     axes: ClassVar[Axes] = {"kind": {"a": "the first", "b": "the second"}}
     packages: ClassVar[tuple[str, ...]] = ("gpadjust", "numpy")
 
@@ -367,4 +366,4 @@ def test_runs_on_ray(tmp_path):
     settings = Settings(steps=1, lengthscales=(0.5,), ridges=(0.01,))
     experiment = Forrester(out=tmp_path, runs=2, jobs=2, backend="ray", settings=settings)
     run_missing(experiment)
-    assert len(runs_file(experiment).read()) == 10
+    assert len(runs_file(experiment).read()) == 12

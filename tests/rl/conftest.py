@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from gpadjust.control import Task
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.rl import DynaOptions, DynaSAC
-from gpadjust.systems.cart_pole import CART_POLE_SPEC, REAL_CART_POLE, equation_physics
+from gpadjust.systems.swing_up import CART_POLE_SPEC, REAL_CART_POLE, equation_physics
 from tests.point import *  # noqa: F403
 from tests.point import assert_equal
 

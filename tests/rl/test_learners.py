@@ -9,7 +9,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from gpadjust.control import Task
 from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
 from gpadjust.rl.buffer import CompactReplayBuffer
-from gpadjust.systems.cart_pole import cart_pole_reward, cart_pole_start
+from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
 from tests.rl.conftest import model_rows
 
 

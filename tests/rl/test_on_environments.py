@@ -9,8 +9,8 @@ from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.rl import DynaOptions, DynaSAC
 from gpadjust.systems import CartPoleSwingUpEnv, RememberAction, arm, cart_pole
-from gpadjust.systems.cart_pole import CART_POLE_RAW_SPEC, cart_pole_reward, cart_pole_start
 from gpadjust.systems.reaching import ARM_SPEC, arm_reward
+from gpadjust.systems.swing_up import CART_POLE_RAW_SPEC, cart_pole_reward, cart_pole_start
 
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "device": "cpu"}
 

@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 from gpadjust.dynamics import PhysicsDynamics
 from gpadjust.physics import ODEPhysics
 from gpadjust.systems import CartPoleEquation, cart_pole, hand_distance_cm
-from gpadjust.systems.cart_pole import (
+from gpadjust.systems.reaching import arm_start, hand_position
+from gpadjust.systems.swing_up import (
     CART_POLE_RAW_SPEC,
     CART_POLE_SPEC,
     REAL_CART_POLE,
@@ -21,7 +22,6 @@ from gpadjust.systems.cart_pole import (
     cart_pole_start,
     equation_physics,
 )
-from gpadjust.systems.reaching import arm_start, hand_position
 
 PARAMETERS = [(0.5, 0.5, 0.6, 0.1), (1.3, 0.2, 0.9, 0.0)]
 

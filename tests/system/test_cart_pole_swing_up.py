@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from gpadjust.systems import CartPoleEquation, CartPoleSwingUpEnv
-from gpadjust.systems.cart_pole import (
+from gpadjust.systems.swing_up import (
     CART_POLE_SPEC,
     REAL_CART_POLE,
     cart_pole_cost,

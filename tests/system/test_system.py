@@ -1,6 +1,8 @@
 """A system in one object: its environment, its task, its physics with and without unknowns."""
 
 import pickle
+from pathlib import Path
+from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
@@ -11,9 +13,9 @@ from gpadjust import systems
 from gpadjust.control import Task
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.systems import NoisySensors, System
-from gpadjust.systems.cart_pole import REAL_CART_POLE, believed_cart_pole, equation_physics
 from gpadjust.systems.reaching import ARM_MEMORY_SPEC
-from gpadjust.systems.torque_arm import torque_arm
+from gpadjust.systems.swing_up import REAL_CART_POLE, believed_cart_pole, equation_physics
+from gpadjust.systems.torque_arm import believed_arm
 
 SPEC = StateSpec(["x", "v"], ["force"])
 arm_needs_opensim = pytest.mark.skipif(
@@ -126,6 +128,13 @@ def test_environment_and_task_agree():
     assert task.rewards(before, torch.tensor([[2.0]]).double(), after).item() == pytest.approx(paid)
 
 
+def test_no_system_hides_a_module():
+    """`import gpadjust.systems.cart_pole as m` gave the function of that name."""
+    for path in Path(systems.__file__).parent.glob("[!_]*.py"):
+        found = getattr(systems, path.stem, None)
+        assert found is None or isinstance(found, ModuleType), path.stem
+
+
 @pytest.mark.parametrize("make", [systems.cart_pole, systems.arm])
 def test_unknown_parameters_make_the_same_physics_of_their_guesses(make):
     known, unknown = make(), make(unknowns=True)
@@ -147,7 +156,7 @@ def test_each_row_has_the_parameters_that_it_is_given():
         equation = systems.CartPoleEquation(*values.tolist())
         torch.testing.assert_close(found, equation_physics(equation)(X), rtol=1e-12, atol=1e-12)
     states, actions = states_and_actions(4)
-    crude = torque_arm()
+    crude = believed_arm()
     factor = {"masses": (crude.masses[0], 1.3 * crude.masses[1])}
     factor["inertias"] = (crude.inertias[0], 1.3 * crude.inertias[1])
     heavier = systems.ArmEquation(
