@@ -9,8 +9,23 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_columns
-from gpadjust.dynamics.free_run import FreeRun, free_run
+from gpadjust.checks import check_columns, check_level
+from gpadjust.dynamics.free_run import (
+    FreeRun,
+    check_start,
+    checked_noise,
+    with_lags,
+    without_jumps,
+)
+from gpadjust.dynamics.particles import (
+    about_center,
+    central_interval,
+    check_enough,
+    measurement_noise,
+    move_on,
+    of_states,
+    step_or_nan,
+)
 from gpadjust.dynamics.state import fingerprint
 from gpadjust.dynamics.targets import check_spec
 from gpadjust.dynamics.trajectories import Trajectories, check_doubles
@@ -18,6 +33,7 @@ from gpadjust.models import Prediction
 from gpadjust.states import StateSpec
 from gpadjust.validation import Scores
 
+_ROWS = 1024  # whose noise is asked for at once
 TransitionFunctions = Callable[[Tensor, Tensor], Tensor]
 """Functions from states and actions, ``k x N x ...``, to next states: a sample of the dynamics."""
 
@@ -175,19 +191,80 @@ class Dynamics(ABC):
             tensor([0.1000, 0.2000, 0.3000], dtype=torch.float64)
         """
         sample_functions = self.sample_functions if variation is None else self._varied(variation)
-        return free_run(
-            self.spec,
-            sample_functions,
-            self.noise_variance,
-            initial_states,
-            actions,
-            num_functions=num_functions,
+        spec = self.spec
+        check_start(spec, initial_states, actions)
+        check_level(level)
+        check_enough(num_functions, level)
+        if state_bounds is not None:
+            state_bounds = of_states(state_bounds, "state_bounds", (2, spec.state_dim))
+        start_noise, process_noise = (
+            checked_noise(spec, given, name)
+            for given, name in ((start_noise, "start_noise"), (process_noise, "process_noise"))
+        )
+        sensors = None if isinstance(noise, bool) else checked_noise(spec, noise, "noise")
+        if noise is True and isinstance(process_noise, str):
+            raise ValueError(
+                "The learnt noise moves particles on (process_noise='learnt'), so that it is not "
+                "that of measurements as well; say the noise of these, such as "
+                "noise=smoothed.noise of smooth(records, physics), or noise=False."
+            )
+        generator = torch.Generator().manual_seed(seed)
+        # Dynamics of a user's may draw from PyTorch's generator all the same.
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            functions = sample_functions(num_functions, seed)
+            particles = initial_states.expand(num_functions, -1, -1)
+            if isinstance(start_noise, str):
+                variance = step_or_nan(self.noise_variance, initial_states, actions[:, 0])
+                start_noise = with_lags(spec, (variance.nan_to_num(nan=0.0) / 2).sqrt())
+            if start_noise is not None:
+                error = start_noise.expand_as(initial_states)
+                particles = particles + measurement_noise(spec, error, num_functions, generator)
+            lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
+            path, lost_by_then = [], []
+            for each in actions.unbind(1):
+                before, added = particles, None
+                if not isinstance(process_noise, str):
+                    added = process_noise
+                else:
+                    middle = about_center(spec, particles)[0]
+                    variance = step_or_nan(self.noise_variance, middle, each)
+                    added = variance.nan_to_num(nan=0.0).sqrt()
+                particles, lost = move_on(functions, particles, lost, each, state_bounds)
+                if added is not None:
+                    error = torch.zeros_like(initial_states)
+                    error[:, spec.moving] = added.expand_as(initial_states)[:, spec.moving]
+                    moved = measurement_noise(spec, error, num_functions, generator)
+                    particles = particles + moved.masked_fill(lost.unsqueeze(-1), 0.0)
+                    if state_bounds is not None:
+                        low, high = state_bounds
+                        lost = lost | ((particles < low) | (particles > high)).any(-1)
+                        particles = torch.where(lost.unsqueeze(-1), before, particles)
+                path.append(particles)
+                lost_by_then.append(lost.double().mean(0))
+            center, cloud = about_center(spec, torch.stack(path, dim=2))
+            center = without_jumps(spec, initial_states, center)
+            mean = center + cloud.mean(0)
+            if isinstance(sensors, Tensor):
+                error = sensors.expand_as(center)
+                cloud = cloud + measurement_noise(spec, error, num_functions, generator)
+            elif noise:
+                before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
+                rows = (each.flatten(0, 1).split(_ROWS) for each in (before, actions))
+                parts = zip(*rows, strict=True)
+                variances = [step_or_nan(self.noise_variance, *part) for part in parts]
+                scatter = with_lags(spec, torch.cat(variances).sqrt().view_as(center))
+                cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
+        low, high = central_interval(cloud, level)
+        return FreeRun(
+            mean=mean,
+            lower=center + low,
+            upper=center + high,
+            particles=center + cloud,
+            lost=torch.stack(lost_by_then, 1),
+            spec=spec,
             level=level,
-            noise=noise,
-            start_noise=start_noise,
-            process_noise=process_noise,
-            state_bounds=state_bounds,
-            seed=seed,
+            initial_states=initial_states,
         )
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_finite, check_level, checked_whole
-from gpadjust.dynamics.particles import (
-    Move,
-    about_center,
-    central_interval,
-    check_enough,
-    measurement_noise,
-    move_on,
-    of_states,
-    step_or_nan,
-)
+from gpadjust.checks import check_finite, checked_whole
+from gpadjust.dynamics.particles import of_states
 from gpadjust.dynamics.trajectories import check_doubles
 from gpadjust.states import StateSpec
 from gpadjust.validation import Scores, energy_score
 
-_ROWS = 1024  # whose noise is asked for at once
 _CERTAIN = 1e-9  # of how far the means range: a spread that is one of rounding errors
 
 
@@ -166,97 +156,7 @@ def checked_horizons(horizons: Sequence[int]) -> tuple[int, ...]:
     return tuple(sorted(given))
 
 
-def free_run(
-    spec: StateSpec,
-    sample_functions: Callable[[int, int], Move],
-    noise_variance: Move,
-    initial_states: Tensor,
-    actions: Tensor,
-    *,
-    num_functions: int,
-    level: float,
-    noise: Tensor | bool,
-    start_noise: Tensor | Literal["learnt"] | None,
-    process_noise: Tensor | Literal["learnt"] | None,
-    state_bounds: Tensor | None,
-    seed: int,
-) -> FreeRun:
-    """Free runs of dynamics; for the arguments see :meth:`~gpadjust.dynamics.Dynamics.free_run`."""
-    _check_start(spec, initial_states, actions)
-    check_level(level)
-    check_enough(num_functions, level)
-    if state_bounds is not None:
-        state_bounds = of_states(state_bounds, "state_bounds", (2, spec.state_dim))
-    start_noise, process_noise = (
-        _checked_noise(spec, given, name)
-        for given, name in ((start_noise, "start_noise"), (process_noise, "process_noise"))
-    )
-    sensors = None if isinstance(noise, bool) else _checked_noise(spec, noise, "noise")
-    if noise is True and isinstance(process_noise, str):
-        raise ValueError(
-            "The learnt noise moves particles on (process_noise='learnt'), so that it is not that "
-            "of measurements as well; say the noise of these, such as noise=smoothed.noise of "
-            "smooth(records, physics), or noise=False."
-        )
-    generator = torch.Generator().manual_seed(seed)
-    # Dynamics of a user's may draw from PyTorch's generator all the same.
-    with torch.no_grad(), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        functions = sample_functions(num_functions, seed)
-        particles = initial_states.expand(num_functions, -1, -1)
-        if isinstance(start_noise, str):
-            variance = step_or_nan(noise_variance, initial_states, actions[:, 0])
-            start_noise = _with_lags(spec, (variance.nan_to_num(nan=0.0) / 2).sqrt())
-        if start_noise is not None:
-            error = start_noise.expand_as(initial_states)
-            particles = particles + measurement_noise(spec, error, num_functions, generator)
-        lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
-        path, lost_by_then = [], []
-        for each in actions.unbind(1):
-            before, added = particles, None
-            if not isinstance(process_noise, str):
-                added = process_noise
-            else:
-                middle = about_center(spec, particles)[0]
-                added = step_or_nan(noise_variance, middle, each).nan_to_num(nan=0.0).sqrt()
-            particles, lost = move_on(functions, particles, lost, each, state_bounds)
-            if added is not None:
-                error = torch.zeros_like(initial_states)
-                error[:, spec.moving] = added.expand_as(initial_states)[:, spec.moving]
-                moved = measurement_noise(spec, error, num_functions, generator)
-                particles = particles + moved.masked_fill(lost.unsqueeze(-1), 0.0)
-                if state_bounds is not None:
-                    low, high = state_bounds
-                    lost = lost | ((particles < low) | (particles > high)).any(-1)
-                    particles = torch.where(lost.unsqueeze(-1), before, particles)
-            path.append(particles)
-            lost_by_then.append(lost.double().mean(0))
-        center, cloud = about_center(spec, torch.stack(path, dim=2))
-        center = _without_jumps(spec, initial_states, center)
-        mean = center + cloud.mean(0)
-        if isinstance(sensors, Tensor):
-            error = sensors.expand_as(center)
-            cloud = cloud + measurement_noise(spec, error, num_functions, generator)
-        elif noise:
-            before = torch.cat([initial_states.unsqueeze(1), mean[:, :-1]], dim=1)
-            rows = before.flatten(0, 1).split(_ROWS), actions.flatten(0, 1).split(_ROWS)
-            variances = [step_or_nan(noise_variance, *part) for part in zip(*rows, strict=True)]
-            scatter = _with_lags(spec, torch.cat(variances).sqrt().view_as(center))
-            cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
-    low, high = central_interval(cloud, level)
-    return FreeRun(
-        mean=mean,
-        lower=center + low,
-        upper=center + high,
-        particles=center + cloud,
-        lost=torch.stack(lost_by_then, 1),
-        spec=spec,
-        level=level,
-        initial_states=initial_states,
-    )
-
-
-def _checked_noise(
+def checked_noise(
     spec: StateSpec, given: Tensor | str | None, name: str
 ) -> Tensor | Literal["learnt"] | None:
     """Standard deviations ``state_dim`` as the user said them, or what else was said."""
@@ -276,7 +176,7 @@ def _checked_noise(
     return sd
 
 
-def _with_lags(spec: StateSpec, noise: Tensor) -> Tensor:
+def with_lags(spec: StateSpec, noise: Tensor) -> Tensor:
     """Noise ``... x state_dim`` of measured states, whose lags were measured alike."""
     noise = noise.clone()
     for name in spec.previous:
@@ -288,7 +188,7 @@ def _with_lags(spec: StateSpec, noise: Tensor) -> Tensor:
     return noise
 
 
-def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:
+def without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Tensor:
     """A path ``w x T x state_dim`` whose angles go on from those of the initial states."""
     path, angles = path.clone(), spec.angle_columns
     before = torch.cat([initial_states.unsqueeze(1), path[:, :-1]], dim=1)
@@ -297,7 +197,7 @@ def _without_jumps(spec: StateSpec, initial_states: Tensor, path: Tensor) -> Ten
     return path
 
 
-def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> None:
+def check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> None:
     """Raise an error unless each state has a sequence of actions, all of them finite."""
     check_doubles("initial_states", initial_states, spec.state_dim)
     check_doubles("actions", actions, spec.action_dim)

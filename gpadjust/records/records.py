@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -288,7 +288,7 @@ class Records:
         )
 
 
-def _columns(given: Any, names: tuple[str, ...], argument: str) -> dict[str, Any]:
+def _columns(given: Any, names: Sequence[str], argument: str) -> dict[str, Any]:
     """The column of each name: the one given, or else that of the same name."""
     given = {} if given is None else given
     if not isinstance(given, Mapping):
@@ -297,5 +297,7 @@ def _columns(given: Any, names: tuple[str, ...], argument: str) -> dict[str, Any
             f"{{{names[0]!r}: 'q'}}, found {given!r}."
         )
     if unknown := [name for name in given if name not in names]:
-        raise ValueError(f"There is no {unknown[0]!r} among the {argument} of the spec, {names}.")
+        raise ValueError(
+            f"There is no {unknown[0]!r} among the {argument} of the spec, {tuple(names)}."
+        )
     return {name: given.get(name, name) for name in names}

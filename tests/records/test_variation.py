@@ -7,7 +7,7 @@ import torch
 
 from gpadjust import CalibratedPhysics
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
-from gpadjust.dynamics.varying_parameters import varying_parameters
+from gpadjust.dynamics.particles import varying_parameters
 from gpadjust.models import PhysicsParameters
 from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
@@ -157,7 +157,7 @@ def test_bad_variations(varied, variation, message):
     states, actions = torch.zeros(1, 2).double(), torch.zeros(1, 2, 1).double()
     with pytest.raises(ValueError, match=message):
         varied[1].free_run(states, actions, variation=variation)
-    with pytest.raises(TypeError, match="variation as a number"):
+    with pytest.raises(TypeError, match="variation to be real numbers"):
         varied[1].free_run(states, actions, variation="much")
 
 
