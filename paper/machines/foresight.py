@@ -39,8 +39,9 @@ def run(experiment: Foresight, system: str, seed: int) -> Run:
     agent.learn(experiment.settings.trials * length, log_interval=experiment.settings.trials + 1)
     seconds = time.process_time() - start
     made = agent.recorded_episodes()
-    parts: Any = (part.split(length) for part in (made.states, made.actions, made.next_states))
-    trials = [Trajectories(*rows, episode=torch.zeros(length)) for rows in zip(*parts, strict=True)]
+    parts = (part.split(length) for part in (made.states, made.actions, made.next_states))
+    episode = torch.zeros(length)
+    trials = [Trajectories(x, u, after, episode) for x, u, after in zip(*parts, strict=True)]
     rewards = [each.mean().item() for each in made.rewards.split(length)]
     found: dict[str, Any] = {"agent_seconds": seconds, "rewards": rewards}
     for noise in NOISES:

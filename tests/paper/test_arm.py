@@ -85,7 +85,7 @@ class TestArm:
         settings = replace(TINY_ARM, episodes=2, evaluate_every=2, map_after=9)
         experiment = Arm(out=tmp_path, runs=2, jobs=1, only=("cka", "mf"), settings=settings)
         main(experiment)
-        assert "A4  Dyna-CKA" in capsys.readouterr().out
+        assert "A4   Dyna-CKA" in capsys.readouterr().out
         assert (tmp_path / "curves.png").stat().st_size > 5_000
         record = runs_file(experiment).read()["cka", 1]
         assert record["evaluations"]["episode"] == [0, 2]

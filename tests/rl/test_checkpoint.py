@@ -67,8 +67,8 @@ def go_on(agent, *callbacks):
     ("kind", "step", "layers"),
     [
         ("physics", 6, ("normalised",)),
-        ("cka", 13, ()),
         ("cka", 13, ("monitored", "normalised")),
+        pytest.param("cka", 13, (), marks=pytest.mark.slow),
         pytest.param("physics", 6, (), marks=pytest.mark.slow),
         pytest.param("physics", 6, ("monitored", "normalised"), marks=pytest.mark.slow),
         pytest.param("cka", 13, ("normalised",), marks=pytest.mark.slow),
