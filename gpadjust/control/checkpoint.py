@@ -370,10 +370,11 @@ def warn_unsaved(problem: str) -> None:
 def layer_names(env: Any) -> list[str]:
     """The classes of an environment and of what it wraps, from the outside."""
     names = [type(env).__name__]
-    for holder in ("venv", "envs", "env"):
-        inner = getattr(env, holder, None)
+    held = getattr(env, "envs", None)  # of a vectorised environment, which are alike
+    first = held[0] if isinstance(held, list) and held else None
+    for inner in (getattr(env, "venv", None), getattr(env, "env", None), first):
         if inner is not None:
-            return names + layer_names(inner[0] if holder == "envs" else inner)
+            return names + layer_names(inner)
     return names
 
 
