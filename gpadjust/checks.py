@@ -98,6 +98,12 @@ def check_switch(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be True or False; found {value!r}.")
 
 
+def check_kind(name: str, value: Any, kind: Any, expected: str) -> None:
+    """Raise a TypeError unless an option is an object of a class, which is told as expected."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be {expected}; found {value!r}.")
+
+
 def check_choice(name: str, value: Any, known: Sequence[str]) -> None:
     """Raise a ValueError unless an option is one of these words."""
     if value not in known:
@@ -229,7 +235,7 @@ def check_finite(name: str, tensor: Tensor) -> None:
 
 
 def check_observed(name: str, Y: Tensor) -> None:
-    """As :func:`check_finite`, but NaN is a missing value; a row of them is an error."""
+    """Check that values are finite or missing (NaN); a row of NaN alone is an error."""
     _check_rows(name, Y.isinf().any(-1), "to be finite, found infinity")
     expected = "to hold an observation in each row, found nothing but NaN"
     _check_rows(name, Y.isnan().all(-1), expected)
@@ -246,5 +252,5 @@ def _check_rows(name: str, bad: Tensor, expected: str) -> None:
 
 
 def marked_rows(marked: Tensor) -> list[int]:
-    """Where in the last dimension something is marked."""
+    """Return the positions in the last dimension at which something is marked."""
     return sorted({int(where[-1]) for where in marked.nonzero()})

@@ -1,4 +1,18 @@
-"""A point on a line, and what learns to move it in moments; its fixtures are imported by rooms."""
+"""A point on a line, what learns to move it in moments, and what interrupts that.
+
+Its fixtures are imported by rooms.
+"""
+
+import io
+import os
+import pickle
+import random
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+import zipfile
 
 import gymnasium
 import numpy as np
@@ -90,6 +104,99 @@ def point_task(point_dynamics, point_reward):
 def near_one(n):
     """Starts of the point."""
     return 0.5 + torch.rand(n, 1, dtype=torch.float64)
+
+
+# Interrupted runs
+
+
+class PowerCut(Exception):  # noqa: N818
+    """Ends a run."""
+
+
+def scramble():
+    """Draws from all generators, as other code between two runs may."""
+    torch.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002
+    random.seed(99)
+
+
+class Falls(gymnasium.Wrapper):
+    """A robot that has to be set up again after its eighth step."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 8:
+            raise OSError("the robot fell")
+        return super().step(action)
+
+
+class Shouting(gymnasium.Wrapper):
+    """Another wrapper."""
+
+
+def robot(env):
+    """An environment that cannot be pickled."""
+    env.unwrapped.lock = threading.Lock()
+    return env
+
+
+class Planted:
+    """Code in a pickle."""
+
+    ran = False
+
+    def __reduce__(self):
+        return setattr, (Planted, "ran", True)
+
+
+def assert_read_without_pickle(path, part, read):
+    """Asserts that code which is planted in a part of a checkpoint does not run."""
+    planted = io.BytesIO()
+    torch.save(Planted(), planted)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**parts, part: planted.getvalue()}.items():
+            archive.writestr(name, content)
+    with pytest.raises(pickle.UnpicklingError, match="weights"):
+        read()
+    assert not Planted.ran
+
+
+def forbid_unpickling(monkeypatch):
+    """Lets whatever unpickles fail."""
+
+    def unpickled(*_, **__):
+        raise AssertionError("unpickled")
+
+    calls = [f"{room}.{call}" for room in ("pickle", "cloudpickle") for call in ("load", "loads")]
+    for name in (*calls, "gpadjust.control.agent._Unpickler"):
+        monkeypatch.setattr(name, unpickled)
+
+
+def last_lines(script, folder):
+    """The last line that a script prints, and that of one which is killed at random moments."""
+    file = folder / "run.py"
+    file.write_text(textwrap.dedent(script))
+
+    def start(name):
+        command = [sys.executable, str(file), str(folder / name)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+
+    def last(process):
+        return process.communicate()[0].splitlines()[-1]
+
+    whole, moments = last(start("whole.ckpt")), random.Random(0)
+    for _ in range(3):
+        process = start("run.ckpt")
+        assert process.stdout.readline() == "written\n"
+        time.sleep(moments.uniform(0.0, 0.4))
+        process.kill()
+        process.communicate()
+    return whole, last(start("run.ckpt"))
 
 
 def flat(name, value, found):

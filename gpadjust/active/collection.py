@@ -261,9 +261,7 @@ class Collection(Measurements):
         """
         X = checked_points("X", X, self.bounds.shape[-1])
         Y = checked_outcomes(Y, len(X), self.num_outputs)
-        records = [measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)]
-        self._enter(records)
-        self._warn(records)
+        self._enter([measurement(x, y) for x, y in zip(X.tolist(), Y.tolist(), strict=True)])
 
     def fail(self, X: Tensor, reason: str | Exception) -> None:
         """Take it that measurements failed. Their points are not asked for again.
@@ -277,9 +275,7 @@ class Collection(Measurements):
         """
         X = checked_points("X", X, self.bounds.shape[-1])
         message = reason if isinstance(reason, str) else f"{type(reason).__name__}: {reason}"
-        records: list[Record] = [{"x": x, "failed": message} for x in X.tolist()]
-        self._enter(records)
-        self._warn(records)
+        self._enter([{"x": x, "failed": message} for x in X.tolist()])
 
     def withdraw(self, X: Tensor | None = None) -> None:
         """Take it that points asked for will not be measured, but may be asked for again.
@@ -395,13 +391,21 @@ class Collection(Measurements):
         return self._last_model
 
     def _enter(self, records: list[Record]) -> None:
-        """Log records, then take them in."""
+        """Log records, take them in, and warn of measurements that failed."""
         known = len(self.X)
         if self.log is not None:
             self.log.append(records)
         for record in records:
             self._take(record)
         self._model = None if len(self.X) > known else self._model
+        if failed := [record for record in records if "failed" in record]:
+            warnings.warn(
+                f"{len(failed)} of {len(records)} measurements failed, the first at x = "
+                f"{failed[0]['x']}: {failed[0]['failed']}. They count against a budget, and are "
+                "not asked for again.",
+                MeasurementWarning,
+                stacklevel=3,
+            )
 
     def _resume(self, log: MeasurementLog) -> None:
         """Take in what is in the log."""
@@ -415,18 +419,6 @@ class Collection(Measurements):
                     f"this collection of {self.bounds.shape[-1]} inputs and {m} outputs "
                     f"({type(error).__name__}: {error}). Remove it, or name another file."
                 ) from error
-
-    def _warn(self, records: list[Record]) -> None:
-        """Warn of failed measurements."""
-        failed = [record for record in records if "failed" in record]
-        if failed:
-            warnings.warn(
-                f"{len(failed)} of {len(records)} measurements failed, the first at x = "
-                f"{failed[0]['x']}: {failed[0]['failed']}. They count against a budget, and are "
-                "not asked for again.",
-                MeasurementWarning,
-                stacklevel=3,
-            )
 
     def _measure(self, oracle: Callable[[Tensor], Any], X: Tensor) -> Exception | None:
         """Measure points and tell them; return what went wrong."""

@@ -21,6 +21,7 @@ from gpadjust.models.exact_conditioning import Factors, conditional_covariance
 from gpadjust.models.terms_gp import TermsGP
 
 About = Literal["rho", "delta", "both"]
+Covariance = Callable[[Tensor], Tensor]
 
 
 class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch names its own
@@ -102,7 +103,7 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         super().__init__(model=model)
         self.about = about
         self.set_X_pending(X_pending)
-        self._rest: _Rest | None = None
+        self._made: tuple[Any, Covariance, Covariance | None] | None = None
 
     @concatenate_pending_points  # type: ignore[untyped-decorator]
     @t_batch_mode_transform()  # type: ignore[untyped-decorator]
@@ -116,39 +117,27 @@ class qAdjustmentInformationGain(AcquisitionFunction):  # noqa: N801, as BoTorch
         Returns:
             The information of each batch of ``q`` points, ``batch_shape``.
         """
-        model = self.model
-        model.eval()
-        rest = self._rests()
-        return information_gain(model, X, rest.whole, rest.remaining)
+        self.model.eval()
+        _, whole, remaining = self._covariances()
+        return information_gain(self.model, X, whole, remaining)
 
-    def _rests(self) -> _Rest:
-        """The unknown given the data; made again after the model is given other data."""
-        if self._rest is None or self._rest.source is not self.model.conditioning():
-            self._rest = _Rest(self.model, self.about)
-        return self._rest
+    def _covariances(self) -> tuple[Any, Covariance, Covariance | None]:
+        """Covariance of f_a given the data, and given also the adjustment in question.
 
-
-class _Rest:
-    """Covariance of f_a given the data, and given also the adjustment in question.
-
-    Args:
-        model: The model, in eval mode.
-        about: The adjustment in question.
-    """
-
-    def __init__(self, model: TermsModel, about: About) -> None:
-        self.source = model.conditioning()
-        self.whole: Any = _posterior_covariance(model)
-        others = {"rho": model.other_names, "delta": model.rho_names, "both": ()}[about]
-        others = tuple(name for name in others if name in model.term_names)
-        self.remaining = UnknownCovariance(model, others) if others else None
-
-
-def _posterior_covariance(model: TermsModel) -> Callable[[Tensor], Tensor]:
-    """The posterior covariance of f_a at transformed inputs."""
-    if not isinstance(model, VariationalCKA):
-        return UnknownCovariance(model)
-    return lambda inputs: model.conditioning().joint(model.at(inputs))[1]
+        The first entry tells of which data: they are made again after the model is given others.
+        """
+        model: Any = self.model
+        source = model.conditioning()
+        if self._made is None or self._made[0] is not source:
+            whole: Covariance = (
+                (lambda inputs: model.conditioning().joint(model.at(inputs))[1])
+                if isinstance(model, VariationalCKA)
+                else UnknownCovariance(model)
+            )
+            kept = {"rho": model.other_names, "delta": model.rho_names, "both": ()}[self.about]
+            others = tuple(name for name in kept if name in model.term_names)
+            self._made = source, whole, UnknownCovariance(model, others) if others else None
+        return self._made
 
 
 def _check(model: Any, about: str) -> None:
@@ -158,7 +147,7 @@ def _check(model: Any, about: str) -> None:
     name = type(model).__name__
     if isinstance(model, TermsModel) and not model.term_names:
         raise TypeError(
-            f"{type(model).__name__} has neither rho nor delta to learn about; what observations "
+            f"{name} has neither rho nor delta to learn about; what observations "
             "tell of parameters of the physics is not computed. CKA has both."
         )
     if not isinstance(model, TermsModel) or not model.rho_names:
@@ -251,8 +240,8 @@ class UnknownCovariance:
 def information_gain(
     model: TermsModel,
     X: Tensor,
-    unknown: Callable[[Tensor], Tensor],
-    remaining: Callable[[Tensor], Tensor] | None = None,
+    unknown: Covariance,
+    remaining: Covariance | None = None,
     counted: Tensor | None = None,
 ) -> Tensor:
     r"""The information of noisy observations at a batch of points, in nats.

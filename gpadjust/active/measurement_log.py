@@ -35,8 +35,6 @@ class MeasurementLog:
     and says nothing by itself. Copies and pickles of a log do not hold its file; an :meth:`append`
     takes it again, if nobody else has written to it.
 
-    Nothing in a file is executed or unpickled: a stranger's can be wrong, but does no harm.
-
     Args:
         path: The file.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from inspect import Parameter, signature
 from typing import Any, Self
 
@@ -94,7 +95,8 @@ class ParameterPhysics:
         if names not in self._made:
             physics = self.physics
             if not isinstance(physics, Physics) and set(names) <= set(self._arguments()):
-                physics = FunctionPhysics(_OfColumns(physics, names), name=self.name)
+                of_rows = partial(_of_columns, physics, names)
+                physics = FunctionPhysics(of_rows, name=self.name)
             self._made[names] = as_physics(physics)
         return self._made[names]
 
@@ -109,7 +111,7 @@ class ParameterPhysics:
         )
 
     def __hash__(self) -> int:
-        """By its name, which may be that of another."""
+        """Return the hash of its name, which may be that of another."""
         return hash(self.name)
 
     def __deepcopy__(self, memo: Any) -> Self:
@@ -146,12 +148,6 @@ def of_each(change: Callable[[Any], Any], physics: Any) -> Any:
     return change(physics)
 
 
-class _OfColumns:
+def _of_columns(function: Callable[..., Tensor], names: tuple[str, ...], X: Tensor) -> Tensor:
     """A function of named arguments as one of rows."""
-
-    def __init__(self, function: Callable[..., Tensor], names: tuple[str, ...]) -> None:
-        self.function = function
-        self.names = names
-
-    def __call__(self, X: Tensor) -> Tensor:
-        return self.function(**dict(zip(self.names, X.unbind(-1), strict=True)))
+    return function(**dict(zip(names, X.unbind(-1), strict=True)))

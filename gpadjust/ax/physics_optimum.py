@@ -108,7 +108,7 @@ class PhysicsOptimumNode(CenterGenerationNode):
         self._at_center = False
 
     def gen(self, *, experiment: Experiment, **arguments: Any) -> GeneratorRun | None:
-        """As Ax's center node, at the optimum of the physics.
+        """Generate a trial at the optimum of the physics.
 
         Raises:
             ValueError: If a physics that is asked reads what is no parameter, or text.
@@ -209,7 +209,7 @@ class _Wanted:
         self.parameters: list[str] = []
 
     def reads(self, parameters: list[str]) -> set[str]:
-        """Those of the search space's parameters that some physics reads."""
+        """Return the parameters of the search space that some physics reads."""
         self.parameters = parameters
         parts = [part for several in self.physics.values() for part in several]
         return {name for part in parts for name in part.names_of(parameters)}
@@ -335,7 +335,7 @@ def _scale(parameter: RangeParameter) -> tuple[Callable[[float], float], Callabl
 
 
 def _deviation(values: Tensor) -> float:
-    """Of the values that there are, or 1 if it is none."""
+    """Return the standard deviation of the known values, or 1 if there is none."""
     found = values[values.isfinite()]
     return (found.std(correction=0).item() if len(found) else 0.0) or 1.0
 

@@ -32,6 +32,8 @@ from gpadjust.physics import Physics, PhysicsError
 from gpadjust.physics.unknown import ParameterValues
 
 Columns = dict[str, Tensor]
+Step = Callable[[Columns], None]
+Change = Callable[[Tensor], Tensor]
 
 _NEXT_TO = 1e-6  # of a whole number
 
@@ -77,7 +79,7 @@ class Units:
             name: torch.tensor(values, dtype=torch.float64)
             for name, values in (choices or {}).items()
         }
-        self._back: list[Callable[[Columns], None]] = []
+        self._back: list[Step] = []
         for t in reversed(transforms):
             self._back += _BACK[type(t)](t) if type(t) in _BACK else []
         self._forth = [_FORTH[type(t)](t) for t in transforms if type(t) in _FORTH]
@@ -119,15 +121,14 @@ class Units:
         """Values of a metric, in its units, as the model is to see them."""
         for steps in self._forth:
             if metric in steps:
-                Y = steps[metric](Y)
+                Y = steps[metric][0](Y)
         return Y
 
     def of_metric(self, Y: Tensor, metric: str) -> Tensor:
         """The reverse; what was clipped stays so."""
         for steps in reversed(self._forth):
             if metric in steps:
-                step: Any = steps[metric]
-                Y = _UNDO[step.func](*step.args, Y)
+                Y = steps[metric][1](Y)
         return Y
 
 
@@ -170,7 +171,7 @@ class PhysicsInUnits(Physics):
         return self.units.metric(Y, self.metric)
 
     def in_user_units(self, values: Tensor) -> Tensor:
-        """As the metric is."""
+        """Return values in the units of the metric."""
         return self.units.of_metric(values, self.metric)
 
 
@@ -182,7 +183,7 @@ def several_outputs(name: str, metric: str, count: int) -> PhysicsError:
     )
 
 
-def _change(function: Callable[[Tensor], Tensor], name: str, columns: Columns) -> None:
+def _change(function: Change, name: str, columns: Columns) -> None:
     if name in columns:
         columns[name] = function(columns[name])
 
@@ -216,90 +217,66 @@ def are_numbers(values: Sequence[Any]) -> bool:
     return all(isinstance(value, bool | int | float) for value in values)
 
 
-def _power_of_ten(x: Tensor) -> Tensor:
-    return 10**x
-
-
-def _from_unit(lower: float, upper: float, x: Tensor) -> Tensor:
-    return lower + x * (upper - lower)
-
-
-def _log(t: Log) -> list[Callable[[Columns], None]]:
-    return [partial(_change, _power_of_ten, name) for name in t.transform_parameters]
-
-
-def _logit(t: Logit) -> list[Callable[[Columns], None]]:
-    return [partial(_change, torch.sigmoid, name) for name in t.transform_parameters]
-
-
-def _unit(t: UnitX) -> list[Callable[[Columns], None]]:
-    return [partial(_change, partial(_from_unit, *t.bounds[name]), name) for name in t.bounds]
-
-
-def _number(t: ChoiceToNumericChoice) -> list[Callable[[Columns], None]]:
-    return [partial(_value_of, name, [*code], ()) for name, code in t.encoded_parameters.items()]
-
-
-def _one_hot(t: OneHot) -> list[Callable[[Columns], None]]:
-    return [
-        partial(_value_of, name, values, t.encoded_parameters[name])
-        for name, values in t.encoded_values.items()
-    ]
-
-
-def _fixed(t: RemoveFixed) -> list[Callable[[Columns], None]]:
-    values: dict[str, Any] = {
-        n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
-    }
-    return [partial(_constant, n, float(v)) for n, v in values.items() if are_numbers([v])]
-
-
-def _clip(t: Winsorize) -> dict[str, Callable[[Tensor], Tensor]]:
-    return {m: partial(torch.clamp, min=low, max=high) for m, (low, high) in t.cutoffs.items()}
-
-
-def _bilog(t: BilogY) -> dict[str, Callable[[Tensor], Tensor]]:
-    return {metric: partial(_bilog_of, bound) for metric, bound in t.metric_to_bound.items()}
-
-
-def _bilog_of(bound: float, Y: Tensor) -> Tensor:
-    return bound + (Y - bound).sign() * (Y - bound).abs().log1p()
-
-
-def _standardize(t: StandardizeY) -> dict[str, Callable[[Tensor], Tensor]]:
-    return {m: partial(_scaled, float(t.Ymean[m]), float(t.Ystd[m])) for m in t.Ymean}
+def _bent(bend: Change, bound: float, Y: Tensor) -> Tensor:
+    return bound + (Y - bound).sign() * bend((Y - bound).abs())
 
 
 def _scaled(mean: float, sd: float, Y: Tensor) -> Tensor:
     return (Y - mean) / sd
 
 
-def _of_bilog(bound: float, Y: Tensor) -> Tensor:
-    return bound + (Y - bound).sign() * (Y - bound).abs().expm1()
-
-
 def _unscaled(mean: float, sd: float, Y: Tensor) -> Tensor:
     return mean + sd * Y
 
 
-_UNDO: Mapping[Any, Callable[..., Tensor]] = {
-    torch.clamp: lambda Y: Y,
-    _bilog_of: _of_bilog,
-    _scaled: _unscaled,
-}
-_BACK: Mapping[type[Transform], Callable[[Any], list[Callable[[Columns], None]]]] = {
-    Log: _log,
-    Logit: _logit,
-    UnitX: _unit,
+def _as_it_is(Y: Tensor) -> Tensor:
+    return Y
+
+
+def _fixed(t: RemoveFixed) -> list[Step]:
+    values: dict[str, Any] = {
+        n: getattr(p, "value", None) for n, p in t.nontunable_parameters.items()
+    }
+    return [partial(_constant, n, float(v)) for n, v in values.items() if are_numbers([v])]
+
+
+def _number(t: ChoiceToNumericChoice) -> list[Step]:
+    return [partial(_value_of, name, [*code], ()) for name, code in t.encoded_parameters.items()]
+
+
+_BACK: Mapping[type[Transform], Callable[[Any], list[Step]]] = {
+    Log: lambda t: [
+        partial(_change, partial(torch.pow, 10), name) for name in t.transform_parameters
+    ],
+    Logit: lambda t: [partial(_change, torch.sigmoid, name) for name in t.transform_parameters],
+    UnitX: lambda t: [
+        partial(_change, partial(_unscaled, lower, upper - lower), name)
+        for name, (lower, upper) in t.bounds.items()
+    ],
     ChoiceToNumericChoice: _number,
     OrderedChoiceToIntegerRange: _number,
-    OneHot: _one_hot,
+    OneHot: lambda t: [
+        partial(_value_of, name, values, t.encoded_parameters[name])
+        for name, values in t.encoded_values.items()
+    ],
     RemoveFixed: _fixed,
 }
-_FORTH: Mapping[type[Transform], Callable[[Any], dict[str, Callable[[Tensor], Tensor]]]] = {
-    Winsorize: _clip,
-    BilogY: _bilog,
-    StandardizeY: _standardize,
+"""By transform, the steps that undo it."""
+_FORTH: Mapping[type[Transform], Callable[[Any], dict[str, tuple[Change, Change]]]] = {
+    Winsorize: lambda t: {
+        metric: (partial(torch.clamp, min=low, max=high), _as_it_is)
+        for metric, (low, high) in t.cutoffs.items()
+    },
+    BilogY: lambda t: {
+        metric: (partial(_bent, torch.log1p, bound), partial(_bent, torch.expm1, bound))
+        for metric, bound in t.metric_to_bound.items()
+    },
+    StandardizeY: lambda t: {
+        metric: (partial(_scaled, float(mean), sd), partial(_unscaled, float(mean), sd))
+        for metric, mean in t.Ymean.items()
+        for sd in [float(t.Ystd[metric])]
+    },
 }
+"""By transform, what it does to a metric, and the reverse."""
 # MapKeyToFloat adds a parameter, which the physics does not read, if there are learning curves.
 _NEITHER = (FillMissingParameters, Cast, IntToFloat, MapKeyToFloat, Derelativize)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import pickle
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
 
 import cloudpickle
@@ -16,12 +17,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.checks import checked_number, checked_whole
+from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.checkpoint import (
     EpisodeCheckpoint,
     RandomState,
     TaskAgent,
     layer_names,
+    locked,
     packed,
     pickled_environment,
     unpacked,
@@ -31,7 +33,7 @@ from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.dynamics.free_run import checked_horizons
 
-_MAX_HOLD = 5  # steps of a random action
+MAX_HOLD = 5  # steps of a random action
 
 Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
@@ -109,10 +111,8 @@ class Agent(TaskAgent):
             should; after a real episode, if its rewards or terminations are not those of the task.
     """
 
-    not_saved: ClassVar[tuple[str, ...]] = (
-        *("_task", "env", "model", "_steps", "_callbacks", "_random_state"),
-    )
-    """Attributes that are not in checkpoints; a subclass adds those that hold a task."""
+    not_saved: ClassVar[tuple[str, ...]] = ("env", "_steps", "_callbacks", "_random_state")
+    """Attributes that are not in checkpoints; a subclass adds those that cannot be pickled."""
 
     model: Task | None
 
@@ -177,7 +177,7 @@ class Agent(TaskAgent):
         return True
 
     def promise(self, state: Any) -> dict[str, float]:
-        """Say of an episode that begins what the model promises, such as its ``promised_reward``.
+        """Return the promises of the model for an episode, such as its ``promised_reward``.
 
         Args:
             state: What :meth:`predict` returned with its first action.
@@ -198,10 +198,7 @@ class Agent(TaskAgent):
         """
         given = [] if callback is None else [callback] if callable(callback) else [*callback]
         end = self.num_timesteps + total_timesteps
-        with ExitStack() as held:
-            for each in given:
-                if isinstance(each, EpisodeCheckpoint):
-                    held.enter_context(each.locked())
+        with locked(given):
             self._callbacks = given
             self._begin()
             while self.num_timesteps < end:
@@ -290,11 +287,8 @@ class Agent(TaskAgent):
 
     @task.setter
     def task(self, task: Task) -> None:
-        if not isinstance(task, Task):
-            raise TypeError(
-                f"{type(self).__name__} needs a task to learn, as Task(dynamics, reward, ...); "
-                f"found {task!r}."
-            )
+        told = "a Task(dynamics, reward, ...), which an agent needs to learn"
+        check_kind("task", task, Task, told)
         self._task = task
         self.model = None
 
@@ -351,15 +345,7 @@ class Agent(TaskAgent):
         if self._random_state is not None:  # a run that goes on
             self._random_state.restore()
             self._random_state = None
-        spec = self.task.dynamics.spec
-        seen = torch.from_numpy(np.asarray(self._reset(), dtype=np.float64)).unsqueeze(0)
-        before = RandomState.capture()
-        spec.check_observations(seen)
-        # Of a single state much would look right that is not.
-        twice = spec.decode(seen).repeat(2, 1)
-        self.episode_length()
-        self.task.try_functions(twice, self.action_bounds().mean(0).expand(2, -1))
-        before.restore()
+        self.try_task(np.atleast_2d(self._reset()), self.env.action_space)
         if self.model is None:
             self._improve()
 
@@ -374,7 +360,7 @@ class Agent(TaskAgent):
         """Random actions, held for some steps, for the episode and, if it is longer, beyond."""
         num_steps, bounds = self.episode_length(), self.action_bounds()
         while True:
-            for action in random_sequences(1, num_steps, bounds, _MAX_HOLD)[0]:
+            for action in random_sequences(1, num_steps, bounds, MAX_HOLD)[0]:
                 yield action.numpy().astype(self.env.action_space.dtype)
             num_steps = 1
 
@@ -424,49 +410,71 @@ class Agent(TaskAgent):
         """Write a checkpoint, from which :func:`resume` makes the agent."""
         EpisodeCheckpoint(path).write(self)
 
-    @classmethod
-    def described(cls, env: Any) -> dict[str, Any]:
-        """The environment's wrappers and spaces, as texts."""
-        return {
-            "wrappers": " of ".join(layer_names(env)),
-            "observation_space": str(env.observation_space),
-            "action_space": str(env.action_space),
-        }
-
     def saved_parts(self) -> dict[str, bytes]:
         """Settings and counts, the real steps, what the dynamics learnt, and the environment."""
         state = {name: part for name, part in vars(self).items() if name not in self.not_saved}
-        learnt = io.BytesIO()
-        torch.save(self.task.dynamics.state_dict(), learnt)
-        columns = zip(*self._steps, strict=True) if self._steps else []
-        steps = dict(zip(_Step._fields, map(np.array, columns), strict=False))
+        columns = [torch.from_numpy(np.array(part)) for part in zip(*self._steps, strict=True)]
         env = pickled_environment(self.env)
         if env is None:
             state["_start"] = None  # it will be reset
+        settings = io.BytesIO()
+        _Pickler(settings, self).dump(state)
         return {
-            "agent.pkl": cloudpickle.dumps((state, self.model is not None)),
-            "steps.npz": packed(steps),
-            "dynamics.pt": learnt.getvalue(),
+            "agent.pkl": settings.getvalue(),
+            "steps.pt": packed(columns),
+            "dynamics.pt": packed(self.task.dynamics.state_dict()),
             "environment.pkl": env or b"",
         }
 
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
         """The agent that :meth:`saved_parts` saved."""
-        columns = unpacked(parts["steps.npz"])
-        task.dynamics.load_state_dict(torch.load(io.BytesIO(parts["dynamics.pt"])))
+        rows = zip(*unpacked(parts["steps.pt"]), strict=True)
+        task.dynamics.load_state_dict(unpacked(parts["dynamics.pt"]))
         agent = cls.__new__(cls)
-        state, acted = cloudpickle.loads(parts["agent.pkl"])
-        vars(agent).update(state)
         agent.task, agent._callbacks = task, []
         agent.env = cloudpickle.loads(parts["environment.pkl"]) if parts["environment.pkl"] else env
-        rows = zip(*(columns[name] for name in _Step._fields), strict=True) if columns else []
         agent._steps = [
-            _Step(int(number), seen, action, following, float(reward), bool(terminated))
-            for number, seen, action, following, reward, terminated in rows
+            _Step(*(value.numpy() if value.dim() else value.item() for value in row))
+            for row in rows
         ]
-        agent.model = agent.known_task() if acted else None
+        vars(agent).update(_Unpickler(io.BytesIO(parts["agent.pkl"]), agent).load())
         return agent
+
+
+class _Pickler(cloudpickle.Pickler):
+    """Pickles attributes of an agent, in which names stand for task, model and dynamics."""
+
+    def __init__(self, file: io.BytesIO, agent: Agent) -> None:
+        super().__init__(file)
+        self.agent = agent
+
+    def persistent_id(self, value: Any) -> str | None:
+        """The name of what is not pickled, wherever it is kept."""
+        task, model = self.agent.task, self.agent.model or self.agent.task
+        names = {id(model.dynamics): "model.dynamics", id(task.dynamics): "task.dynamics"}
+        names[id(task)] = "task"
+        if id(value) in names or not isinstance(value, Task):
+            return names.get(id(value))
+        if value.dynamics in (task.dynamics, model.dynamics):
+            return "model"
+        raise TypeError(
+            f"{type(self.agent).__name__} keeps a Task with dynamics of its own, which no "
+            "checkpoint holds. Keep its reward and so on, and make it where it is needed, or name "
+            "the attribute in not_saved."
+        )
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, agent: Agent) -> None:
+        super().__init__(file)
+        self.agent = agent
+
+    def persistent_load(self, name: str) -> Any:
+        """The part of the agent that has this name; the model when it is first asked for."""
+        if name.startswith("model") and self.agent.model is None:
+            self.agent.model = self.agent.known_task()
+        return attrgetter(name)(self.agent)
 
 
 def print_progress(agent: Agent, event: str, values: dict[str, float]) -> None:

@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpadjust.control.agent import Agent
-from gpadjust.control.mpc import MPC, PlanState, check_planner
+from gpadjust.checks import check_kind
+from gpadjust.control.agent import MAX_HOLD, Agent
+from gpadjust.control.mpc import MPC, PlanState
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch
@@ -22,7 +23,7 @@ from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
-_EPISODES, _MAX_HOLD = 128, 5  # of random actions, by which the policy's inputs are scaled
+_EPISODES = 128  # of random actions, by which the policy's inputs are scaled
 
 
 class MPCAgent(Agent):
@@ -64,8 +65,7 @@ class MPCAgent(Agent):
         **options: Any,
     ) -> None:
         for name, planner in (("each_step", each_step), ("first", first)):
-            if planner is not None:
-                check_planner(name, planner)
+            check_kind(name, planner, Planner | None, "a Planner(...)")
         self.each_step = each_step
         self.first = first
         self.tolerance = tolerance
@@ -166,15 +166,11 @@ class PolicySearchAgent(Agent):
         **options: Any,
     ) -> None:
         self.search = PolicySearch() if search is None else search
-        if not isinstance(self.search, PolicySearch):
-            raise TypeError(f"search must be a PolicySearch(...); found {search!r}.")
+        check_kind("search", self.search, PolicySearch, "a PolicySearch(...)")
         super().__init__(env, task, **options)
         made = policy(task.dynamics.spec, self.action_bounds()) if callable(policy) else policy
-        if not isinstance(made, BoundedPolicy):
-            raise TypeError(
-                "policy must make a BoundedPolicy of a spec and bounds, as mlp_policy does; found "
-                f"{made!r}."
-            )
+        told = "a function that makes a BoundedPolicy of a spec and bounds, as mlp_policy does"
+        check_kind("policy", made, BoundedPolicy, told)
         self.policy = made
         self.is_trained = False
         self._reward = math.nan  # of a step, as the last search foresaw it
@@ -225,7 +221,7 @@ class PolicySearchAgent(Agent):
     def _random_states(self, task: Task) -> Tensor:
         """States ``N x state_dim`` of episodes of random actions in a model."""
         length = self.episode_length()
-        steps = random_sequences(_EPISODES, length, self.action_bounds(), _MAX_HOLD).unbind(1)
+        steps = random_sequences(_EPISODES, length, self.action_bounds(), MAX_HOLD).unbind(1)
         taken = iter(steps)
         with torch.no_grad():
             starts = task.draw_initial_states(_EPISODES)

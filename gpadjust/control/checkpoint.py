@@ -10,23 +10,22 @@ import time
 import warnings
 import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import cloudpickle
 import numpy as np
 import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
 
+from gpadjust.checks import check_kind, checked_whole
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.task import Task
 from gpadjust.files import sync_folder
 
-_FORMAT = "gpadjust episode checkpoint, version 3"
-_OWN = ("manifest.json", "random.npz")
+_FORMAT = "gpadjust episode checkpoint, version 4"
 
 
 class TaskAgent(ABC):
@@ -68,10 +67,22 @@ class TaskAgent(ABC):
                 length = self.env_attribute("_max_episode_steps")
         if length is None:
             raise ValueError(
-                "The environment has no time limit that could be read; give the task an "
-                "episode_length, the number of steps of an episode."
+                "There is no environment, or no time limit that could be read of it; give the task "
+                "an episode_length, the number of steps of an episode."
             )
         return int(length)
+
+    def try_task(self, observations: np.ndarray, action_space: Any) -> None:
+        """Call the task's functions at observations ``N x observation_dim`` and a middle action."""
+        self.episode_length()
+        before, task = RandomState.capture(), self.ready_task()
+        seen = torch.from_numpy(observations.astype(np.float64))
+        task.dynamics.spec.check_observations(seen)
+        # Of a single state much would look right that is not.
+        twice = task.dynamics.spec.decode(seen).repeat(2, 1)
+        middle = torch.from_numpy((action_space.low + action_space.high) / 2).double()
+        task.try_functions(twice, middle.expand(len(twice), -1))
+        before.restore()
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -96,9 +107,13 @@ class TaskAgent(ABC):
         return env
 
     @classmethod
-    @abstractmethod
     def described(cls, env: Any) -> dict[str, Any]:
         """The environment in plain values, which are compared before anything is unpickled."""
+        return {
+            "wrappers": " of ".join(layer_names(env)),
+            "observation_space": str(env.observation_space),
+            "action_space": str(env.action_space),
+        }
 
     @abstractmethod
     def saved_parts(self) -> dict[str, bytes]:
@@ -107,7 +122,7 @@ class TaskAgent(ABC):
     @classmethod
     @abstractmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
-        """The agent of these files; a missing one is a KeyError."""
+        """The agent of these files."""
 
 
 class EpisodeCheckpoint:
@@ -141,10 +156,8 @@ class EpisodeCheckpoint:
     """
 
     def __init__(self, path: str | Path, every: int = 1) -> None:
-        if every < 1:
-            raise ValueError(f"every must be at least 1; found {every}.")
         self.path = Path(path).absolute()
-        self.every = every
+        self.every = checked_whole("every", every, 1)
         self._episodes = 0
 
     def locked(self) -> AcquireReturnProxy[Any]:
@@ -190,7 +203,7 @@ class EpisodeCheckpoint:
         }
         parts = {
             "manifest.json": json.dumps(manifest, default=_plain).encode(),
-            "random.npz": packed((agent._random_state or RandomState.capture()).as_arrays()),
+            "random.pt": packed(tuple(agent._random_state or RandomState.capture())),
             **agent.saved_parts(),
         }
         temporary = self.path.with_name(f".{self.path.name}.part")  # a killed process's goes
@@ -206,6 +219,16 @@ class EpisodeCheckpoint:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
+
+
+@contextmanager
+def locked(callbacks: Iterable[Any]) -> Iterator[None]:
+    """Hold the locks of all checkpoints among some callbacks."""
+    with ExitStack() as held:
+        for each in callbacks:
+            if isinstance(each, EpisodeCheckpoint):
+                held.enter_context(each.locked())
+        yield
 
 
 def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | None = None) -> Any:
@@ -235,8 +258,7 @@ def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | 
         ValueError: If the file is no checkpoint, or is of another algorithm, environment or task.
         RuntimeError: If the run had other dynamics, or another physics.
     """
-    if not isinstance(task, Task):
-        raise TypeError(f"task must be a Task(dynamics, reward, ...); found {task!r}.")
+    check_kind("task", task, Task, "a Task(dynamics, reward, ...)")
     manifest, parts = _read(path)
     algorithm = _known(manifest["algorithm"]) if algorithm is None else algorithm
     env = algorithm.wrapped(env)
@@ -247,11 +269,8 @@ def resume(path: str | Path, env: Any, task: Task, algorithm: type[TaskAgent] | 
     }
     for part, here in own.items():
         _compare(path, part, manifest[part], here)
-    random_state = RandomState.from_arrays(unpacked(parts["random.npz"]))
-    try:
-        agent = algorithm.from_parts(parts, env, task)
-    except KeyError as error:
-        raise ValueError(f"{path} is not a checkpoint of EpisodeCheckpoint: no {error}.") from error
+    random_state = RandomState(*unpacked(parts["random.pt"]))
+    agent = algorithm.from_parts(parts, env, task)
     agent._random_state = random_state
     return agent
 
@@ -289,18 +308,26 @@ def _known(name: str) -> type[TaskAgent]:
     return known[name]
 
 
-def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The manifest of a checkpoint and its other parts, as they are on the disk."""
-    try:
+class _Parts(dict[str, bytes]):
+    """The files of a checkpoint; a missing one is a ValueError, not the KeyError of a user's."""
+
+    def __init__(self, path: str | Path) -> None:
         with zipfile.ZipFile(path) as archive:
-            parts = {name: archive.read(name) for name in archive.namelist()}
-        missing = {*_OWN} - {*parts}
-        if missing:
-            raise ValueError(f"it has no {min(missing)}")
-        manifest = json.loads(parts["manifest.json"])
-        if manifest["format"] != _FORMAT:
-            raise ValueError(f"its format is {manifest['format']!r}, expected {_FORMAT!r}")
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+            super().__init__({name: archive.read(name) for name in archive.namelist()})
+        self.path = path
+
+    def __missing__(self, name: str) -> bytes:
+        raise ValueError(f"{self.path} is not a checkpoint of EpisodeCheckpoint: it has no {name}.")
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], _Parts]:
+    """The manifest of a checkpoint, and all its parts, as they are on the disk."""
+    try:
+        parts = _Parts(path)
+        manifest = json.loads(parts.get("manifest.json", "{}"))
+        if manifest.get("format") != _FORMAT:
+            raise ValueError(f"its format is {manifest.get('format')!r}, expected {_FORMAT!r}")
+    except (zipfile.BadZipFile, AttributeError, ValueError) as error:
         raise ValueError(
             f"{path} is not a checkpoint of EpisodeCheckpoint ({error}). An agent that was saved "
             "by agent.save of DynaSAC is read by DynaSAC.load."
@@ -308,17 +335,16 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     return manifest, parts
 
 
-def packed(arrays: dict[str, Any]) -> bytes:
-    """Arrays as the bytes of an ``.npz`` file."""
+def packed(values: Any) -> bytes:
+    """Tensors and plain values in bytes, which :func:`unpacked` reads without pickle."""
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **arrays)
+    torch.save(values, file)
     return file.getvalue()
 
 
-def unpacked(content: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file, which must hold no pickle."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        return dict(arrays)
+def unpacked(content: bytes) -> Any:
+    """Return the values of :func:`packed`; an error if there are others than these."""
+    return torch.load(io.BytesIO(content), weights_only=True)
 
 
 def pickled_environment(env: Any) -> bytes | None:
@@ -344,9 +370,10 @@ def warn_unsaved(problem: str) -> None:
 def layer_names(env: Any) -> list[str]:
     """The classes of an environment and of what it wraps, from the outside."""
     names = [type(env).__name__]
-    while hasattr(env, "env"):
-        env = env.env
-        names.append(type(env).__name__)
+    for holder in ("venv", "envs", "env"):
+        inner = getattr(env, holder, None)
+        if inner is not None:
+            return names + layer_names(inner[0] if holder == "envs" else inner)
     return names
 
 
@@ -355,8 +382,7 @@ def _plain(value: Any) -> Any:
     return value.tolist()
 
 
-@dataclass(frozen=True)
-class RandomState:
+class RandomState(NamedTuple):
     """The state of the global generators of Python, NumPy and PyTorch, from which a run draws."""
 
     python: Any
@@ -373,10 +399,11 @@ class RandomState:
 
     @classmethod
     def capture(cls) -> Self:
-        """Return the present state."""
+        """Return the present state, in tensors and plain values."""
+        name, keys, *others = np.random.get_state()  # noqa: NPY002
         return cls(
             random.getstate(),
-            np.random.get_state(),  # noqa: NPY002
+            (name, np.asarray(keys).tolist(), *others),
             torch.get_rng_state(),
             torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         )
@@ -388,31 +415,3 @@ class RandomState:
         torch.set_rng_state(self.torch)
         if self.cuda and torch.cuda.is_available():
             torch.cuda.set_rng_state_all(self.cuda)
-
-    def as_arrays(self) -> dict[str, np.ndarray]:
-        """The state in arrays of numbers."""
-        version, python, python_gauss = self.python
-        _, keys, pos, has_gauss, gauss = self.numpy
-        arrays = {
-            "python": np.array([version, *python], dtype=np.uint64),
-            "python_gauss": np.array([] if python_gauss is None else [python_gauss]),
-            "numpy": np.array([*keys, pos, has_gauss], dtype=np.uint64),
-            "numpy_gauss": np.array(gauss),
-            "torch": self.torch.numpy(),
-        }
-        return arrays | {f"cuda{i}": state.numpy() for i, state in enumerate(self.cuda)}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Self:
-        """The state of which :meth:`as_arrays` made arrays."""
-        version, *python = map(int, arrays["python"])
-        *keys, pos, has_gauss = map(int, arrays["numpy"])
-        legacy = (np.array(keys, dtype=np.uint32), pos, has_gauss, float(arrays["numpy_gauss"]))
-        gauss = arrays["python_gauss"].tolist()
-        cuda = (f"cuda{i}" for i in range(len(arrays)))
-        return cls(
-            (version, tuple(python), gauss[0] if gauss else None),
-            ("MT19937", *legacy),
-            torch.from_numpy(arrays["torch"]),
-            [torch.from_numpy(arrays[name]) for name in cuda if name in arrays],
-        )

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gpadjust.checks import checked_bounds, checked_number
+from gpadjust.checks import check_kind, checked_bounds, checked_number
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.task import Task
@@ -110,13 +110,14 @@ class MPC:
         tolerance: float | None = 0.25,
         seed: int = 0,
     ) -> None:
+        for name, planner in (("each_step", each_step), ("first", first)):
+            check_kind(name, planner, Planner | None, "a Planner(...)")
         if tolerance is not None:
             checked_number("tolerance", tolerance, above=0)
         length = task.episode_length
         if each_step is None:
             third = 0 if length is None else length // 3
             each_step = replace(EACH_STEP, horizon=max(third, _SHORTEST))
-        check_planner("each_step", each_step)
         if first is None:
             first = replace(
                 FIRST,
@@ -125,7 +126,6 @@ class MPC:
                 seconds=each_step.seconds,
                 horizon=each_step.horizon if length is None else None,
             )
-        check_planner("first", first)
         if length is None and None in (each_step.horizon, first.horizon):
             raise ValueError(
                 "Nobody says how far to plan; give the task an episode_length, or the planners a "
@@ -146,16 +146,10 @@ class MPC:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], PlanState]:
-        """Plan actions.
+        """Plan actions; arguments and result are those of :meth:`~gpadjust.control.Agent.predict`.
 
-        Args:
-            observation: ``observation_dim`` of the spec, or ``n x observation_dim``.
-            state: What the last call returned; None at the start.
-            episode_start: Which episodes begin, ``n``. Default: all without ``state``, none with.
-            deterministic: Whether the search is always the same.
-
-        Returns:
-            Actions, ``action_dim`` or ``n x action_dim``, and the state for the next call.
+        The state is the plan. Without one all episodes begin. If ``deterministic``, the search is
+        always the same.
         """
         spec = self.task.dynamics.spec
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
@@ -208,9 +202,3 @@ class MPC:
             return False
         loss = (promised - plan.rewards[: len(promised)]).mean()
         return bool(loss > self.tolerance * (earlier.promised.max() - earlier.promised.min()))
-
-
-def check_planner(name: str, planner: object) -> None:
-    """Raise a TypeError unless an option is a planner."""
-    if not isinstance(planner, Planner):
-        raise TypeError(f"{name} must be a Planner(...); found {planner!r}.")

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from gpadjust.checks import checked_bounds, checked_number, checked_whole
+from gpadjust.checks import check_kind, checked_bounds, checked_number, checked_whole
 from gpadjust.control.rollouts import Objective, Return, Rollouts
 from gpadjust.control.search import CrossEntropy, Search, correlated_noise, random_sequences
 from gpadjust.control.task import Task
@@ -92,16 +92,10 @@ class Planner:
 
     def __post_init__(self) -> None:
         """Check objective, search and numbers."""
-        if not isinstance(self.objective, Objective):
-            raise TypeError(
-                "objective must be an object of an Objective, such as Return(); found "
-                f"{self.objective!r}."
-            )
-        if not isinstance(self.search, Search):
-            raise TypeError(
-                "search must be an object of a Search, such as CrossEntropy() or PathIntegral(); "
-                f"found {self.search!r}."
-            )
+        told = "an object of an Objective, such as Return()"
+        check_kind("objective", self.objective, Objective, told)
+        told = "an object of a Search, such as CrossEntropy() or PathIntegral()"
+        check_kind("search", self.search, Search, told)
         for name in ("num_random", "max_hold", "restarts"):
             checked_whole(name, getattr(self, name), 1)
         for name in ("horizon", "num_functions"):
@@ -166,7 +160,7 @@ class Planner:
             return Plan(actions, value, rewards[found], float(left[found]), made[found])
 
         plans = [search()]
-        for _ in range(self.restarts - 1 if known is None else 0):
+        while len(plans) < (self.restarts if known is None else 1):
             if time.perf_counter() > deadline:
                 break
             plans.append(search())
@@ -176,7 +170,12 @@ class Planner:
         """The sequences that a search begins with, ``n x num_steps x action_dim``."""
         if known is None:
             return random_sequences(self.num_random, num_steps, bounds, self.max_hold)
-        known = _resized(known, num_steps, bounds.shape[-1])
+        if known.dim() != 2 or known.shape[-1] != bounds.shape[-1]:
+            raise ValueError(
+                f"Expected known of shape {num_steps} x {bounds.shape[-1]}, found "
+                f"{tuple(known.shape)}."
+            )
+        known = known[torch.arange(num_steps).clamp_max(len(known) - 1)]
         noise = correlated_noise(torch.Size((self.num_random, *known.shape)), 0.5)
         drawn = known + self.spread * (bounds[1] - bounds[0]) * noise
         return torch.cat([known.unsqueeze(0), torch.clamp(drawn, bounds[0], bounds[1])])
@@ -207,13 +206,3 @@ class Planner:
                 "give the task an episode_length, or the planner a horizon."
             )
         return num_steps if self.horizon is None else min(num_steps, self.horizon)
-
-
-def _resized(known: Tensor, num_steps: int, action_dim: int) -> Tensor:
-    """An earlier plan with as many steps."""
-    if known.dim() != 2 or known.shape[-1] != action_dim:
-        raise ValueError(
-            f"Expected known of shape {num_steps} x {action_dim}, found {tuple(known.shape)}."
-        )
-    rows = torch.arange(num_steps).clamp_max(len(known) - 1)
-    return known[rows]

@@ -61,6 +61,11 @@ class BoundedPolicy(nn.Module):
         raw = self.body((observations - self.origin) / self.unit)
         return self.middle + self.reach * raw.tanh()
 
+    @property
+    def action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the actions, ``2 x action_dim``."""
+        return torch.stack([self.middle - self.reach, self.middle + self.reach])
+
     def look_at(self, states: Tensor) -> None:
         """Take the scale of what is seen from states ``N x state_dim``; once, before training."""
         seen = self.spec.observe(states)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from gpadjust.checks import checked_number, checked_whole
+from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy
 from gpadjust.control.rollouts import Objective, Return, Rollouts
@@ -96,11 +96,8 @@ class PolicySearch:
 
     def __post_init__(self) -> None:
         """Check the options."""
-        if not isinstance(self.objective, Objective):
-            raise TypeError(
-                f"objective must be an object of an Objective, such as Return(); found "
-                f"{self.objective!r}."
-            )
+        told = "an object of an Objective, such as Return()"
+        check_kind("objective", self.objective, Objective, told)
         for name in ("updates", "num_starts", "redraw_every", "num_guides"):
             checked_whole(name, getattr(self, name), 1)
         if self.num_functions is not None:
@@ -108,8 +105,7 @@ class PolicySearch:
         self.objective.check_functions(self.num_functions)
         for name in ("learning_rate", "max_grad_norm"):
             checked_number(name, getattr(self, name), above=0)
-        if not isinstance(self.guide, Planner | None):
-            raise TypeError(f"guide must be a Planner, or None; found {self.guide!r}.")
+        check_kind("guide", self.guide, Planner | None, "a Planner, or None")
 
     def improve(
         self,
@@ -149,7 +145,13 @@ class PolicySearch:
         before = {name: t.detach().clone() for name, t in policy.state_dict().items()}
         try:
             if guided and self.guide is not None:
-                imitate(policy, *self.plans(task, policy_bounds(policy)))
+                if not isinstance(policy, BoundedPolicy):
+                    raise TypeError(
+                        "A guide plans within the bounds of the actions, which only a "
+                        "BoundedPolicy says, such as mlp_policy(...); found "
+                        f"{type(policy).__name__}."
+                    )
+                imitate(policy, *self.plans(task, policy.action_bounds))
             return self._improve(policy, task, task.episode_length, progress)
         except BaseException:
             policy.load_state_dict(before)
@@ -222,20 +224,6 @@ class PolicySearch:
             return task.draw_initial_states(self.num_starts)
         starts = task.draw_initial_states(num_functions * self.num_starts)
         return starts.unflatten(0, (num_functions, self.num_starts))
-
-
-def policy_bounds(policy: nn.Module) -> Tensor:
-    """The bounds of a policy's actions, ``2 x action_dim``.
-
-    Raises:
-        TypeError: If it does not say them.
-    """
-    if not isinstance(policy, BoundedPolicy):
-        raise TypeError(
-            "A guide plans within the bounds of the actions, which only a BoundedPolicy says, such "
-            f"as mlp_policy(...); found {type(policy).__name__}."
-        )
-    return torch.stack([policy.middle - policy.reach, policy.middle + policy.reach])
 
 
 def imitate(

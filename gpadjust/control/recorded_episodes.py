@@ -196,7 +196,10 @@ def _scores(
     found = {"nlpd": float(score.nlpd.mean()), "coverage": float(score.coverage.mean())}
     names = [spec.states[i] for i in spec.moving]
     found |= {f"rmse/{name}": float(e) for name, e in zip(names, score.rmse, strict=True)}
-    found["overrides"] = _overrides(dynamics, new.states, new.actions)
+    if isinstance(dynamics, LearnedDynamics):
+        model, inputs = dynamics.model, dynamics.targets.inputs(new.states, new.actions)
+        if isinstance(model, TermsModel) and model.rho_names:
+            found["overrides"] = float(trust(model, inputs).data.mean())
     possible = [k for k in horizons if k <= new.longest]
     if not possible:
         return found
@@ -225,13 +228,3 @@ def _scores(
             values = values if name == "energy" else values[spec.moving]
             found[f"{name}_{horizon}"] = float(values.mean())
     return found
-
-
-def _overrides(dynamics: Dynamics, states: Tensor, actions: Tensor) -> float:
-    """The share of predictions in which data override the physics; nan without one."""
-    if not isinstance(dynamics, LearnedDynamics):
-        return float("nan")
-    model = dynamics.model
-    if not isinstance(model, TermsModel) or not model.rho_names:
-        return float("nan")
-    return float(trust(model, dynamics.targets.inputs(states, actions)).data.mean())

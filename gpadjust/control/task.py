@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import check_kind, checked_whole
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
 
@@ -87,8 +87,7 @@ class Task:
 
     def __post_init__(self) -> None:
         """Check what can be checked without a state."""
-        if not isinstance(self.dynamics, Dynamics):
-            raise TypeError(f"dynamics must be an object of a Dynamics; found {self.dynamics!r}.")
+        check_kind("dynamics", self.dynamics, Dynamics, "an object of a Dynamics")
         if self.reward is None:
             raise TypeError(
                 "reward must be a function of states, actions, next states; found None."

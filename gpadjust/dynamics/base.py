@@ -238,11 +238,7 @@ class Dynamics(ABC):
         raise NotImplementedError(self._not_saved)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take back what :meth:`state_dict` gave; predictions and later fits are the same.
-
-        Raises:
-            NotImplementedError: As :meth:`state_dict`.
-        """
+        """Take back what :meth:`state_dict` gave; predictions and later fits are the same."""
         raise NotImplementedError(self._not_saved)
 
     @property

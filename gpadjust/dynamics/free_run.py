@@ -151,11 +151,7 @@ class FreeRun(NamedTuple):
 
 
 def checked_horizons(horizons: Sequence[int]) -> tuple[int, ...]:
-    """The numbers of steps, in order.
-
-    Raises:
-        ValueError: If they are not different whole numbers of at least 1.
-    """
+    """The numbers of steps, in order; an error unless they are different, and at least 1."""
     try:
         given = tuple(horizons)
     except TypeError:
@@ -319,13 +315,7 @@ def _check_start(spec: StateSpec, initial_states: Tensor, actions: Tensor) -> No
 
 
 def typical_change(spec: StateSpec, states: Tensor, next_states: Tensor) -> Tensor:
-    """Root mean square change of each state in a step, ``state_dim``; 1 if it never changed.
-
-    Args:
-        spec: What the entries of states are.
-        states: ``... x state_dim``.
-        next_states: ``... x state_dim``; NaN where an entry was not measured.
-    """
+    """Root mean square change of each state in a step, ``state_dim``; 1 if it never changed."""
     change = spec.change(states, next_states).flatten(0, -2)
     size = change.square().nanmean(0).sqrt()
     return size.where(size > 0, torch.ones_like(size))

@@ -257,12 +257,7 @@ class LearnedDynamics(Dynamics):
         return step
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The variance of the noise that was learnt, ``N x state_dim``.
-
-        Raises:
-            RuntimeError: If nothing was learnt yet.
-            PhysicsError: If the physics fails.
-        """
+        """The variance of the noise that was learnt, ``N x state_dim``; errors as `predict`."""
         noisy, without = (self._predict(states, actions, noise)[1] for noise in (True, False))
         return self.spec.complete_variance((noisy - without).clamp_min(0.0))
 

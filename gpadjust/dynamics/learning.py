@@ -38,23 +38,14 @@ class DynamicsFitOptions(FitOptions, total=False):
 
 
 class Learnt(NamedTuple):
-    """Transitions, and the model of them; replaced as a whole, so that no error leaves half of it.
-
-    Args:
-        data: The transitions.
-        known: What the physics says of the targets there, or None.
-        chunks: Numbers of transitions: fitted, then conditioned on, one after the other.
-        searched_at: The number of them at the last search of the hyper-parameters.
-        fitted: The model of the first chunk.
-        model: The model of all.
-    """
+    """Transitions, and the model of them; replaced as a whole, so that no error leaves half."""
 
     data: Trajectories
-    known: Tensor | None
-    chunks: tuple[int, ...]
-    searched_at: int
-    fitted: TermsModel
-    model: TermsModel
+    known: Tensor | None  # what the physics says of the targets there
+    chunks: tuple[int, ...]  # numbers of transitions: fitted, then conditioned on in turn
+    searched_at: int  # number of transitions at the last search of the hyper-parameters
+    fitted: TermsModel  # of the first chunk
+    model: TermsModel  # of all
 
     def with_rows(self, data: Trajectories, known: Tensor | None) -> tuple[Trajectories, Any]:
         """All transitions, and what the physics says there, with those of further ones."""
@@ -74,7 +65,7 @@ class Learnt(NamedTuple):
 
     @staticmethod
     def loaded(state: Mapping[str, Any], recipe: Recipe) -> Learnt:
-        """What a state holds, copied; a RuntimeError if something is missing, or not right."""
+        """Return a copy of a state's entries; a RuntimeError if one is missing or wrong."""
         for name in ("transitions", "physics", "chunks", "searched_at", "model"):
             if name not in state:
                 raise RuntimeError(f"The state is damaged: it lacks {name!r}.")

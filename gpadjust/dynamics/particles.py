@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import checked_tensor, checked_whole
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 
@@ -27,15 +27,9 @@ def step_or_nan(
 ) -> Tensor:
     """The next states ``N x state_dim``; not finite where the physics fails.
 
-    Args:
-        move: A model, from states and actions to next states.
-        states: ``N x state_dim``.
-        actions: ``N x action_dim``.
-        some_must_succeed: Whether it is an error that the physics fails for all of them.
-
     Raises:
-        PhysicsError: If the physics does not say where it fails; or fails everywhere, though it
-            must not.
+        PhysicsError: If the physics does not say where it fails; or fails everywhere, and
+            ``some_must_succeed``.
     """
     states, actions = states.clone(), actions.clone()
     failed = torch.zeros(len(states), dtype=torch.bool)
@@ -62,12 +56,8 @@ def move_on(
 ) -> tuple[Tensor, Tensor]:
     """Particles a step later, and which are lost by then; a lost one stays where it was.
 
-    Args:
-        functions: Functions of states ``K x n x ...`` and actions to next states.
-        particles: ``K x w x state_dim``.
-        lost: Which of them are lost already, ``K x w`` booleans.
-        actions: ``w x action_dim``.
-        bounds: Lower and upper ones of the states, ``2 x state_dim``.
+    Particles are ``K x w x state_dim``, those lost already ``K x w``, actions ``w x action_dim``,
+    and bounds of the states ``2 x state_dim``.
     """
 
     def move(states: Tensor, actions: Tensor) -> Tensor:
@@ -138,17 +128,16 @@ def _order_statistic(sample: Tensor, level: float) -> Tensor:
     return ordered[below].lerp(ordered[below + 1], min(max(place - below, 0.0), 1.0))
 
 
-def of_states(values: Tensor, name: str, shape: tuple[int, ...]) -> Tensor:
-    """The user's numbers, one or more for each state, in float64.
+def even_normal(number: int, p: int, seed: int) -> Tensor:
+    """Standard normal draws ``number x p`` that fill space evenly (Sobol)."""
+    engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=seed)
+    shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
+    return torch.special.ndtri(shares)
 
-    Raises:
-        TypeError: If they are no numbers.
-        ValueError: If they are not of that shape.
-    """
-    try:
-        values = torch.as_tensor(values, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"Expected {name} as a tensor of numbers, got {values!r}.") from error
+
+def of_states(values: Tensor, name: str, shape: tuple[int, ...]) -> Tensor:
+    """The user's numbers, one or more for each state, in float64; an error if they are none."""
+    values = checked_tensor(name, values)
     if values.shape != shape:
         raise ValueError(
             f"Expected {name} of shape {' x '.join(map(str, shape))}, an entry for each state, got "

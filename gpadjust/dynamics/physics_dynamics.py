@@ -20,7 +20,7 @@ from gpadjust.dynamics.state import (
     loaded,
     saved,
 )
-from gpadjust.dynamics.targets import next_values, one_physics, warn_of_differences
+from gpadjust.dynamics.targets import check_next_values, one_physics, warn_of_differences
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.inference.calibrate import warn_of_parameters
 from gpadjust.inference.calibration import Misfit, or_infinite
@@ -170,12 +170,12 @@ class PhysicsDynamics(Dynamics):
         return step
 
     def describe(self) -> dict[str, str]:
-        """What these dynamics are, each setting as a text."""
+        """Return the settings, each as a text."""
         unknowns = {name: repr(u) for name, u in self.physics.unknowns.items()}
         return fingerprint(type(self), self.spec, **({"unknowns": unknowns} if unknowns else {}))
 
     def state_dict(self) -> dict[str, Any]:
-        """What these dynamics are, what was learnt, and what the physics said of some transitions.
+        """Return settings, fitted values, and the physics' outputs at some transitions.
 
         That is at the guesses of unknown parameters.
         """
@@ -221,7 +221,9 @@ class PhysicsDynamics(Dynamics):
         actions = actions.expand(*states.shape[:-1], -1)
         following = states.clone()
         inputs = torch.cat([states[..., moving], actions], dim=-1)
-        following[..., moving] = next_values(self.physics, inputs, len(moving), parameters)
+        Y = self.physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0), parameters)
+        check_next_values(self.physics, Y, len(moving))
+        following[..., moving] = Y
         return self.spec.remember(following, states, actions)
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from gpadjust.dynamics.free_run import FreeRun
 from gpadjust.dynamics.trajectories import Windows
 from gpadjust.states import StateSpec
-from gpadjust.validation.plots.drawing import BAND, BLUE, RED, given_axes, legend, new_axes, tidy
+from gpadjust.validation.plots.drawing import BAND, BLUE, RED, axes_of, legend, tidy
 
 __all__ = ["plot_free_run"]
 
@@ -86,8 +86,7 @@ def plot_free_run(
     names = [spec.states[i] for i in spec.moving] if states is None else list(states)
     check_names("states", names, spec.states)
     called, step = labels(spec, units), spec.step if step is None else step
-    grid = new_axes(len(names), len(rows), 2.5) if axes is None else axes
-    grid = given_axes(grid, (len(names), len(rows)))
+    grid = axes_of(axes, len(names), len(rows), 2.5)
     times = (1 if step is None else step) * np.arange(run.mean.shape[1] + 1)
     for name, line in zip(names, grid, strict=True):
         i = spec.states.index(name)

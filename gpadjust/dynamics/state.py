@@ -33,9 +33,6 @@ def check_fingerprint(state: dict[str, Any], expected: dict[str, str]) -> None:
     """Raise a RuntimeError, as PyTorch does, if a state is of other dynamics.
 
     The state of dynamics that learnt nothing is empty, and fits all.
-
-    Raises:
-        TypeError: If it is no dictionary.
     """
     if not isinstance(state, Mapping):
         raise TypeError(f"Expected a dictionary that `state_dict` gave, found {state!r}.")
@@ -61,19 +58,12 @@ def check_fingerprint(state: dict[str, Any], expected: dict[str, str]) -> None:
 
 
 class PhysicsProbes(NamedTuple):
-    """A few transitions, and what a physics says of them.
+    """A few transitions, and what a physics says of them."""
 
-    Args:
-        states: ``k x state_dim``.
-        actions: ``k x action_dim``.
-        values: ``k x m``.
-        tolerance: By how much the same physics may differ, ``m``.
-    """
-
-    states: Tensor
-    actions: Tensor
-    values: Tensor
-    tolerance: Tensor
+    states: Tensor  # k x state_dim
+    actions: Tensor  # k x action_dim
+    values: Tensor  # k x m
+    tolerance: Tensor  # by how much the same physics may differ, m
 
     @classmethod
     def of(

@@ -215,15 +215,6 @@ def parts_of(physics: Physics) -> dict[str, Physics]:
     return {physics.name: physics}
 
 
-def next_values(
-    physics: Physics, inputs: Tensor, num_states: int, parameters: Tensor | None = None
-) -> Tensor:
-    """Next states by the physics, ``... x num_states``, from ``... x (num_states + a)``."""
-    Y = physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0), parameters)
-    check_next_values(physics, Y, num_states)
-    return Y
-
-
 def check_next_values(physics: Physics, Y: Tensor, num_states: int) -> None:
     """Raise a ValueError unless the physics has returned as many columns as there are states."""
     if Y.shape[-1] != num_states:

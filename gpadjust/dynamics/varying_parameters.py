@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from gpadjust.checks import checked_tensor
+from gpadjust.dynamics.particles import even_normal
 from gpadjust.models import PhysicsParameters
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
@@ -25,12 +27,8 @@ def varying_parameters(
 ) -> Callable[[int, int | None], Callable[[Tensor, Tensor], Tensor]]:
     """Changes of next states by parameters that differ, in each draw by numbers of its own.
 
-    Args:
-        physics: Next values of the states that move; it has unknown parameters, ``p``.
-        spec: What the entries of states and actions are.
-        learnt: The parameters that were learnt.
-        actions: The actions that were learnt from, ``N x action_dim``.
-        variation: Standard deviations of the coordinates of the parameters.
+    They vary by standard deviations of their coordinates about those that were learnt, by more
+    beyond the actions that were learnt from, ``N x action_dim``.
 
     Returns:
         A function of a number ``k`` of draws and a seed to a function of states and actions, which
@@ -42,12 +40,7 @@ def varying_parameters(
         ValueError: If it is not one of 0 or more, or one for each parameter.
     """
     unknowns, moving, p = physics.unknowns, spec.moving, len(physics.unknowns.names)
-    try:
-        sd = torch.as_tensor(variation, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(
-            f"Expected variation as a number or a tensor of numbers, got {variation!r}."
-        ) from error
+    sd = checked_tensor("variation", variation)
     if sd.shape not in ((), (p,)) or not (sd.isfinite() & (sd >= 0)).all():
         raise ValueError(
             f"Expected variation as one number of 0 or more, or one for each of "
@@ -66,9 +59,7 @@ def varying_parameters(
 
     def changes(number: int, seed: int | None) -> Callable[[Tensor, Tensor], Tensor]:
         seed = int(torch.randint(2**31, ())) if seed is None else seed
-        engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=seed)
-        shares = engine.draw(number, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
-        drawn = torch.special.ndtri(shares).unsqueeze(1)  # number x 1 x p
+        drawn = even_normal(number, p, seed).unsqueeze(1)  # number x 1 x p
 
         def change(states: Tensor, actions: Tensor) -> Tensor:
             actions = actions.expand(*states.shape[:-1], -1)

@@ -25,83 +25,61 @@ _BETTER = 0.01  # what a worse path may cost more, by rounding
 
 
 class Known(NamedTuple):
-    """Prior knowledge of the ``d`` states that move.
+    """Prior knowledge of the ``d`` states that move; variances are NaN where they are learnt."""
 
-    Args:
-        noise: Variances of the errors of what is measured; NaN where they are learnt.
-        process_noise: Variances of what a step adds to the physics; NaN where they are learnt.
-        start: Of states by number, mean and standard deviation at the beginning of a stretch.
-    """
-
-    noise: Array
-    process_noise: Array
-    start: Mapping[int, tuple[float, float]]
+    noise: Array  # variances of the errors of what is measured
+    process_noise: Array  # variances of what a step adds to the physics
+    start: Mapping[int, tuple[float, float]]  # mean and sd at the beginning of a stretch, by number
 
 
 class Path(NamedTuple):
-    """States of each stretch, ``T + 1 x d``, parameters ``p``, and f_p there: ``sum T x d``."""
+    """States through the stretches, and what was measured, angles within half a turn of them."""
 
-    states: list[Array]
-    parameters: Array
-    following: Array
+    states: list[Array]  # of each stretch, T + 1 x d
+    measured: list[Array]
+    parameters: Array  # p
+    following: Array  # f_p there, sum T x d
 
 
 class Move(NamedTuple):
-    """Step of a search from a path.
-
-    Args:
-        path: The next one.
-        whole: Whether it is the one that was found, and not on the way there or the one before.
-        refused: How far a path was that explains less, in standard deviations of the states; 0
-            where one was taken.
-    """
+    """Step of a search from a path."""
 
     path: Path
-    whole: bool
-    refused: float
+    whole: bool  # whether it is the one that was found, and not on the way or the one before
+    refused: float  # how far in sd of the states a path was that explains less; 0 if one was taken
 
 
 class Chain:
-    """Stretches, and the physics that leads through them.
-
-    Args:
-        physics: The physics.
-        spec: What the entries of states and actions are.
-        stretches: The stretches.
-        known: What is known beforehand.
-    """
+    """Stretches, the physics that leads through them, and what is known beforehand."""
 
     def __init__(
         self, physics: Physics, spec: StateSpec, stretches: Sequence[Stretch], known: Known
     ) -> None:
-        self.physics, self.known = physics, known
+        self.physics, self.stretches, self.known = physics, tuple(stretches), known
         self.num_parameters = len(physics.unknowns)
         moving = spec.moving
         self.angles = [moving.index(i) for i in spec.angle_columns if i in moving]
         self.actions = torch.cat([stretch.actions for stretch in stretches])
-        self.measured = [stretch.states[:, moving].numpy() for stretch in stretches]
-        self._unwrap(self.measured)
+        self.measured = [
+            self._unwrapped(stretch.states[:, moving].numpy()) for stretch in stretches
+        ]
         self.middle, self.spread = self._sizes()
         self.starts = [self._start(measured) for measured in self.measured]
 
     def first_path(self, parameters: Array) -> Path:
-        """Measured states, and between them and in hidden ones where f_p leads.
-
-        Args:
-            parameters: Its parameters' coordinates, ``p``.
-        """
+        """Measured states, and between them and in hidden ones where f_p leads."""
         lengths = [len(m) for m in self.measured]
-        states = [np.empty_like(m) for m in self.measured]
+        states, measured = ([m.copy() for m in self.measured] for _ in range(2))
         bounds = np.cumsum([0, *(n - 1 for n in lengths)])
         now = np.stack([start[: len(self.spread)] for start, _ in self.starts])
-        complete = not np.isnan(np.concatenate(self.measured)).any()
+        complete = not np.isnan(np.concatenate(measured)).any()
         for t in range(max(lengths)):
             going = [i for i, n in enumerate(lengths) if n > t]
-            rows = np.stack([self.measured[i][t] for i in going])
+            rows = np.stack([measured[i][t] for i in going])
             if not complete and t:  # after a gap the angle may have gone round
                 rows[:, self.angles] = _near(rows, now[going], self.angles)
                 for i, row in zip(going, rows, strict=True):
-                    self.measured[i][t] = row
+                    measured[i][t] = row
             now[going] = np.where(np.isnan(rows), now[going], rows)
             for i in going:
                 states[i][t] = now[i]
@@ -110,11 +88,20 @@ class Chain:
                 actions = self.actions[[bounds[i] + t for i in onward]]
                 now[onward] = self._following(now[onward], actions, parameters)
         everything = np.concatenate([x[:-1] for x in states])
-        return Path(states, parameters, self._following(everything, self.actions, parameters))
+        following = self._following(everything, self.actions, parameters)
+        return Path(states, measured, parameters, following)
+
+    def path(self, states: list[Array], parameters: Array) -> Path:
+        """The path of these states, NaN where f_p fails."""
+        measured = [m.copy() for m in self.measured]
+        for own, there in zip(measured, states, strict=True):
+            own[:, self.angles] = _near(own, there, self.angles)
+        rows = np.concatenate([x[:-1] for x in states])
+        return Path(states, measured, parameters, self.asked(rows, self.actions, parameters))
 
     def first_variances(self, path: Path) -> tuple[Array, Array]:
         """First variances of both noises, by f_p's errors in single steps."""
-        ends = np.concatenate([m[1:] for m in self.measured])
+        ends = np.concatenate([m[1:] for m in path.measured])
         begins = np.concatenate([x[:-1] for x in path.states])
         change = ((path.following - begins) ** 2).mean(0)
         errors = np.array(
@@ -153,8 +140,8 @@ class Chain:
         here = np.concatenate([states, np.broadcast_to(path.parameters, (N, p))], axis=1)
         onward = np.concatenate([path.following, here[:, d:]], axis=1)
         offsets = onward - np.einsum("tij,tj->ti", matrices, here)
-        cuts = np.cumsum([len(m) - 1 for m in self.measured])[:-1]
-        parts = zip(np.split(matrices, cuts), np.split(offsets, cuts), self.measured, strict=True)
+        cuts = np.cumsum([len(m) - 1 for m in path.measured])[:-1]
+        parts = zip(np.split(matrices, cuts), np.split(offsets, cuts), path.measured, strict=True)
         return [Link(*part) for part in parts]
 
     def towards(
@@ -169,7 +156,8 @@ class Chain:
             states = [x + share * (y - x) for x, y in zip(path.states, ahead, strict=True)]
             moved = path.parameters + share * (parameters - path.parameters)
             rows = np.concatenate([x[:-1] for x in states])
-            other = Path(states, moved, self.asked(rows, self.actions, moved))
+            following = self.asked(rows, self.actions, moved)
+            other = Path(states, path.measured, moved, following)
             cost = self.cost(other, noise, process_noise)
             if cost <= before + _BETTER:  # false of NaN
                 return Move(other, share == 1.0, 0.0)
@@ -203,7 +191,7 @@ class Chain:
     def cost(self, path: Path, noise: Array, process_noise: Array) -> float:
         """Twice the negative log density of a path, but for a constant; NaN where f_p fails."""
         states, d = np.concatenate(path.states), len(self.spread)
-        off = np.nan_to_num(states - np.concatenate(self.measured), nan=0.0) ** 2 / noise
+        off = np.nan_to_num(states - np.concatenate(path.measured), nan=0.0) ** 2 / noise
         ends = np.concatenate([x[1:] for x in path.states])
         added = (ends - path.following) ** 2 / process_noise
         begins = sum(
@@ -261,12 +249,12 @@ class Chain:
         p = self.num_parameters
         return np.concatenate([mean, np.zeros(p)]), np.concatenate([sd**2, np.ones(p)])
 
-    def _unwrap(self, stretches: Sequence[Array]) -> None:
-        """Let measured angles go on without jumps."""
-        for measured in stretches:
-            for i in self.angles:
-                rows = ~np.isnan(measured[:, i])
-                measured[rows, i] = np.unwrap(measured[rows, i])
+    def _unwrapped(self, measured: Array) -> Array:
+        """Measured states of a stretch, whose angles go on without jumps."""
+        for i in self.angles:
+            rows = ~np.isnan(measured[:, i])
+            measured[rows, i] = np.unwrap(measured[rows, i])
+        return measured
 
     @staticmethod
     def _columns(rows: Array) -> list[tuple[Array, bool]]:

@@ -13,29 +13,18 @@ Array = NDArray[np.float64]
 
 
 class Link(NamedTuple):
-    """Steps of a stretch of the chain, ``T`` of them: ``x[t + 1] = matrices[t] x[t] + offsets[t]``.
+    """Steps of a stretch of the chain: ``x[t + 1] = matrices[t] x[t] + offsets[t]``."""
 
-    Args:
-        matrices: ``T x D x D``.
-        offsets: ``T x D``.
-        measured: Of the first entries of the states, ``T + 1 x d``; NaN where there is nothing.
-    """
-
-    matrices: Array
-    offsets: Array
-    measured: Array
+    matrices: Array  # T x D x D
+    offsets: Array  # T x D
+    measured: Array  # of the first entries of the states, T + 1 x d; NaN where there is nothing
 
 
 class Moments(NamedTuple):
-    """Means and covariances of the states of a stretch.
+    """Means and covariances of the states of a stretch."""
 
-    Args:
-        means: ``T + 1 x D``.
-        covariances: ``T + 1 x D x D``.
-    """
-
-    means: Array
-    covariances: Array
+    means: Array  # T + 1 x D
+    covariances: Array  # T + 1 x D x D
 
 
 class Filtered(NamedTuple):
@@ -46,15 +35,10 @@ class Filtered(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """Distribution of the states of a stretch by all that was measured.
-
-    Args:
-        states: Their moments.
-        crossed: Covariances of each state but the first with the one before, ``T x D x D``.
-    """
+    """Distribution of the states of a stretch by all that was measured."""
 
     states: Moments
-    crossed: Array
+    crossed: Array  # covariances of each state but the first with the one before, T x D x D
 
 
 def smooth_chain(
@@ -63,14 +47,8 @@ def smooth_chain(
     """All stretches of a chain, one after the other (Rauch, Tung and Striebel 1965).
 
     The last entries of a state, beyond those that a stretch starts again with, are constants that
-    all stretches share.
-
-    Args:
-        links: The stretches.
-        starts: Means ``d`` and variances ``d`` of the first state of each; of the first stretch
-            of all ``D`` entries.
-        noise: Variances ``d`` of the errors of what is measured.
-        process_noise: Variances ``d`` of what a step adds to the first entries.
+    all stretches share. Starts are means and variances ``d`` of the first state of each stretch, of
+    the first one of all ``D`` entries; noises are variances ``d``.
 
     Returns:
         What is known of each stretch, and the log density of what was measured.
@@ -100,13 +78,7 @@ def smooth_chain(
 def draw_paths(
     found: Sequence[Smoothed], num_constants: int, rng: np.random.Generator
 ) -> list[Array]:
-    """Draw the states of all stretches, ``T + 1 x D`` each, with the same constants in all.
-
-    Args:
-        found: What is known of the stretches.
-        num_constants: How many of the last entries are constants.
-        rng: Source of random numbers.
-    """
+    """Draw the states of all stretches, ``T + 1 x D`` each; their last entries are constants."""
     paths, constants = [], None
     for (means, covariances), crossed in found:
         path, mean, covariance = np.empty_like(means), means[-1], covariances[-1]

@@ -6,18 +6,16 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import torch
 
 from gpadjust.checks import checked_number
 from gpadjust.dynamics import Trajectories, Windows
+from gpadjust.dynamics.targets import check_spec
 from gpadjust.files import CsvColumns
-from gpadjust.records.record import Record, Stretch, in_control_steps
-from gpadjust.records.resampling import resampled
+from gpadjust.records.record import Record, Stretch, in_control_steps, resampled
 from gpadjust.states import StateSpec
-
-Column = TypeVar("Column", bound=str | None)
 
 
 class Records:
@@ -53,7 +51,7 @@ class Records:
     """
 
     def __init__(self, records: Iterable[Record], spec: StateSpec) -> None:
-        _check_spec(spec)
+        check_spec(spec)
         if isinstance(records, Record):
             records = [records]
         self.records, self.spec = tuple(records), spec
@@ -134,24 +132,35 @@ class Records:
             tensor([[0.1000, 0.0000],
                     [0.2000, 0.4000]], dtype=torch.float64)
         """
-        _check_spec(spec)
-        columns = (
-            _columns(states, spec.states, "states"),
-            _columns(actions, spec.actions, "actions"),
-        )
+        check_spec(spec)
+        state_columns = _columns(states, spec.states, "states")
+        action_columns = _columns(actions, spec.actions, "actions")
+
+        def read(file: str | Path) -> Record:
+            table = CsvColumns(file, delimiter, decimal=decimal)
+            if isinstance(time, str):
+                times = table.numbers(time)
+            else:
+                rows = torch.arange(len(table), dtype=torch.float64)
+                times = checked_number("time", time, above=0) * rows
+            measured = []
+            for name, column in state_columns.items():
+                filled_in = name in spec.previous and name == column and name not in table.names
+                if column is None or filled_in:
+                    measured.append(torch.full_like(times, math.nan))
+                else:
+                    measured.append(table.numbers(column, may_miss=True))
+            taken = [table.numbers(column) for column in action_columns.values()]
+            labels = None if segment is None else table.texts(segment)
+            columns = torch.stack(measured, -1), torch.stack(taken, -1)
+            return Record(times, *columns, labels, str(file))
+
         several = [files] if isinstance(files, str | Path) else files
-        records = [_read(f, spec, *columns, time, segment, delimiter, decimal) for f in several]
-        return cls(records, spec)
+        return cls([read(file) for file in several], spec)
 
     @classmethod
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
-        """A record of each window, such as to :func:`smooth` them.
-
-        Args:
-            windows: The windows.
-            spec: What the entries of states and actions are.
-            step: The control step.
-        """
+        """A record of each window, in control steps, such as to :func:`smooth` them."""
         times = checked_number("step", step, above=0) * torch.arange(
             windows.states.shape[1], dtype=torch.float64
         )
@@ -279,54 +288,9 @@ class Records:
         )
 
 
-def _check_spec(spec: StateSpec) -> None:
-    if not isinstance(spec, StateSpec):
-        raise TypeError(
-            f"Expected spec as a StateSpec, such as StateSpec(['x', 'v'], ['force']); found "
-            f"{spec!r}."
-        )
-
-
-def _read(
-    file: str | Path,
-    spec: StateSpec,
-    states: Mapping[str, str | None],
-    actions: Mapping[str, str],
-    time: str | float,
-    segment: str | None,
-    delimiter: str,
-    decimal: str,
-) -> Record:
-    """The record in a file; for the arguments see :meth:`Records.read_csv`."""
-    table = CsvColumns(file, delimiter, decimal=decimal)
-    if isinstance(time, str):
-        times = table.numbers(time)
-    else:
-        times = checked_number("time", time, above=0) * torch.arange(
-            len(table), dtype=torch.float64
-        )
-    measured = []
-    for name, column in states.items():
-        filled_in = name in spec.previous and name == column and name not in table.names
-        if column is None or filled_in:
-            measured.append(torch.full_like(times, math.nan))
-        else:
-            measured.append(table.numbers(column, may_miss=True))
-    taken = [table.numbers(column) for column in actions.values()]
-    labels = None if segment is None else table.texts(segment)
-    return Record(times, torch.stack(measured, -1), torch.stack(taken, -1), labels, str(file))
-
-
-def _columns(
-    given: Mapping[str, Column] | None, names: Iterable[str], argument: str
-) -> dict[str, Column | str]:
-    """The column of each name: the one given, or else that of the same name.
-
-    Raises:
-        TypeError: If it is no mapping.
-        ValueError: If it has another name.
-    """
-    given, names = {} if given is None else given, tuple(names)
+def _columns(given: Any, names: tuple[str, ...], argument: str) -> dict[str, Any]:
+    """The column of each name: the one given, or else that of the same name."""
+    given = {} if given is None else given
     if not isinstance(given, Mapping):
         raise TypeError(
             f"Expected {argument} as a dictionary from names of the spec to columns, such as "

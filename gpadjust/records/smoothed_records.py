@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
 
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_whole
-from gpadjust.dynamics.particles import of_states
-from gpadjust.dynamics.targets import check_physics, parts_of
+from gpadjust.dynamics.particles import even_normal, of_states
+from gpadjust.dynamics.targets import one_physics
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.physics import ODEPhysics, Physics
 from gpadjust.records.chain import Chain, Known
@@ -23,6 +23,7 @@ from gpadjust.records.kalman import Array, draw_paths
 from gpadjust.records.record import Record, Stretch, in_control_steps
 from gpadjust.records.records import Records
 from gpadjust.records.smoothing import Estimate, estimate, variation
+from gpadjust.states import StateSpec
 
 _DRAWS = 256  # of the parameters
 _SAME = 0.01  # of a step, by which another one may differ from it
@@ -47,10 +48,8 @@ class SmoothedRecords:
     noise: Tensor
     process_noise: Tensor
     log_density: float
-    _physics: Physics = field(repr=False)
-    _stretches: tuple[Stretch, ...] = field(repr=False)
-    _found: Estimate = field(repr=False)
-    _known: Known = field(repr=False)
+    _chain: Chain
+    _found: Estimate
 
     @property
     def physics_parameters(self) -> PhysicsParameters:
@@ -59,15 +58,13 @@ class SmoothedRecords:
         Raises:
             ValueError: If it has none.
         """
-        unknowns, last = self._physics.unknowns, self._found.stretches[0].states
+        unknowns, last = self._chain.physics.unknowns, self._found.stretches[0].states
         if not unknowns:
             return PhysicsParameters.of(None)
         p = len(unknowns)
         mean, covariance = (torch.from_numpy(part[0, ..., -p:].copy()) for part in last)
         values, vectors = torch.linalg.eigh(covariance[-p:])
-        engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=0)
-        shares = engine.draw(_DRAWS, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
-        spread = torch.special.ndtri(shares) * values.clamp_min(0).sqrt()
+        spread = even_normal(_DRAWS, p, seed=0) * values.clamp_min(0).sqrt()
         return PhysicsParameters(unknowns, unknowns.at(mean + spread @ vectors.mT))
 
     @cached_property
@@ -84,10 +81,9 @@ class SmoothedRecords:
         Raises:
             ValueError: If the physics has no unknown parameters.
         """
-        if not self._physics.unknowns:
+        if not self._chain.physics.unknowns:
             PhysicsParameters.of(None)
-        chain = Chain(self._physics, self.records.spec, self._stretches, self._known)
-        return variation(chain, self._found)
+        return variation(self._chain, self._found)
 
     def draw(self, seed: int = 0) -> Records:
         """States drawn from their posterior, along each record.
@@ -102,8 +98,8 @@ class SmoothedRecords:
             ValueError: If it is no whole number of 0 or more.
         """
         rng = np.random.default_rng(checked_whole("seed", seed, 0))
-        paths = draw_paths(self._found.stretches, len(self._physics.unknowns), rng)
-        return _records(self.records, self._stretches, paths)
+        paths = draw_paths(self._found.stretches, self._chain.num_parameters, rng)
+        return _records(self.records, self._chain.stretches, paths)
 
     def __repr__(self) -> str:
         """Names, noise and process noise."""
@@ -204,21 +200,17 @@ def smooth(
         )
         stretches = [stretch for stretch in stretches if len(stretch.actions)]
     whole = _checked_physics(physics, records, stretches[0])
-    known = Known(
-        _variances(noise, "noise", records),
-        _variances(process_noise, "process_noise", records),
-        _starts(start, records),
-    )
-    _check_hidden(stretches, known, records)
-    measured = torch.cat([stretch.states for stretch in stretches])
-    hidden = [i for i in spec.moving if measured[:, i].isnan().all()]
+    variances = _variances(noise, "noise", spec), _variances(process_noise, "process_noise", spec)
+    known = Known(*variances, _starts(start, spec))
+    hidden = _hidden(stretches, known, spec)
     if num_starts is None:
         num_starts = 4 if hidden and whole.unknowns else 1
     checked_whole("num_starts", num_starts, 1)
-    found = estimate(whole, spec, stretches, known, max_rounds, num_starts, progress)
-    variances = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
+    chain = Chain(whole, spec, stretches, known)
+    found = estimate(chain, max_rounds, num_starts, progress)
+    squares = [np.diagonal(s.covariances, axis1=1, axis2=2) for s, _ in found.stretches]
     still = [each._replace(states=torch.zeros_like(each.states)) for each in stretches]
-    sd = _by_record(records, still, [np.sqrt(v.clip(0)) for v in variances], remember=False)
+    sd = _by_record(records, still, [np.sqrt(v.clip(0)) for v in squares], remember=False)
     sizes = torch.zeros(2, spec.state_dim, dtype=torch.float64)
     sizes[:, spec.moving] = torch.from_numpy(np.sqrt([found.noise, found.process_noise]))
     sizes[0, hidden] = torch.nan
@@ -228,10 +220,8 @@ def smooth(
         sizes[0],
         sizes[1],
         found.log_density,
-        whole,
-        tuple(stretches),
+        chain,
         found,
-        known,
     )
 
 
@@ -266,12 +256,7 @@ def _checked_physics(
     physics: Physics | Callable[[Tensor], Tensor], records: Records, stretch: Stretch
 ) -> Physics:
     """One physics of next states, of the control step of a stretch."""
-    whole = check_physics(physics, records.spec)
-    if len(parts := parts_of(whole)) > 1:
-        raise ValueError(
-            f"Expected one physics to follow, got {', '.join(map(repr, parts))}; smooth by one of "
-            "them."
-        )
+    whole = one_physics(physics, records.spec, "smooth by one of them")
     found = float(stretch.times[1] - stretch.times[0])
     if isinstance(whole, ODEPhysics) and abs(whole.step - found) > _SAME * found:
         raise ValueError(
@@ -281,9 +266,8 @@ def _checked_physics(
     return whole
 
 
-def _variances(given: Tensor | None, name: str, records: Records) -> Array:
+def _variances(given: Tensor | None, name: str, spec: StateSpec) -> Array:
     """Variances of the states that move, NaN where they are to be learnt."""
-    spec = records.spec
     sd = torch.full((spec.state_dim,), math.nan, dtype=torch.float64)
     if given is not None:
         sd = of_states(given, name, (spec.state_dim,))
@@ -297,10 +281,9 @@ def _variances(given: Tensor | None, name: str, records: Records) -> Array:
 
 
 def _starts(
-    given: Mapping[str, tuple[float, float]] | None, records: Records
+    given: Mapping[str, tuple[float, float]] | None, spec: StateSpec
 ) -> dict[int, tuple[float, float]]:
     """Prior knowledge of the first states, by their number among those that move."""
-    spec = records.spec
     if given is not None and not isinstance(given, Mapping):
         raise TypeError(
             f"Expected start as a dictionary, such as {{{spec.states[0]!r}: (0.0, 1.0)}}: mean and "
@@ -320,16 +303,17 @@ def _starts(
     return found
 
 
-def _check_hidden(stretches: Sequence[Stretch], known: Known, records: Records) -> None:
-    """Raise a ValueError unless something is measured, and states that never are have a start."""
-    spec = records.spec
+def _hidden(stretches: Sequence[Stretch], known: Known, spec: StateSpec) -> list[int]:
+    """The states that were never measured; a ValueError if they are all, or have no start."""
     names = [spec.states[i] for i in spec.moving]
     measured = torch.cat([~stretch.states[:, spec.moving].isnan() for stretch in stretches])
     if not measured.any():
         raise ValueError(f"Expected measured states, found none of {', '.join(names)}.")
-    for i in (~measured.any(0)).nonzero().flatten().tolist():
+    hidden: list[int] = (~measured.any(0)).nonzero().flatten().tolist()
+    for i in hidden:
         if i not in known.start:
             raise ValueError(
                 f"State {names[i]!r} was never measured; say where it may be at the beginning of a "
                 f"stretch, such as start={{{names[i]!r}: (0.0, 1.0)}}: mean and standard deviation."
             )
+    return [spec.moving[i] for i in hidden]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gpadjust.physics import Physics, PhysicsError
-from gpadjust.records.chain import Chain, Known, Path
+from gpadjust.dynamics.particles import even_normal
+from gpadjust.physics import PhysicsError
+from gpadjust.records.chain import Chain
 from gpadjust.records.kalman import Array, Smoothed, smooth_chain
-from gpadjust.records.record import Stretch
-from gpadjust.states import StateSpec
 
 _LONGER = 1.6  # than a step of expectation maximisation, in logarithms
 _NEARER = math.log(4)  # the most that a logarithm of a variance changes in a round
@@ -37,18 +36,13 @@ class SmoothingWarning(UserWarning):
 class Estimate(NamedTuple):
     """The states that stretches went through, and what decided that.
 
-    Args:
-        stretches: Moments of their states, ``T + 1 x (d + p)``: after the ``d`` states come the
-            coordinates of the unknown parameters.
-        noise: Variances ``d`` of the errors of what is measured.
-        process_noise: Variances ``d`` of what a step adds to the physics.
-        log_density: Of what was measured.
+    Moments are of ``d`` states and after them the coordinates of the ``p`` unknown parameters.
     """
 
     stretches: list[Smoothed]
-    noise: Array
-    process_noise: Array
-    log_density: float
+    noise: Array  # variances d of the errors of what is measured
+    process_noise: Array  # variances d of what a step adds to the physics
+    log_density: float  # of what was measured
 
 
 class _End(NamedTuple):
@@ -58,15 +52,7 @@ class _End(NamedTuple):
     gained: float
 
 
-def estimate(
-    physics: Physics,
-    spec: StateSpec,
-    stretches: Sequence[Stretch],
-    known: Known,
-    max_rounds: int,
-    num_starts: int,
-    progress: bool = False,
-) -> Estimate:
+def estimate(chain: Chain, max_rounds: int, num_starts: int, progress: bool) -> Estimate:
     """States, parameters of the physics and sizes of errors that explain stretches best.
 
     Each round linearises the physics along the trajectories found so far, smooths them (an iterated
@@ -86,7 +72,7 @@ def estimate(
     Warns:
         SmoothingWarning: If there are no rounds left.
     """
-    chain, ends = Chain(physics, spec, stretches, known), list[_End]()
+    ends = list[_End]()
     with tqdm(total=num_starts * max_rounds, unit="round", disable=not progress) as bar:
         for i, (coordinates, known_at_once) in enumerate(_starts(chain, num_starts)):
             bar.set_description(f"start {i + 1} of {num_starts}")
@@ -125,9 +111,7 @@ def _starts(chain: Chain, number: int) -> Iterator[tuple[Array, bool]]:
         yield np.zeros(p), True
     others = max(number - 2, 0) if something_known else number - 1
     if p and others:
-        engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=0)
-        shares = engine.draw(others, dtype=torch.float64).clamp(1e-6, 1 - 1e-6)
-        for i, coordinates in enumerate(torch.special.ndtri(shares).numpy()):
+        for i, coordinates in enumerate(even_normal(others, p, seed=0).numpy()):
             yield coordinates, something_known and i % 2 == 1
 
 
@@ -161,18 +145,6 @@ def _search(
     return _End(estimate, gained)
 
 
-class _Likelihood(NamedTuple):
-    """Likelihood of the parameters of each stretch: log Gaussians about one place.
-
-    Args:
-        precision: ``S x p x p``.
-        pull: Precision times mean, less the place, ``S x p``.
-    """
-
-    precision: Tensor
-    pull: Tensor
-
-
 def variation(chain: Chain, found: Estimate) -> Tensor:
     r"""Standard deviations of stretches' parameters, ``p``, in those of the priors.
 
@@ -182,15 +154,15 @@ def variation(chain: Chain, found: Estimate) -> Tensor:
     Laird and Ware 1982), with :math:`\log v \sim N(\log 0.05, 1)`: what the stretches say nothing
     of stays there.
     """
-    told = _told(chain, found)
+    precision, pull = _told(chain, found)
     start = math.log(_MEDIAN)
-    log_v = torch.full_like(told.pull[0], start).requires_grad_()
+    log_v = torch.full_like(pull[0], start).requires_grad_()
     search = torch.optim.LBFGS([log_v], max_iter=_ROUNDS, line_search_fn="strong_wolfe")
 
     def cost() -> Tensor:
         search.zero_grad()
         prior = 0.5 * ((log_v - start) / _SPREAD).square().sum()
-        value = prior - log_evidence(told.precision, told.pull, log_v.exp())
+        value = prior - log_evidence(precision, pull, log_v.exp())
         value.backward()
         return value
 
@@ -203,12 +175,8 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
 
     What stretch s says of its parameters is
     :math:`\exp(h_s^\top \theta_s - \theta_s^\top \Lambda_s \theta_s / 2)`; :math:`\eta_s`, and then
-    :math:`\theta \sim N(0, I)`, are integrated out.
-
-    Args:
-        precision: The :math:`\Lambda_s`, ``S x p x p``.
-        pull: The :math:`h_s`, ``S x p``.
-        v: Standard deviations of the :math:`\eta_s`, ``p``.
+    :math:`\theta \sim N(0, I)`, are integrated out. Precisions :math:`\Lambda_s` are
+    ``S x p x p``, pulls :math:`h_s` ``S x p``, standard deviations v of the :math:`\eta_s` ``p``.
     """
     eye = torch.eye(len(v), dtype=v.dtype)
     scaled, h = precision * v, pull * v  # Lambda_s V, V h_s
@@ -222,24 +190,19 @@ def log_evidence(precision: Tensor, pull: Tensor, v: Tensor) -> Tensor:
     return own + common - whole.diagonal().log().sum()
 
 
-def _told(chain: Chain, found: Estimate) -> _Likelihood:
-    """Smooth each stretch alone, with a standard normal prior about the estimate by all."""
+def _told(chain: Chain, found: Estimate) -> tuple[Tensor, Tensor]:
+    """Precision and pull of each stretch, by smoothing it alone about the estimate by all."""
     d, p = len(found.noise), chain.num_parameters
     parameters = found.stretches[0].states.means[0, d:]
-    path = _path(chain, [s.states.means[:, :d] for s in found.stretches], parameters)
+    path = chain.path([s.states.means[:, :d] for s in found.stretches], parameters)
     precisions, pulls = [], []
     for link, (mean, variance) in zip(chain.linearised(path), chain.starts, strict=True):
         mean, variance = mean.copy(), variance.copy()
-        mean[d:], variance[d:] = parameters, 1.0
+        mean[d:], variance[d:] = parameters, 1.0  # a standard normal prior there
         (alone,), _ = smooth_chain([link], [(mean, variance)], found.noise, found.process_noise)
         covariance = alone.states.covariances[0, d:, d:]
         # No stretch knows less than its prior, but by rounding.
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - np.eye(p))
         precisions.append((vectors * values.clip(0)) @ vectors.T)
         pulls.append(np.linalg.solve(covariance, alone.states.means[0, d:] - parameters))
-    return _Likelihood(torch.from_numpy(np.stack(precisions)), torch.from_numpy(np.stack(pulls)))
-
-
-def _path(chain: Chain, states: Sequence[Array], parameters: Array) -> Path:
-    rows = np.concatenate([x[:-1] for x in states])
-    return Path([*states], parameters, chain.asked(rows, chain.actions, parameters))
+    return torch.from_numpy(np.stack(precisions)), torch.from_numpy(np.stack(pulls))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gpadjust.physics import PhysicsError
-from gpadjust.report.markup import Markup, image, number, with_unit
+from gpadjust.report.markup import Markup, image, name_and_unit, number, with_unit
 from gpadjust.report.subject import Subject
 from gpadjust.validation.plots import (
     plot_adjustment,
@@ -62,16 +61,12 @@ def inputs_drawn(subject: Subject) -> list[int]:
 def slices(subject: Subject, output: int, inputs: list[int]) -> list[Markup]:
     """Along each input what is predicted, the physics, rho and delta, the others at the median."""
     shown = subject.adjusted[output]
-    terms = [] if shown is None else [n for n in shown.model.term_names if n != "f"]
-    figures = []
-    d = len(subject.inputs)
-    axes = np.empty((1 + len(terms), d), dtype=object)
-    for i in range(d):
-        figure = Figure(figsize=(_WIDTH, 2.1 + 1.5 * len(terms)), layout="constrained")
-        heights = [1.4, *[1.0] * len(terms)]
-        grid = figure.subplots(1 + len(terms), 1, sharex=True, squeeze=False, height_ratios=heights)
-        axes[:, i] = grid[:, 0]
-        figures.append(figure)
+    terms = () if shown is None else shown.terms
+    d, rows = len(subject.inputs), 1 + len(terms)
+    figures = _figures(d, 2.1 + 1.5 * len(terms))
+    ratios = [1.4, *[1.0] * len(terms)]
+    grids = [f.subplots(rows, sharex=True, squeeze=False, height_ratios=ratios) for f in figures]
+    axes = np.hstack(grids)
     with torch.no_grad():
         for i in inputs:
             _prediction(subject, output, i, axes[0, i])
@@ -100,8 +95,8 @@ def pairs(subject: Subject, output: int) -> list[Markup]:
     shown = subject.adjusted[output]
     if shown is None or len(subject.inputs) != 2 or len(subject.outputs) > _FEW:
         return []
-    terms = [name for name in shown.model.term_names if name != "f"]
-    figures = [Figure(figsize=(_WIDTH, 2.9), layout="constrained") for _ in range(2 * len(terms))]
+    terms = shown.terms
+    figures = _figures(2 * len(terms))
     axes = np.array([figure.subplots() for figure in figures]).reshape(-1, 2)
     if terms:
         plot_adjustment_pair(shown.model, output=shown.output, axes=axes, num_points=20)
@@ -114,10 +109,10 @@ def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> 
     """The basis of predictions, over both of two inputs or along each."""
     alt = f"whether the prediction of {page_output} rests on physics, data or neither"
     if len(trusted.input_names) == 2:
-        figure = Figure(figsize=(_WIDTH, 2.8), layout="constrained")
+        (figure,) = _figures(1, 2.8)
         _without_legend(plot_trust_pair(trusted, output=output, ax=figure.subplots()))
         return [image(figure, alt)]
-    figures = [Figure(figsize=(_WIDTH, 2.0), layout="constrained") for _ in trusted.input_names]
+    figures = _figures(len(trusted.input_names), 2.0)
     axes = [figure.subplots() for figure in figures]
     plot_trust(trusted, output=output, axes=axes)
     _without_legend(axes[-1])
@@ -128,7 +123,7 @@ def trusts(trusted: Trust, output: int, inputs: list[int], page_output: str) -> 
 
 def left_out(subject: Subject, output: int) -> list[Markup]:
     """Left-out predictions against observations, and their standardized residuals."""
-    figures = [Figure(figsize=(_WIDTH, 2.9), layout="constrained") for _ in range(2)]
+    figures = _figures(2)
     plot_leave_one_out(subject.loo, output=output, axes=[f.subplots() for f in figures])
     name = subject.outputs[output]
     alts = (f"predictions of left-out {name} against observations", f"their residuals, of {name}")
@@ -137,10 +132,10 @@ def left_out(subject: Subject, output: int) -> list[Markup]:
 
 def coverage(subject: Subject, output: int) -> list[Markup]:
     """Observed against nominal coverage, and the histogram of PIT values."""
-    figures = [Figure(figsize=(_WIDTH, 2.9), layout="constrained") for _ in range(2)]
+    figures = _figures(2)
     plot_coverage(subject.loo, output=output, ax=figures[0].subplots())
-    n = int((~subject.Y[:, output].isnan()).sum())
-    plot_pit(subject.loo, output=output, bins=max(4, min(10, n // 4)), ax=figures[1].subplots())
+    bins = max(4, min(10, subject.counts[output] // 4))
+    plot_pit(subject.loo, output=output, bins=bins, ax=figures[1].subplots())
     name = subject.outputs[output]
     alts = (f"observed against nominal coverage of {name}", f"histogram of PIT values of {name}")
     return [image(figure, alt) for figure, alt in zip(figures, alts, strict=True)]
@@ -151,11 +146,15 @@ def held(subject: Subject, inputs: list[int]) -> str:
     if len(subject.inputs) == 1:
         return ""
     values = zip(subject.inputs, subject.base.tolist(), strict=True)
-    pairs = [f"{name} = {with_unit(number(v), name)}" for name, v in values]
-    pairs = [re.sub(r"\s*\[[^\[\]]*\] =", " =", pair) for pair in pairs]
+    pairs = [f"{name_and_unit(name)[0]} = {with_unit(number(v), name)}" for name, v in values]
     drawn_of = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
     few = drawn_of if len(inputs) < len(pairs) else ""
     return f"Along each input the others stay at the median of the data: {', '.join(pairs)}{few}."
+
+
+def _figures(number_of_figures: int, height: float = 2.9) -> list[Figure]:
+    size = (_WIDTH, height)  # in inches
+    return [Figure(figsize=size, layout="constrained") for _ in range(number_of_figures)]
 
 
 def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:

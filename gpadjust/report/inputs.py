@@ -269,11 +269,8 @@ def _imported(path: str) -> Any:
         ) from error
     except (Exception, SystemExit) as error:  # importing runs the user's code
         last = traceback.extract_tb(error.__traceback__)[-1]
-        place = (
-            ""
-            if isinstance(error, SyntaxError)
-            else f" ({Path(last.filename).name}, line {last.lineno})"
-        )
+        where = f" ({Path(last.filename).name}, line {last.lineno})"
+        place = "" if isinstance(error, SyntaxError) else where
         raise ValueError(
             f"{module} cannot be imported: {type(error).__name__}: {error}{place}"
         ) from error
@@ -310,22 +307,16 @@ def _check(physics: Physics, data: CsvData) -> None:
             f"{', '.join(data.Y.columns)}, found {Y.shape[-1]}."
         )
     same = torch.isclose(again, Y, rtol=_SAME, atol=_SAME * float(Y.abs().max()))
+    small = f"values between {-LARGEST:.0e} and {LARGEST:.0e}"
+    exclude = "Correct the physics there, or exclude such inputs:"
+    settle = "Take random numbers out of it, or let it set their seed itself:"
     for expected, wrong, way_out in (
-        (
-            f"values between {-LARGEST:.0e} and {LARGEST:.0e}",
-            Y.abs() > LARGEST,
-            "Correct the physics there, or exclude such inputs:",
-        ),
-        (
-            "the same values whenever it is called",
-            ~same,
-            "Take random numbers out of it, or let it set their seed itself:",
-        ),
+        (small, Y.abs() > LARGEST, exclude),
+        ("the same values whenever it is called", ~same, settle),
     ):
-        rows = tuple(wrong.any(-1).nonzero().flatten().tolist())
-        if rows:
-            found = f"found others in {len(rows)} of {plural(n, 'row')}"
-            raise ValueError(f"expected {expected}, {found}. {way_out}{_told(rows, data)}")
+        if lost := wrong.any(-1).nonzero().flatten().tolist():
+            found = f"found others in {len(lost)} of {plural(n, 'row')}"
+            raise ValueError(f"expected {expected}, {found}. {way_out}{_told(lost, data)}")
 
 
 def _error_at(physics: Physics, row: Tensor) -> str:

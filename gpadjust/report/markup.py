@@ -150,10 +150,10 @@ def name_and_unit(name: str) -> tuple[str, str]:
     return (found[1], found[2].strip()) if found else (name, "")
 
 
-def with_unit(value: str, name: str) -> str:
-    """A number and the unit that a name carries."""
+def with_unit(value: str, name: str, form: str = "{} {}") -> str:
+    """A number, or words, and the unit that a name carries; as they are if it carries none."""
     unit = name_and_unit(name)[1]
-    return f"{value} {unit}" if unit else value
+    return form.format(value, unit) if unit else value
 
 
 def listed(items: Iterable[str]) -> str:

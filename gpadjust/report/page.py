@@ -134,21 +134,9 @@ def write(
 
 
 def page(
-    subject: Subject,
-    title: str,
-    saved: Saved | str,
-    origin: Origin,
-    progress: bool = False,
+    subject: Subject, title: str, saved: Saved | str, origin: Origin, progress: bool = False
 ) -> str:
-    """A page of HTML that needs nothing else.
-
-    Args:
-        subject: Its subject.
-        title: Its title.
-        saved: The model's file beside it; or why there is none.
-        origin: The origin of the subject.
-        progress: Whether to show a progress bar.
-    """
+    """A page of HTML that needs nothing else; ``saved`` tells why if there is no model."""
     made_by = {
         "Recommendation": lambda: sections.recommendation(subject),
         "Structures": lambda: sections.structures(subject),
@@ -163,10 +151,8 @@ def page(
         "Load the model, predict": lambda: sections.loading(subject, saved, origin),
         "Settings": lambda: sections.settings(subject, origin),
     }
-    made = {}
-    for name, make in tqdm(made_by.items(), disable=not progress, unit="section", leave=False):
-        if text := make():
-            made[name] = text
+    bar = tqdm(made_by.items(), disable=not progress, unit="section", leave=False)
+    made = {name: text for name, make in bar if (text := make())}
     links = [tag("a", name, href=f"#{_anchor(name)}") for name in made]
     body = [tag("section", tag("h2", name), text, id=_anchor(name)) for name, text in made.items()]
     lead = (

@@ -86,9 +86,7 @@ class Origin:
 def verdicts(subject: Subject, how: str = COMPARE) -> Markup:
     """The verdict on each output, below the errors of formula, adjustment and data.
 
-    Args:
-        subject: The subject of the page.
-        how: Code or a command that compares, for a subject that was not compared.
+    A subject that was not compared is told ``how``, code or a command that compares.
     """
     cards = []
     for j, name in enumerate(subject.outputs):
@@ -134,8 +132,10 @@ def recommendation(subject: Subject) -> Markup:
     """The recommended model, and the reason."""
     comparison = subject.comparison
     if comparison is None:
-        what = f"This page is of a given model, {subject.model!r}. It was not compared with others."
-        return tag("p", what)
+        return tag(
+            "p",
+            f"This page is of a given model, {subject.model!r}. It was not compared with others.",
+        )
     rows = [*comparison.table.values()]
     if len(comparison.models) == 1:
         return tag("p", f"Only {rows[0][0].structure} was fitted: {_what(rows[0][0].structure)}.")
@@ -151,12 +151,8 @@ def recommendation(subject: Subject) -> Markup:
         )
         weights.append(f"{name}: {shares}" if len(comparison.table) > 1 else shares)
     mixture = tag("strong", "the mixture of all structures")
-    return join(
-        [
-            tag("p", "Recommended: ", mixture, f". {why}"),
-            tag("p", f"Its weights are {'; '.join(weights)}."),
-        ]
-    )
+    first = tag("p", "Recommended: ", mixture, f". {why}")
+    return join([first, tag("p", f"Its weights are {'; '.join(weights)}.")])
 
 
 def structures(subject: Subject) -> Markup:
@@ -166,9 +162,8 @@ def structures(subject: Subject) -> Markup:
         return _weights(subject)
     parts = []
     for j, output in enumerate(comparison.table):
-        unit = name_and_unit(output)[1]
         head = ["structure", "elpd", "less the best", "its error", "weight"]
-        head += [f"RMSE [{unit}]" if unit else "RMSE", "RMSE / sd", "in 95 %"]
+        head += [with_unit("RMSE", output, "{} [{}]"), "RMSE / sd", "in 95 %"]
         spread = spread_of(subject, j)
         rows = [
             [
@@ -186,16 +181,13 @@ def structures(subject: Subject) -> Markup:
         parts.append(table(f"Left-out predictions of {output}, best first", head, rows, marked=0))
     names = {row.structure: None for output in comparison.table for row in comparison.rows(output)}
     terms = [join([tag("dt", name), tag("dd", _what(name))]) for name in names]
-    parts.append(
-        tag(
-            "p",
-            "elpd is the log density of left-out observations, summed, in nats: higher is better. "
-            "A difference of less than two of its errors shows nothing. RMSE is of the left-out "
-            "predictions, sd is that of the observations, and the last column is the share of "
-            "left-out observations within their 95 % intervals.",
-        )
+    words = (
+        "elpd is the log density of left-out observations, summed, in nats: higher is better. A "
+        "difference of less than two of its errors shows nothing. RMSE is of the left-out "
+        "predictions, sd is that of the observations, and the last column is the share of left-out "
+        "observations within their 95 % intervals."
     )
-    return join([*parts, tag("dl", *terms)])
+    return join([*parts, tag("p", words), tag("dl", *terms)])
 
 
 def advice(subject: Subject, notes: list[str]) -> Markup:
@@ -250,8 +242,7 @@ def _weights(subject: Subject) -> Markup:
 def _what(name: str) -> str:
     """The description of a structure, with the physics if it is of one of several."""
     short, of, physics = name.partition(" of ")
-    what = _WHAT.get(short, "a structure of your own")
-    return f"{what} ({physics})" if of else what
+    return _WHAT.get(short, "a structure of your own") + f" ({physics})" * bool(of)
 
 
 def where_wrong(subject: Subject) -> Markup:
@@ -266,8 +257,7 @@ def where_wrong(subject: Subject) -> Markup:
         parts.append(drawn(partial(figures.slices, subject, j, inputs)))
         parts.append(drawn(partial(figures.pairs, subject, j)))
     held = figures.held(subject, inputs)
-    notes = [tag("p", held, class_="note")] if held else []
-    return join([*notes, *parts])
+    return join([tag("p", held, class_="note") if held else Markup(), *parts])
 
 
 def trusted(subject: Subject) -> Markup:
@@ -286,8 +276,9 @@ def trusted(subject: Subject) -> Markup:
     rows = []
     for name, shown, found in shares:
         three = (found.physics, found.data, found.neither)
-        told = [percent(float(share[shown.output])) for share in three]
-        rows.append([name, shown.structure, *told])
+        rows.append(
+            [name, shown.structure, *(percent(float(each[shown.output])) for each in three)]
+        )
     head = ["output", "by the model", "physics", "data", "neither"]
     points = f"{len(shares[0][2].X):,}"
     words = (
@@ -329,20 +320,19 @@ def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
             f"{with_unit(number(rms), name)} (root mean square; observed less physics is "
             f"{with_unit(number(mean), name)} in the mean)."
         )
-    terms = [term for term in shown.model.term_names if term != "f"]
     top = "the prediction of what is recommended, and dashed the physics"
     if subject.comparison is None:
         top = "the prediction, and dashed the physics"
     if len(subject.inputs) == 1:
         top += ", with the data"
     found.append(f"Topmost: {top}.")
-    if terms:
+    if terms := shown.terms:
         weight = "" if shown.weight == 1 else f" (weight {shown.weight:.2f})"
-        means = [shown.model.term_mean(term, shown.output) for term in terms]
-        means = [
-            0.0 if abs(mean) < _ROUNDING * spread_of(subject, output) else mean for mean in means
-        ]
-        back = [f"{term} = {number(mean)}" for term, mean in zip(terms, means, strict=True)]
+        back = []
+        for term in terms:
+            mean = shown.model.term_mean(term, shown.output)
+            none = abs(mean) < _ROUNDING * spread_of(subject, output)
+            back.append(f"{term} = {number(0.0 if none else mean)}")
         found.append(
             f"Below: {listed(terms)} of {shown.structure}{weight}, with ticks at the data; dashed, "
             f"what they fall back to without data, {listed(back)}."
@@ -358,17 +348,13 @@ def predictions(subject: Subject) -> Markup:
     scores = subject.loo.score()
     for j, name in enumerate(subject.outputs):
         rmse = float(scores.rmse[j])
-        n = int((~subject.Y[:, j].isnan()).sum())
         words = (
-            f"{name}: {plural(n, 'observation')}, root mean square error "
+            f"{name}: {plural(subject.counts[j], 'observation')}, root mean square error "
             f"{with_unit(number(rmse), name)}, {percent(rmse / spread_of(subject, j))} of the "
             "standard deviation of the observations."
         )
-        parts += [
-            tag("p", words),
-            drawn(partial(figures.left_out, subject, j)),
-            _worst(subject, j),
-        ]
+        drawing = drawn(partial(figures.left_out, subject, j))
+        parts += [tag("p", words), drawing, _worst(subject, j)]
     return join(parts)
 
 
@@ -377,7 +363,7 @@ def coverage(subject: Subject) -> Markup:
     rows, parts = [], []
     held_by = {level: subject.loo.score(level).coverage for level in _LEVELS}
     for j, name in enumerate(subject.outputs):
-        n = int((~subject.Y[:, j].isnan()).sum())
+        n = subject.counts[j]
         for level in _LEVELS:
             share = float(held_by[level][j])
             low, high = (int(binom.ppf(p, n, level)) for p in (0.025, 0.975))
@@ -417,10 +403,9 @@ def _worst(subject: Subject, j: int) -> Markup:
     loo, name = subject.loo, subject.outputs[j]
     sure = loo.residuals[:, j].abs().nan_to_num(nan=-1.0)
     order = [i for i in sure.argsort(descending=True).tolist() if sure[i] >= 0][:_WORST]
-    unit = name_and_unit(name)[1]
-    of = f" [{unit}]" if unit else ""
     few = len(subject.inputs) <= 4
-    head = ["", f"observed{of}", f"predicted{of}", "95 %", "residual / sd"]
+    said = [with_unit(what, name, "{} [{}]") for what in ("observed", "predicted")]
+    head = ["", *said, "95 %", "residual / sd", *(subject.inputs if few else ())]
     rows = []
     for i in order:
         half = quantile(0.95) * float(loo.variance[i, j].sqrt())
@@ -430,7 +415,6 @@ def _worst(subject: Subject, j: int) -> Markup:
         cells += [f"{float(loo.residuals[i, j]):+.1f}"]
         cells += [number(x, 4) for x in subject.X[i].tolist()] if few else []
         rows.append([subject.rows[i], *cells])
-    head += list(subject.inputs) if few else []
     caption = f"The {len(rows)} observations of {name} that are farthest from their predictions"
     return table(caption, head, rows)
 
@@ -440,9 +424,7 @@ def parameters(subject: Subject) -> Markup:
     parts = []
     seen: set[str] = set()
     for shown in subject.adjusted:
-        if shown is None or not shown.model.has_unknowns:
-            continue
-        if shown.structure in seen:
+        if shown is None or not shown.model.has_unknowns or shown.structure in seen:
             continue  # outputs share them
         seen.add(shown.structure)
         known: PhysicsParameters = shown.model.physics_parameters
@@ -471,10 +453,8 @@ def summary(subject: Subject) -> Markup:
         "lengthscale is the distance over which a function changes, sd how much. Means are those "
         "of the prior; what was learnt of rho and delta is in the figures."
     )
-    text = code(subject.model.summary())
-    return join(
-        [tag("p", words), tag("details", tag("summary", "All hyper-parameters"), text, open="")]
-    )
+    title, text = tag("summary", "All hyper-parameters"), code(subject.model.summary())
+    return join([tag("p", words), tag("details", title, text, open="")])
 
 
 def data(subject: Subject, origin: Origin) -> Markup:
@@ -485,8 +465,7 @@ def data(subject: Subject, origin: Origin) -> Markup:
         for name, column in zip(names, values.unbind(-1), strict=True):
             seen = column[~column.isnan()]
             short, unit = name_and_unit(name)
-            ends = [seen.min(), seen.median(), seen.max()]
-            numbers = [number(float(end), 4) for end in ends]
+            numbers = [number(float(end), 4) for end in (seen.min(), seen.median(), seen.max())]
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
     remarks = [f"{plural(len(subject.X), 'row')} of data.", *_repeats(subject), *origin.remarks]
@@ -504,9 +483,8 @@ def _repeats(subject: Subject) -> list[str]:
     for name, y in zip(subject.outputs, subject.Y.unbind(-1), strict=True):
         sd = _pooled_sd(y, index)
         told += [] if sd is None else [f"{with_unit(number(sd), name)} ({name_and_unit(name)[0]})"]
-    differ = (
-        f", and their outputs differ by a standard deviation of {', '.join(told)}" if told else ""
-    )
+    by = f", and their outputs differ by a standard deviation of {', '.join(told)}"
+    differ = by if told else ""
     return [f"{plural(repeated, 'row')} share their inputs with another{differ}."]
 
 
@@ -538,13 +516,7 @@ def settings(subject: Subject, origin: Origin) -> Markup:
 
 
 def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
-    """Code that loads the model beside the page, and predicts.
-
-    Args:
-        subject: The subject of the page.
-        saved: The model's file; or why there is none.
-        origin: The origin of the physics.
-    """
+    """Code that loads the model beside the page and predicts; or why no model was saved."""
     if isinstance(saved, str):
         return tag("p", f"The model could not be saved: {saved}", class_="caution")
     file, missing = saved.path.name, saved.missing
@@ -566,9 +538,8 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
                 "model was built with as f_p."
             )
         elif saved.physics:
-            words.append(
-                f"The physics is found by its name: Python has to find {', '.join(saved.physics)}."
-            )
+            by = ", ".join(saved.physics)
+            words.append(f"The physics is found by its name: Python has to find {by}.")
     arguments += [f"{name}={'f_p' if name == 'physics' else name}" for name in missing]
     call = ", ".join([repr(file), *arguments])
     point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())
@@ -589,5 +560,4 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
 def _expression(physics: Mapping[str, str]) -> str:
     if [*physics] == [""]:
         return physics[""]
-    pairs = ", ".join(f"{name!r}: {each}" for name, each in physics.items())
-    return f"{{{pairs}}}"
+    return f"{{{', '.join(f'{name!r}: {each}' for name, each in physics.items())}}}"

@@ -33,6 +33,11 @@ class Adjusted(NamedTuple):
     output: int
     weight: float
 
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """The names of rho and delta, as far as the model has them."""
+        return tuple(name for name in self.model.term_names if name != "f")
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -67,6 +72,12 @@ class Subject:
         return tuple(self.model.output_names)
 
     @property
+    def counts(self) -> list[int]:
+        """The number of observations of each output."""
+        counts: list[int] = (~self.Y.isnan()).sum(0).tolist()
+        return counts
+
+    @property
     def base(self) -> Tensor:
         """The medians of the inputs, ``d``, through which slices are laid."""
         return self.X.median(0).values
@@ -80,8 +91,9 @@ class Subject:
             if isinstance(transform, PhysicsInput):
                 given: Any = transform.physics
                 several = isinstance(given, JoinedPhysics)
-                parts = zip(given.names, given.parts, strict=True) if several else ()
-                found |= dict(parts) if several else {given.name: given}
+                found |= (
+                    zip(given.names, given.parts, strict=True) if several else {given.name: given}
+                )
         return found
 
     @property

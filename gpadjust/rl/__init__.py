@@ -7,7 +7,6 @@ except ImportError as error:
         'gpadjust.rl needs Stable-Baselines3 and Gymnasium; run `pip install "gpadjust[rl]"`.'
     ) from error
 
-from gpadjust.rl.actor_policy import actor_policy
 from gpadjust.rl.buffer import MixedReplayBuffer
 from gpadjust.rl.dyna import Dyna, DynaCallback, DynaSAC, DynaTD3
 from gpadjust.rl.model_vec_env import ModelVecEnv
@@ -21,5 +20,4 @@ __all__ = [
     "DynaTD3",
     "MixedReplayBuffer",
     "ModelVecEnv",
-    "actor_policy",
 ]

@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from gpadjust.checks import checked_number, checked_whole
 from gpadjust.control import RecordedEpisodes
 from gpadjust.states import StateSpec
 
@@ -57,12 +57,12 @@ class CompactReplayBuffer(ReplayBuffer):
         self.full = self.full or self.pos + n >= self.buffer_size
         self.pos = (self.pos + n) % self.buffer_size
 
-    def filled(self) -> dict[str, np.ndarray]:
-        """The rows that are filled and where the next one goes, as arrays."""
-        rows = {name: getattr(self, name)[: self.size()] for name in self.rows}
-        return {**rows, "next": np.array([self.pos, self.full])}
+    def filled(self) -> dict[str, Any]:
+        """The rows that are filled, and where the next one goes."""
+        rows = {name: torch.from_numpy(getattr(self, name)[: self.size()]) for name in self.rows}
+        return {**rows, "pos": self.pos, "full": self.full}
 
-    def fill(self, content: Mapping[str, np.ndarray]) -> None:
+    def fill(self, content: Mapping[str, Any]) -> None:
         """Take back what :meth:`filled` gave, with space for the other rows.
 
         Raises:
@@ -73,23 +73,19 @@ class CompactReplayBuffer(ReplayBuffer):
             if found.shape[1:] != own.shape[1:] or len(found) > len(own):
                 raise ValueError(
                     f"Expected {name} of at most {len(own)} rows of shape {own.shape[1:]}, found "
-                    f"{found.shape}."
+                    f"{tuple(found.shape)}."
                 )
-        for name in self.rows:
-            rows = np.zeros_like(getattr(self, name))
-            rows[: len(content[name])] = content[name]
-            setattr(self, name, rows)
-        self.pos, self.full = int(content["next"][0]), bool(content["next"][1])
+        self.__setstate__(dict(content))
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, of the rows those that are filled."""
-        return {**self.__dict__, **{name: getattr(self, name)[: self.size()] for name in self.rows}}
+        return {**self.__dict__, **self.filled()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the attributes back, with space for the other rows."""
         self.__dict__.update(state)
         for name in self.rows:
-            filled = state[name]
+            filled = state[name].numpy()
             rows = np.zeros((self.buffer_size, *filled.shape[1:]), dtype=filled.dtype)
             rows[: len(filled)] = filled
             setattr(self, name, rows)
@@ -110,14 +106,11 @@ class MixedReplayBuffer(CompactReplayBuffer):
 
     Args:
         buffer_size: Capacity of the real buffer.
-        observation_space: A one-dimensional ``Box``.
-        action_space: A ``Box``.
-        device: Device of the samples.
-        n_envs: Number of real environments.
-        optimize_memory_usage: Must be False.
-        handle_timeout_termination: See Stable-Baselines3.
+        args: As of Stable-Baselines3's ``ReplayBuffer``: a one-dimensional ``Box`` of observations,
+            a ``Box`` of actions, and the device, for example.
         real_fraction: Share of real samples in a batch, in [0, 1].
         model_buffer_size: Capacity of the model's buffer. Default: as ``buffer_size``.
+        options: As of ``ReplayBuffer``; ``optimize_memory_usage`` must be False.
 
     Attributes:
         model_buffer: The model's transitions.
@@ -136,43 +129,27 @@ class MixedReplayBuffer(CompactReplayBuffer):
     def __init__(
         self,
         buffer_size: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        device: torch.device | str = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        handle_timeout_termination: bool = True,
-        *,
+        *args: Any,
         real_fraction: float = 1 / 11,
         model_buffer_size: int | None = None,
+        **options: Any,
     ) -> None:
-        if not 0 <= real_fraction <= 1:
-            raise ValueError(f"real_fraction must lie in [0, 1]; found {real_fraction}.")
-        if model_buffer_size is not None and model_buffer_size < 1:
-            raise ValueError(f"model_buffer_size must be at least 1; found {model_buffer_size}.")
-        if optimize_memory_usage:
+        checked_number("real_fraction", real_fraction, least=0, most=1)
+        if model_buffer_size is not None:
+            checked_whole("model_buffer_size", model_buffer_size, 1)
+        if options.get("optimize_memory_usage"):
             raise ValueError(
                 "MixedReplayBuffer does not support optimize_memory_usage=True: model transitions "
                 "do not lie in the order of a trajectory."
             )
-        super().__init__(
-            buffer_size,
-            observation_space,
-            action_space,
-            device,
-            n_envs,
-            handle_timeout_termination=handle_timeout_termination,
-        )
+        super().__init__(buffer_size, *args, **options)
         self.real_fraction = real_fraction
         self.mix = True
-        self.failed = np.zeros((self.buffer_size, n_envs), dtype=bool)
+        self.failed = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         self.learnt = np.zeros_like(self.failed)
-        self.model_buffer = CompactReplayBuffer(
-            buffer_size if model_buffer_size is None else model_buffer_size,
-            observation_space,
-            action_space,
-            device,
-        )
+        size = buffer_size if model_buffer_size is None else model_buffer_size
+        spaces = (self.observation_space, self.action_space)
+        self.model_buffer = CompactReplayBuffer(size, *spaces, self.device)
 
     def add(
         self,

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cloudpickle
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from gpadjust.control import EpisodeCheckpoint
-from gpadjust.control.checkpoint import layer_names, pickled_environment, warn_unsaved
+from gpadjust.control.checkpoint import pickled_environment, warn_unsaved
 
 _OF_ALL = ("venv", "envs", "class_attributes", "observation_space", "action_space", "metadata")
 
@@ -32,19 +30,6 @@ class CheckpointCallback(BaseCallback):
         # Unless another callback stopped the run within an episode.
         if self.model.num_timesteps >= self.model._total_timesteps:
             self.checkpoint(self.model, "done")  # type: ignore[arg-type]
-
-
-def described(env: VecEnv) -> dict[str, Any]:
-    """Return a description of an environment in plain values."""
-    layers = _layers(env)
-    inner: list[Any] = getattr(layers[-1], "envs", [])
-    names = [type(layer).__name__ for layer in layers] + (layer_names(inner[0]) if inner else [])
-    return {
-        "wrappers": " of ".join(names),
-        "num_envs": env.num_envs,
-        "observation_space": str(env.observation_space),
-        "action_space": str(env.action_space),
-    }
 
 
 def environment_state(env: VecEnv) -> bytes:

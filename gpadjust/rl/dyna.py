@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import warnings
-from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import fields
 from pathlib import Path
@@ -29,16 +28,12 @@ from stable_baselines3.common.type_aliases import (
 )
 from stable_baselines3.common.vec_env import VecEnv
 
+from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
-from gpadjust.control.checkpoint import RandomState, TaskAgent, packed, unpacked
+from gpadjust.control.checkpoint import TaskAgent, locked, packed, unpacked
 from gpadjust.control.recorded_episodes import learn_dynamics
 from gpadjust.rl.buffer import CompactReplayBuffer, MixedReplayBuffer
-from gpadjust.rl.checkpoint import (
-    CheckpointCallback,
-    described,
-    environment_state,
-    restore_environment,
-)
+from gpadjust.rl.checkpoint import CheckpointCallback, environment_state, restore_environment
 from gpadjust.rl.model_vec_env import ModelVecEnv
 from gpadjust.rl.options import DynaOptions
 
@@ -55,15 +50,10 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     parameters of the dynamics, but not the task: pass it to ``load``, or get an agent that can only
     predict. (Files of ``save`` are Stable-Baselines3's, which hold pickles: open those you trust.)
 
-    An error on the way (a wrong reward, a physics that fails, a fit that does not converge) loses
-    nothing: the episodes are in the buffer, and the dynamics learn them after the next one. Mend
-    what is wrong, set ``agent.task`` to a task with other functions or dynamics, for example, and
-    call ``learn`` again; dynamics that know nothing learn all that is in the buffer. (Where the
-    environment was wrong, ``agent.replay_buffer.reset()`` forgets what it said.) Transitions at
-    which the physics fails are left out of what the dynamics learn, with a warning.
-
-    A step that did not happen is no data: environments tell of one, as where a simulator failed, by
-    a true ``info["step_failed"]``.
+    An error on the way loses nothing, and steps that did not happen are no data, as of
+    :class:`gpadjust.control.Agent`: mend what is wrong, set ``agent.task``, for example, and call
+    ``learn`` again. Dynamics that know nothing learn all that is in the buffer. (Where the
+    environment was wrong, ``agent.replay_buffer.reset()`` forgets what it said.)
 
     A learner of Stable-Baselines3 becomes one of this family as
     ``class DynaTD3(Dyna, TD3): ...``, if its ``train`` samples from ``replay_buffer``.
@@ -85,13 +75,11 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         num_episodes: Real episodes that have ended and were learnt from.
         task: The task; to change a part of it, set another one.
         wall_time: Seconds spent on ``"fit"``, ``"rollout"`` and ``"update"``.
-        notes: What you want to keep with the agent, in plain values; saved and resumed with it.
+        notes: As of :class:`gpadjust.control.Agent`.
 
     Raises:
-        ValueError: If there is no task, observations or actions are not boxes of the spec's
-            entries, n-step returns are asked for, or a number is out of range; when learning
-            starts, if the task's functions do not return what they should; after a real episode,
-            if its rewards or terminations are not those of the task.
+        ValueError: As :class:`gpadjust.control.Agent`, and if there is no task, or n-step returns
+            are asked for.
         TypeError: If task or options are of another kind.
         AssertionError: By Stable-Baselines3, if the actions are no box.
     """
@@ -172,8 +160,13 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             super().train(gradient_steps, batch_size)
         if new is None:
             return
-        metrics = self._learn_dynamics(new) if serves else {}
-        self.logger.record("model/real_reward", float(new.rewards.mean()))
+        metrics: dict[str, float] = {}
+        if serves:
+            with self.timed("fit"):
+                known = (self.recorded_episodes(), self.options.score_horizons)
+                metrics = learn_dynamics(self.model_task(), new, *known)
+        for name, value in {**metrics, "real_reward": float(new.rewards.mean())}.items():
+            self.logger.record(f"model/{name}", value)
         self.replay_buffer.learnt[: self.replay_buffer.size()] = True
         self.num_episodes += num_ended
         if serves:
@@ -193,15 +186,6 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         new = self._recorded(~buffer.learnt if is_fitted else None)
         least = 1 if is_fitted else 2  # a first fit needs two
         return (new if new.num_transitions >= least else None), num_ended
-
-    def _learn_dynamics(self, new: RecordedEpisodes) -> dict[str, float]:
-        """Score the dynamics on new episodes, and let them learn these; return what is logged."""
-        with self.timed("fit"):
-            horizons = self.options.score_horizons
-            metrics = learn_dynamics(self.model_task(), new, self.recorded_episodes(), horizons)
-        for name, value in metrics.items():
-            self.logger.record(f"model/{name}", value)
-        return metrics
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
         """Run model episodes, side by side, with updates at each step."""
@@ -274,9 +258,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
                 f"use {type(self).__name__} with use_sde=False."
             )
         known = [CheckpointCallback(each) if each in checkpoints else each for each in given]
-        with ExitStack() as held:
-            for each in checkpoints:
-                held.enter_context(each.locked())
+        with locked(checkpoints):
             return super().learn(total_timesteps, known if several else known[0], *args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
@@ -324,16 +306,9 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         self.model_hooks = []  # callbacks that have some add themselves
         noise = deepcopy(self.action_noise)  # which SB3 resets
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
-        before = RandomState.capture()
         seen = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         assert isinstance(seen, np.ndarray), "observations are boxes"
-        observations = torch.from_numpy(seen.astype(np.float64))
-        task.dynamics.spec.check_observations(observations)
-        # Of a single state much would look right that is not.
-        twice = task.dynamics.spec.decode(observations).repeat(2, 1)
-        middle = torch.from_numpy((self.action_space.low + self.action_space.high) / 2).double()
-        task.try_functions(twice, middle.expand(len(twice), -1))
-        before.restore()
+        self.try_task(seen, self.action_space)
         if self._random_state is not None:  # a run that goes on
             self._random_state.restore()
             self._random_state, self.action_noise = None, noise
@@ -353,19 +328,16 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
                 f"to {name} or, as it is not saved, to {name}.load. Without it the agent can only "
                 "predict."
             )
-        if not isinstance(self.task, Task):
-            raise TypeError(f"task must be a Task(dynamics, reward, ...); found {self.task!r}.")
-        if not isinstance(self.options, DynaOptions):
-            raise TypeError(f"options must be DynaOptions(...); found {self.options!r}.")
+        check_kind("task", self.task, Task, "a Task(dynamics, reward, ...)")
+        check_kind("options", self.options, DynaOptions, "DynaOptions(...)")
         return self.task
 
     def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
         """The real steps in the buffer; or the newest of each environment only."""
-        keep = None
+        buffer, keep = self.replay_buffer, None
         if newest is not None:
-            keep = np.zeros((self.replay_buffer.buffer_size, self.n_envs), dtype=bool)
-            last = self.replay_buffer.pos - 1 - np.arange(min(newest, self.replay_buffer.size()))
-            keep[last] = True
+            keep = np.zeros_like(buffer.learnt)
+            keep[buffer.pos - 1 - np.arange(min(newest, buffer.size()))] = True
         return self._recorded(keep)
 
     def _recorded(self, keep: np.ndarray | None = None) -> RecordedEpisodes:
@@ -373,13 +345,8 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         return self.replay_buffer.recorded(spec, self.policy.unscale_action, keep)
 
     def env_attribute(self, name: str) -> Any:
-        """An attribute of the first environment."""
-        if self.env is None:
-            raise ValueError(
-                "Nobody says how long an episode is; give the task an episode_length, or the agent "
-                "an environment: load(..., env=env)."
-            )
-        return self.env.get_attr(name)[0]
+        """An attribute of the first environment; None without one."""
+        return None if self.env is None else self.env.get_attr(name)[0]
 
     # The model
 
@@ -425,10 +392,9 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _model_noise(self, num_envs: int) -> ActionNoise | None:
         """Action noise as the real steps have it, begun again for each particle."""
-        noise = self.action_noise
-        if noise is None:
+        if self.action_noise is None:
             return None
-        base = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
+        base = getattr(self.action_noise, "base_noise", self.action_noise)  # of a vectorised one
         vectorised = VectorizedActionNoise(base, num_envs)
         vectorised.reset()
         return vectorised
@@ -506,7 +472,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     @classmethod
     def described(cls, env: VecEnv) -> dict[str, Any]:
         """Number, wrappers and spaces of the environments."""
-        return described(env)
+        return {**super().described(env), "num_envs": env.num_envs}
 
     def saved_parts(self) -> dict[str, bytes]:
         """SB3's file of the agent, both buffers, and the environments."""
@@ -533,7 +499,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _buffers(self) -> dict[str, CompactReplayBuffer]:
         buffer = self.replay_buffer
-        return {"replay_buffer.npz": buffer, "model_buffer.npz": buffer.model_buffer}
+        return {"replay_buffer.pt": buffer, "model_buffer.pt": buffer.model_buffer}
 
     @property
     def _action_generator(self) -> Any:

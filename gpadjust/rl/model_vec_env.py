@@ -68,6 +68,7 @@ class ModelVecEnv(VecEnv):
         worst_reward: The worst reward seen elsewhere, such as in real episodes.
 
     Attributes:
+        episode_length: Steps after which an episode is truncated.
         num_left_bounds: How many particles have left the bounds.
         worst_reward: The worst reward seen so far; infinite before the first.
 
@@ -103,6 +104,7 @@ class ModelVecEnv(VecEnv):
         self.render_mode = None
         super().__init__(num_envs, observation_space, action_space)
         self.task = task
+        self.episode_length: Any = task.episode_length
         self.sampling = sampling
         self.worst_reward = worst_reward
         self.num_left_bounds = 0
@@ -110,12 +112,6 @@ class ModelVecEnv(VecEnv):
         self._steps = torch.zeros(num_envs, dtype=torch.long)
         self._functions: TransitionFunctions | None = None
         self._is_followed = True  # whether particles have followed them already
-
-    @property
-    def episode_length(self) -> int:
-        """Steps after which an episode is truncated."""
-        assert self.task.episode_length is not None, "checked at the start"
-        return self.task.episode_length
 
     def reset(self) -> np.ndarray:
         """Start all episodes; observations ``num_envs x observation_dim``."""
@@ -170,12 +166,9 @@ class ModelVecEnv(VecEnv):
         return self.episode_length - self._steps.numpy()
 
     def refresh(self, buffer: CompactReplayBuffer) -> None:
-        """Predict the next states in a buffer again, by the model as it is now.
+        """Predict the transitions of an earlier model in a buffer again, by the model as it is now.
 
         The states and actions stay, and with them the time limits.
-
-        Args:
-            buffer: Transitions of an earlier model.
         """
         if not buffer.size():
             return
@@ -204,10 +197,8 @@ class ModelVecEnv(VecEnv):
         if not step.left_bounds.any():
             return step
         rewards = step.rewards.double().masked_fill(step.left_bounds, self.worst_reward)
-        terminated = (
-            step.terminated | step.left_bounds if self.worst_reward >= 0 else step.terminated
-        )
-        return step._replace(rewards=rewards, terminated=terminated)
+        terminal = step.left_bounds & (self.worst_reward >= 0)
+        return step._replace(rewards=rewards, terminated=step.terminated | terminal)
 
     def _draw_functions(self) -> None:
         if self.sampling == "trajectory":

@@ -54,13 +54,9 @@ class DynaOptions:
     def __post_init__(self) -> None:
         """Check them."""
         checked_whole("model_episodes", self.model_episodes, 0)
-        for name, least in (
-            ("last_model_episode", 0),
-            ("model_buffer_size", 1),
-            ("num_particles", 1),
-        ):
+        for name in ("last_model_episode", "model_buffer_size", "num_particles"):
             if getattr(self, name) is not None:
-                checked_whole(name, getattr(self, name), least)
+                checked_whole(name, getattr(self, name), 0 if name == "last_model_episode" else 1)
         checked_number("updates_per_model_step", self.updates_per_model_step, least=0)
         checked_number("real_fraction", self.real_fraction, least=0, most=1)
         check_switch("refresh_model_data", self.refresh_model_data)

@@ -110,9 +110,6 @@ class MuscleArmEnv(ViewedEnv):
             options: ``"state"``, the two angles and velocities to start from, and ``"target"``, the
                 two angles to reach, in rad and s. Default of each: drawn.
 
-        Returns:
-            The observation and an empty ``info``.
-
         Raises:
             TypeError: If ``options`` is no dictionary.
             ValueError: If ``options`` has another key, or its numbers are too few, too many or out

@@ -301,9 +301,7 @@ class ArmSimulation:
         self._start_anew()
 
 
-def opensim_arm_physics(
-    gains: tuple[float, float] = (8.0, 4.0), accuracy: float = 1e-6
-) -> BlackBoxPhysics:
+def opensim_arm_physics(gains: tuple[float, float] = (8.0, 4.0)) -> BlackBoxPhysics:
     """The physics of :func:`torque_arm_physics`, computed by OpenSim, a row at a time.
 
     The two agree to 1e-5 rad. In parallel it runs in processes (``joblib``'s ``loky``): threads
@@ -311,7 +309,6 @@ def opensim_arm_physics(
 
     Args:
         gains: As of :func:`~gpadjust.systems.arm`.
-        accuracy: The relative accuracy of the integrator.
 
     Returns:
         A physics of columns ``[theta_s, theta_e, theta_s_dot, theta_e_dot, a1, a2, a3, a4]``, in
@@ -319,8 +316,7 @@ def opensim_arm_physics(
 
     Raises:
         ImportError: If ``opensim`` is missing.
-        ValueError: If the gains are not two finite numbers that are not negative, or ``accuracy``
-            is not in (0, 1).
+        ValueError: If the gains are not two finite numbers that are not negative.
 
     Example:
         >>> import torch
@@ -328,26 +324,21 @@ def opensim_arm_physics(
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
-    step = _TorqueStep(believed_arm(gains), accuracy)
+    equation = believed_arm(gains)
+    _simulation(equation)  # a missing OpenSim is found now
+    step = partial(_torque_step, equation)
     return BlackBoxPhysics(step, batched=False, fd_step=FD_STEP, name="opensim_arm")
 
 
-class _TorqueStep:
+def _torque_step(equation: ArmEquation, row: NDArray[np.float64]) -> NDArray[np.float64]:
     """A step of one row; a light pickle, as each process keeps the models it has built."""
-
-    def __init__(self, equation: ArmEquation, accuracy: float) -> None:
-        self.equation = equation
-        self.accuracy = accuracy
-        _simulation(equation, accuracy)  # bad arguments are found now
-
-    def __call__(self, row: NDArray[np.float64]) -> NDArray[np.float64]:
-        if row.shape != (8,):
-            raise ValueError(f"expected rows of 4 states and 4 actions; found shape {row.shape}")
-        a1, a2, a3, a4 = row[4:]
-        torques = np.array(self.equation.gains) * (a3 - a4, a1 - a2)
-        return _simulation(self.equation, self.accuracy).step(row[:4], torques)
+    if row.shape != (8,):
+        raise ValueError(f"expected rows of 4 states and 4 actions; found shape {row.shape}")
+    a1, a2, a3, a4 = row[4:]
+    torques = np.array(equation.gains) * (a3 - a4, a1 - a2)
+    return _simulation(equation).step(row[:4], torques)
 
 
 @lru_cache(maxsize=8)
-def _simulation(equation: ArmEquation, accuracy: float) -> ArmSimulation:
-    return ArmSimulation(partial(build_torque_arm, equation), accuracy)
+def _simulation(equation: ArmEquation) -> ArmSimulation:
+    return ArmSimulation(partial(build_torque_arm, equation), accuracy=1e-6)

@@ -100,7 +100,7 @@ def arm_targets() -> Tensor:
 
 
 def hand_position(angles: Tensor) -> Tensor:
-    """Where the hand is, seen from the shoulder.
+    """Return the position of the hand, seen from the shoulder.
 
     Args:
         angles: ``... x 2``, of shoulder and elbow, in rad.
@@ -120,7 +120,7 @@ def hand_position(angles: Tensor) -> Tensor:
 
 
 def hand_distance_cm(states: Tensor) -> Tensor:
-    """How far the hand is from where it would be at the target angles, in cm.
+    """Return the distance of the hand from its place at the target angles, in cm.
 
     Args:
         states: ``... x 6``.

@@ -323,9 +323,6 @@ class CartPoleSwingUpEnv(ViewedEnv):
                 at most 100. Default: drawn around the hanging pole at rest, with standard
                 deviation 0.2.
 
-        Returns:
-            The observation and an empty ``info``.
-
         Raises:
             TypeError: If ``options`` is no dictionary.
             ValueError: If ``options`` has another key, or the state is not four such numbers.

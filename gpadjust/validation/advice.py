@@ -22,7 +22,7 @@ _ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
 
 class Gain(NamedTuple):
-    """By how much an output is predicted better with the physics than without it: the verdict.
+    """The gain of predictions of an output by the physics, and the verdict on it.
 
     Attributes:
         elpd: The difference of expected log predictive densities, the sum over the observations, in
@@ -108,13 +108,10 @@ def physics_gain(
 ) -> Gain | None:
     """The gain by the physics; None if no structure uses it, or none is without it.
 
-    Args:
-        structures: The structures by their names.
-        order: The names, best first.
-        density: The log predictive densities of left-out observations by each, ``n``.
-        relevance: Probabilities that the physics is of use, of the structures that were weighed
-            without it. Of a structure that was not, the highest one counts: of several physics one
-            may be of use, and others not.
+    Structures, log predictive densities ``n`` of left-out observations, and ``relevance``
+    (probabilities that the physics is of use, of structures that were weighed without it) are by
+    name, the ``order`` best first. Of a structure that was not weighed, the highest probability
+    counts: of several physics one may be of use, and others not.
     """
     names = [*order]
     physical = [name for name in names if structures[name].uses_physics]
@@ -144,20 +141,11 @@ def advice(
     table: dict[str, list[Candidate]],
     X: Tensor,
 ) -> tuple[dict[str, Gain], list[str]]:
-    """The gain of each output by the physics, and sentences on all else.
+    """The gain by the physics of outputs where there is one without it, and sentences on all else.
 
-    Args:
-        structures: The structures that were fitted.
-        models: The models by the names of their structures.
-        left_out: Their leave-one-out predictions.
-        converged: Whether their samples are of the posterior, ``m`` each.
-        relevance: Probabilities that the physics is of use, ``m``, of the structures that say it.
-        table: The rankings, by the names of the outputs.
-        X: Training inputs, ``n x d``.
-
-    Returns:
-        The gains by the names of the outputs, where structures with and without the physics were
-        compared; and the sentences.
+    Models, predictions, ``converged`` (whether samples are of the posterior, ``m``) and
+    ``relevance`` (probabilities that the physics is of use, ``m``) are by the names of structures,
+    rankings by those of outputs.
     """
     by_name = {structure.name: structure for structure in structures}
     gains: dict[str, Gain] = {}
@@ -255,7 +243,8 @@ def _preferred(model: TermsGP, X: Tensor, output: int) -> list[str]:
         return []
     with torch.no_grad():
         if set(names) <= set(model.term_names):
-            sizes = torch.stack([_mean_of(model, n, X)[:, output].abs() for n in names])  # k x n
+            means = [model.term(name, X).mean for name in names]
+            sizes = torch.stack([mean[:, output].abs() for mean in means])  # k x n
         else:
             constants = [abs(model.term_mean(n, output)) for n in names]
             sizes = torch.tensor(constants).unsqueeze(-1).expand(-1, len(X)).to(X)
@@ -265,19 +254,10 @@ def _preferred(model: TermsGP, X: Tensor, output: int) -> list[str]:
     sentences = [f"Mean size of rho at the data: {shares}."]
     for i in range(X.shape[-1]):
         low = X[:, i] <= X[:, i].median()
-        if low.all():
-            continue
-        first, second = sizes[:, low].mean(-1), sizes[:, ~low].mean(-1)
-        a, b = int(first.argmax()), int(second.argmax())
-        if a != b:
+        a, b = (int(sizes[:, part].mean(-1).argmax()) for part in (low, ~low))
+        if a != b and not low.all():
             sentences.append(
                 f"Below the median of {model.input_names[i]} the data prefer {labels[a]}, above it "
                 f"{labels[b]}."
             )
     return sentences
-
-
-def _mean_of(model: TermsGP, term: str, X: Tensor) -> Tensor:
-    """The posterior mean of a term, ``n x m``."""
-    mean: Tensor = model.term(term, X).mean
-    return mean

@@ -72,7 +72,7 @@ class Comparison:
     @property
     def chosen(self) -> str:
         """The structure that has 0.95 of the weight of all outputs, otherwise ``"stacked"``."""
-        least = _weights(self.models, [*self.table.values()]).amin(-1).tolist()
+        least = _weights(self.models, self.table).amin(-1).tolist()
         return next((n for n, w in zip(self.models, least, strict=True) if w >= _ALL), STACKED)
 
     @property
@@ -87,7 +87,7 @@ class Comparison:
         """
         if self.chosen != STACKED:
             return self.left_out[self.chosen]
-        weight = _weights(self.models, [*self.table.values()]).unsqueeze(-2)  # K x 1 x m
+        weight = _weights(self.models, self.table).unsqueeze(-2)  # K x 1 x m
         return mixed([self.left_out[name] for name in self.models], weight)
 
     def errors(self) -> dict[str, dict[str, float]]:
@@ -134,17 +134,19 @@ class Comparison:
         lines: list[str] = []
         for output, errors in self.errors().items():
             where = f"{output}: " if len(self.table) > 1 else ""
-            each = "; ".join(f"{_told(name)}: RMSE {rmse:.3g}" for name, rmse in errors.items())
+            # That of the physics alone is the same, left out or not.
+            told = {n: n if n.startswith(ALONE) else f"{n}, left out" for n in errors}
+            each = "; ".join(f"{told[name]}: RMSE {rmse:.3g}" for name, rmse in errors.items())
             lines += [where + each] if each else []
         lines += [""] if lines else []
         for output, rows in shown.items():
             lines.append(f"{output:{width}}" + "".join(f"  {name:>9}" for name in head))
-            lines += [
-                f"{row.structure:{width}}  {row.elpd:>9.4g}  {row.elpd_diff:>9.3g}"
-                f"  {row.se_diff:>9.2g}  {_weight_of(row):>9}  {row.rmse:>9.3g}"
-                f"  {row.coverage:>9.2f}"
-                for row in rows
-            ]
+            for row in rows:
+                weight = "-" if row.structure.startswith(ALONE) else f"{row.weight:.2f}"
+                lines.append(
+                    f"{row.structure:{width}}  {row.elpd:>9.4g}  {row.elpd_diff:>9.3g}"
+                    f"  {row.se_diff:>9.2g}  {weight:>9}  {row.rmse:>9.3g}  {row.coverage:>9.2f}"
+                )
             lines.append("")
         verdict = [text for name, gain in self.gain.items() for text in gain.sentences(name)]
         return "\n".join([*lines, *verdict, *self.advice])
@@ -188,11 +190,6 @@ def compare(
     where (by the mean size of each rho at the data below and above the median of each input). A
     structure with too many unknown constants for the points is left out of models and tables,
     unless there is no other.
-
-    Beneath each table is ``"physics alone"``, f_p as it is, whose noise is estimated from the other
-    observations: no candidate, but what an adjustment has to be better than. The text begins with
-    the errors of the physics alone, adjusted, and of the data alone
-    (:meth:`Comparison.errors`).
 
     A physics with unknown parameters is calibrated by each structure that uses it: then
     ``"physics mean"`` is the calibrated physics and a delta (Kennedy and O'Hagan 2001), ``"CKA"``
@@ -258,6 +255,7 @@ def compare(
     converged: dict[str, Tensor] = {}
     relevance: dict[str, Tensor] = {}
     said: set[str] = set()
+    number = max(_DRAWS[0], min(_DRAWS[1], _MEMORY // len(data.X)))
     for structure, part in tqdm(found, disable=not progress, unit="structure"):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
@@ -274,7 +272,7 @@ def compare(
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so
                 with threads_for(len(data.X)):
-                    result = fit(model, "bayes", num_samples=_number(len(data.X)), **search)
+                    result = fit(model, "bayes", num_samples=number, **search)
                     left_out[structure.name] = leave_one_out(model)
             except Exception as error:
                 error.add_note(f"This is of the structure {structure.name!r}.")
@@ -290,44 +288,28 @@ def compare(
         converged[structure.name] = result.converged.flatten()
         if result.relevance is not None:
             relevance[structure.name] = result.relevance.flatten()
-        models[structure.name] = _thinned(model, _HELD)
+        models[structure.name] = _thinned(model)
     prior = [structure.prior for structure, _ in found]
     by_output = [ranking(left_out, j, prior) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))
-    stacked = StackedGP(models, _weights(models, by_output), _HELD)
+    stacked = StackedGP(models, _weights(models, table), _HELD)
     fitted = [structure for structure, _ in found]
     gain, sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
     alone = physics_alone(given_physics, data)
     return Comparison(models, stacked, table, sentences, gain, left_out, alone)
 
 
-def _told(name: str) -> str:
-    """The name of an error; that of the physics alone is the same, left out or not."""
-    return name if name.startswith(ALONE) else f"{name}, left out"
-
-
-def _weight_of(row: Candidate) -> str:
-    """The weight of a candidate; the physics alone is none."""
-    return "-" if row.structure.startswith(ALONE) else f"{row.weight:.2f}"
-
-
-def _number(num_points: int) -> int:
-    """Number of samples of the hyper-parameters for leave-one-out."""
-    least, most = _DRAWS
-    return max(least, min(most, _MEMORY // num_points))
-
-
-def _thinned(model: TermsGP, number: int) -> TermsGP:
+def _thinned(model: TermsGP) -> TermsGP:
     """A model that holds some of its samples."""
-    if model.num_samples is None or model.num_samples <= number:
+    if model.num_samples is None or model.num_samples <= _HELD:
         return model
-    index = torch.linspace(0, model.num_samples - 1, number).round().long()
+    index = torch.linspace(0, model.num_samples - 1, _HELD).round().long()
     thinned: TermsGP = take_samples(model, index, as_mixture=True)
     return thinned
 
 
-def _weights(models: dict[str, TermsGP], by_output: list[list[Candidate]]) -> Tensor:
+def _weights(models: dict[str, TermsGP], table: dict[str, list[Candidate]]) -> Tensor:
     """The weights of the tables, ``K x m``, in the order of the models."""
-    named = [{row.structure: row.weight for row in rows} for rows in by_output]
+    named = [{row.structure: row.weight for row in rows} for rows in table.values()]
     weights = [[own[name] for own in named] for name in models]
     return torch.tensor(weights, dtype=torch.float64)

@@ -144,14 +144,14 @@ def leave_one_out(
         else:
             mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
         density = log_densities(mean, variance, Y)
-        mean, variance, density = mixture_of(mean, variance, density, _without_each(density))
+        mean, variance, density = _mixture_of(mean, variance, density, _without_each(density))
     X, Y = X[..., rows, :].expand(*mean.shape[:-1], X.shape[-1]), Y.expand(mean.shape)
     names = getattr(model, "output_names", ())
     return LeaveOneOut(X.clone(), Y.clone(), mean, variance, density, names)
 
 
 def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:
-    """Of observations ``... x n x m`` by Gaussians ``... x S x n x m``; NaN where there is none."""
+    """Return log densities ``... x n x m`` by Gaussians ``... x S x n x m``; NaN if missing."""
     spread = (Y - Y.nanmean(-2, keepdim=True)).square().nanmean(-2, keepdim=True).sqrt()
     sd = torch.maximum(variance.sqrt(), ROUNDING * spread.unsqueeze(MCMC_DIM))
     normal = torch.distributions.Normal(mean, sd, validate_args=False)
@@ -165,7 +165,7 @@ def _without_each(density: Tensor) -> Tensor:
     return weight / weight.sum(MCMC_DIM, keepdim=True)
 
 
-def mixture_of(
+def _mixture_of(
     mean: Tensor, variance: Tensor, density: Tensor, weight: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, variance and log density of mixtures with weights, 1 in all, along ``MCMC_DIM``."""
@@ -176,7 +176,7 @@ def mixture_of(
 
 
 def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
-    """Of the mixture of several models of one output."""
+    """Return leave-one-out predictions by the mixture of several models of one output."""
     numbers = torch.tensor([part.number for part in parts], dtype=torch.float64)
     weight = (numbers / numbers.sum()).reshape(-1, 1, 1)
     return mixed([leave_one_out(part.model) for part in parts], weight)
@@ -184,11 +184,9 @@ def _of_parts(parts: Sequence[Part]) -> LeaveOneOut:
 
 def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
     """The predictions by a mixture of ``K`` models with weights ``K x 1 x m``, 1 in all."""
-    mean, variance, density = (
-        torch.stack([getattr(loo, name) for loo in each], MCMC_DIM)
-        for name in ("mean", "variance", "log_density")
-    )
-    mean, variance, density = mixture_of(mean, variance, density, weight)
+    parts = ((loo.mean, loo.variance, loo.log_density) for loo in each)
+    mean, variance, density = (torch.stack(p, MCMC_DIM) for p in zip(*parts, strict=True))
+    mean, variance, density = _mixture_of(mean, variance, density, weight)
     return replace(each[0], mean=mean, variance=variance, log_density=density)
 
 
@@ -198,9 +196,8 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
     Of an :class:`~gpadjust.AR1` those of the high level; of a batch the first.
     """
     if isinstance(model, ModelListGP | StackedGP):
-        models = (
-            model.models if isinstance(model, ModelListGP) else [p[0].model for p in model.parts]
-        )
+        several = isinstance(model, ModelListGP)
+        models = model.models if several else [parts[0].model for parts in model.parts]
         parts = [observations(part) for part in models]
         return parts[0][0], torch.cat([Y for _, Y in parts], dim=-1)
     if isinstance(model, VariationalCKA):
@@ -216,7 +213,7 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
 
 
 def _targets(model: Any) -> tuple[Tensor, Tensor]:
-    """As :meth:`~gpadjust.models.TermsGP.left_out`, for models of other libraries."""
+    """Return left-out predictions of targets, for models of other libraries."""
     inputs, y = model.train_inputs[0], model.train_targets
     covariance = to_dense(model.covar_module(inputs))
     residual = y - model.mean_module(inputs).expand(covariance.shape[:-1])
@@ -262,9 +259,7 @@ def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
                 "The models of the list have different training inputs, so their observations do "
                 "not belong to the same points; call `leave_one_out` on each of `model.models`."
             )
-    Y, mean, variance, density = (
-        torch.cat([getattr(part, name) for part in parts], dim=-1)
-        for name in ("Y", "mean", "variance", "log_density")
-    )
+    columns = ((part.Y, part.mean, part.variance, part.log_density) for part in parts)
+    Y, mean, variance, density = (torch.cat(each, dim=-1) for each in zip(*columns, strict=True))
     names = tuple(name for part in parts for name in part.output_names)
     return LeaveOneOut(X, Y, mean, variance, density, names)

@@ -45,13 +45,7 @@ class Candidate(NamedTuple):
 def ranking(
     left_out: dict[str, LeaveOneOut], output: int, prior: Sequence[float] | None = None
 ) -> list[Candidate]:
-    """The structures for one output, best first.
-
-    Args:
-        left_out: The leave-one-out predictions of each structure.
-        output: The number of the output.
-        prior: As in :func:`stacking_weights`.
-    """
+    """The structures for one output, best first; ``prior`` as in :func:`stacking_weights`."""
     density = densities(left_out, output)
     weights = stacking_weights(density, prior).tolist()
     order = density.sum(0).argsort(descending=True, stable=True).tolist()
@@ -64,17 +58,12 @@ def ranking(
 def beside(
     alone: dict[str, LeaveOneOut], left_out: dict[str, LeaveOneOut], output: int
 ) -> list[Candidate]:
-    """Rows of what is no candidate, beside the best structure for one output.
-
-    Args:
-        alone: The leave-one-out predictions of each.
-        left_out: Those of each structure.
-        output: The number of the output.
-    """
+    """Rows of what is no candidate, beside the best structure for one output."""
     density = densities(left_out, output)
     best = density[:, int(density.sum(0).argmax())]
-    each = {name: densities({name: loo}, output).squeeze(-1) for name, loo in alone.items()}
-    return [_row(name, loo, output, each[name], best, 0.0) for name, loo in alone.items()]
+    each = densities(alone, output).unbind(-1)
+    rows = zip(alone.items(), each, strict=True)
+    return [_row(name, loo, output, own, best, 0.0) for (name, loo), own in rows]
 
 
 def _row(

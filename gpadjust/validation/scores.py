@@ -48,19 +48,11 @@ def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
 def nlpd(mean: Tensor, variance: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
     """Mean negative log predictive density over the points; lower is better.
 
-    Args:
-        mean: Predicted means, as in :func:`rmse`.
-        variance: Predicted variances, of the same shape.
-        y: True values, ``... x n x m``, NaN where not observed.
-        mixture_dim: As in :func:`rmse`.
+    Arguments and errors are those of :func:`rmse`, and the predicted ``variance``, of the shape of
+    ``mean``, which is not negative.
 
     Returns:
         ``... x m``, in nats.
-
-    Raises:
-        TypeError: If one of the three is no tensor of numbers.
-        ValueError: If the shapes disagree, ``mean`` or ``variance`` has NaN, or a variance is
-            negative.
 
     Example:
         >>> import torch
@@ -130,14 +122,11 @@ def coverage(
 ) -> Tensor:
     """Share of the points that lie within the central interval of a given level.
 
-    Arguments are those of :func:`nlpd`, and the nominal coverage ``level``, between 0 and 1.
+    Arguments and errors are those of :func:`nlpd`, and the nominal coverage ``level``, a number
+    between 0 and 1.
 
     Returns:
         ``... x m``, between 0 and 1; near ``level`` if the intervals hold.
-
-    Raises:
-        TypeError: As :func:`nlpd`, or if ``level`` is not a number.
-        ValueError: As :func:`nlpd`, or if ``level`` is not between 0 and 1.
 
     Example:
         >>> import torch
@@ -209,9 +198,8 @@ class Scores:
             output_names: The names of the ``m`` outputs.
 
         Raises:
-            TypeError: As :func:`nlpd`, or if ``level`` is not a number.
-            ValueError: As :func:`rmse`, if a variance is negative, or if ``level`` is not between
-                0 and 1.
+            TypeError: As :func:`coverage`.
+            ValueError: As :func:`coverage`.
 
         Example:
             >>> import torch
@@ -374,8 +362,9 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
                 f"Expected variances of at least 0, got {values.min().item():.3g}; if they are "
                 "negative by rounding, pass `variance.clamp_min(0)`."
             )
-    one = mixture_dim is None
-    return [v.unsqueeze(0) if one else v.movedim(mixture_dim, 0) for v in predicted.values()]
+    if mixture_dim is None:
+        return [values.unsqueeze(0) for values in predicted.values()]
+    return [values.movedim(mixture_dim, 0) for values in predicted.values()]
 
 
 def _filled(y: Tensor) -> Tensor:

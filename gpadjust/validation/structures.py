@@ -142,10 +142,8 @@ def physics_alone(physics: Physics, data: TrainingData) -> dict[str, LeaveOneOut
     the mean square error at the others and ``n - 1`` degrees of freedom (Gelman et al. 2013,
     section 3.2); with known variances it is Gaussian.
 
-    Args:
-        physics: The physics, or several. Those with unknown parameters are left out: alone, they
-            are :class:`~gpadjust.CalibratedPhysics`.
-        data: Of one data set.
+    Physics with unknown parameters are left out: alone, they are
+    :class:`~gpadjust.CalibratedPhysics`.
 
     Returns:
         The predictions by ``"physics alone"``, of several physics ``"physics alone of coarse"`` and
@@ -161,13 +159,13 @@ def _left_out(physics: Physics, data: TrainingData) -> LeaveOneOut:
     if data.Yvar is not None:
         variance = data.Yvar.expand_as(mean)
         density = log_densities(mean.unsqueeze(-3), variance.unsqueeze(-3), data.Y).squeeze(-3)
-        return LeaveOneOut(data.X, data.Y, mean, variance, density, data.output_names)
-    squares = (data.Y - mean).square()
-    freedom = (~data.Y.isnan()).sum(0) - 1
-    others = squares.nansum(0) - squares.nan_to_num(nan=0.0)
-    spread = (data.Y - data.Y.nanmean(0)).square().nanmean(0)
-    scale = torch.maximum(others.clamp_min(0) / freedom, ROUNDING**2 * spread).sqrt()
-    student = StudentT(freedom.to(mean), mean, scale, validate_args=False)
-    variance = student.variance.nan_to_num(nan=torch.inf)
-    density = student.log_prob(data.Y)
+    else:
+        squares = (data.Y - mean).square()
+        freedom = (~data.Y.isnan()).sum(0) - 1
+        others = squares.nansum(0) - squares.nan_to_num(nan=0.0)
+        spread = (data.Y - data.Y.nanmean(0)).square().nanmean(0)
+        scale = torch.maximum(others.clamp_min(0) / freedom, ROUNDING**2 * spread).sqrt()
+        student = StudentT(freedom.to(mean), mean, scale, validate_args=False)
+        variance = student.variance.nan_to_num(nan=torch.inf)
+        density = student.log_prob(data.Y)
     return LeaveOneOut(data.X, data.Y, mean, variance, density, data.output_names)

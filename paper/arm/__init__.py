@@ -65,7 +65,6 @@ class Arm(Control):
     out: Path = Path("results/arm")
     settings: Settings = field(default_factory=Settings)
 
-    name: ClassVar[str] = "arm"
     axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
     packages: ClassVar[tuple[str, ...]] = (*Control.packages, "opensim")
     known: ClassVar[Mapping[str, Scenario]] = SCENARIOS
@@ -130,7 +129,6 @@ class Reaching(Experiment):
     out: Path = Path("results/reaching")
     settings: ReachingSettings = field(default_factory=ReachingSettings)
 
-    name: ClassVar[str] = "reaching"
     axes: ClassVar[Axes] = {
         "system": {
             "plain": "as the paper's",

@@ -52,7 +52,6 @@ class Calibration(Experiment):
     out: Path = Path("results/calibration")
     settings: Settings = field(default_factory=Settings)
 
-    name: ClassVar[str] = "calibration"
     axes: ClassVar[Axes] = {
         ("problem", "per_input", "noise"): {row: label(*row) for row in (*ROWS, PUMP)},
         "method": METHODS,
@@ -120,7 +119,6 @@ class Seeds(Experiment):
     """data sets of each smooth function without noise"""
     settings: SeedsSettings = field(default_factory=SeedsSettings)
 
-    name: ClassVar[str] = "seeds"
     axes: ClassVar[Axes] = {
         "data": {str(data): str(data) for data in dict.fromkeys(SETS + SMOOTH)},
         "fit": {kind: kind for kind in (SHORT, LONG, MANY)},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,9 +12,9 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from gpadjust import CKA, fit
-from gpadjust.inference import SamplingWarning
 from paper.calibration import LONG, MANY, SETS, SHORT, SMOOTH, Data, Seeds
 from paper.common.experiment import Run, Table
+from paper.common.runs import timed
 from paper.common.tables import markdown
 from paper.common.verdicts import met
 
@@ -56,11 +55,7 @@ def run(experiment: Seeds, data: str, kind: str, seed: int) -> Run:
     if kind == LONG:
         first = max(128, min(1024, 5_120_000 // len(X) ** 2))
         options = {"num_draws": settings.effort * first, "num_samples": settings.samples}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        begin = time.process_time()
-        fit(model, seed=seed, **options)
-        seconds = time.process_time() - begin
+    _, found = timed(lambda: fit(model, seed=seed, **options), time.process_time)
     mean, variance = (each.squeeze(-1) for each in model.predict(Z))
     low, high = (each.squeeze(-1) for each in model.interval(Z))
     return {
@@ -69,8 +64,7 @@ def run(experiment: Seeds, data: str, kind: str, seed: int) -> Run:
         "log_width": float((high - low).log().mean()),
         "held": float(((low <= truth) & (truth <= high)).double().mean()),
         "error": math.sqrt(float((mean - truth).square().mean())),
-        "seconds": seconds,
-        "warned": any(issubclass(each.category, SamplingWarning) for each in caught),
+        **found,
     }
 
 

@@ -200,7 +200,6 @@ class CartPole(Control):
     out: Path = Path("results/cartpole")
     settings: Settings = field(default_factory=Settings)
 
-    name: ClassVar[str] = "cartpole"
     axes: ClassVar[Axes] = {"scenario": {name: each.label for name, each in SCENARIOS.items()}}
     known: ClassVar[Mapping[str, Scenario]] = SCENARIOS
     rmses: ClassVar[Mapping[str, str]] = {
@@ -287,7 +286,6 @@ class Planning(Experiment):
     out: Path = Path("results/planning")
     settings: PlanningSettings = field(default_factory=PlanningSettings)
 
-    name: ClassVar[str] = "planning"
     axes: ClassVar[Axes] = {
         "system": {
             "plain": "as the paper's",
@@ -364,7 +362,6 @@ class Floor(Experiment):
     out: Path = Path("results/floor")
     settings: FloorSettings = field(default_factory=FloorSettings)
 
-    name: ClassVar[str] = "floor"
     axes: ClassVar[Axes] = {
         "system": {
             "mean-start": "cart-pole, mean start: cost of the best open loop found",

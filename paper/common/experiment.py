@@ -64,7 +64,7 @@ class Experiment:
     if more are to be run: nothing is run, they are kept with the new ones, or they are run again"""
 
     name: ClassVar[str]
-    """on the command line, and in the markers of the pages"""
+    """on the command line, and in the markers of the pages: that of the class in lower case"""
     axes: ClassVar[Axes]
     """by the name of each axis, its values and their labels; if values have several parts, the
     name is a tuple of theirs and each value a tuple"""
@@ -79,6 +79,7 @@ class Experiment:
     """whose versions decide the numbers"""
 
     def __init_subclass__(cls) -> None:
+        cls.name = cls.__name__.lower()
         if "axes" in cls.__dict__:
             cls.key = (*_flat(cls.axes), "seed")
 

@@ -7,17 +7,22 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from botorch.exceptions.warnings import OptimizationWarning
 from filelock import FileLock
 
 import gpadjust
+from gpadjust.inference import SamplingWarning
 from paper.common.experiment import Case, Run
+
+_Fitted = TypeVar("_Fitted")
 
 
 class RunsFile:
@@ -125,6 +130,25 @@ def rounded(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: rounded(entry) for key, entry in value.items()}
     return value
+
+
+def timed(fitted: Callable[[], _Fitted], clock: Callable[[], float]) -> tuple[_Fitted, Run]:
+    """The result of a fit; its ``"seconds"`` and whether it ``"warned"`` of samples, for a run.
+
+    Args:
+        fitted: Fits; optimisations that stopped early are shown by scores, other warnings shown.
+        clock: Of the seconds.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        start = clock()
+        result = fitted()
+        seconds = clock() - start
+    for each in caught:
+        if not issubclass(each.category, OptimizationWarning | SamplingWarning):
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    warned = any(issubclass(each.category, SamplingWarning) for each in caught)
+    return result, {"seconds": seconds, "warned": warned}
 
 
 @cache

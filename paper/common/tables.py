@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from paper.common.experiment import Run, Table
@@ -204,13 +203,6 @@ def numbers(table: pd.DataFrame, header: Sequence[str], form: str) -> str:
         for label, values in zip(table.index, table.to_numpy(), strict=True)
     ]
     return markdown(header, rows)
-
-
-def best_in_bold(values: pd.Series[float]) -> list[str]:
-    """Two digits of each value, the lowest in bold (and what looks the same)."""
-    cells = [f"{value:.2g}" for value in values]
-    best = f"{np.nanmin(values):.2g}"
-    return [f"**{cell}**" if cell == best else cell for cell in cells]
 
 
 def settings_table(columns: Mapping[str, Mapping[str, Any]]) -> str:

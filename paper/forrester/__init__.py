@@ -42,7 +42,6 @@ class Forrester(Experiment):
     out: Path = Path("results/forrester")
     settings: Settings = field(default_factory=Settings)
 
-    name: ClassVar[str] = "forrester"
     axes: ClassVar[Axes] = {"reading": READINGS, "protocol": PROTOCOLS | {GRID: GRID, OTHER: OTHER}}
     calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.RRA")
 

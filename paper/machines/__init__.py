@@ -92,7 +92,6 @@ class Real(Experiment):
     out: Path = Path("results/real")
     settings: RealSettings = field(default_factory=RealSettings)
 
-    name: ClassVar[str] = "real"
     axes: ClassVar[Axes] = {
         "system": {
             "double-pendulum": "double pendulum",
@@ -155,7 +154,6 @@ class Elsewhere(Experiment):
     out: Path = Path("results/elsewhere")
     settings: ElsewhereSettings = field(default_factory=ElsewhereSettings)
 
-    name: ClassVar[str] = "elsewhere"
     axes: ClassVar[Axes] = {
         "training": TRAININGS,
         "learner": {
@@ -257,7 +255,6 @@ class Tanks(Experiment):
     out: Path = Path("results/tanks")
     settings: TanksSettings = field(default_factory=TanksSettings)
 
-    name: ClassVar[str] = "tanks"
     axes: ClassVar[Axes] = {
         "n": {1024: "all samples", 100: "100", 400: "400"},
         "learner": {**CANDIDATES, TENTH: "chosen f_p, every tenth sample", **GPS, **NARX},
@@ -325,7 +322,6 @@ class Foresight(Experiment):
     out: Path = Path("results/foresight")
     settings: ForesightSettings = field(default_factory=ForesightSettings)
 
-    name: ClassVar[str] = "foresight"
     axes: ClassVar[Axes] = {"system": {"cartpole": "cart-pole", "arm": "arm"}}
     calls: ClassVar[tuple[str, ...]] = _DYNAMICS
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
@@ -392,7 +388,6 @@ class Kinks(Experiment):
     out: Path = Path("results/kinks")
     settings: KinksSettings = field(default_factory=KinksSettings)
 
-    name: ClassVar[str] = "kinks"
     axes: ClassVar[Axes] = {
         "data": {"scattered": "random states and actions", "episodes": "steps of episodes"},
         "n": {100: "100", 300: "300"},

@@ -68,7 +68,6 @@ class Active(Experiment):
     park91a: Settings = field(default_factory=lambda: Settings(initial=10, budget=40, every=2))
     cartpole: Settings = field(default_factory=lambda: replace(_FOUR_OUTPUTS))
 
-    name: ClassVar[str] = "active"
     axes: ClassVar[Axes] = {
         "problem": {
             "forrester": "Forrester, reading B",
@@ -126,7 +125,6 @@ class Optimisation(Experiment):
     out: Path = Path("results/optimisation")
     settings: OptimisationSettings = field(default_factory=OptimisationSettings)
 
-    name: ClassVar[str] = "optimisation"
     axes: ClassVar[Axes] = {
         "problem": {
             "forrester": "forrester",
@@ -185,7 +183,6 @@ class Misled(Experiment):
     out: Path = Path("results/misled")
     settings: MisledSettings = field(default_factory=MisledSettings)
 
-    name: ClassVar[str] = "misled"
     axes: ClassVar[Axes] = {
         "problem": {name: name for name in MISLEADS + HELPS},
         "method": {

@@ -33,7 +33,6 @@ class Multifidelity(Experiment):
     out: Path = Path("results/multifidelity")
     settings: Settings = field(default_factory=Settings)
 
-    name: ClassVar[str] = "multifidelity"
     axes: ClassVar[Axes] = {
         "pair": {pair: pair for pair in DIMENSIONS},
         "per_input": {5: "N = 5 d", 10: "N = 10 d"},
@@ -79,7 +78,6 @@ class Polynomials(Experiment):
     out: Path = Path("results/polynomials")
     settings: PolynomialsSettings = field(default_factory=PolynomialsSettings)
 
-    name: ClassVar[str] = "polynomials"
     axes: ClassVar[Axes] = {
         ("pair", "n"): {kind: "{}, N = {}".format(*kind) for kind in (*_NEARLY, *_TEXTBOOK)},
         "method": {"cka": "CKA", "cka-map": 'CKA, "map"', "ar1": "AR1", "mfk": "SMT MFK"},
@@ -121,7 +119,6 @@ class Large(Experiment):
     out: Path = Path("results/large")
     settings: LargeSettings = field(default_factory=LargeSettings)
 
-    name: ClassVar[str] = "large"
     axes: ClassVar[Axes] = {
         ("learner", "observations"): {
             ("variational", 100_000): "VariationalCKA, `fit`",

@@ -20,7 +20,6 @@ class Parameters(Experiment):
     """cases of each problem"""
     out: Path = Path("results/parameters")
 
-    name: ClassVar[str] = "parameters"
     axes: ClassVar[Axes] = {
         "problem": {
             "right": "growth: f_p is right but for its parameters",
@@ -76,7 +75,6 @@ class Ridges(Experiment):
     out: Path = Path("results/ridges")
     settings: Settings = field(default_factory=Settings)
 
-    name: ClassVar[str] = "ridges"
     axes: ClassVar[Axes] = {
         "problem": {name: name for name in (*RIDGES, NINE, *FOLDS)},
         "model": {

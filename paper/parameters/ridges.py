@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,8 +11,8 @@ import pandas as pd
 from torch import Tensor
 
 from gpadjust import fit
-from gpadjust.inference import SamplingWarning
 from paper.common.experiment import Run, Table
+from paper.common.runs import timed
 from paper.common.tables import markdown
 from paper.common.verdicts import Verdict, met
 from paper.parameters import FOLDS, NINE, RIDGES, Ridges
@@ -35,18 +34,14 @@ def run(experiment: Ridges, problem: str, model: str, seed: int) -> Run:
     """Fit a model to a case; what is returned is for each parameter, in their order."""
     known = case(problem, seed)
     fitted: Any = MODELS[model](known.X, known.Y, physics=known.physics)
-    begin = time.process_time()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        result: Any = fit(fitted)
-    seconds = time.process_time() - begin
+    result: Any
+    result, timing = timed(lambda: fit(fitted), time.process_time)
     parameters = fitted.physics_parameters
     found: Run = {
         "true": [*known.true.values()],
         "interval": [end.tolist() for end in parameters.interval()],
         "size": result.effective_size.min().item(),
-        "warned": any(issubclass(each.category, SamplingWarning) for each in caught),
-        "seconds": seconds,
+        **timing,
         "reference": None,
         "distance": None,
     }

@@ -50,7 +50,6 @@ class Structures(Experiment):
     out: Path = Path("results/structures")
     settings: Settings = field(default_factory=Settings)
 
-    name: ClassVar[str] = "structures"
     axes: ClassVar[Axes] = {
         ("problem", "size", "noise"): {cell: "{}, {}".format(*cell) for cell in CELLS},
         "model": MODELS,
@@ -104,7 +103,6 @@ class Choice(Experiment):
     out: Path = Path("results/choice")
     settings: ChoiceSettings = field(default_factory=ChoiceSettings)
 
-    name: ClassVar[str] = "choice"
     axes: ClassVar[Axes] = {
         "problem": {name: name for name in OF_NO_USE + KINDS},
         "per_input": {5: "N = 5 d", 10: "N = 10 d"},

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from botorch.exceptions.warnings import OptimizationWarning
 from torch import Tensor
 
 from gpadjust import fit
 from gpadjust.dynamics import LearnedDynamics
-from gpadjust.inference import SampleResult, SamplingWarning
+from gpadjust.inference import SampleResult
 from gpadjust.models import TermsGP
 from paper.calibration import PUMP, label
 from paper.calibration.calibration import Data, of_pair, pump, scored
 from paper.common.experiment import Experiment, Run, Table
 from paper.common.learners import LEARNERS
-from paper.common.runs import RunsFile
+from paper.common.runs import RunsFile, timed
 from paper.common.tables import Cell, claims_table, frame, table
 from paper.common.verdicts import Difference, Judged, Verdict, met, paired, within
 from paper.pairs import Multifidelity
@@ -36,7 +34,6 @@ MOST_RRA = 1.15  # of RRA's RMSE in CKA's, in the mean
 _CONTAINED = ["phy", "gp"]
 _CELL = ["problem", "size", "noise"]
 _AHEAD: dict[Verdict, Verdict] = {"reproduced": "met", "not reproduced": "missed"}
-_Fitted = TypeVar("_Fitted")
 
 
 def run(
@@ -58,7 +55,7 @@ def _make(name: str) -> Callable[..., TermsGP]:
 
 def _of_function(data: Data, name: str, seed: int) -> Run:
     """Scores of each output, as those of calibration."""
-    (model, sizes), found = _timed(lambda: _fitted(data, name))
+    (model, sizes), found = timed(lambda: _fitted(data, name), time.perf_counter)
     scores = scored(model, data, seed)
     parts = (scores[score] for score in ("nrmse", "nlpd", "coverage"))
     return {"N": len(data.X), **_scores(*parts), "effective_size": sizes, **found}
@@ -78,7 +75,7 @@ def _of_system(data: System, name: str) -> Run:
         dynamics.update(*data.train)
         return dynamics
 
-    dynamics, found = _timed(learnt)
+    dynamics, found = timed(learnt, time.perf_counter)
     scores = dynamics.score(*data.test)
     change = data.spec.change(data.test.states, data.test.next_states)[:, data.spec.moving]
     sd = change.std(0)
@@ -104,20 +101,6 @@ def _scores(nrmse: Tensor, nlpd: Tensor, coverage: Tensor) -> Run:
 def _sizes(result: Any) -> list[float]:
     """The effective sample size of the draws of each output."""
     return result.effective_size.reshape(-1).tolist() if isinstance(result, SampleResult) else []
-
-
-def _timed(fitted: Callable[[], _Fitted]) -> tuple[_Fitted, Run]:
-    """What a fit returns; its seconds, and whether it said that its draws are few."""
-    start = time.perf_counter()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        result = fitted()
-    seconds = time.perf_counter() - start
-    for each in caught:
-        if not issubclass(each.category, OptimizationWarning | SamplingWarning):
-            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-    warned = any(issubclass(each.category, SamplingWarning) for each in caught)
-    return result, {"seconds": seconds, "warned": warned}
 
 
 @cache

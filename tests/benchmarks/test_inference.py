@@ -100,14 +100,14 @@ def test_full_bayes(benchmark, record_ratio, uniform, n):
 @pytest.mark.parametrize("row", [("currin", 5), ("hartmann6", 5), ("branin", 100)])
 def test_default_beside_map(benchmark, record_ratio, row, points):
     """On data sets of paper/calibration: fitting, or predicting at so many points."""
-    from paper.calibration.run import fitted, of_pair
+    from paper.calibration.calibration import fitted, of_pair
 
     sets = [of_pair(*row, 0.0, 10, seed) for seed in range(3 if row[0] == "branin" else 5)]
 
     def models(method):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return [fitted(data, method)[0] for data in sets]
+            return [fitted(data, method) for data in sets]
 
     benchmark.group = f"default beside map, {row[0]}, n = {len(sets[0].X)}"
     if not points:

@@ -27,6 +27,7 @@ from gpadjust.physics import PhysicsError
 from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 from tests.control.conftest import PLAN
+from tests.point import Falls
 
 pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
 WHOLE = replace(PLAN, horizon=None)
@@ -232,18 +233,6 @@ def test_an_error_loses_no_episode(make_agent, kind, point_reward):
     assert agent.num_episodes == 2
 
 
-class Falls(gymnasium.Wrapper):
-    """A robot that has to be set up again after its eighth step."""
-
-    steps = 0
-
-    def step(self, action):
-        self.steps += 1
-        if self.steps == 8:
-            raise OSError("the robot fell")
-        return super().step(action)
-
-
 def test_an_environment_that_fails_within_an_episode(make_agent, point_env):
     agent = make_agent(MPCAgent, Falls(point_env()))
     with pytest.raises(OSError, match="fell"):
@@ -328,7 +317,7 @@ def test_an_unknown_time_limit_is_refused(make_agent, point_env):
     ("kind", "given", "error", "message"),
     [
         (PolicySearchAgent, {"search": 3}, TypeError, r"PolicySearch\(...\); found 3"),
-        (PolicySearchAgent, {"policy": "mlp"}, TypeError, "make a BoundedPolicy .* found 'mlp'"),
+        (PolicySearchAgent, {"policy": "mlp"}, TypeError, "makes a BoundedPolicy .* found 'mlp'"),
         (PolicySearchAgent, {"policy": lambda *_: 3}, TypeError, "BoundedPolicy .* found 3"),
         (MPCAgent, {"first": 3}, TypeError, r"first must be a Planner\(...\); found 3"),
         (MPCAgent, {"reward_tolerance": "no"}, TypeError, "reward_tolerance must be a number"),
@@ -343,7 +332,7 @@ def test_bad_arguments_are_refused(make_agent, kind, given, error, message):
 
 @pytest.mark.parametrize("task", [None, 3])
 def test_without_a_task_there_is_no_agent(point_env, task):
-    with pytest.raises(TypeError, match="MPCAgent needs a task to learn"):
+    with pytest.raises(TypeError, match=r"task must be a Task.* needs to learn; found"):
         MPCAgent(point_env(), task)
 
 

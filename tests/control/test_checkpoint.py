@@ -1,14 +1,11 @@
 """Runs of agents that are interrupted, and go on as if they had not been; files of checkpoints."""
 
-import io
 import os
 import pickle
 import random
 import subprocess
 import sys
 import textwrap
-import threading
-import time
 import zipfile
 
 import gymnasium
@@ -17,17 +14,22 @@ import pytest
 import torch
 from filelock import FileLock
 
-from gpadjust.control import EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
+from gpadjust.control import MPC, EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
 from gpadjust.control.checkpoint import RandomState
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
-from tests.point import assert_equal
+from tests.point import (
+    PowerCut,
+    Shouting,
+    assert_equal,
+    assert_read_without_pickle,
+    forbid_unpickling,
+    last_lines,
+    robot,
+    scramble,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
 TOTAL = 15  # three episodes of the point
-
-
-class PowerCut(Exception):  # noqa: N818
-    pass
 
 
 def cut_at(step):
@@ -40,13 +42,6 @@ def cut_at(step):
     return callback
 
 
-def scramble():
-    """Draws from all generators, as other code between two runs may."""
-    torch.manual_seed(99)
-    np.random.seed(99)  # noqa: NPY002
-    random.seed(99)
-
-
 def numbers(agent):
     """All that an agent has learnt, and what its generators draw next."""
     episodes = agent.recorded_episodes()
@@ -55,7 +50,7 @@ def numbers(agent):
         "dynamics": agent.task.dynamics.state_dict(),
         "policy": agent.policy.state_dict() if isinstance(agent, PolicySearchAgent) else None,
         "counts": [agent.num_timesteps, agent.num_episodes, agent.promised_reward, agent.notes],
-        "random": RandomState.capture().as_arrays(),
+        "random": tuple(RandomState.capture()),
     }
 
 
@@ -126,26 +121,8 @@ SCRIPT = """
 
 @pytest.mark.slow
 def test_a_process_that_is_killed_at_random_moments(tmp_path):
-    script = tmp_path / "run.py"
-    script.write_text(textwrap.dedent(SCRIPT))
-
-    def start(name):
-        command = [sys.executable, str(script), str(tmp_path / name)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-
-    def learnt(process):
-        return process.communicate()[0].splitlines()[-1]
-
-    whole = learnt(start("whole.ckpt"))
-    moments = random.Random(0)
-    for _ in range(3):
-        process = start("run.ckpt")
-        assert process.stdout.readline() == "written\n"
-        time.sleep(moments.uniform(0.0, 0.4))
-        process.kill()
-        process.communicate()
-    assert learnt(start("run.ckpt")) == whole
+    whole, killed = last_lines(SCRIPT, tmp_path)
+    assert whole == killed
 
 
 # Files
@@ -200,6 +177,61 @@ def test_an_agent_of_ones_own_is_resumed_by_its_name(make_agent, again, tmp_path
     assert type(resume(path, *again())) is OwnAgent
 
 
+class KeepingAgent(MPCAgent):
+    """An agent that keeps what is code of the user's: tasks, the dynamics, a policy in a model."""
+
+    def improve(self, task):
+        self.kept = [task, {"asked": self.task}, task.dynamics, MPC(task, self.action_bounds())]
+        return True
+
+
+def test_a_task_is_not_pickled_wherever_it_is_kept(make_agent, again, tmp_path):
+    class Code:
+        def __call__(self, states, actions, next_states):
+            return -next_states[:, 0].square()
+
+        def __reduce__(self):
+            raise AssertionError("pickled")
+
+    for steps in (5, 0):  # in a model, in the physics
+        agent = make_agent(KeepingAgent, reward=Code()).learn(steps)
+        agent.improve(agent.known_task())
+        agent.model = agent.kept[0]
+        agent.save(tmp_path / "run.ckpt")
+        env, task = again(reward=Code())
+        resumed = resume(tmp_path / "run.ckpt", env, task)
+        model, asked, dynamics, mpc = resumed.kept
+        assert asked["asked"] is task
+        assert model is resumed.model is mpc.task
+        assert dynamics is model.dynamics
+        assert (dynamics is task.dynamics) == (steps > 0)
+
+
+def test_a_task_with_other_dynamics_is_refused(make_agent, point_task, tmp_path):
+    agent = make_agent(KeepingAgent)
+    agent.kept = point_task()
+    with pytest.raises(TypeError, match=r"keeps a Task .* name the attribute in not_saved"):
+        agent.save(tmp_path / "run.ckpt")
+
+
+class Broken:
+    """What fails as it is unpickled."""
+
+    def __getstate__(self):
+        return {"name": 1}
+
+    def __setstate__(self, state):
+        state["missing"]
+
+
+def test_an_error_of_the_users_own_is_not_that_of_another_file(make_agent, again, tmp_path):
+    agent = make_agent(MPCAgent)
+    agent.notes["broken"] = Broken()
+    agent.save(tmp_path / "run.ckpt")
+    with pytest.raises(KeyError, match="missing"):
+        resume(tmp_path / "run.ckpt", *again())
+
+
 def test_other_files_are_refused(make_agent, again, tmp_path):
     whole, cut, other = (tmp_path / name for name in ("whole", "cut", "other"))
     make_agent(MPCAgent).learn(5).save(whole)
@@ -222,24 +254,15 @@ def test_other_files_are_refused(make_agent, again, tmp_path):
 
 
 def test_an_environment_that_cannot_be_pickled_is_reset(make_agent, point_env, again, tmp_path):
-    def robot():
-        env = point_env()
-        env.unwrapped.lock = threading.Lock()
-        return env
-
     path = tmp_path / "run.ckpt"
     with (
         pytest.warns(UserWarning, match="environment cannot be saved .*pickle"),
         pytest.raises(PowerCut),
     ):
-        make_agent(MPCAgent, robot()).learn(TOTAL, [EpisodeCheckpoint(path), cut_at(13)])
-    agent = resume(path, robot(), again()[1])
+        make_agent(MPCAgent, robot(point_env())).learn(TOTAL, [EpisodeCheckpoint(path), cut_at(13)])
+    agent = resume(path, robot(point_env()), again()[1])
     assert agent.num_timesteps == 10
     assert agent.learn(5).recorded_episodes().num_transitions == TOTAL
-
-
-class Shouting(gymnasium.Wrapper):
-    """Another wrapper."""
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
@@ -248,11 +271,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
     path = tmp_path / "run.ckpt"
     make_agent(MPCAgent).learn(5).save(path)
 
-    def unpickled(*_, **__):
-        raise AssertionError("unpickled")
-
-    for name in ("pickle.load", "pickle.loads", "cloudpickle.load", "cloudpickle.loads"):
-        monkeypatch.setattr(name, unpickled)
+    forbid_unpickling(monkeypatch)
     env, task = again()
     wide = again()[0]
     wide.action_space = gymnasium.spaces.Box(-3, 3, (1,))
@@ -282,31 +301,12 @@ def test_another_physics_is_refused(make_agent, point_dynamics, again, learns, t
         resume(tmp_path / "run.ckpt", *again(**known(0.41)))
 
 
-@pytest.mark.parametrize("part", ["steps.npz", "random.npz", "dynamics.pt"])
+@pytest.mark.parametrize("part", ["steps.pt", "random.pt", "dynamics.pt"])
 def test_numbers_are_read_without_pickle(make_agent, again, tmp_path, part):
     """A planted pickle in the place of arrays does not run."""
     path = tmp_path / "run.ckpt"
     make_agent(MPCAgent).learn(5).save(path)
-    with zipfile.ZipFile(path) as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
-    planted = io.BytesIO()
-    if part.endswith(".npz"):
-        np.savez(planted, episode=np.array([Planted()], dtype=object))
-    else:
-        torch.save(Planted(), planted)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in {**parts, part: planted.getvalue()}.items():
-            archive.writestr(name, content)
-    with pytest.raises((ValueError, pickle.UnpicklingError), match=r"allow_pickle=False|weights"):
-        resume(path, *again())
-    assert not Planted.ran
-
-
-class Planted:
-    ran = False
-
-    def __reduce__(self):
-        return setattr, (Planted, "ran", True)
+    assert_read_without_pickle(path, part, lambda: resume(path, *again()))
 
 
 OTHER = """

@@ -129,15 +129,6 @@ def test_a_careful_plan_keeps_away_from_what_is_not_known():
     assert values[0.1] < values[None]
 
 
-def test_a_budget_of_time_ends_the_search(task):
-    calls = []
-    dynamics = PhysicsDynamics(SPEC, lambda X: (calls.append(len(X)), X[:, :1] + X[:, 1:])[1])
-    within = Task(dynamics, to_one, episode_length=4)
-    planner = quick(1000, seconds=1e-6)
-    planner.plan(within, torch.zeros(1).double(), BOUNDS)
-    assert len(calls) == 4  # the first sequences only
-
-
 @pytest.mark.parametrize(
     ("objective", "expected"),
     [
@@ -163,7 +154,7 @@ def test_returns_are_as_described(task, objective, expected):
         (
             lambda: PathIntegral(temperature=0),
             ValueError,
-            "temperature must be finite and above 0; found 0",
+            "temperature must be .* above 0",
         ),
         (lambda: CrossEntropy(correlation=1.0), ValueError, "correlation must be .* below 1"),
     ],

@@ -223,6 +223,12 @@ def test_bad_arguments_are_refused(change, error, message):
         PolicySearch(updates=1).improve(policy, task)
 
 
+def test_a_guide_needs_bounds():
+    policy, task = torch.nn.Linear(1, 1).double(), task_of(PhysicsDynamics(SPEC, step))
+    with pytest.raises(TypeError, match=r"which only a BoundedPolicy says, .* found Linear"):
+        PolicySearch(updates=1, guide=Planner()).improve(policy, task)
+
+
 def test_bad_options_are_refused():
     with pytest.raises(ValueError, match="updates must be at least 1; found 0"):
         PolicySearch(updates=0)

@@ -110,7 +110,7 @@ def test_horizons_are_rows_of_all_steps(run, measured):
         ({"horizons": (1, 4)}, ValueError, "at most the 3 steps of the runs, got 4"),
         ({"units": torch.zeros(2)}, ValueError, "finite and positive"),
         ({"units": torch.ones(3)}, ValueError, "Expected units of shape 2, an entry for each"),
-        ({"units": "metres"}, TypeError, "Expected units as a tensor of numbers"),
+        ({"units": "metres"}, TypeError, "Expected units to be real numbers"),
     ],
 )
 def test_options_out_of_range(run, measured, options, error, says):

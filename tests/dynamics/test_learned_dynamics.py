@@ -46,7 +46,7 @@ def test_learning_lowers_the_error_of_the_physics(cart_pole_system, make, kind):
     assert dynamics.num_transitions == 50
     states, actions, next_states = system.trial(7)
     scores = dynamics.score(states, actions, next_states)
-    for value in scores:
+    for value in (scores.rmse, scores.median, scores.nlpd, scores.crps, scores.coverage):
         assert value.shape == (4,)
         assert value.isfinite().all()
     assert ((scores.coverage >= 0) & (scores.coverage <= 1)).all()

@@ -105,8 +105,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/active/information_gain.py",
-        "if self._rest is None or self._rest.source is not self.model.conditioning():",
-        "if self._rest is None:",
+        "if self._made is None or self._made[0] is not source:",
+        "if self._made is None:",
         "The information is that before the model was trained or given other data.",
     ),
     Fault(

@@ -7,18 +7,24 @@ from pkgutil import resolve_name
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from scipy import stats
 
 from paper.__main__ import EXPERIMENTS
+from paper.common.learners import LEARNERS
 from paper.common.runner import runs_file, tables_of
 from paper.common.runs import differences
 from paper.common.tables import (
+    across,
     aligned,
-    best_in_bold,
     claims_table,
     filled,
     fragments,
+    frame,
+    groups,
     markdown,
+    of,
+    table,
 )
 from paper.common.verdicts import (
     Claim,
@@ -29,6 +35,7 @@ from paper.common.verdicts import (
     interquartile_mean,
     judge,
     met,
+    paired,
     reproduced,
     within,
 )
@@ -131,10 +138,51 @@ def test_claims_are_judged_by_the_seeds_that_all_their_scenarios_have():
 def test_tables():
     table = markdown(["a", "b"], [["1", "long"], ["22", ""]])
     assert aligned(f"title\n\n{table}") == "title\n\na   b\n--  ----\n1   long\n22"
-    assert best_in_bold(pd.Series([0.121, 0.119, 0.5])) == ["**0.12**", "**0.12**", "0.5"]
     one, other = Judged("F1", "c", "beaten", "x"), Judged("F1", "c", "beaten", "y")
     assert "| **beaten**: x | **beaten**: y |" in claims_table("claim", {"p": [one], "q": [other]})
     assert "| **beaten**: x | the same |" in claims_table("claim", {"p": [one], "q": [one]})
+
+
+def test_tables_of_runs():
+    """Rows and columns in the order of their labels; means do not depend on the order of runs."""
+    made = [
+        {"kind": kind, "learner": name, "seed": seed, "error": error, "settings": {}}
+        for kind, name, seed, error in (
+            ("b", "gp", 0, 0.121), ("b", "cka", 0, 0.1), ("b", "cka", 1, 0.3), ("a", "gp", 0, 0.5)
+        )
+    ]  # fmt: skip
+    runs = frame(made)
+    assert [*runs] == ["kind", "learner", "seed", "error"]
+    rows = groups(runs, "kind", {"a": "A", "b": "B", "c": "C"})
+    columns = across(runs, "learner", {"cka": "CKA", "gp": "GP"}, of("error", "mean", ".2g"))
+    shown = table(rows, columns, "error", bold=True)
+    assert shown.splitlines()[0] == "| error | CKA | GP |"
+    assert shown.splitlines()[2:] == ["| A |  | **0.5** |", "| B | 0.2 | **0.12** |"]
+    assert [*groups(runs, ["kind", "learner"], "{} by {}".format)] == [
+        "b by gp",
+        "b by cka",
+        "a by gp",
+    ]
+    trials = frame([{"seed": 3, "trials": {"cost": [1.0, 2.0]}, "commit": "x"}], "trials")
+    assert trials.to_dict("list") == {"seed": [3, 3], "episode": [1, 2], "cost": [1.0, 2.0]}
+
+
+def test_paired_differences_and_ratios():
+    runs = pd.DataFrame(
+        [{"learner": n, "seed": s, "error": (1 + s) * (2.0 if n == "gp" else 1.0)}
+         for n in ("cka", "gp") for s in range(3)] + [{"learner": "gp", "seed": 9, "error": 1.0}]
+    )  # fmt: skip
+    assert paired(runs, "error", "learner", "gp", "cka").text(".1f") == "+2.0 ± 0.6"
+    assert paired(runs, "error", "learner", "cka", "gp", ratio=True).ratio() == "0.50 [0.50, 0.50]"
+    assert paired(runs, "error", "learner", "cka", "rra").n == 0
+
+
+def test_learners_are_made_with_or_without_the_physics():
+    X = torch.rand(4, 1, dtype=torch.float64)
+    assert LEARNERS["literal"].make(X, X, physics=torch.sin).num_outputs == 1
+    assert type(LEARNERS["gp"].make(X, X, physics=torch.sin)).__name__ == "ZeroMeanGP"
+    with pytest.raises(ValueError, match="chapter makes"):
+        _ = LEARNERS["oracle"].make
 
 
 def test_fragments_replace_what_stands_between_their_markers():
@@ -178,8 +226,8 @@ def test_tables_are_those_of_the_committed_runs(name):
         record | [{}, {"commit": "f" * 40}, {"commit": None}][number % 3]
         for number, record in enumerate(runs.values())
     ]
-    for marker, table in tables_of(experiment, records).items():
-        assert shown[marker] == table.text
+    for marker, found in tables_of(experiment, records).items():
+        assert shown[marker] == found.text
 
 
 def test_markers_keep_what_is_between_them():

@@ -95,14 +95,20 @@ def test_unknown_pair(tmp_path):
         pair("curin")
 
 
-def test_intervals_are_judged_by_their_distance_from_95():
-    rows = [
-        {"pair": "booth", "seed": seed, "method": name, "coverage": value + seed / 1000}
+def test_intervals_are_judged_by_their_distance_from_95_and_by_density():
+    rows = pd.DataFrame(
+        {"pair": "booth", "seed": seed, "method": name, "coverage": value + seed / 1000,
+         "nlpd": density + seed / 1000}
         for seed in range(4)
-        for name, value in {"CKA": 0.94, "RRA": 0.93, "GP": 0.6, "AR1": 0.7}.items()
-    ]
-    assert judge_intervals(pd.DataFrame(rows)).verdict == "reproduced"
-    assert judge_intervals(pd.DataFrame(rows[:2])).verdict == "not run"
+        for name, value, density in (
+            ("CKA", 0.94, -2.0), ("RRA", 0.93, -1.5), ("GP", 0.6, 1.0), ("AR1", 0.7, 0.0)
+        )
+    )  # fmt: skip
+    assert judge_intervals(rows).verdict == "reproduced"
+    assert judge_intervals(rows[:2]).verdict == "not run"
+    worse = judge_intervals(rows.assign(nlpd=-rows["nlpd"]))
+    assert worse.verdict == "undetermined"
+    assert "by coverage reproduced, by NLPD not reproduced" in worse.measured
 
 
 # By the package mf2, version 2022.6.0: name, inputs, high, low.

@@ -29,7 +29,6 @@ class Toy(Experiment):
     jobs: int = 1
     scale: float = 1.0
 
-    name: ClassVar[str] = "toy"
     axes: ClassVar[Axes] = {"kind": {"a": "the first", "b": "the second"}}
     packages: ClassVar[tuple[str, ...]] = ("gpadjust", "numpy")
 

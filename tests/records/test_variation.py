@@ -9,7 +9,7 @@ from gpadjust import CalibratedPhysics
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics, StateSpec
 from gpadjust.dynamics.varying_parameters import varying_parameters
 from gpadjust.models import PhysicsParameters
-from gpadjust.physics import ODEPhysics, Unknown
+from gpadjust.physics import FunctionPhysics, ODEPhysics, Unknown
 from gpadjust.records import Record, Records, smooth
 from gpadjust.records.smoothing import log_evidence
 
@@ -169,3 +169,23 @@ def test_there_have_to_be_unknown_parameters():
     known = ODEPhysics(lambda x, u: rates(x, u, {"stiffness": 4.0, "damping": 0.3}), STEP, 2)
     with pytest.raises(ValueError, match="no unknown parameters"):
         _ = smooth(strokes(3, 0.0, seed=0), known).variation
+
+
+def test_a_turn_in_a_gap_is_no_variation():
+    def coasting(X, p):
+        speed = X[:, 1] * (1 - STEP * p.drag)
+        return torch.stack([X[:, 0] + STEP * X[:, 1], speed], dim=-1)
+
+    physics = FunctionPhysics(coasting, unknowns={"drag": Unknown(0.02, factor=FACTOR)})
+    spec = StateSpec(["q", "dq"], ["u"], angles=["q"])
+    generator, found = torch.Generator().manual_seed(0), []
+    for start in (12.0, 13.0):
+        speeds = start * (1 - STEP * 0.02) ** torch.arange(80).double()
+        angles = torch.cat([torch.zeros(1).double(), STEP * speeds[:-1].cumsum(0)])
+        states = torch.stack([angles, speeds], dim=-1)
+        states += 0.01 * torch.randn(states.shape, generator=generator)
+        states[30:37] = math.nan
+        times = STEP * torch.arange(80).double()
+        found.append(Record(times, states, torch.zeros(80, 1).double()))
+    smoothed = smooth(Records(found, spec), physics)
+    assert smoothed.variation < 0.1

@@ -1,7 +1,6 @@
 """What Dyna refuses."""
 
 import gymnasium
-import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
@@ -23,20 +22,11 @@ POINT_SPEC = StateSpec(["x"], ["v"])
         ({"real_fraction": 2}, "real_fraction must be .*; found 2"),
         ({"updates_per_model_step": float("inf")}, "updates_per_model_step must be .*; found inf"),
         ({"state_bounds": torch.ones(2, 4)}, r"state_bounds must be of shape 2 x 1"),
-        (
-            {"state_bounds": torch.tensor([[1.0], [-1.0]])},
-            r"below its upper one; found",
-        ),
+        ({"state_bounds": torch.tensor([[1.0], [-1.0]])}, "below its upper one; found"),
         ({"model_buffer_size": -1}, "model_buffer_size must be at least 1; found -1"),
         ({"model_episodes": -1}, "model_episodes must be at least 0; found -1"),
-        (
-            {"updates_per_model_step": -0.5},
-            "updates_per_model_step must be .*; found -0.5",
-        ),
-        (
-            {"updates_per_model_step": float("nan")},
-            "updates_per_model_step must be .*; found nan",
-        ),
+        ({"updates_per_model_step": -0.5}, "updates_per_model_step must be .*; found -0.5"),
+        ({"updates_per_model_step": float("nan")}, "updates_per_model_step must be .*; found nan"),
         ({"last_model_episode": -1}, "last_model_episode must be at least 0; found -1"),
         ({"episode_length": 0}, "episode_length must be at least 1; found 0"),
         ({"num_particles": 0}, "num_particles must be at least 1; found 0"),
@@ -103,18 +93,6 @@ def test_discrete_actions_are_refused_by_stable_baselines(point_agent):
         point_agent(Shaped(LINE, spaces.Discrete(2)))
 
 
-def test_a_wrong_reward_is_refused_before_it_is_used(point_agent):
-    agent = point_agent(reward=lambda states, actions, next_states: -states[:, 0].square())
-    with pytest.raises(ValueError, match=r"transition \d+ gave .* but the function says"):
-        agent.learn(5)
-    assert model_rows(agent) == 0
-
-
-def test_terminations_that_were_not_told_are_refused(point_agent, point_env):
-    with pytest.raises(ValueError, match="terminated=True, but none was given"):
-        point_agent(point_env(end=-9)).learn(5)
-
-
 def test_terminations_that_come_late_are_refused(point_agent, point_env):
     env = point_env()
     agent = point_agent(env).learn(5)
@@ -151,22 +129,5 @@ def test_an_unknown_time_limit_is_refused(point_agent, point_env):
 def test_a_model_without_starts_is_refused(point_agent):
     with pytest.raises(ValueError, match="initial_states"):
         point_agent().model_env(3)
-    assert point_agent(initial_states=lambda n: torch.ones(n, 1)).model_env(3).reset().shape == (
-        3,
-        1,
-    )
-
-
-def test_states_that_are_no_numbers_never_reach_the_buffer(point_agent, point_dynamics):
-    step = point_dynamics.sample
-
-    def broken(states, actions):
-        following = step(states, actions)
-        following[0] = torch.nan
-        return following
-
-    point_dynamics.sample = broken
-    agent = point_agent(model_episodes=3).learn(10)
-    assert np.isfinite(agent.replay_buffer.model_buffer.next_observations).all()
-    assert model_rows(agent) == 2 * (1 + 2 * 5)
-    assert all(p.isfinite().all() for p in agent.policy.parameters())
+    agent = point_agent(initial_states=lambda n: torch.ones(n, 1))
+    assert agent.model_env(3).reset().shape == (3, 1)

@@ -40,7 +40,9 @@ def rows(values):
     return obs, obs + 0.5, obs[:, :1] / 100, values, none, none
 
 
-@pytest.mark.parametrize(("batch_size", "fraction"), [(10, 0.25), (11, 1 / 11), (3, 0.5), (8, 0.1)])
+@pytest.mark.parametrize(
+    ("batch_size", "fraction"), [(10, 0.25), (11, 1 / 11), (3, 0.5), (8, 0.1), (16, 0.0), (16, 1.0)]
+)
 def test_batches_hold_the_promised_share(buffer, batch_size, fraction):
     np.random.seed(0)  # noqa: NPY002 - the generator that SB3 uses
     made = buffer(20, 20, real_fraction=fraction)
@@ -49,14 +51,6 @@ def test_batches_hold_the_promised_share(buffer, batch_size, fraction):
     assert set(counts) == {int(np.floor(expected)), int(np.ceil(expected))}
     part = expected % 1
     assert abs(np.mean(counts) - expected) <= 4 * np.sqrt(part * (1 - part) / 400)
-
-
-@pytest.mark.parametrize(("fraction", "share"), [(0.0, 0), (1.0, 1)])
-def test_batches_of_one_kind(buffer, fraction, share):
-    made = buffer(20, 20, real_fraction=fraction)
-    rewards = made.sample(16).rewards
-    assert (rewards > 0).float().mean() == share
-    assert rewards.shape == (16, 1)
 
 
 def test_a_sample_is_a_whole_row(buffer):
@@ -179,7 +173,7 @@ def test_reset_empties_both(buffer):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"real_fraction": 1.5}, "real_fraction must lie in .* found 1.5"),
+        ({"real_fraction": 1.5}, "real_fraction must be .*; found 1.5"),
         ({"real_fraction": -0.1}, "real_fraction"),
         ({"optimize_memory_usage": True}, "optimize_memory_usage"),
         ({"model_buffer_size": 0}, "model_buffer_size must be at least 1; found 0"),

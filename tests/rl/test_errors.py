@@ -3,14 +3,13 @@
 import gymnasium
 import pytest
 import torch
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-)
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from gpadjust.dynamics import LearnedDynamics, StateSpec
+from gpadjust.dynamics import LearnedDynamics
 from gpadjust.physics import PhysicsError
 from gpadjust.rl import ModelVecEnv
+from tests.point import POINT_SPEC, Falls
 from tests.rl.conftest import model_rows
 
 
@@ -21,6 +20,7 @@ def test_a_wrong_reward_is_mended_and_nothing_is_lost(point_agent, point_task, l
     before = [p.clone() for p in agent.policy.parameters()]
     with pytest.raises(ValueError, match="is not the environment's"):
         agent.learn(5)
+    assert model_rows(agent) == 0
     assert all(torch.equal(*pair) for pair in zip(before, agent.policy.parameters(), strict=True))
     agent.task = point_task(dynamics=dynamics)
     agent.learn(5, reset_num_timesteps=False)
@@ -72,18 +72,6 @@ def test_other_dynamics_learn_all_that_there_is(point_agent, point_task, learnt_
 def test_a_buffer_that_holds_no_episode_is_refused(point_agent):
     with pytest.raises(ValueError, match="buffer_size must hold an episode of 5 steps"):
         point_agent(buffer_size=3).learn(5)
-
-
-class Falls(gymnasium.Wrapper):
-    """A robot that has to be set up again after its eighth step."""
-
-    steps = 0
-
-    def step(self, action):
-        self.steps += 1
-        if self.steps == 8:
-            raise OSError("the robot fell")
-        return super().step(action)
 
 
 def test_an_environment_that_fails_within_an_episode(point_agent, point_env, learnt_dynamics):
@@ -172,10 +160,7 @@ class Counts(gymnasium.Wrapper):
         ({"initial_states": lambda n: torch.full((n, 1), torch.nan)}, "finite states; found"),
         ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(2,\)"),
         ({"terminated": lambda s: s}, r"terminated must return one value per row"),
-        (
-            {"dynamics": LearnedDynamics(StateSpec(["x"], ["v"]), lambda X: X)},
-            "next values of the 1 states .* got 2 columns",
-        ),
+        ({"dynamics": LearnedDynamics(POINT_SPEC, lambda X: X)}, "1 states .* got 2 columns"),
     ],
 )
 def test_wrong_functions_are_found_before_the_first_real_step(

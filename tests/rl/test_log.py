@@ -118,10 +118,6 @@ def test_hooks_inside_another_callback(point_agent):
     assert len(watch.fits) == 2
 
 
-def test_a_callback_that_overrides_nothing(point_agent):
-    assert point_agent().learn(10, DynaCallback()).num_episodes == 2
-
-
 def test_a_hook_that_raises_lets_nothing_be_learnt_twice(point_agent, learnt_dynamics):
     class Raises(DynaCallback):
         def on_model_fit(self, metrics):

@@ -25,17 +25,10 @@ def point_particles(point_env, point_task):
     def make(num_envs=3, start=1.0, **given):
         env = point_env()
         parts = {entry.name for entry in fields(Task)} & {*given}
-        task = point_task(
-            **{
-                "initial_states": lambda n: torch.full((n, 1), start),
-                **{name: given.pop(name) for name in parts},
-            }
-        )
-        spaces = (env.observation_space, env.action_space)
-        spaces = tuple(
-            given.pop(name, space)
-            for name, space in zip(("observation_space", "action_space"), spaces, strict=True)
-        )
+        starts = {"initial_states": lambda n: torch.full((n, 1), start)}
+        task = point_task(**{**starts, **{name: given.pop(name) for name in parts}})
+        names = ("observation_space", "action_space")
+        spaces = (given.pop(name, getattr(env, name)) for name in names)
         return ModelVecEnv(task, num_envs, *spaces, **given)
 
     return make
@@ -50,17 +43,9 @@ def rise():
 def test_perfect_physics_are_the_real_environment(cart_pole, cart_pole_dynamics):
     env = cart_pole()
     starts = cart_pole_start(3)
-    particles = ModelVecEnv(
-        Task(
-            cart_pole_dynamics,
-            cart_pole_reward,
-            initial_states=lambda n: starts[:n],
-            episode_length=25,
-        ),
-        3,
-        env.observation_space,
-        env.action_space,
-    )
+    given = {"initial_states": lambda n: starts[:n], "episode_length": 25}
+    task = Task(cart_pole_dynamics, cart_pole_reward, **given)
+    particles = ModelVecEnv(task, 3, env.observation_space, env.action_space)
     actions = np.random.default_rng(0).uniform(-10, 10, (25, 3, 1)).astype(np.float32)
     seen = [particles.reset()]
     steps = [particles.step(action) for action in actions]
@@ -244,16 +229,22 @@ def test_particles_that_leave_the_numbers_end(point_particles, point_dynamics, v
     assert np.isfinite(infos[1]["terminal_observation"]).all()
 
 
-@pytest.mark.parametrize("sampling", ["step", "trajectory"])
-def test_particles_at_which_the_physics_fails_end(point_particles, unsure_dynamics, sampling, rise):
+@pytest.fixture
+def choosy_dynamics(point_dynamics):
+    """The point, whose physics fails at large actions."""
+
     def choosy(X):
-        if (X[:, 1] > 1.5).any():
-            rows = (X[:, 1] > 1.5).nonzero().flatten().tolist()
-            raise PhysicsError("too fast", rows)
+        bad = (X[:, 1] > 1.5).nonzero().flatten().tolist()
+        if bad:
+            raise PhysicsError("too fast", bad)
         return X[:, :1] + 0.4 * X[:, 1:]
 
-    dynamics = PhysicsDynamics(unsure_dynamics.spec, choosy)
-    env = point_particles(dynamics=dynamics, sampling=sampling, num_envs=3)
+    return PhysicsDynamics(point_dynamics.spec, choosy)
+
+
+@pytest.mark.parametrize("sampling", ["step", "trajectory"])
+def test_particles_at_which_the_physics_fails_end(point_particles, choosy_dynamics, sampling, rise):
+    env = point_particles(dynamics=choosy_dynamics, sampling=sampling, num_envs=3)
     env.reset()
     obs, _, dones, infos = env.step(np.array([[1.0], [2.0], [0.0]], dtype=np.float32))
     assert dones.tolist() == [False, True, False]
@@ -277,20 +268,11 @@ def test_where_all_rewards_are_positive_leaving_terminates(point_particles, rise
 
 
 @pytest.mark.parametrize("failing", [0, 3, 6])
-def test_functions_whose_physics_fails_at_any_row(point_particles, unsure_dynamics, failing):
+def test_functions_whose_physics_fails_at_any_row(point_particles, choosy_dynamics, failing):
     """Rows are filled up to blocks of one size, which the physics may blame."""
-
-    def choosy(X):
-        bad = (X[:, 1] > 1.5).nonzero().flatten().tolist()
-        if bad:
-            raise PhysicsError("too fast", bad)
-        return X[:, :1] + 0.4 * X[:, 1:]
-
-    dynamics = PhysicsDynamics(unsure_dynamics.spec, choosy)
-    env = point_particles(dynamics=dynamics, sampling="trajectory", num_envs=3)
+    env = point_particles(dynamics=choosy_dynamics, sampling="trajectory", num_envs=3)
     env.reset()
-    space = spaces.Box(-2, 2, (1,))
-    buffer = CompactReplayBuffer(20, spaces.Box(-np.inf, np.inf, (1,)), space, "cpu")
+    buffer = CompactReplayBuffer(20, env.observation_space, env.action_space, "cpu")
     scaled = np.where(np.arange(7) == failing, 1.0, 0.1)[:, None]
     zeros = np.zeros(7, dtype=np.float32)
     buffer.add_rows(np.ones((7, 1)), np.ones((7, 1)), scaled, zeros, zeros, zeros)
@@ -310,11 +292,10 @@ def test_bounds_give_way_to_the_starts(point_particles, rise):
 @pytest.mark.parametrize("sampling", ["step", "trajectory"])
 @pytest.mark.parametrize("rows", [0, 1, 7])
 def test_refreshed_transitions_end_as_the_model_has_it(
-    point_particles, unsure_dynamics, point_env, sampling, rows
+    point_particles, unsure_dynamics, sampling, rows
 ):
     env = point_particles(dynamics=unsure_dynamics, sampling=sampling)
-    spaces_of = point_env()
-    buffer = CompactReplayBuffer(20, spaces_of.observation_space, spaces_of.action_space, "cpu")
+    buffer = CompactReplayBuffer(20, env.observation_space, env.action_space, "cpu")
     states = np.linspace(0.1, 0.9, rows, dtype=np.float32)[:, None]
     zeros = np.zeros(rows, dtype=np.float32)
     buffer.add_rows(states, states + 99, 0.2 * states, zeros, zeros, zeros)
@@ -354,29 +335,18 @@ def test_attributes_are_those_of_all_particles(point_particles):
         particles.env_method("fly")
 
 
-def column(states, actions, next_states):
-    return next_states
-
-
-def not_finite(states, actions, next_states):
-    return next_states[:, 0] / 0
-
-
 @pytest.mark.parametrize(
-    ("reward", "message"),
-    [(column, r"reward must return one value per row, shape \(3,\)"), (not_finite, "reward.*inf")],
+    ("wrong", "message"),
+    [
+        ({"reward": lambda s, a, n: n}, r"reward must return one value per row, shape \(3,\)"),
+        ({"reward": lambda s, a, n: n[:, 0] / 0}, "reward.*inf"),
+        ({"terminated": lambda s: s > 0}, "terminated must return one value per row"),
+    ],
 )
-def test_bad_rewards_are_refused(point_particles, reward, message, rise):
-    particles = point_particles(reward=reward)
+def test_bad_functions_are_refused(point_particles, wrong, message, rise):
+    particles = point_particles(**wrong)
     particles.reset()
     with pytest.raises(ValueError, match=message):
-        particles.step(rise(3))
-
-
-def test_bad_terminations_are_refused(point_particles, rise):
-    particles = point_particles(terminated=lambda states: states > 0)
-    particles.reset()
-    with pytest.raises(ValueError, match=r"terminated must return one value per row"):
         particles.step(rise(3))
 
 
@@ -403,7 +373,7 @@ def test_bad_arguments_are_refused(point_particles, options, message):
 
 
 def test_functions_are_drawn_once_for_what_is_refreshed_and_the_episodes_after(
-    point_particles, point_env, unsure_dynamics, monkeypatch, rise
+    point_particles, unsure_dynamics, monkeypatch, rise
 ):
     drawn = []
     draw = unsure_dynamics.sample_functions

@@ -169,11 +169,6 @@ def test_threads_take_turns_in_opensim(states_and_actions):
         assert torch.equal(arm(opensim=True).physics(X), expected)
 
 
-def test_opensim_physics_refuses_bad_arguments():
-    with pytest.raises(ValueError, match="accuracy"):
-        opensim_arm_physics(accuracy=0.0)
-
-
 def test_torque_arm_physics_can_be_pickled(states_and_actions):
     physics = arm().physics
     X = torch.cat(states_and_actions(5), dim=-1)

@@ -201,7 +201,7 @@ def test_given_axes_are_drawn_on(line, forrester):
     ax, axes = Figure().subplots(), Figure().subplots(2)
     assert plot_prediction(line, forrester.test_X, ax=ax) is ax
     assert plot_adjustment(line, axes=axes)[0, 0] is axes[0]
-    with pytest.raises(ValueError, match="Expected 2 axes, got 1"):
+    with pytest.raises(ValueError, match="Expected 1 x 2 axes, got 1"):
         plot_leave_one_out(leave_one_out(line), axes=ax)
 
 
@@ -281,7 +281,7 @@ BAD_OPTIONS = [
     (
         "bounds",
         ValueError,
-        r"Expected bounds of shape \(2, 2\), finite, lower below upper, got",
+        "Expected bounds of shape 2 x 2|Expected finite bounds, each lower one below",
         ([0.0, 1.0], [[0.0, 0.0]], [[0.0, 0.0], [1.0, float("inf")]], torch.zeros(2, 2)),
     ),
     (
@@ -291,8 +291,8 @@ BAD_OPTIONS = [
         ([[0.5, 0.5]], 0.5, [0.5, float("nan")], torch.zeros(3)),
     ),
     ("axes", ValueError, "Expected 2 x 2 axes, got 0", (np.zeros((2, 2)), [1, 2])),
-    ("bounds", TypeError, "Expected bounds as a tensor or lists of numbers", RANGES),
-    ("base", TypeError, "Expected base as a tensor or lists of numbers", RANGES),
+    ("bounds", TypeError, "Expected bounds to be real numbers", RANGES),
+    ("base", TypeError, "Expected base to be real numbers", RANGES),
 ]
 
 

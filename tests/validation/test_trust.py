@@ -234,7 +234,7 @@ def test_figures_refuse_what_they_cannot_draw(half, known):
         (lambda: plot_trust(half), TypeError, r"Expected a Trust, got CKA; pass `trust\(model\)`"),
         (lambda: plot_trust(known, output=2), ValueError, "There is no output 2"),
         (lambda: plot_trust(known, bins=0), ValueError, "bins must be at least 1"),
-        (lambda: plot_trust(known, axes=[1]), ValueError, "Expected 2 axes"),
+        (lambda: plot_trust(known, axes=[1]), ValueError, "1 x 2 axes"),
         (lambda: plot_trust_pair(known, (0, 2)), ValueError, "two different inputs from 0 to 1"),
         (lambda: plot_trust_pair(trust(half)), ValueError, "of one input with `plot_trust`"),
     ):

@@ -9,18 +9,17 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import checked_bounds, checked_tensor, checked_whole
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     BLUE,
     GREY,
     RED,
+    axes_of,
     band,
     column,
-    given_axes,
     labels,
     mean_and_half_width,
-    new_axes,
     quantile,
     tidy,
     two_inputs,
@@ -80,8 +79,7 @@ def plot_adjustment(
     quantile(level)  # refused before there is a figure
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     d = train_X.shape[-1]
-    shape = (len(names), d)
-    axes = new_axes(*shape, size=2.6) if axes is None else given_axes(axes, shape)
+    axes = axes_of(axes, len(names), d, 2.6)
     for i, label in enumerate(labels(model, "input", d)):
         x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
         X = base.repeat(num_points, 1)
@@ -117,21 +115,14 @@ def plot_adjustment_pair(
 ) -> Any:
     r"""Draw the mean and the sd of :math:`\rho` and :math:`\delta` over two inputs, as contours.
 
-    Args:
-        model: A model with ``rho`` or ``delta``.
-        inputs: The two inputs, counted from 0; the others stay at the base point.
-        bounds: As in :func:`plot_adjustment`.
-        base: As in :func:`plot_adjustment`.
-        output: Which output to draw.
-        num_points: Number of points along each input.
-        axes: Axes to draw on. Default: a new figure.
+    Other arguments and errors are those of :func:`plot_adjustment`, with ``num_points`` along each
+    of the two ``inputs``, which are counted from 0.
 
     Returns:
         An array of axes, ``rows x 2``: mean and sd.
 
     Raises:
-        TypeError: As :func:`plot_adjustment`.
-        ValueError: As :func:`plot_adjustment`, and if ``inputs`` are not two of the model's.
+        ValueError: If ``inputs`` are not two of the model's.
 
     Example:
         >>> import torch
@@ -145,8 +136,7 @@ def plot_adjustment_pair(
     num_points = checked_whole("num_points", num_points, 2)
     train_X, bounds, base, suffix = _domain(model, bounds, base, output)
     i, j = two_inputs(inputs, train_X.shape[-1], "`plot_adjustment`")
-    shape = (len(names), 2)
-    axes = new_axes(*shape) if axes is None else given_axes(axes, shape)
+    axes = axes_of(axes, len(names), 2)
     lines = [
         torch.linspace(bounds[0, k], bounds[1, k], num_points, dtype=base.dtype) for k in (i, j)
     ]
@@ -211,25 +201,12 @@ def _domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Te
         # An input that never changed is drawn around its value.
         pad = torch.where(lower == upper, 0.5 * lower.abs().clamp_min(1.0), torch.zeros_like(lower))
         bounds = torch.stack([lower - pad, upper + pad])
-    bounds = _numbers(bounds, "bounds", X)
-    if bounds.shape != (2, d) or not (bounds[0] < bounds[1]).all() or bounds.isinf().any():
-        raise ValueError(
-            f"Expected bounds of shape (2, {d}), finite, lower below upper, got {bounds.tolist()}."
-        )
-    base = X.median(0).values if base is None else _numbers(base, "base", X)
+    bounds = checked_bounds("bounds", bounds, d).to(X)
+    base = X.median(0).values if base is None else checked_tensor("base", base).to(X)
     if base.shape != (d,) or not base.isfinite().all():
         raise ValueError(f"Expected a base point of {d} inputs, finite, got {base.tolist()}.")
     suffix = f"\nfor {labels(model, 'output', num_outputs)[output]}" if num_outputs > 1 else ""
     return X[seen], bounds, base, suffix
-
-
-def _numbers(values: Any, name: str, like: Tensor) -> Tensor:
-    try:
-        return torch.as_tensor(values, dtype=like.dtype, device=like.device).detach()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(
-            f"Expected {name} as a tensor or lists of numbers, got {values!r}."
-        ) from error
 
 
 _COLORS = dict(zip(SIDES, (BLUE, RED, "0.85"), strict=True))
@@ -266,7 +243,7 @@ def plot_trust(trust: Trust, *, output: int = 0, bins: int = 10, axes: Any = Non
     side, named = _side_and_names(trust, output)
     bins = checked_whole("bins", bins, 1)
     d = trust.X.shape[-1]
-    axes = new_axes(1, d)[0] if axes is None else given_axes(axes, (d,))
+    axes = axes_of(axes, 1, d)[0]
     for ax, x, name in zip(axes, trust.X.unbind(-1), labels(trust, "input", d), strict=True):
         edges = np.histogram_bin_edges(x.numpy(), bins)
         counts = np.stack([np.histogram(x[side == i].numpy(), edges)[0] for i in range(3)])
@@ -288,15 +265,10 @@ def plot_trust_pair(
 ) -> Axes:
     """Draw over two inputs which predictions rest on physics, data, or neither, as points.
 
-    Args:
-        trust: The result of :func:`~gpadjust.validation.trust`.
-        inputs: The two inputs, counted from 0.
-        output: Which output to draw.
-        ax: Where to draw. Default: a new figure.
+    Other arguments and errors are those of :func:`plot_trust`.
 
     Raises:
-        TypeError: As :func:`plot_trust`.
-        ValueError: If there is no such output, or ``inputs`` are not two of the model's.
+        ValueError: If ``inputs`` are not two of the model's, counted from 0.
 
     Example:
         >>> import torch
@@ -310,7 +282,7 @@ def plot_trust_pair(
     side, named = _side_and_names(trust, output)
     d = trust.X.shape[-1]
     i, j = two_inputs(inputs, d, "`plot_trust`")
-    ax = (new_axes(1, 1, size=4) if ax is None else given_axes(ax, (1, 1)))[0, 0]
+    ax = axes_of(ax, 1, 1, 4)[0, 0]
     for k, kind in enumerate(SIDES):
         points = trust.X[side == k]
         style: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4, "mew": 0}

@@ -90,8 +90,10 @@ def _as_text(name: str) -> str:
     return "\n".join(lines)
 
 
-def new_axes(rows: int, columns: int, size: float = 3.2) -> Any:
-    """Axes of a new figure of pyplot, which shows it, saves it and closes it."""
+def axes_of(given: Any, rows: int, columns: int, size: float = 3.2) -> Any:
+    """The axes that the user gave as an array, or those of a new figure of pyplot."""
+    if given is not None:
+        return given_axes(given, (rows, columns))
     width = 1.3 * size if columns == 1 else 1.15 * size
     figure = plt.figure(figsize=(width * columns, size * rows), layout="constrained")
     return figure.subplots(rows, columns, squeeze=False)

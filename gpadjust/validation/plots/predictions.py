@@ -21,13 +21,12 @@ from gpadjust.validation.plots.drawing import (
     GREY,
     RED,
     against_truth,
+    axes_of,
     band,
     column,
-    given_axes,
     labels,
     legend,
     mean_and_half_width,
-    new_axes,
     observed,
     quantile,
     tidy,
@@ -89,7 +88,7 @@ def plot_prediction(
     if Y is not None:
         truth = column(Y, output)
         seen = observed(truth, output)
-    ax = (new_axes(1, 1) if ax is None else given_axes(ax, (1, 1)))[0, 0]
+    ax = axes_of(ax, 1, 1)[0, 0]
     if X.shape[-1] > 1:
         of = "" if label == "y" else f" {label}"
         seen_values = (truth[seen], mean[seen], half[seen])
@@ -98,9 +97,8 @@ def plot_prediction(
     order = X[:, 0].argsort()
     x = X[order, 0].detach()
     band(ax, x, mean[order], half[order], level)
-    for (name, physics), style in zip(
-        physics_curves(model), cycle(("--", "-.", ":")), strict=False
-    ):
+    styles = cycle(("--", "-.", ":"))
+    for (name, physics), style in zip(physics_curves(model), styles, strict=False):
         with torch.no_grad():
             f_p = column(physics(X[order]), output)
         ax.plot(x, f_p, color=GREY, ls=style, lw=1.2, label=name)
@@ -152,7 +150,7 @@ def plot_leave_one_out(
     seen = observed(column(loo.Y, output), output)
     Y, mean, sd = (column(t, output)[seen] for t in (loo.Y, loo.mean, loo.variance.sqrt()))
     label = labels(loo, "output", loo.Y.shape[-1])[output]
-    axes = new_axes(1, 2)[0] if axes is None else given_axes(axes, (2,))
+    axes = axes_of(axes, 1, 2)[0]
     of = "" if label == "y" else f" {label}"
     against_truth(axes[0], Y, mean, z * sd, level, f"observed{of}", "predicted without it")
     axes[1].axhspan(-z, z, **BAND, label=f"{100 * level:g} %")
@@ -217,11 +215,7 @@ def plot_coverage(
         >>> plot_coverage(torch.rand(50)).get_ylabel()
         'observed coverage'
     """
-    pit, title = _pit_and_title(prediction, output)
-    if ax is None:
-        ax = new_axes(1, 1, size=3.6)[0, 0]
-        ax.set_title(title)
-    ax = given_axes(ax, (1,))[0]
+    pit, ax = _pit_and_axes(prediction, output, ax, 3.6)
     levels = np.linspace(0, 1, 201)
     n = len(pit)
     low, high = (binom.ppf(p, n, levels) / n for p in (0.025, 0.975))
@@ -250,16 +244,8 @@ def plot_pit(
 
     The band holds 95 % of the counts of a bin if intervals hold.
 
-    Args:
-        prediction: PIT values, ``n`` or ``n x m``, or what has them. Those that are NaN, where
-            nothing was observed, are left out.
-        output: Which output to draw.
-        bins: Number of bins.
-        ax: Where to draw. Default: a new figure.
-
-    Raises:
-        TypeError: As :func:`plot_coverage`.
-        ValueError: As :func:`plot_coverage`, or if ``bins`` is not a positive whole number.
+    Other arguments, and errors, are those of :func:`plot_coverage`; ``bins``, the number of bins,
+    is a positive whole number.
 
     Example:
         >>> import torch
@@ -267,11 +253,7 @@ def plot_pit(
         5
     """
     bins = checked_whole("bins", bins, 1)
-    pit, title = _pit_and_title(prediction, output)
-    if ax is None:
-        ax = new_axes(1, 1)[0, 0]
-        ax.set_title(title)
-    ax = given_axes(ax, (1,))[0]
+    pit, ax = _pit_and_axes(prediction, output, ax, 3.2)
     n = len(pit)
     low, high = binom.ppf([0.025, 0.975], n, 1 / bins)
     ax.hist(pit.numpy(), bins=bins, range=(0, 1), color=BLUE, alpha=0.75, ec="white")
@@ -285,8 +267,10 @@ def plot_pit(
     return ax
 
 
-def _pit_and_title(prediction: Tensor | LeaveOneOut | Scores, output: int) -> tuple[Tensor, str]:
-    """The PIT values of what was observed, and which output they are of, if that is a question."""
+def _pit_and_axes(
+    prediction: Tensor | LeaveOneOut | Scores, output: int, ax: Axes | None, size: float
+) -> tuple[Tensor, Axes]:
+    """The PIT values of what was observed, and the axes; new ones say which output, if need be."""
     prediction = prediction.score() if isinstance(prediction, LeaveOneOut) else prediction
     pit = prediction if isinstance(prediction, Tensor) else getattr(prediction, "pit", None)
     if not isinstance(pit, Tensor):
@@ -301,4 +285,7 @@ def _pit_and_title(prediction: Tensor | LeaveOneOut | Scores, output: int) -> tu
     if not ((values >= 0) & (values <= 1)).all():
         raise ValueError("Expected PIT values between 0 and 1, as `gpadjust.validation.pit` makes.")
     label = labels(prediction, "output", pit.shape[-1])[output]
-    return values, "" if label == "y" else label
+    drawn = axes_of(ax, 1, 1, size)[0, 0]
+    if ax is None and label != "y":
+        drawn.set_title(label)
+    return values, drawn
