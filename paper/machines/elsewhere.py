@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 
 from gpadjust.dynamics import FreeRun, Windows
-from gpadjust.inference import SamplingWarning
+from gpadjust.inference import ParameterWarning, SamplingWarning
 from paper.common.experiment import Run, Table
 from paper.common.tables import claims_table, markdown
 from paper.common.verdicts import Judged, met
@@ -27,7 +27,8 @@ _VARIATIONS = {"none": "", "found": " + variation found", "another": " + variati
 
 def run(experiment: Elsewhere, training: str, learner: str, seed: int) -> Run:
     """Learn, and return scores by test, by variation, by steps ahead, of each angle."""
-    warnings.simplefilter("ignore", SamplingWarning)
+    for category in (SamplingWarning, ParameterWarning):
+        warnings.simplefilter("ignore", category)
     settings, known = experiment.settings, ELSEWHERE[training]
     records, smoothed = known.stretches(settings.n, seed), learner == "smoothed"
     begin = time.perf_counter()

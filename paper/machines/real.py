@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gpadjust.dynamics import Dynamics, FreeRun, Windows
-from gpadjust.inference import SamplingWarning
+from gpadjust.inference import ParameterWarning, SamplingWarning
 from paper.common.experiment import Run, Table
 from paper.common.figures import curves, one_legend, panels, save
 from paper.common.tables import Cell, across, claims_table, groups, number, table
@@ -38,7 +38,8 @@ _SYSTEMS = Real.axes["system"]
 
 def run(experiment: Real, name: str, n: int, learner: str, seed: int) -> Run:
     """Learn, and return the scores of each test: by steps ahead, of each state."""
-    warnings.simplefilter("ignore", SamplingWarning)
+    for category in (SamplingWarning, ParameterWarning):
+        warnings.simplefilter("ignore", category)
     settings, known = experiment.settings, REAL[name]
     alone = REAL_LEARNERS[learner].states == "transitions"
     data = known.drawn(n, seed) if alone else known.stretches(n, seed)
