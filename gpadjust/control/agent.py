@@ -112,7 +112,11 @@ class Agent(TaskAgent):
     not_saved: ClassVar[tuple[str, ...]] = (
         *("_task", "env", "model", "_steps", "_callbacks", "_random_state"),
     )
-    """Attributes that are not in checkpoints; a subclass adds those that hold a task."""
+    """Attributes that are not in checkpoints, beside those of the classes above.
+
+    A subclass names those that hold a task. A resumed agent lacks them: better is a property that
+    makes them of ``model``, as ``MPCAgent.mpc``. All others are pickled.
+    """
 
     model: Task | None
 
@@ -173,11 +177,20 @@ class Agent(TaskAgent):
         """
 
     def improve(self, task: Task) -> bool:
-        """Improve in the newest model; return whether the agent can act by now."""
+        """Improve in the newest model; return whether the agent can act by now.
+
+        If it cannot, as where it is not known yet where episodes start, the next episode's actions
+        are random.
+
+        Args:
+            task: The task in the newest model, the ``model`` of the next episode.
+        """
         return True
 
     def promise(self, state: Any) -> dict[str, float]:
-        """Say of an episode that begins what the model promises, such as its ``promised_reward``.
+        """Say of an episode that begins what the model promises: the numbers of ``"plan"``.
+
+        Of these ``promised_reward``, of a step on average, is compared with the real one.
 
         Args:
             state: What :meth:`predict` returned with its first action.
@@ -224,7 +237,7 @@ class Agent(TaskAgent):
                 action = self._scaled(next(random))
             else:
                 with self.timed("plan"):
-                    choice, state = self.predict(observation, state, np.array([begins]))
+                    choice, state = self._chosen(observation, state, np.array([begins]))
                 action = self._scaled(choice, noisy=True)
                 if begins:
                     said = self.promise(state)
@@ -240,6 +253,21 @@ class Agent(TaskAgent):
             if failed or terminated or truncated:
                 return
             observation, begins = following, False
+
+    def _chosen(
+        self, observation: NDArray[Any], state: Any, begins: NDArray[np.bool_]
+    ) -> tuple[NDArray[Any], Any]:
+        """The action and state that a subclass predicts, checked."""
+        found: Any = self.predict(observation, state, begins)
+        shape = self.env.action_space.shape
+        if isinstance(found, tuple) and len(found) == 2:
+            action = np.asarray(found[0])
+            if action.shape == shape and np.isfinite(action).all():
+                return action, found[1]
+        raise ValueError(
+            f"{type(self).__name__}.predict must return the action, finite and of shape {shape}, "
+            f"and the state for the next call; found {found!r}."
+        )
 
     def _learn_dynamics(self) -> bool:
         """Let the dynamics learn the episodes that they have not; return whether there were any."""
@@ -273,6 +301,11 @@ class Agent(TaskAgent):
             return
         with self.timed("update"):
             can_act = self.improve(task)
+        if not isinstance(can_act, bool | np.bool_):
+            raise TypeError(
+                f"{type(self).__name__}.improve must return whether the agent can act by now, True "
+                f"or False; found {can_act!r}."
+            )
         if can_act:
             self.model = task
 
@@ -324,6 +357,21 @@ class Agent(TaskAgent):
     def env_attribute(self, name: str) -> Any:
         """An attribute of the environment or of one that it wraps."""
         return self.env.get_wrapper_attr(name)
+
+    @property
+    def newest_model(self) -> Task:
+        """``model``, or where the agent has not learnt to act yet, the task in what is known.
+
+        Raises:
+            RuntimeError: If there is neither a physics nor a real episode.
+        """
+        task = self.known_task() if self.model is None else self.model
+        if task is None:
+            raise RuntimeError(
+                f"{type(self).__name__} knows nothing of the system yet; call `learn`, or give the "
+                "dynamics a physics."
+            )
+        return task
 
     def known_task(self) -> Task | None:
         """``model_task`` in the newest model, or in the physics; None if nothing is known yet."""
@@ -435,7 +483,8 @@ class Agent(TaskAgent):
 
     def saved_parts(self) -> dict[str, bytes]:
         """Settings and counts, the real steps, what the dynamics learnt, and the environment."""
-        state = {name: part for name, part in vars(self).items() if name not in self.not_saved}
+        left_out = {name for each in type(self).__mro__ for name in vars(each).get("not_saved", ())}
+        state = {name: part for name, part in vars(self).items() if name not in left_out}
         learnt = io.BytesIO()
         torch.save(self.task.dynamics.state_dict(), learnt)
         columns = zip(*self._steps, strict=True) if self._steps else []
@@ -444,11 +493,22 @@ class Agent(TaskAgent):
         if env is None:
             state["_start"] = None  # it will be reset
         return {
-            "agent.pkl": cloudpickle.dumps((state, self.model is not None)),
+            "agent.pkl": self._pickled(state),
             "steps.npz": packed(steps),
             "dynamics.pt": learnt.getvalue(),
             "environment.pkl": env or b"",
         }
+
+    def _pickled(self, state: dict[str, Any]) -> bytes:
+        """Attributes, and whether the agent acted by its model."""
+        try:
+            return bytes(cloudpickle.dumps((state, self.model is not None)))
+        except Exception as error:  # pickling runs the user's code
+            name = next((name for name, part in state.items() if not _can_be_pickled(part)), "?")
+            raise TypeError(
+                f"{type(self).__name__}.{name} cannot be pickled, as a checkpoint does "
+                f"({type(error).__name__}: {error}). Make it a property, or name it in not_saved."
+            ) from error
 
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
@@ -467,6 +527,14 @@ class Agent(TaskAgent):
         ]
         agent.model = agent.known_task() if acted else None
         return agent
+
+
+def _can_be_pickled(part: Any) -> bool:
+    try:
+        cloudpickle.dumps(part)
+    except Exception:  # as above
+        return False
+    return True
 
 
 def print_progress(agent: Agent, event: str, values: dict[str, float]) -> None:

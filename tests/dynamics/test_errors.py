@@ -237,7 +237,7 @@ def test_a_loaded_state_is_a_copy(learnt):
 )
 def test_damaged_probes_are_refused(probes):
     dynamics = PhysicsDynamics(SPEC, push)
-    with pytest.raises(RuntimeError, match="expected 'probes' as .*float64"):
+    with pytest.raises(RuntimeError, match=r"expected 'probes' as .*float64"):
         dynamics.load_state_dict({**dynamics.state_dict(), "probes": probes})
 
 
