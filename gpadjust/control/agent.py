@@ -115,7 +115,7 @@ class Agent(TaskAgent):
     """Attributes that are not in checkpoints, beside those of the classes above.
 
     A subclass names those that hold a task. A resumed agent lacks them: better is a property that
-    makes them of ``model``, as ``MPCAgent.mpc``. All others are pickled.
+    makes them of ``newest_model``, as ``MPCAgent.mpc``. All others are pickled.
     """
 
     model: Task | None
@@ -240,7 +240,7 @@ class Agent(TaskAgent):
                     choice, state = self._chosen(observation, state, np.array([begins]))
                 action = self._scaled(choice, noisy=True)
                 if begins:
-                    said = self.promise(state)
+                    said = self._said(state)
                     self._promises[episode] = said.get("promised_reward")
                     self.tell("plan", said)
             following, reward, terminated, truncated, info = self.env.step(self._unscaled(action))
@@ -268,6 +268,16 @@ class Agent(TaskAgent):
             f"{type(self).__name__}.predict must return the action, finite and of shape {shape}, "
             f"and the state for the next call; found {found!r}."
         )
+
+    def _said(self, state: Any) -> dict[str, float]:
+        """The promise of a subclass, checked."""
+        said: Any = self.promise(state)
+        if not isinstance(said, dict):
+            raise TypeError(
+                f"{type(self).__name__}.promise must return a dictionary of numbers, such as "
+                f"{{'promised_reward': -0.3}}; found {said!r}."
+            )
+        return said
 
     def _learn_dynamics(self) -> bool:
         """Let the dynamics learn the episodes that they have not; return whether there were any."""
@@ -485,6 +495,13 @@ class Agent(TaskAgent):
         """Settings and counts, the real steps, what the dynamics learnt, and the environment."""
         left_out = {name for each in type(self).__mro__ for name in vars(each).get("not_saved", ())}
         state = {name: part for name, part in vars(self).items() if name not in left_out}
+        for name, part in state.items():
+            if isinstance(part, Task) or isinstance(getattr(part, "task", None), Task):
+                raise TypeError(
+                    f"{type(self).__name__}.{name} holds a task, of which a resumed agent would "
+                    f"have a copy that learns no more; found {type(part).__name__}. Make it a "
+                    "property of newest_model, or name it in not_saved and make it again."
+                )
         learnt = io.BytesIO()
         torch.save(self.task.dynamics.state_dict(), learnt)
         columns = zip(*self._steps, strict=True) if self._steps else []

@@ -374,8 +374,9 @@ def _components(y: Tensor, mixture_dim: int | None, **predicted: Tensor) -> list
                 f"Expected variances of at least 0, got {values.min().item():.3g}; if they are "
                 "negative by rounding, pass `variance.clamp_min(0)`."
             )
-    one = mixture_dim is None
-    return [v.unsqueeze(0) if one else v.movedim(mixture_dim, 0) for v in predicted.values()]
+    if mixture_dim is None:
+        return [v.unsqueeze(0) for v in predicted.values()]
+    return [v.movedim(mixture_dim, 0) for v in predicted.values()]
 
 
 def _filled(y: Tensor) -> Tensor:

@@ -40,7 +40,10 @@ def run(experiment: Foresight, system: str, seed: int) -> Run:
     seconds = time.process_time() - start
     made = agent.recorded_episodes()
     parts: Any = (part.split(length) for part in (made.states, made.actions, made.next_states))
-    trials = [Trajectories(*rows, episode=torch.zeros(length)) for rows in zip(*parts, strict=True)]
+    trials = [
+        Trajectories(states, actions, following, episode=torch.zeros(length))
+        for states, actions, following in zip(*parts, strict=True)
+    ]
     rewards = [each.mean().item() for each in made.rewards.split(length)]
     found: dict[str, Any] = {"agent_seconds": seconds, "rewards": rewards}
     for noise in NOISES:

@@ -226,6 +226,15 @@ def test_a_subclass_names_only_what_it_adds_to_not_saved(make_agent, again, tmp_
     assert_equal([agent.learn(5).recorded_episodes().states], [whole.states])
 
 
+def test_an_attribute_that_holds_a_task_is_named(make_agent, tmp_path):
+    agent = make_agent(MPCAgent)
+    for name, part in (("earlier", agent.task), ("planning", agent.mpc)):
+        other = make_agent(MPCAgent)
+        setattr(other, name, part)
+        with pytest.raises(TypeError, match=f"MPCAgent.{name} holds a task, .* newest_model"):
+            other.save(tmp_path / "run.ckpt")
+
+
 def test_an_attribute_that_cannot_be_pickled_is_named(make_agent, tmp_path):
     agent = make_agent(MPCAgent)
     agent.camera = threading.Lock()
