@@ -80,7 +80,7 @@ class Learnt(NamedTuple):
         if known is not None:
             (known,) = copies([known], "physics", (n, num_known))
         chunks, searched_at, parameters = (state[k] for k in ("chunks", "searched_at", "model"))
-        sizes = [*chunks] if isinstance(chunks, list | tuple) else [None]
+        sizes: list[Any] = [*chunks] if isinstance(chunks, list | tuple) else [None]
         whole = all(isinstance(size, int) and 1 <= size <= n for size in sizes)
         expect(whole and sum(sizes) == n, "chunks", f"numbers of transitions, {n} in all")
         whole = isinstance(searched_at, int) and 1 <= searched_at <= n
