@@ -87,22 +87,16 @@ class System:
             ValueError: If the environment's own time limit is less than ``episode_length``.
         """
         env = self.env(**options)
-<<<<<<< HEAD
-        if self.episode_length is not None and not (env.spec and env.spec.max_episode_steps):
-            env = gym.wrappers.TimeLimit(env, self.episode_length)
-        return NoisySensors(env, self.spec, self.noise) if self.noise else env
-=======
         limit = env.spec and env.spec.max_episode_steps
-        if self.episode_length in (None, limit):
-            return env
-        if limit and limit < self.episode_length:
+        if self.episode_length is not None and limit and limit < self.episode_length:
             raise ValueError(
                 f"episode_length must be at most the environment's own time limit, {limit} steps; "
                 f"found {self.episode_length}. Raise that, as in `gymnasium.make(..., "
                 "max_episode_steps=...)`, or leave episode_length out."
             )
-        return gym.wrappers.TimeLimit(env, self.episode_length)
->>>>>>> 8044d7da1baee7058085ed8a120fe457e1711374
+        if self.episode_length not in (None, limit):
+            env = gym.wrappers.TimeLimit(env, self.episode_length)
+        return NoisySensors(env, self.spec, self.noise) if self.noise else env
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
         """The task that agents and planners take.
