@@ -214,7 +214,7 @@ def _seconds(curves: Curves, name: str, first: int = 1, last: int = LAST) -> lis
     """Median seconds of a run in fits, model steps and updates."""
     own = curves.of(name)
     chosen = own[own["episode"].between(first, last)]
-    return [float(seconds) for seconds in seconds_of_a_run(chosen, PARTS).loc[name]]
+    return [float(s) for s in seconds_of_a_run(chosen, PARTS).reindex([name]).loc[name]]
 
 
 def _late(curves: Curves, name: str) -> float:
