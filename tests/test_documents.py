@@ -25,6 +25,11 @@ PICTURES = "tutorials/pictures/"  # taken from the notebooks as the site is buil
 REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.rst"))
 EXAMPLES = [p for p in sorted((ROOT / "docs").rglob("*.rst")) if "_build" not in p.parts]
 
+YOURS = {"NAME.py"}
+MODULES = {
+    p.name for room in ("docs", "gpadjust", "paper", "tests") for p in (ROOT / room).rglob("*.py")
+}
+
 each_document = pytest.mark.parametrize("name", DOCUMENTS)
 
 
@@ -48,6 +53,8 @@ def test_linked_and_quoted_files_exist(name):
     links = {link for link in links if PICTURES not in link}
     assert [link for link in links if not (ROOT / name).parent.joinpath(link).exists()] == []
     assert [path for path in quoted if not (ROOT / path).exists()] == []
+    named = set(re.findall(r"`(?:\w+/)*(\w+\.py)`", text))
+    assert named <= MODULES | YOURS
 
 
 @each_document

@@ -7,8 +7,10 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.evaluation import evaluate_policy
 
 import gpadjust
 from gpadjust import FunctionPhysics, Unknown
@@ -190,3 +192,9 @@ def test_the_agent_learns_and_goes_on(tmp_path, monkeypatch, capsys):
     assert names["agent"].num_episodes == 2
     exec(own, names)  # with the dynamics that have learnt already
     assert "Greedy(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes" in capsys.readouterr().out
+    greedy = names["Greedy"](names["env"], names["system"].task())  # knows the physics alone
+    seen = np.array([names["env"].reset(seed=i)[0] for i in range(2)])
+    actions = greedy.predict(seen)[0]
+    assert actions.shape == (2, 1)
+    assert greedy.predict(seen[1])[0] == actions[1]
+    assert evaluate_policy(greedy, names["env"], n_eval_episodes=1, warn=False)[0] < 0

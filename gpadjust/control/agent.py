@@ -112,7 +112,10 @@ class Agent(TaskAgent):
     """
 
     not_saved: ClassVar[tuple[str, ...]] = ("env", "_steps", "_callbacks", "_random_state")
-    """Attributes that are not in checkpoints; a subclass adds those that cannot be pickled."""
+    """Attributes that are not in checkpoints, beside those of the classes above.
+
+    A subclass names those that cannot be pickled; a resumed agent lacks them.
+    """
 
     model: Task | None
 
@@ -173,11 +176,20 @@ class Agent(TaskAgent):
         """
 
     def improve(self, task: Task) -> bool:
-        """Improve in the newest model; return whether the agent can act by now."""
+        """Improve in the newest model; return whether the agent can act by now.
+
+        If it cannot, as where it is not known yet where episodes start, the next episode's actions
+        are random.
+
+        Args:
+            task: The task in the newest model, the ``model`` of the next episode.
+        """
         return True
 
     def promise(self, state: Any) -> dict[str, float]:
-        """Return the promises of the model for an episode, such as its ``promised_reward``.
+        """Return the promises of the model for an episode that begins: the numbers of ``"plan"``.
+
+        Of these ``promised_reward``, of a step on average, is compared with the real one.
 
         Args:
             state: What :meth:`predict` returned with its first action.
@@ -221,7 +233,7 @@ class Agent(TaskAgent):
                 action = self._scaled(next(random))
             else:
                 with self.timed("plan"):
-                    choice, state = self.predict(observation, state, np.array([begins]))
+                    choice, state = self._chosen(observation, state, np.array([begins]))
                 action = self._scaled(choice, noisy=True)
                 if begins:
                     said = self.promise(state)
@@ -237,6 +249,21 @@ class Agent(TaskAgent):
             if failed or terminated or truncated:
                 return
             observation, begins = following, False
+
+    def _chosen(
+        self, observation: NDArray[Any], state: Any, begins: NDArray[np.bool_]
+    ) -> tuple[NDArray[Any], Any]:
+        """The action and state that a subclass predicts, checked."""
+        found: Any = self.predict(observation, state, begins)
+        shape = self.env.action_space.shape
+        if isinstance(found, tuple) and len(found) == 2:
+            action = np.asarray(found[0])
+            if action.shape == shape and np.isfinite(action).all():
+                return action, found[1]
+        raise ValueError(
+            f"{type(self).__name__}.predict must return the action, finite and of shape {shape}, "
+            f"and the state for the next call; found {found!r}."
+        )
 
     def _learn_dynamics(self) -> bool:
         """Let the dynamics learn the episodes that they have not; return whether there were any."""
@@ -270,6 +297,11 @@ class Agent(TaskAgent):
             return
         with self.timed("update"):
             can_act = self.improve(task)
+        if not isinstance(can_act, bool | np.bool_):
+            raise TypeError(
+                f"{type(self).__name__}.improve must return whether the agent can act by now, True "
+                f"or False; found {can_act!r}."
+            )
         if can_act:
             self.model = task
 
@@ -318,6 +350,21 @@ class Agent(TaskAgent):
     def env_attribute(self, name: str) -> Any:
         """An attribute of the environment or of one that it wraps."""
         return self.env.get_wrapper_attr(name)
+
+    @property
+    def newest_model(self) -> Task:
+        """``model``, or where the agent has not learnt to act yet, the task in what is known.
+
+        Raises:
+            RuntimeError: If there is neither a physics nor a real episode.
+        """
+        task = self.known_task() if self.model is None else self.model
+        if task is None:
+            raise RuntimeError(
+                f"{type(self).__name__} knows nothing of the system yet; call `learn`, or give the "
+                "dynamics a physics."
+            )
+        return task
 
     def known_task(self) -> Task | None:
         """``model_task`` in the newest model, or in the physics; None if nothing is known yet."""
@@ -412,19 +459,29 @@ class Agent(TaskAgent):
 
     def saved_parts(self) -> dict[str, bytes]:
         """Settings and counts, the real steps, what the dynamics learnt, and the environment."""
-        state = {name: part for name, part in vars(self).items() if name not in self.not_saved}
+        left_out = {name for each in type(self).__mro__ for name in vars(each).get("not_saved", ())}
+        state = {name: part for name, part in vars(self).items() if name not in left_out}
         columns = [torch.from_numpy(np.array(part)) for part in zip(*self._steps, strict=True)]
         env = pickled_environment(self.env)
         if env is None:
             state["_start"] = None  # it will be reset
-        settings = io.BytesIO()
-        _Pickler(settings, self).dump(state)
         return {
-            "agent.pkl": settings.getvalue(),
+            "agent.pkl": self._pickled(state),
             "steps.pt": packed(columns),
             "dynamics.pt": packed(self.task.dynamics.state_dict()),
             "environment.pkl": env or b"",
         }
+
+    def _pickled(self, state: dict[str, Any]) -> bytes:
+        """Attributes, without task, model and dynamics."""
+        try:
+            return _pickled(state, self)
+        except Exception as error:  # pickling runs the user's code
+            name = next(name for name, part in state.items() if not _can_be_pickled(part, self))
+            raise TypeError(
+                f"{type(self).__name__}.{name} cannot be pickled, as a checkpoint does "
+                f"({type(error).__name__}: {error}). Make it a property, or name it in not_saved."
+            ) from error
 
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
@@ -460,9 +517,22 @@ class _Pickler(cloudpickle.Pickler):
             return "model"
         raise TypeError(
             f"{type(self.agent).__name__} keeps a Task with dynamics of its own, which no "
-            "checkpoint holds. Keep its reward and so on, and make it where it is needed, or name "
-            "the attribute in not_saved."
+            "checkpoint holds; keep its reward and so on, and make it where it is needed"
         )
+
+
+def _pickled(value: Any, agent: Agent) -> bytes:
+    file = io.BytesIO()
+    _Pickler(file, agent).dump(value)
+    return file.getvalue()
+
+
+def _can_be_pickled(value: Any, agent: Agent) -> bool:
+    try:
+        _pickled(value, agent)
+    except Exception:  # as above
+        return False
+    return True
 
 
 class _Unpickler(pickle.Unpickler):

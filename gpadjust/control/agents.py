@@ -78,14 +78,8 @@ class MPCAgent(Agent):
         Raises:
             RuntimeError: If there is neither a physics nor a real episode to plan with.
         """
-        task = self.known_task() if self.model is None else self.model
-        if task is None:
-            raise RuntimeError(
-                f"{type(self).__name__} knows nothing of the system yet; call `learn`, or give the "
-                "dynamics a physics."
-            )
         how: dict[str, Any] = {"first": self.first, "tolerance": self.tolerance}
-        return MPC(task, self.action_bounds(), self.each_step, **how)
+        return MPC(self.newest_model, self.action_bounds(), self.each_step, **how)
 
     def predict(
         self,

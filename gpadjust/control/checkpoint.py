@@ -292,12 +292,19 @@ def _compare(path: str | Path, part: str, found: Any, here: Any) -> None:
 
 
 def _known(name: str) -> type[TaskAgent]:
-    """The class of an agent by its name, of all that are imported."""
+    """The class of an agent by its name, of all that are imported; the newest definition of it."""
     known: dict[str, type[TaskAgent]] = {}
     waiting: list[Any] = [TaskAgent]
     while waiting:
         for each in waiting.pop().__subclasses__():
-            known.setdefault(each.__name__, each)
+            other = known.get(each.__name__, each)
+            if each.__name__ == name and other.__module__ != each.__module__:
+                raise ValueError(
+                    f"The checkpoint is of the class {name!r}, which is one of "
+                    f"{other.__module__} and one of {each.__module__}; pass algorithm, the class "
+                    "of the agent."
+                )
+            known[each.__name__] = each  # a cell of a notebook that ran twice defines it twice
             waiting.append(each)
     if name not in known:
         raise ValueError(

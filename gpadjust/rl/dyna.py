@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -56,7 +57,8 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     environment was wrong, ``agent.replay_buffer.reset()`` forgets what it said.)
 
     A learner of Stable-Baselines3 becomes one of this family as
-    ``class DynaTD3(Dyna, TD3): ...``, if its ``train`` samples from ``replay_buffer``.
+    ``class DynaTD3(Dyna, TD3): ...``, if it is off-policy and its ``train`` samples from
+    ``replay_buffer``. Other bases are a TypeError where the class is defined.
 
     Args:
         policy: As in the learner.
@@ -144,6 +146,24 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             replay_buffer_class=buffer_class,
             **kwargs,
         )
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuse a class that is made of other bases than Dyna and an off-policy learner."""
+        super().__init_subclass__(**options)
+        lines = cls.__mro__
+        for base in lines:
+            if not issubclass(base, BaseAlgorithm) or issubclass(OffPolicyAlgorithm, base):
+                continue
+            if not issubclass(base, OffPolicyAlgorithm):
+                raise TypeError(
+                    f"{cls.__name__} needs an off-policy learner, such as SAC, beside Dyna; found "
+                    f"{base.__name__}, which can learn in a ModelVecEnv of fitted dynamics."
+                )
+            if not issubclass(base, Dyna) and lines.index(base) < lines.index(Dyna):
+                raise TypeError(
+                    f"Dyna comes first among the bases of {cls.__name__}; found {base.__name__} "
+                    f"before it. Write class {cls.__name__}(Dyna, {base.__name__})."
+                )
 
     # One iteration
 

@@ -1,5 +1,8 @@
 """The point, and agents of both kinds that learn to move it."""
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import pytest
 
 from gpadjust.control import (
@@ -17,7 +20,38 @@ PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32, max_hold=1)
 SEARCH = PolicySearch(updates=12, num_starts=6, num_functions=2, learning_rate=0.05)
 
 
-@pytest.fixture(params=[MPCAgent, PolicySearchAgent])
+class Kind(NamedTuple):
+    """What tests of all agents have to know of one.
+
+    Args:
+        options: Its arguments at the point.
+        events: Those of an improvement.
+        untrained: Message of its `predict` if nothing is known yet; None if it acts.
+        learnt: What it has learnt beside the dynamics, in nested values.
+    """
+
+    options: dict[str, Any]
+    events: tuple[str, ...] = ()
+    untrained: str | None = None
+    learnt: Callable[[Any], Any] = lambda agent: None
+
+
+KINDS = {
+    MPCAgent: Kind({"each_step": PLAN, "first": PLAN}, untrained="knows nothing"),
+    PolicySearchAgent: Kind(
+        {"policy": linear_policy, "search": SEARCH},
+        events=(*["update"] * 12, "search"),
+        learnt=lambda agent: agent.policy.state_dict(),
+    ),
+}
+
+
+def described(agent):
+    """What is said of the kind of an agent, or of the one that it is derived from."""
+    return next(KINDS[each] for each in type(agent).__mro__ if each in KINDS)
+
+
+@pytest.fixture(params=KINDS)
 def kind(request):
     return request.param
 
@@ -30,9 +64,7 @@ def make_agent(point_env, point_task, learnt_dynamics):
         parts = {"dynamics": learnt_dynamics(), "initial_states": near_one}
         names = {"dynamics", "reward", "initial_states", "state_bounds", "episode_length"}
         task = point_task(**{**parts, **{name: given.pop(name) for name in names & {*given}}})
-        how = {"each_step": PLAN, "first": PLAN}
-        if kind is PolicySearchAgent:
-            how = {"policy": linear_policy, "search": SEARCH}
+        how = KINDS[kind].options if kind in KINDS else {}
         env = point_env() if env is None else env
         return kind(env, task, **{**how, "score_horizons": (), "seed": 0, **given})
 

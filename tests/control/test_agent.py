@@ -26,7 +26,7 @@ from gpadjust.models import ZeroMeanGP
 from gpadjust.physics import PhysicsError
 from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
-from tests.control.conftest import PLAN
+from tests.control.conftest import KINDS, PLAN
 from tests.point import Falls
 
 pytestmark = pytest.mark.filterwarnings("ignore:A step of the last real episode")
@@ -66,8 +66,8 @@ def test_without_a_physics_the_first_episode_is_random(make_agent, kind, point_d
     fit = {"method": "map", "num_starts": 1, "num_screened": 0}
     blind = LearnedDynamics(point_dynamics.spec, model=ZeroMeanGP, fit_options=fit)
     agent = make_agent(kind, dynamics=blind)
-    knows_nothing = pytest.raises(RuntimeError, match="knows nothing")
-    with knows_nothing if kind is MPCAgent else nullcontext():
+    message = KINDS[kind].untrained
+    with pytest.raises(RuntimeError, match=message) if message else nullcontext():
         agent.predict(np.ones(1, dtype=np.float32))
     assert agent.learn(5).recorded_episodes().actions.unique().numel() > 1
     assert agent.promised_reward is None
@@ -99,7 +99,7 @@ class Farthest(Agent):
     """A user's own: it takes the action from which the model moves farthest to the left."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        task, choices = self.model, torch.linspace(-2, 2, 9).double().unsqueeze(-1)
+        task, choices = self.newest_model, torch.linspace(-2, 2, 9).double().unsqueeze(-1)
         states = task.dynamics.spec.decode(torch.as_tensor(observation).double().reshape(1, -1))
         found = task.dynamics.predict(states.expand(9, -1), choices).mean[:, 0]
         return choices[found.argmin()].numpy(), state
@@ -112,10 +112,57 @@ def test_an_agent_of_ones_own_needs_predict_alone(make_agent, tmp_path, point_en
     assert agent.num_episodes == 2
 
 
+def test_an_agent_of_ones_own_knows_the_physics_before_it_learns(make_agent, point_env):
+    given = {"score_horizons": (), "seed": 0}
+    agent = Farthest(point_env(), make_agent(MPCAgent).task, **given)
+    assert agent.model is None
+    assert agent.predict(np.ones(1))[0] == -2
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        np.zeros(1),
+        (np.zeros((1, 1)), None),
+        (torch.zeros(()), None),
+        (np.full(1, np.nan), None),
+    ],
+)
+def test_a_prediction_that_is_none_is_refused_before_a_real_step(point_env, point_task, answer):
+    class Wrong(Agent):
+        def predict(self, *given):
+            return answer
+
+    agent = Wrong(point_env(), point_task())
+    with pytest.raises(ValueError, match=r"Wrong.predict must return the action, .*\(1,\)"):
+        agent.learn(5)
+    assert agent.num_timesteps == 0
+
+
+def test_an_action_may_be_a_tensor(point_env, point_task):
+    class Rests(Agent):
+        def predict(self, *given):
+            return torch.zeros(1).double(), None
+
+    agent = Rests(point_env(), point_task(), reward_tolerance=None).learn(5)
+    assert (agent.recorded_episodes().actions == 0).all()
+
+
+def test_an_agent_that_does_not_say_if_it_can_act_is_refused(point_env, point_task):
+    """Its actions would be random for ever."""
+
+    class Silent(Farthest):
+        def improve(self, task):
+            self.improved = True
+
+    with pytest.raises(TypeError, match=r"Silent.improve must return whether .*found None"):
+        Silent(point_env(), point_task()).learn(5)
+
+
 def test_callbacks_are_told_what_happens(make_agent, kind):
     events = []
     make_agent(kind).learn(10, lambda agent, event, values: events.append(event))
-    search = ["update"] * 12 + ["search"] if kind is PolicySearchAgent else []
+    search = KINDS[kind].events
     episode = ["episode", "plan", *["step"] * 5, "fit", *search]
     assert events == [*search, *episode, *episode, "done"]
 
@@ -124,7 +171,8 @@ def test_progress_is_printed(make_agent, kind, capsys):
     make_agent(kind).learn(5, [print_progress])
     said = capsys.readouterr().out
     assert "5 steps, fit: fit_seconds" in said
-    assert ("0 steps, update: number 12, value" in said) == (kind is PolicySearchAgent)
+    for event in ("update", "search"):
+        assert (f"0 steps, {event}: " in said) == (event in KINDS[kind].events)
 
 
 def test_its_representation_says_what_it_is(make_agent, kind):

@@ -6,6 +6,7 @@ import random
 import subprocess
 import sys
 import textwrap
+import threading
 import zipfile
 
 import gymnasium
@@ -17,6 +18,7 @@ from filelock import FileLock
 from gpadjust.control import MPC, EpisodeCheckpoint, MPCAgent, PolicySearchAgent, resume
 from gpadjust.control.checkpoint import RandomState
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
+from tests.control.conftest import PLAN, described
 from tests.point import (
     PowerCut,
     Shouting,
@@ -48,7 +50,7 @@ def numbers(agent):
     return {
         "episodes": [episodes.states, episodes.actions, episodes.rewards, episodes.episode],
         "dynamics": agent.task.dynamics.state_dict(),
-        "policy": agent.policy.state_dict() if isinstance(agent, PolicySearchAgent) else None,
+        "learnt": described(agent).learnt(agent),
         "counts": [agent.num_timesteps, agent.num_episodes, agent.promised_reward, agent.notes],
         "random": tuple(RandomState.capture()),
     }
@@ -78,7 +80,7 @@ def test_an_interrupted_run_ends_as_another(make_agent, kind, steps, again, tmp_
     assert_equal(numbers(agent), whole)
     given = again(kind)
     last = numbers(resume(path, *given))
-    for part in ("episodes", "dynamics", "policy", "counts"):
+    for part in ("episodes", "dynamics", "learnt", "counts"):
         assert_equal(last[part], whole[part])
 
 
@@ -210,7 +212,7 @@ def test_a_task_is_not_pickled_wherever_it_is_kept(make_agent, again, tmp_path):
 def test_a_task_with_other_dynamics_is_refused(make_agent, point_task, tmp_path):
     agent = make_agent(KeepingAgent)
     agent.kept = point_task()
-    with pytest.raises(TypeError, match=r"keeps a Task .* name the attribute in not_saved"):
+    with pytest.raises(TypeError, match=r"KeepingAgent.kept .* keeps a Task .* in not_saved"):
         agent.save(tmp_path / "run.ckpt")
 
 
@@ -230,6 +232,54 @@ def test_an_error_of_the_users_own_is_not_that_of_another_file(make_agent, again
     agent.save(tmp_path / "run.ckpt")
     with pytest.raises(KeyError, match="missing"):
         resume(tmp_path / "run.ckpt", *again())
+
+
+class Planning(MPCAgent):
+    """One that keeps what holds a task, which it makes again where it is missing."""
+
+    not_saved = ("planning",)
+
+    def improve(self, task):
+        self.planning = self.mpc
+        return True
+
+    def predict(self, *given):
+        if not hasattr(self, "planning"):
+            self.planning = self.mpc
+        return self.planning.predict(*given)
+
+
+def test_a_subclass_names_only_what_it_adds_to_not_saved(make_agent, again, tmp_path):
+    path = tmp_path / "run.ckpt"
+    options = {"each_step": PLAN, "first": PLAN}
+    whole = make_agent(Planning, **options).learn(10).recorded_episodes()
+    make_agent(Planning, **options).learn(5).save(path)
+    agent = resume(path, *again())
+    assert not hasattr(agent, "planning")
+    assert_equal([agent.learn(5).recorded_episodes().states], [whole.states])
+
+
+def test_an_attribute_that_cannot_be_pickled_is_named(make_agent, tmp_path):
+    agent = make_agent(MPCAgent)
+    agent.camera = threading.Lock()
+    with pytest.raises(TypeError, match=r"MPCAgent.camera cannot be pickled.*not_saved"):
+        agent.save(tmp_path / "run.ckpt")
+    assert not (tmp_path / "run.ckpt").exists()
+
+
+def test_of_a_class_that_is_defined_twice_the_newest_is_resumed(make_agent, again, tmp_path):
+    def define(module):
+        return type("CellAgent", (MPCAgent,), {"__module__": module})
+
+    path, first = tmp_path / "run.ckpt", define("notebook")
+    make_agent(first).save(path)
+    assert type(resume(path, *again())) is first
+    second = define("notebook")
+    assert type(resume(path, *again())) is second
+    other = define("elsewhere")
+    with pytest.raises(ValueError, match="one of notebook and one of elsewhere; pass algorithm"):
+        resume(path, *again())
+    assert type(resume(path, *again(), other)) is other
 
 
 def test_other_files_are_refused(make_agent, again, tmp_path):

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 from gpadjust.control import Task
-from gpadjust.rl import DynaOptions, DynaSAC, DynaTD3
+from gpadjust.rl import Dyna, DynaOptions, DynaSAC, DynaTD3
 from gpadjust.rl.buffer import CompactReplayBuffer
 from gpadjust.systems.swing_up import cart_pole_reward, cart_pole_start
+from tests.point import assert_equal
 from tests.rl.conftest import model_rows
 
 
@@ -40,6 +41,25 @@ def test_one_that_never_uses_its_model_is_the_learner(point_agent, point_env, no
             one, other = (getattr(agent.replay_buffer, name) for agent in (ours, theirs))
             np.testing.assert_array_equal(one, other)
         assert model_rows(ours) == 0
+
+
+def test_other_bases_are_refused_where_the_class_is_defined():
+    with pytest.raises(TypeError, match=r"found TD3 before it. Write class Other\(Dyna, TD3\)"):
+        type("Other", (TD3, Dyna), {})
+    with pytest.raises(TypeError, match=r"Other needs an off-policy learner, .* found PPO"):
+        type("Other", (Dyna, PPO), {})
+
+
+def test_another_learner_needs_no_code(point_agent, point_env, point_task, tmp_path):
+    class Other(Dyna, DDPG):
+        """As a user writes it."""
+
+    agent = point_agent(algorithm=Other).learn(10)
+    assert agent.num_episodes == 2
+    assert model_rows(agent) > 0
+    agent.save(tmp_path / "agent.zip")
+    again = Other.load(tmp_path / "agent.zip", env=point_env(), task=point_task())
+    assert_equal(again.policy.state_dict(), agent.policy.state_dict())
 
 
 @pytest.mark.slow
