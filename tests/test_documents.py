@@ -115,6 +115,15 @@ def test_one_version():
     assert gpadjust.__version__ in (ROOT / "CHANGELOG.md").read_text()
 
 
+def test_the_rooms_have_the_files_to_read_first():
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| .* \| ([^|]*) \|$", text, flags=re.MULTILINE)
+    read = [(room, file) for room, files in rows for file in re.findall(r"`([\w./]+\.py)`", files)]
+    assert len({room for room, _ in read}) > 10
+    paths = [ROOT / "gpadjust" / room / file for room, file in read]
+    assert [path for path in paths if not path.parent.resolve().joinpath(path.name).exists()] == []
+
+
 def test_the_reference_has_a_page_for_each_room_and_lists_the_top_level():
     rooms = {path.parent.name for path in (ROOT / "gpadjust").glob("*/__init__.py")}
     assert {page.stem for page in REFERENCE} == rooms | {"index"}

@@ -236,7 +236,7 @@ class Agent(TaskAgent):
                     choice, state = self._chosen(observation, state, np.array([begins]))
                 action = self._scaled(choice, noisy=True)
                 if begins:
-                    said = self.promise(state)
+                    said = self._said(state)
                     self._promises[episode] = said.get("promised_reward")
                     self.tell("plan", said)
             following, reward, terminated, truncated, info = self.env.step(self._unscaled(action))
@@ -264,6 +264,16 @@ class Agent(TaskAgent):
             f"{type(self).__name__}.predict must return the action, finite and of shape {shape}, "
             f"and the state for the next call; found {found!r}."
         )
+
+    def _said(self, state: Any) -> dict[str, float]:
+        """The promise of a subclass, checked."""
+        said: Any = self.promise(state)
+        if not isinstance(said, dict):
+            raise TypeError(
+                f"{type(self).__name__}.promise must return a dictionary of numbers, such as "
+                f"{{'promised_reward': -0.3}}; found {said!r}."
+            )
+        return said
 
     def _learn_dynamics(self) -> bool:
         """Let the dynamics learn the episodes that they have not; return whether there were any."""

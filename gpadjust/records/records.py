@@ -160,7 +160,27 @@ class Records:
 
     @classmethod
     def of_windows(cls, windows: Windows, spec: StateSpec, step: float) -> Records:
-        """A record of each window, in control steps, such as to :func:`smooth` them."""
+        """A record of each window, in control steps, such as to :func:`smooth` them.
+
+        Args:
+            windows: Windows, such as an agent's episodes in full length.
+            spec: What the entries of states and actions are.
+            step: The control step, in the unit of the times.
+
+        Raises:
+            TypeError: If ``spec`` is no :class:`StateSpec`, or ``step`` no number.
+            ValueError: If ``step`` is not positive, or windows have not the columns of the spec.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust.dynamics import Trajectories
+            >>> from gpadjust.records import Records
+            >>> from gpadjust.states import StateSpec
+            >>> x = torch.arange(6, dtype=torch.float64).unsqueeze(-1)
+            >>> episodes = Trajectories(x, x, x + 1, episode=[0, 0, 0, 1, 1, 1])
+            >>> [*Records.of_windows(episodes.windows(3), StateSpec(["x"], ["v"]), step=0.1)][0]
+            Record('window 0', 4 rows every 0.1, 1 state, 1 action)
+        """
         times = checked_number("step", step, above=0) * torch.arange(
             windows.states.shape[1], dtype=torch.float64
         )

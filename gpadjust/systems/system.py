@@ -33,8 +33,8 @@ class System:
         start: Draws ``n`` states at which episodes start, ``n x state_dim``. Default: those at
             which real episodes started.
         terminated: Whether states ``N x state_dim`` end an episode, ``N`` booleans. Default: none.
-        episode_length: Steps after which an episode is truncated. Default: the time limit of the
-            environment.
+        episode_length: Steps after which an episode is truncated; an environment's own time limit
+            may only be longer. Default: the time limit of the environment.
         state_bounds: As of a :class:`~gpadjust.control.Task`.
         noise: Standard deviations of the sensors' noise, by the name of the state, which
             :class:`NoisySensors` adds to what the environment observes.
@@ -82,11 +82,27 @@ class System:
 
         Args:
             options: Keyword arguments of ``env``, such as ``render_mode="human"``.
+
+        Raises:
+            ValueError: If the environment's own time limit is less than ``episode_length``.
         """
         env = self.env(**options)
+<<<<<<< HEAD
         if self.episode_length is not None and not (env.spec and env.spec.max_episode_steps):
             env = gym.wrappers.TimeLimit(env, self.episode_length)
         return NoisySensors(env, self.spec, self.noise) if self.noise else env
+=======
+        limit = env.spec and env.spec.max_episode_steps
+        if self.episode_length in (None, limit):
+            return env
+        if limit and limit < self.episode_length:
+            raise ValueError(
+                f"episode_length must be at most the environment's own time limit, {limit} steps; "
+                f"found {self.episode_length}. Raise that, as in `gymnasium.make(..., "
+                "max_episode_steps=...)`, or leave episode_length out."
+            )
+        return gym.wrappers.TimeLimit(env, self.episode_length)
+>>>>>>> 8044d7da1baee7058085ed8a120fe457e1711374
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
         """The task that agents and planners take.

@@ -159,6 +159,17 @@ def test_an_agent_that_does_not_say_if_it_can_act_is_refused(point_env, point_ta
         Silent(point_env(), point_task()).learn(5)
 
 
+def test_a_promise_that_is_no_dictionary_is_refused(point_env, point_task):
+    class Boasts(Farthest):
+        def promise(self, state):
+            return 3.0
+
+    agent = Boasts(point_env(), point_task())
+    with pytest.raises(TypeError, match=r"Boasts.promise must return a dictionary .* found 3\.0"):
+        agent.learn(5)
+    assert agent.num_timesteps == 0
+
+
 def test_callbacks_are_told_what_happens(make_agent, kind):
     events = []
     make_agent(kind).learn(10, lambda agent, event, values: events.append(event))

@@ -67,8 +67,19 @@ def test_the_environment_ends_where_the_system_says():
     env.reset(seed=0)
     assert [env.step(np.ones(1))[3] for _ in range(3)] == [False, False, True]
     assert not isinstance(cart().make(), gym.wrappers.TimeLimit)
-    limited = System(lambda: gym.make("Pendulum-v1"), SPEC, coast, reward, episode_length=7).make()
-    assert limited.spec.max_episode_steps == 200  # the environment's own
+
+
+def test_the_environments_own_time_limit_may_only_be_longer():
+    def pendulum(length):  # gymnasium truncates it after 200 steps
+        return System(lambda: gym.make("Pendulum-v1"), SPEC, coast, reward, episode_length=length)
+
+    env = pendulum(3).make()
+    env.reset(seed=0)
+    assert [env.step(np.ones(1, np.float32))[3] for _ in range(3)] == [False, False, True]
+    for length in (None, 200):
+        assert isinstance(pendulum(length).make().env, gym.wrappers.OrderEnforcing)  # as it was
+    with pytest.raises(ValueError, match=r"at most the environment's own time limit, 200 .* 300"):
+        pendulum(300).make()
 
 
 def test_the_task_has_what_the_system_knows():
