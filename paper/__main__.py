@@ -52,6 +52,8 @@ def main() -> None:
         if {"-h", "--help"} & {name, *arguments}:
             print(usage)
             raise SystemExit(0)
+        if name == "report":
+            raise SystemExit(f"report takes no options; found {' '.join(arguments)}.")
         raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -53,9 +53,13 @@ def main(experiment: Experiment) -> None:
             raise Refused(str(error)) from error
         with _alone(experiment.out):
             run_missing(experiment)
-    runs = list(file.read().values())
+    done = file.read()
+    runs = list(done.values())
     if not runs:
         raise Refused(f"There are no results in {experiment.out}.")
+    if experiment.only_tables:
+        with suppress(ImportError):  # of a simulator that tables do not need
+            check_all(file.path, done, experiment)
     tables = tables_of(experiment, runs)
     for table in tables.values():
         print(f"\n{table.title}\n\n{aligned(table.text)}")
@@ -82,9 +86,7 @@ def run_missing(experiment: Experiment) -> None:
     file = runs_file(experiment)
     done, cases = file.read(), experiment.cases()
     kinds = {case[:-1] for case in cases}
-    for case, run in done.items():
-        if case[:-1] in kinds:
-            check_settings(file.path, case, run, experiment)
+    check_all(file.path, done, experiment)
     others = {
         case: differ
         for case, run in done.items()
@@ -133,6 +135,14 @@ def run_one(experiment: Experiment, case: Case) -> Case:
             file.append({**named, **made_by, **rounded(experiment.run(*case))})
         Path(lock.lock_file).unlink(missing_ok=True)
     return case
+
+
+def check_all(path: Path, done: Mapping[Case, Run], experiment: Experiment) -> None:
+    """Refuse runs of other settings, of whatever kind: their tables are one file, with one list."""
+    kinds = {case[:-1] for case in replace(experiment, only=()).cases()}
+    for case, run in done.items():
+        if case[:-1] in kinds:
+            check_settings(path, case, run, experiment)
 
 
 def check_settings(path: Path, case: Case, run: Run, experiment: Experiment) -> None:

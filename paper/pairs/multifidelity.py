@@ -182,8 +182,9 @@ def tables(runs: Sequence[Run], experiment: Multifidelity) -> dict[str, Table]:
         found[name] = Table(title, table(rows, columns, bold=bold))
     title = "RMSE of CKA / that of others on the same data sets, geometric mean (Wilcoxon's p)"
     others = [name for name in _PAIRED if name in {*scored["method"]}]
-    paired: dict[str, Cell] = {other: _ratio_to(other) for other in others}
-    found["paired"] = Table(title, table(rows, paired, "CKA /"))
+    for name, ours in (("paired", "CKA"), ("paired-default", "CKA Bayes")):
+        paired: dict[str, Cell] = {other: _ratio_to(other, ours) for other in others}
+        found[name] = Table(title.replace("CKA", ours), table(rows, paired, f"{ours} /"))
     judged = {
         f"N = {size} d": [judge_intervals(part)] for size, part in scored.groupby("per_input")
     }
@@ -248,12 +249,12 @@ def _short(runs: pd.DataFrame) -> str:
     return "\n".join([found, *(part.splitlines()[-1] for part in (held, time))])
 
 
-def _ratio_to(other: str) -> Cell:
-    """The error of CKA over that of another, with Wilcoxon's p."""
+def _ratio_to(other: str, ours: str) -> Cell:
+    """The error of a CKA over that of another, with Wilcoxon's p."""
 
     def cell(part: pd.DataFrame) -> str:
         logs = np.log(part.pivot(index="seed", columns="method", values="nrmse"))
-        gap = (logs["CKA"] - logs[other]).dropna() if "CKA" in logs else pd.Series(dtype=float)
+        gap = (logs[ours] - logs[other]).dropna() if ours in logs else pd.Series(dtype=float)
         p = stats.wilcoxon(gap).pvalue if gap.abs().sum() > 0 else np.nan
         return f"{number(np.exp(exact_mean(gap)), '.2g')} ({number(p, '.2g', '-')})"
 

@@ -13,6 +13,7 @@ import pytest
 from cloudpickle import register_pickle_by_value, unregister_pickle_by_value
 from filelock import FileLock
 
+from paper.__main__ import main as paper_main
 from paper.common import runner
 from paper.common.experiment import Axes, Experiment, Table
 from paper.common.runner import Refused, check_settings, main, run_missing, runs_file
@@ -98,8 +99,17 @@ def test_only_tables_runs_nothing(tmp_path):
     with pytest.raises(Refused, match="There are no results"):
         main(Toy(out=tmp_path, only_tables=True))
     main(Toy(out=tmp_path, runs=2))
-    main(Toy(out=tmp_path, only_tables=True, scale=7.0))
+    main(Toy(out=tmp_path, only_tables=True))
     assert len(calls(tmp_path)) == 4
+
+
+def test_tables_do_not_claim_settings_that_the_runs_do_not_have(tmp_path):
+    main(Toy(out=tmp_path, runs=2, only=("a",)))
+    with pytest.raises(Refused, match=r"a-0 was made with other settings: scale was 1\.0 and is "):
+        main(Toy(out=tmp_path, only_tables=True, scale=7.0))
+    with pytest.raises(Refused, match=r"a-0 was made with other settings"):
+        main(Toy(out=tmp_path, runs=2, only=("b",), scale=7.0))
+    assert len(calls(tmp_path)) == 2
 
 
 @pytest.mark.parametrize("option", ["runs", "jobs"])
@@ -355,6 +365,12 @@ def test_help_is_quick_and_imports_nothing_slow():
     )
     assert "--gamma" in made.stdout
     assert "--evaluate-every" in made.stdout
+
+
+def test_report_takes_no_options(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["paper", "report", "--force"])
+    with pytest.raises(SystemExit, match="report takes no options; found --force"):
+        paper_main()
 
 
 @pytest.mark.slow
