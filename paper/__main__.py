@@ -38,11 +38,17 @@ def main() -> None:
     name, *arguments = sys.argv[1:] or ["--help"]
     if name in EXPERIMENTS:
         _run(name, arguments)
-    elif name == "all":  # options are those that all experiments have
+    elif name == "all" and {*arguments} <= {"--only-tables"}:
+        refused = []
         for each in EXPERIMENTS:
             print(f"\n{each}: {_about(each)}")
-            _run(each, ["--out", f"{Path(__file__).parent}/results/{each}", *arguments])
+            try:
+                _run(each, ["--out", f"{Path(__file__).parent}/results/{each}", *arguments])
+            except SystemExit as error:
+                refused.append(f"{each}: {error}")
         import_module("paper.report").report()
+        if refused:
+            raise SystemExit("\nNothing was run of these:\n" + "\n".join(refused))
     elif name == "report" and not arguments:
         import_module("paper.report").report()
     else:
@@ -52,8 +58,9 @@ def main() -> None:
         if {"-h", "--help"} & {name, *arguments}:
             print(usage)
             raise SystemExit(0)
-        if name == "report":
-            raise SystemExit(f"report takes no options; found {' '.join(arguments)}.")
+        if name in _OTHER:
+            known = "none but --only-tables" if name == "all" else "no options"
+            raise SystemExit(f"{name} takes {known}; found {' '.join(arguments)}.")
         raise SystemExit(f"{usage}\n\nThere is no experiment {name!r}.")
 
 

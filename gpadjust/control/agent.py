@@ -12,6 +12,7 @@ from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
 
 import cloudpickle
+import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -134,6 +135,8 @@ class Agent(TaskAgent):
         if reward_tolerance is not None:
             checked_number("reward_tolerance", reward_tolerance, least=0)
         self.task = task
+        expected = "an environment of Gymnasium, as gymnasium.make(...) makes it, not vectorized"
+        check_kind("env", env, gym.Env, expected)
         self.env = env
         task.check_spaces(env.observation_space, env.action_space)
         self.action_noise = action_noise
@@ -247,6 +250,8 @@ class Agent(TaskAgent):
                 self._steps.append(_Step(episode, *row))
             self.tell("step", {"reward": float(reward)})
             if failed or terminated or truncated:
+                if failed and begins:
+                    self._promises.pop()  # there is no step of it to compare
                 return
             observation, begins = following, False
 
@@ -277,9 +282,9 @@ class Agent(TaskAgent):
 
     def _learn_dynamics(self) -> bool:
         """Let the dynamics learn the episodes that they have not; return whether there were any."""
-        recorded, is_fitted = self.recorded_episodes(), self.task.dynamics.is_fitted
-        new = recorded.some(recorded.episode >= (self.num_episodes if is_fitted else 0))
-        if new.num_transitions < (1 if is_fitted else 2):  # a first fit needs two
+        recorded, dynamics = self.recorded_episodes(), self.task.dynamics
+        new = recorded.some(recorded.episode >= (self.num_episodes if dynamics.has_learnt else 0))
+        if new.num_transitions < (1 if dynamics.is_fitted else 2):  # a first fit needs two
             return False
         if self.reward_tolerance is not None:
             new.check(self.task, self.reward_tolerance)
@@ -523,8 +528,10 @@ class _Pickler(cloudpickle.Pickler):
         names[id(task)] = "task"
         if id(value) in names or not isinstance(value, Task):
             return names.get(id(value))
-        if value.dynamics in (task.dynamics, model.dynamics):
+        if value is model:
             return "model"
+        if value.dynamics in (task.dynamics, model.dynamics):
+            return None  # pickled, but for its dynamics
         raise TypeError(
             f"{type(self.agent).__name__} keeps a Task with dynamics of its own, which no "
             "checkpoint holds; keep its reward and so on, and make it where it is needed"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import pickle
 import random
 import time
 import warnings
@@ -343,9 +344,20 @@ def _read(path: str | Path) -> tuple[dict[str, Any], _Parts]:
 
 
 def packed(values: Any) -> bytes:
-    """Tensors and plain values in bytes, which :func:`unpacked` reads without pickle."""
+    """Tensors and plain values in bytes, which :func:`unpacked` reads without pickle.
+
+    Raises:
+        TypeError: If there are others, with which a run could not be resumed.
+    """
     file = io.BytesIO()
     torch.save(values, file)
+    try:
+        unpacked(file.getvalue())
+    except pickle.UnpicklingError as error:
+        raise TypeError(
+            "A checkpoint holds tensors and plain values; found others, such as NumPy arrays, in "
+            "what an agent or the state_dict() of its dynamics gave. Make tensors of them."
+        ) from error
     return file.getvalue()
 
 

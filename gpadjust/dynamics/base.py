@@ -60,6 +60,11 @@ class Dynamics(ABC):
     def is_fitted(self) -> bool:
         """True once it can predict."""
 
+    @property
+    def has_learnt(self) -> bool:
+        """True once it has learnt from transitions, or if it has nothing to learn."""
+        return self.is_fitted
+
     @abstractmethod
     def update(self, states: Tensor, actions: Tensor, next_states: Tensor) -> None:
         """Learn from further transitions, ``N`` rows each."""
@@ -284,8 +289,8 @@ class Dynamics(ABC):
     ) -> Callable[[int, int | None], TransitionFunctions]:
         """Like `sample_functions`, each function with parameters of its own."""
         raise ValueError(
-            "Expected dynamics that learnt unknown parameters of one physics, which are to differ "
-            f"by variation={variation!r}; {type(self).__name__} has none, or several physics."
+            "Expected LearnedDynamics that learnt unknown parameters of one physics, which are to "
+            f"differ by variation={variation!r}; found {type(self).__name__}, or several physics."
         )
 
     def try_physics(self, states: Tensor, actions: Tensor) -> None:

@@ -129,6 +129,7 @@ class FreeRun(NamedTuple):
         # Step by step: ... x H x w x state_dim.
         mean, variance, found, *ends, draws = (x[..., steps, :].transpose(-3, -2) for x in parts)
         draws, y = ((x / units)[..., self.spec.moving] for x in (draws, found))
+        y = y.masked_fill(draws.isnan().any(0), torch.nan)  # where the physics fails
         return Scores.of(
             mean,
             variance,

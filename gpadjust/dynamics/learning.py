@@ -223,6 +223,12 @@ def check_factory(make: Any, options: Mapping[str, Any]) -> None:
             "such as CKA, PhysicsMeanGP or ZeroMeanGP, a functools.partial of it with further "
             f"arguments, or a function; found {found}."
         )
+    taken = {"train_X", "train_Y", "train_Yvar", "physics", "input_transform"}
+    if isinstance(make, partial) and (own := sorted(taken & {*make.keywords})):
+        raise TypeError(
+            f"Expected a model whose data and physics come from the dynamics; found {own[0]} in "
+            "the functools.partial: leave it out, and give the physics to the dynamics."
+        )
     inner, has_physics = made_by(make), "physics" in options
     name = getattr(inner, "__name__", repr(inner))
     if has_physics and isinstance(inner, type) and issubclass(inner, ZeroMeanGP):

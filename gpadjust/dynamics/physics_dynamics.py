@@ -87,6 +87,11 @@ class PhysicsDynamics(Dynamics):
         return True
 
     @property
+    def has_learnt(self) -> bool:
+        """True once unknown parameters are fitted, or if there are none."""
+        return self._fitted is not None or not self.physics.unknowns
+
+    @property
     def physics_parameters(self) -> PhysicsParameters:
         """Unknown parameters: 1024 draws about the fitted ones, or the guesses before.
 

@@ -64,7 +64,7 @@ class Trajectories:
         states: ``N x state_dim``.
         actions: ``N x action_dim``.
         next_states: ``N x state_dim``; NaN where an entry was not measured.
-        episode: ``N`` numbers; the rows of an episode follow each other. Default: each row is
+        episode: ``N`` whole numbers; the rows of an episode follow each other. Default: each row is
             an episode, as of transitions that were measured one by one.
 
     Raises:
@@ -85,6 +85,8 @@ class Trajectories:
         episode: Tensor | Sequence[int] | None = None,
     ) -> None:
         episode = torch.arange(len(states)) if episode is None else torch.as_tensor(episode)
+        if episode.is_floating_point() and (episode != episode.round()).any():
+            raise ValueError(f"Expected episode as whole numbers, found {episode.tolist()[:5]}.")
         rows = {"states": states, "actions": actions, "next_states": next_states}
         vars(self).update(rows, episode=episode.long())
         found = {name: len(tensor) for name, tensor in vars(self).items()}

@@ -15,7 +15,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -199,12 +199,12 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _new_episodes(self) -> tuple[RecordedEpisodes | None, int]:
         """The real steps that the dynamics have not learnt, if an episode has ended; how many."""
-        buffer, is_fitted = self.replay_buffer, self.ready_task().dynamics.is_fitted
+        buffer, dynamics = self.replay_buffer, self.ready_task().dynamics
         num_ended = int((buffer.dones.astype(bool) & ~buffer.failed & ~buffer.learnt).sum())
         if not num_ended:
             return None, 0
-        new = self._recorded(~buffer.learnt if is_fitted else None)
-        least = 1 if is_fitted else 2  # a first fit needs two
+        new = self._recorded(~buffer.learnt if dynamics.has_learnt else None)
+        least = 1 if dynamics.is_fitted else 2  # a first fit needs two
         return (new if new.num_transitions >= least else None), num_ended
 
     def _train_in_model(self, num_episodes: int, batch_size: int) -> None:
@@ -268,9 +268,9 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     # Real episodes
 
     def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
-        """Learn; a callback may be or hold an :class:`~gpadjust.control.EpisodeCheckpoint`."""
-        several = isinstance(callback, list)
-        given = callback if several else [callback]
+        """Learn; a callback may be, or a list of them hold, an :class:`EpisodeCheckpoint`."""
+        several = isinstance(callback, list | CallbackList)
+        given = getattr(callback, "callbacks", callback) if several else [callback]
         checkpoints = [each for each in given if isinstance(each, EpisodeCheckpoint)]
         if checkpoints and self.use_sde:
             raise ValueError(

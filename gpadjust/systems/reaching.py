@@ -11,7 +11,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_columns, checked_whole
+from gpadjust.checks import check_columns, check_switch, checked_whole
 from gpadjust.physics import Physics, Unknown
 from gpadjust.states import StateSpec
 from gpadjust.systems.system import System
@@ -173,7 +173,8 @@ def arm(
 
     Raises:
         ImportError: If ``opensim`` is asked for and missing.
-        ValueError: If an option is out of range, or ``opensim`` is asked for with ``unknowns``.
+        ValueError: If an option is out of range, or ``opensim`` is asked for with ``unknowns``,
+            ``substeps`` or ``gradient``.
 
     Example:
         >>> import torch
@@ -182,6 +183,8 @@ def arm(
         >>> physics(torch.tensor([[0.6, 1.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0]], dtype=torch.float64))
         tensor([[ 0.6902,  1.0405,  0.7442, -0.2988]], dtype=torch.float64)
     """
+    for name, switch in {"memory": memory, "unknowns": unknowns, "opensim": opensim}.items():
+        check_switch(name, switch)
     spec = ARM_MEMORY_SPEC if memory else ARM_SPEC
     physics: Physics
     if opensim:
@@ -189,6 +192,8 @@ def arm(
 
         if unknowns:
             raise ValueError("The physics by OpenSim has no unknown parameters; use opensim=False.")
+        if (substeps, gradient) != (SUBSTEPS, "autograd"):
+            raise ValueError("OpenSim takes no substeps and gradient; use opensim=False.")
         physics = opensim_arm_physics(gains)
     else:
         believed = believed_arm(gains)

@@ -419,6 +419,7 @@ def cart_pole(
         >>> systems.cart_pole(seed=1, unknowns=True).unknowns["damping"].prior_text
         '0 to 1'
     """
+    check_switch("unknowns", unknowns)
     believed, named = believed_cart_pole(seed), None
     if unknowns:
         named = {

@@ -86,12 +86,20 @@ def known_structures(
 
 
 def _of_factory(factory: Any) -> Structure:
-    """The structure of what makes a model, named by its class and arguments."""
+    """The structure of what makes a model, named by its class and arguments.
+
+    What it is is known if it is the class of a structure above.
+    """
     function = getattr(factory, "func", factory)
     given = getattr(factory, "keywords", {})
     told = ", ".join(f"{name}={value!r}" for name, value in given.items())
     name = getattr(function, "__name__", type(function).__name__)
-    return Structure(f"{name}({told})" if told else name, factory)
+    known = [structure for structure in STRUCTURES if structure.model is function]
+    like = known[0] if known else Structure(name, factory)
+    unknowns = sum(value == "learn" for key, value in given.items() if key.endswith("_mean"))
+    adjusts = like.adjusts or bool(given.keys() & {"rho_mean", "delta_mean"})
+    called = f"{name}({told})" if told else name
+    return like._replace(name=called, model=factory, unknowns=unknowns, adjusts=adjusts)
 
 
 def candidates(

@@ -139,7 +139,8 @@ def run_one(experiment: Experiment, case: Case) -> Case:
 
 def check_all(path: Path, done: Mapping[Case, Run], experiment: Experiment) -> None:
     """Refuse runs of other settings, of whatever kind: their tables are one file, with one list."""
-    kinds = {case[:-1] for case in replace(experiment, only=()).cases()}
+    cases = [*replace(experiment, only=()).cases(), *experiment.cases()]
+    kinds = {case[:-1] for case in cases}
     for case, run in done.items():
         if case[:-1] in kinds:
             check_settings(path, case, run, experiment)

@@ -23,7 +23,7 @@ from gpadjust.control import (
 )
 from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
 from gpadjust.models import ZeroMeanGP
-from gpadjust.physics import PhysicsError
+from gpadjust.physics import FunctionPhysics, PhysicsError, Unknown
 from gpadjust.systems import CartPoleSwingUpEnv, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_SPEC, cart_pole_reward
 from tests.control.conftest import KINDS, PLAN
@@ -311,9 +311,47 @@ def test_a_step_that_failed_is_no_data_and_ends_its_episode(make_agent, point_en
             return *super().step(action)[:4], {"step_failed": failed}
 
     recorded = make_agent(MPCAgent, Jams(point_env())).learn(13).recorded_episodes()
-    assert recorded.episode.tolist() == 5 * [1] + [2] + 5 * [3]
+    assert recorded.episode.tolist() == 5 * [0] + [1] + 5 * [2]
     moved = recorded.next_states - recorded.states
     torch.testing.assert_close(moved, 0.5 * recorded.actions, atol=0.1, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:.*promised")
+def test_an_episode_without_a_step_counts_for_nothing(point_env, point_task):
+    class Boasts(Farthest):
+        def promise(self, state):
+            return {"promised_reward": 100.0 if self.env.steps == 5 else -1.0}
+
+    class Jams(gymnasium.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            self.steps += 1
+            return *super().step(action)[:4], {"step_failed": self.steps == 6}
+
+    agent = Boasts(Jams(point_env()), point_task(), score_horizons=(), reward_tolerance=None)
+    agent.learn(11)
+    assert agent.num_episodes == 2
+    assert agent.promised_reward == -1.0
+
+
+def test_a_physics_that_is_to_be_fitted_learns_all_episodes(make_agent, point_task):
+    agent = make_agent(MPCAgent).learn(10)
+    physics = FunctionPhysics(
+        lambda X, p: (X[:, 0] + p.gain * X[:, 1]).unsqueeze(-1),
+        unknowns={"gain": Unknown(0.4, factor=1.5)},
+    )
+    agent.task = point_task(dynamics=PhysicsDynamics(agent.task.dynamics.spec, physics))
+    agent.learn(5)
+    found = agent.task.dynamics.physics_parameters.mean["gain"]
+    assert len(agent.task.dynamics.state_dict()["fitted"]["transitions"]["states"]) == 15
+    assert abs(float(found) - 0.5) < 0.05
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", None])
+def test_an_environment_is_needed(env, point_task):
+    with pytest.raises(TypeError, match="env must be an environment of Gymnasium"):
+        MPCAgent(env, point_task())
 
 
 def test_a_callback_that_raises_lets_nothing_be_learnt_twice(make_agent, kind):

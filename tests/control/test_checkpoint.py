@@ -8,6 +8,7 @@ import sys
 import textwrap
 import threading
 import zipfile
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -214,6 +215,19 @@ def test_a_task_with_other_dynamics_is_refused(make_agent, point_task, tmp_path)
     agent.kept = point_task()
     with pytest.raises(TypeError, match=r"KeepingAgent.kept .* keeps a Task .* in not_saved"):
         agent.save(tmp_path / "run.ckpt")
+
+
+def test_a_task_that_an_agent_changed_is_kept(make_agent, again, tmp_path):
+    agent = make_agent(MPCAgent).learn(5)
+    agent.shaped = replace(agent.model, reward=seven)
+    agent.save(tmp_path / "run.ckpt")
+    resumed = resume(tmp_path / "run.ckpt", *again())
+    assert resumed.shaped.reward is seven
+    assert resumed.shaped.dynamics is resumed.model.dynamics
+
+
+def seven(states, actions, next_states):
+    return torch.full((len(states),), -7.0, dtype=torch.float64)
 
 
 class Broken:

@@ -91,6 +91,17 @@ def test_the_energy_of_one_state_without_doubt_is_the_distance_in_typical_steps(
     np.testing.assert_allclose(scores.energy, [0.5, 1.0, 1.5, 2.0])
 
 
+def test_windows_where_the_physics_fails_have_no_energy(run, measured):
+    particles = run.particles.clone()
+    particles[0, 1] = torch.nan
+    kept = [0, 2, 3]
+    failing = run._replace(particles=particles)
+    energy = failing.score(measured, units=torch.ones(2).double()).energy
+    others = run_of(run.particles[:, kept])
+    others = others.score(measured[kept], units=torch.ones(2).double()).energy
+    torch.testing.assert_close(energy, others, equal_nan=True)
+
+
 def test_horizons_are_rows_of_all_steps(run, measured):
     whole, some = run.score(measured), run.score(measured, horizons=[3, 1])
     for name in ("rmse", "median", "nlpd", "coverage", "energy"):

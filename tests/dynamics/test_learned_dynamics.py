@@ -403,3 +403,9 @@ def test_the_model_has_the_names_of_the_spec(uniform):
     assert trust(model).input_names == model.input_names
     absolute = LearnedDynamics(spec, lambda X: X[:, :2], target="absolute")
     assert absolute.targets.output_names == ("theta", "omega")
+
+
+def test_data_and_physics_are_those_of_the_dynamics():
+    for name in ("physics", "train_Yvar"):
+        with pytest.raises(TypeError, match=f"found {name} in the functools.partial"):
+            LearnedDynamics(StateSpec(["x"], ["u"]), None, model=partial(CKA, **{name: None}))

@@ -92,3 +92,9 @@ def test_episodes_that_are_none(episode, says):
 def test_lengths_are_whole_numbers(length, stride):
     with pytest.raises((TypeError, ValueError), match=r"(length|stride) must be"):
         count(5).windows(length, stride=stride)
+
+
+def test_episodes_are_whole_numbers():
+    rows = torch.zeros(2, 1).double()
+    with pytest.raises(ValueError, match=r"whole numbers, found \[0.5, 0.75\]"):
+        Trajectories(rows, rows, rows, episode=[0.5, 0.75])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
@@ -303,3 +303,9 @@ def test_cart_pole_of_co_kriging(sampling, cart_pole, assert_same, tmp_path):
     rest = resume(path, VecNormalize(DummyVecEnv([cart_pole])), task())
     assert rest.num_timesteps == 75
     assert_same(whole, rest.learn(25, reset_num_timesteps=False))
+
+
+def test_a_checkpoint_may_be_in_a_list_of_callbacks(point_agent, tmp_path):
+    path = tmp_path / "run.ckpt"
+    point_agent().learn(5, CallbackList([EpisodeCheckpoint(path)]))
+    assert path.exists()

@@ -516,3 +516,15 @@ def test_repeated_inputs_are_no_evidence_of_the_physics():
     comparison = compare(X, Y, lambda X: 5 * X.sin())
     assert comparison.gain["y"].shown == 0
     assert comparison.chosen == "CKA"
+
+
+def test_a_class_is_the_structure_that_is_known_of_it():
+    from gpadjust.validation.structures import known_structures
+
+    named = known_structures(["CKA", "zero mean", "constant rho"])
+    made = known_structures(
+        [CKA, ZeroMeanGP, partial(PhysicsMeanGP, rho_mean="learn", delta_mean="learn")]
+    )
+    assert [each._replace(name="", model=None) for each in made] == [
+        each._replace(name="", model=None) for each in named
+    ]
