@@ -343,7 +343,7 @@ def test_a_physics_that_is_to_be_fitted_learns_all_episodes(make_agent, point_ta
     )
     agent.task = point_task(dynamics=PhysicsDynamics(agent.task.dynamics.spec, physics))
     agent.learn(5)
-    found = agent.task.dynamics.physics_parameters.mean["gain"]
+    found = agent.task.dynamics.physics_parameters.mean
     assert len(agent.task.dynamics.state_dict()["fitted"]["transitions"]["states"]) == 15
     assert abs(float(found) - 0.5) < 0.05
 
