@@ -268,7 +268,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
     # Real episodes
 
     def learn(self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any) -> Self:
-        """Learn; a callback may be, or a list of them hold, an :class:`EpisodeCheckpoint`."""
+        """Learn; a callback may be, or a list of them hold, an ``EpisodeCheckpoint``."""
         several = isinstance(callback, list | CallbackList)
         given = getattr(callback, "callbacks", callback) if several else [callback]
         checkpoints = [each for each in given if isinstance(each, EpisodeCheckpoint)]

@@ -97,12 +97,15 @@ def run_missing(experiment: Experiment) -> None:
         missing = [case for case in cases if case not in done or case in others]
     elif others and missing and experiment.other_versions == "refuse":
         raise Refused(
-            f"{file.path} has runs of other versions: {next(iter(others.values()))}. Pass "
-            "--other-versions keep to add to them, --other-versions replace to run them again, or "
-            "another --out."
+            f"{file.path} has runs that differ from those to come: {next(iter(others.values()))}. "
+            "Pass --other-versions keep to add to them, --other-versions replace to run them "
+            "again, or another --out."
         )
     elif others:
-        print(f"{len(others)} of the runs were made by other versions of the packages.")
+        print(
+            f"{len(others)} of the runs were made by other versions, defaults or settings, or do "
+            "not say by which."
+        )
     shown = _first_look(experiment, done.values()) if missing else True
     bar = tqdm(total=len(cases), initial=len(cases) - len(missing), unit="run", disable=not missing)
     with bar, _backend(experiment.backend) as options:
