@@ -213,7 +213,7 @@ def test_runs_of_other_versions_are_refused_kept_or_run_again(tmp_path, monkeypa
     main(Toy(out=tmp_path))  # nothing is missing
     assert "6 of the runs were made by other versions" in capsys.readouterr().out
     more = Toy(out=tmp_path, runs=4)
-    with pytest.raises(Refused, match=r"other versions: numpy was .* and is now 99\. Pass --other"):
+    with pytest.raises(Refused, match=r"that differ .*: numpy was .* and is now 99\. Pass --other"):
         main(more)
     main(replace(more, other_versions="keep"))
     assert len(calls(tmp_path)) == 8
