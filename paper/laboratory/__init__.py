@@ -1,0 +1,1 @@
+"""Data as laboratories have them: each kind beside what ignores it."""
