@@ -205,6 +205,10 @@ def stationary_terms(
         variances = [term.mean_variance for term in kernel.terms if term.learns_mean]
         root = basis * torch.stack(variances, dim=-1).sqrt()
         of_means, basis = root @ root.mT, None
+    if kernel.sister is not None:  # of which nothing is learnt
+        taught = kernel.at(inputs).sister
+        of_sister = taught.covariance(taught)
+        of_means = of_sister if of_means is None else of_means + of_sister
     selection = None if known_noise is not None else likelihood.selection(inputs)
     return StationaryTerms(parts, current, mean, of_means, basis, noise, selection)
 
