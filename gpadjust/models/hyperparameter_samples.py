@@ -13,6 +13,7 @@ from torch import Size, Tensor
 from torch.nn import Parameter
 
 from gpadjust.gp import AppendedPhysics, OrthogonalKernel, Term
+from gpadjust.gp.noise import RowNoise
 from gpadjust.models.updates import UpdatedWeights
 
 HOLDS_SAMPLES = (
@@ -20,7 +21,7 @@ HOLDS_SAMPLES = (
     "`model.release_samples()` keeps the first."
 )
 # Modules whose buffers have the batch.
-_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term, UpdatedWeights)
+_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, RowNoise, Term, UpdatedWeights)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:

@@ -63,7 +63,7 @@ class WeightConditioning(ExactConditioning):
         """
         train = self.kernel.at(self.train_inputs[0])
         design, residual = train.features(self.features), self.targets - train.mean()
-        noise = self.noise.at(train.x)
+        noise = self.noise.of_rows(self.noise.at(train.x))
         if self._known is None:
             return regression(design, residual, noise)
         mean, root, n = self._known
@@ -278,7 +278,8 @@ class RRA(TermsGP):
             obs = None if Y is None else self.outputs_first(Y)
             if X is None:
                 inputs: Tensor = self.train_inputs[0]
-                noise, obs = self.noise.at(inputs), self.train_targets * scale + shift
+                noise = self.noise.of_rows(self.noise.at(inputs))
+                obs = self.train_targets * scale + shift
             else:
                 inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)
                 noise = self.observation_noise(inputs)
@@ -385,7 +386,7 @@ class PaperRRA(RRA):
                 design @ design.mT + torch.eye(design.shape[-2]).to(design)
             )
             latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
-            return mean, latent + self.noise.at(train.x)
+            return mean, latent + self.noise.of_rows(self.noise.at(train.x))
 
 
 def fourier_kernel(
