@@ -249,6 +249,8 @@ class RRA(TermsGP):
     def pyro_model(self, X: Tensor | None = None, Y: Tensor | None = None) -> Tensor:
         r"""The regression as a Pyro model, in the user's units, for NUTS, SVI or any guide.
 
+        Of outputs with a link (``outcome_transform="log"``) it is the model of their links.
+
         Its sample sites are ``"weights"``, ``(m) x 2D`` as in :meth:`weights`, and ``"Y"``,
         ``(m) x n``. Lengthscales, prior scales and noise stand as they are in the model.
 
@@ -275,6 +277,7 @@ class RRA(TermsGP):
         self.eval()
         shift, scale = self.units()
         with torch.no_grad():
+            Y = Y if Y is None or self.link is None else self.link.value(Y)
             obs = None if Y is None else self.outputs_first(Y)
             if X is None:
                 inputs: Tensor = self.train_inputs[0]

@@ -109,7 +109,7 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = made.units
+            self.outcome_transform = made.units if made.link is None else made.link.units(made.units)
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
@@ -171,8 +171,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         noise = self.noise.of_rows(self.noise.at(train.x))
         covariance = train.covariance() + torch.diag_embed(noise)
         value = negative_log_likelihood(residual, covariance).value
-        count = (~residual.isnan()).sum(-1)
-        return "log likelihood", -value - count * scale.squeeze(-1).log()
+        value, count = -value, (~residual.isnan()).sum(-1)
+        if self.link is not None:
+            value = value + self.outputs_first(self.link.log_slope(self.user_targets())).nansum(-1)
+        return "log likelihood", value - count * scale.squeeze(-1).log()
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Each training target predicted from all others, means and variances ``... x (m) x n``.
@@ -223,10 +225,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         inputs = self._original_train_inputs
         inputs = self.train_inputs[0] if inputs is None else inputs
         inputs = inputs.select(-3, 0) if self._num_outputs > 1 else inputs
-        shift, scale = self.units()
-        targets = self.outputs_last(self.train_targets * scale + shift)
-        noise = self.noise.known
+        targets, noise, scale = self.user_targets(), self.noise.known, self.units()[1]
         noise = None if noise is None else self.outputs_last(noise * scale.square())
+        if noise is not None and self.link is not None:
+            noise = noise / (2 * self.link.log_slope(targets)).exp().nan_to_num(nan=1.0)
         if self.num_samples is not None:
             inputs, targets = inputs[0], targets[0]
             if noise is not None and noise.shape != targets.shape:  # of later observations, too
@@ -487,6 +489,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         self._check_noise(noise, Y)
         if noise is not None:
             transform = getattr(self, "outcome_transform", None)
+            if self.link is not None and fantasize_flag.off():
+                noise = self.link(Y, noise)[1]
             if transform is not None and fantasize_flag.off():
                 noise = noise / transform.stdvs.square()
             kwargs["noise"] = noise.nan_to_num(nan=1.0, posinf=1.0)  # where nothing was observed
