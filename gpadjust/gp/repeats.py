@@ -8,8 +8,6 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-_FEWER = 0.75  # distinct inputs for each row, at most, for groups to pay
-
 
 class Within(NamedTuple):
     r"""What observations of equal inputs say of their noise, beside their means.
@@ -76,17 +74,21 @@ class Repeats:
     group: Tensor
 
     @classmethod
-    def of(cls, inputs: Tensor) -> Self | None:
-        """Those of raw inputs ``... x n x d`` of a batch; None where they do not pay."""
+    def of(cls, inputs: Tensor) -> Self:
+        """The rows of inputs ``... x n x d`` that are equal in all of a batch."""
         n = inputs.shape[-2]
         rows = inputs.reshape(-1, *inputs.shape[-2:]).transpose(0, 1).reshape(n, -1)
         distinct, group = rows.unique(dim=0, return_inverse=True)
-        if len(distinct) > _FEWER * n:
-            return None
         every = torch.arange(n, device=group.device)
         first = every.new_full((len(distinct),), n).scatter_reduce(0, group, every, "amin")
         order = first.argsort()
         return cls(first[order], order.argsort()[group])
+
+    def appended(self, number: int) -> Repeats:
+        """Return the same with more rows, each of which counts by itself."""
+        n, u = len(self.group), len(self.first)
+        more = torch.arange(number, device=self.group.device)
+        return Repeats(torch.cat([self.first, n + more]), torch.cat([self.group, u + more]))
 
     def sum(self, values: Tensor) -> Tensor:
         """Sum values ``... x n`` of each distinct input, ``... x u``."""
