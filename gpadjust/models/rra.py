@@ -55,7 +55,8 @@ class WeightConditioning(ExactConditioning):
         """Regress the targets on the features, see :func:`regression`."""
         train = self.kernel.at(self.train_inputs[0])
         residual = self.targets - train.mean()
-        return regression(train.features(self.features), residual, self.noise.at(train.x))
+        noise = self.noise.of_rows(self.noise.at(train.x))
+        return regression(train.features(self.features), residual, noise)
 
     def _push_forward(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Mean ``... x q`` and a root ``... x q x p`` of the covariance of a sum of terms."""
@@ -179,7 +180,8 @@ class RRA(TermsGP):
             obs = None if Y is None else self.outputs_first(Y)
             if X is None:
                 inputs: Tensor = self.train_inputs[0]
-                noise, obs = self.noise.at(inputs), self.train_targets * scale + shift
+                noise = self.noise.of_rows(self.noise.at(inputs))
+                obs = self.train_targets * scale + shift
             else:
                 inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)
                 noise = self.observation_noise(inputs)
@@ -286,7 +288,7 @@ class PaperRRA(RRA):
                 design @ design.mT + torch.eye(design.shape[-2]).to(design)
             )
             latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
-            return mean, latent + self.noise.at(train.x)
+            return mean, latent + self.noise.of_rows(self.noise.at(train.x))
 
 
 def fourier_kernel(

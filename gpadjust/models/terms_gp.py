@@ -12,14 +12,19 @@ from botorch.fit import _fit_fallback
 from botorch.models import SingleTaskGP
 from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.sampling.pathwise.update_strategies import GaussianUpdate
 from botorch.settings import validate_input_scaling
+from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.mlls import ExactMarginalLogLikelihood, MarginalLogLikelihood
+from gpytorch.models import ExactGP
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
+from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
 import gpadjust
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
+from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.kernels import Stationary
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
@@ -66,7 +71,7 @@ class TermsGP(TermsModel, SingleTaskGP):
     _learnt_noise = staticmethod(learnt_noise)
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
-        data, likelihood = made.data, made.likelihood
+        data, likelihood = made.data, made.noise()
         if likelihood is not None and data.Yvar is not None:
             raise ValueError("Expected train_Yvar or a likelihood, got both: give one of them.")
         unknown = sum(term.learns_mean for term in terms)
@@ -103,6 +108,8 @@ class TermsGP(TermsModel, SingleTaskGP):
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
             self.outcome_transform = made.units
+        if made.sources:
+            self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
@@ -159,7 +166,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
         train, (_, scale) = self.at(self.train_inputs[0]), self.units()
         residual = self.train_targets - train.mean()
-        covariance = train.covariance() + torch.diag_embed(self.noise.at(train.x))
+        noise = self.noise.of_rows(self.noise.at(train.x))
+        covariance = train.covariance() + torch.diag_embed(noise)
         value = negative_log_likelihood(residual, covariance).value
         count = (~residual.isnan()).sum(-1)
         return "log likelihood", -value - count * scale.squeeze(-1).log()
@@ -419,3 +427,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
         with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
             return super(TermsGP, shell).condition_on_observations(X, Y, **kwargs)
+
+
+@GaussianUpdate.register(TermsGP, _GaussianLikelihoodBase)  # type: ignore[untyped-decorator, unused-ignore]
+def _update(model: TermsGP, likelihood: _GaussianLikelihoodBase, **arguments: Any) -> Any:
+    """BoTorch's pathwise update, with the noise of each point."""
+    noise, update = model.noise, GaussianUpdate.dispatch(ExactGP, _GaussianLikelihoodBase)
+    if noise.rows is None and noise.selection(model.train_inputs[0]) is None:
+        return update(model, likelihood, **arguments)
+    variances = DiagLinearOperator(noise.of_rows(noise.at(model.train_inputs[0])))
+    return update(model, likelihood, **{"noise_covariance": variances, **arguments})
