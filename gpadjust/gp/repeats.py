@@ -126,8 +126,8 @@ class Repeats:
         mean = mean.where(count > 0, torch.nan)
         return Means(mean, known.reciprocal(), weight, within)
 
-    def left_out(
-        self, means: Means, residual: Tensor, variance: Tensor, alpha: Tensor, precision: Tensor
+    def of_each(
+        self, means: Means, targets: Tensor, variance: Tensor, alpha: Tensor, precision: Tensor
     ) -> tuple[Tensor, Tensor]:
         r"""Weights and precisions of the rows by those of the means.
 
@@ -137,13 +137,13 @@ class Repeats:
 
         Args:
             means: The means.
-            residual: Targets, ``... x n``.
+            targets: Those of the rows, ``... x n``.
             variance: V, ``... x u``.
             alpha: ``... x u``.
             precision: ``... x u``.
         """
         weight = means.weight
         each = weight / self.of_rows(variance)
-        away = (residual - self.of_rows(means.targets)).nan_to_num(nan=0.0)
+        away = (targets - self.of_rows(means.targets)).nan_to_num(nan=0.0)
         alpha = weight * self.of_rows(alpha) + each * away
         return alpha, each * (1 - weight) + weight.square() * self.of_rows(precision)

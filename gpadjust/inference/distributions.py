@@ -169,6 +169,7 @@ def stationary_terms(
     known_noise: Tensor | None,
     random_means: bool,
     kept: Any = slice(None),
+    share: Tensor | None = None,
 ) -> StationaryTerms | None:
     """The distribution of a model in closed form, or None if it has another form.
 
@@ -217,7 +218,11 @@ def stationary_terms(
         root = basis * torch.stack(variances, dim=-1).sqrt()
         of_means, basis = root @ root.mT, None
     shares = (None, None) if known_noise is not None else likelihood.shares(inputs, kept)
-    return StationaryTerms(parts, current, mean, of_means, basis, noise, *shares)
+    selection, added = shares
+    if share is not None and known_noise is None:
+        each = share.unsqueeze(-1)
+        selection = each if selection is None else selection * each
+    return StationaryTerms(parts, current, mean, of_means, basis, noise, selection, added)
 
 
 @dataclass(eq=False)
@@ -235,6 +240,8 @@ class ByModules:
         known_noise: The noise variances of these inputs, if they are known.
         random_means: Whether the prior variances of unknown constants are in the covariance.
         kept: Which rows of the training data these are.
+        share: The share of the noise of one observation that each input has, ``... x n``, if its
+            target is a mean; None for all of it.
     """
 
     model: BatchedMultiOutputGPyTorchModel
@@ -243,6 +250,7 @@ class ByModules:
     known_noise: Tensor | None
     random_means: bool
     kept: Any = field(default_factory=lambda: slice(None))
+    share: Tensor | None = None
 
     def __call__(self, values: Values, derivatives: bool = False) -> Moments:
         """Moments at values by name; see :class:`Moments`."""
@@ -284,7 +292,9 @@ class ByModules:
             basis = kernel.basis_of_means(inputs)
         if noise is None:
             likelihood = Noise(model.likelihood)
-            noise = likelihood.of_rows(likelihood.at(inputs), self.kept)
+            noise = likelihood.at(inputs)
+            alone = self.share is None
+            noise = likelihood.of_rows(noise, self.kept) if alone else noise * self.share
         noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
         mean = model.mean_module(inputs).expand(noise.shape)
         return mean, covariance + torch.diag_embed(noise), basis, noise

@@ -54,9 +54,8 @@ class WeightConditioning(ExactConditioning):
     def regress(self) -> tuple[Tensor, Tensor]:
         """Regress the targets on the features, see :func:`regression`."""
         train = self.kernel.at(self.train_inputs[0])
-        residual = self.targets - train.mean()
-        noise = self.noise.of_rows(self.noise.at(train.x))
-        return regression(train.features(self.features), residual, noise)
+        targets, noise, _ = self.observations()
+        return regression(train.features(self.features), targets - train.mean(), noise)
 
     def _push_forward(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Mean ``... x q`` and a root ``... x q x p`` of the covariance of a sum of terms."""
@@ -224,7 +223,9 @@ class PaperConditioning(WeightConditioning):
     def regress(self) -> tuple[Tensor, Tensor]:
         """The paper's mean and root of the covariance of weights."""
         design = self.kernel.at(self.train_inputs[0]).features(self.features)
-        _, root = regression(design, self.targets, torch.ones_like(design[..., 0]))
+        targets, _, means = self.observations()
+        ridge = torch.ones_like(design[..., 0]) if means is None else means.share
+        _, root = regression(design, targets, ridge)
         return super().regress()[0], root
 
 
