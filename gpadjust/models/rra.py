@@ -62,8 +62,8 @@ class WeightConditioning(ExactConditioning):
         After updates it is their weights that are known, and of observations those after them.
         """
         train = self.kernel.at(self.train_inputs[0])
-        design, residual = train.features(self.features), self.targets - train.mean()
-        noise = self.noise.of_rows(self.noise.at(train.x))
+        targets, noise, _ = self.observations()
+        design, residual = train.features(self.features), targets - train.mean()
         if self._known is None:
             return regression(design, residual, noise)
         mean, root, n = self._known
@@ -325,7 +325,9 @@ class PaperConditioning(WeightConditioning):
     def regress(self) -> tuple[Tensor, Tensor]:
         """The paper's mean and root of the covariance of weights."""
         design = self.kernel.at(self.train_inputs[0]).features(self.features)
-        _, root = regression(design, self.targets, torch.ones_like(design[..., 0]))
+        targets, _, means = self.observations()
+        ridge = torch.ones_like(design[..., 0]) if means is None else means.share
+        _, root = regression(design, targets, ridge)
         return super().regress()[0], root
 
 
