@@ -14,13 +14,15 @@ from torch.nn import Parameter
 
 from gpadjust.gp import AppendedPhysics, Term
 from gpadjust.gp.kernels import CompositeKernel
+from gpadjust.gp.noise import RowNoise
+from gpadjust.models.updates import UpdatedWeights
 
 HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
     "`model.release_samples()` keeps the first."
 )
 # Modules whose buffers have the batch.
-_BATCHED = (AppendedPhysics, CompositeKernel, RFFKernel, Term)
+_BATCHED = (AppendedPhysics, CompositeKernel, RFFKernel, RowNoise, Term, UpdatedWeights)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:

@@ -20,7 +20,7 @@ from torch.nn import Module
 
 from gpadjust.gp import AppendedPhysics, PhysicsInput, Term, Unit
 from gpadjust.gp.gaussian import least_squares
-from gpadjust.gp.noise import Noise
+from gpadjust.gp.noise import Noise, RowSource
 from gpadjust.gp.physics_columns import check_one_to_one
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models.plausibility import complaint
@@ -39,12 +39,15 @@ KernelLike: TypeAlias = Kernel | Callable[[int, Size], Kernel]
 Kernels: TypeAlias = KernelLike | Sequence[KernelLike] | None
 Means = float | Sequence[float] | Literal["learn"]
 Center = float | Tensor | Literal["mean", "learn"]
+LikelihoodLike: TypeAlias = (
+    Likelihood | str | Sequence[str] | Callable[["TermBuilder"], Likelihood] | None
+)
 
 
 class ModelOptions(TypedDict, total=False):
     """The arguments that all structures share, see :class:`~gpadjust.CKA`."""
 
-    likelihood: Likelihood | None
+    likelihood: LikelihoodLike
     outcome_transform: Standardize | _DefaultType | None
     input_transform: InputTransform | None
 
@@ -57,12 +60,13 @@ class TermBuilder:
         input_transform: What makes the columns that terms read out of raw inputs, or None.
         units: Shift and scale of the targets, or None.
         num_inputs: Number ``d`` of these columns without those of the physics.
-        likelihood: The user's, or None.
+        likelihood: The user's, a function that makes it of the builder, names of ours, or None.
 
     Attributes:
         batch_shape: That of the model with its outputs last, for its kernels.
         f: Each physics at the training inputs, ``batch_shape x n x m``.
         given: What the user brought, whose parameters stay as they are.
+        sources: What sets the noise of training rows apart between fits.
     """
 
     def __init__(
@@ -71,27 +75,20 @@ class TermBuilder:
         input_transform: InputTransform | None,
         units: Standardize | None,
         num_inputs: int,
-        likelihood: Likelihood | None = None,
+        likelihood: LikelihoodLike = None,
     ) -> None:
-        if likelihood is not None and not isinstance(likelihood, _GaussianLikelihoodBase):
-            raise TypeError(f"Expected a Gaussian likelihood of GPyTorch, got {likelihood!r}.")
         self.data = data
         self.input_transform = input_transform
         self.units = units
         self.num_inputs = num_inputs
         self.likelihood = likelihood
         _, self.batch_shape = BatchedMultiOutputGPyTorchModel.get_batch_dimensions(data.X, data.Y)
-        learnt = None if likelihood is None else Noise(likelihood).learnt
-        if learnt is not None and learnt.shape[:-1] != self.batch_shape:
-            raise ValueError(
-                f"Expected a likelihood with batch_shape {tuple(self.batch_shape)}, one for each "
-                f"output, got {tuple(learnt.shape[:-1])}."
-            )
         m = data.Y.shape[-1]
         self._zero = torch.zeros_like(data.X[..., :1, :1]).expand(*data.X.shape[:-2], 1, m)
         self._shift = self._zero if units is None else units.means
         self._scale = self._zero + 1 if units is None else units.stdvs
         self.given: list[object] = [likelihood]
+        self.sources: list[RowSource] = []
         # Of each physics: its values, and the mean of its rho and its center, batch_shape x 1 x m.
         self.f: list[Tensor] = []
         self._means: list[Tensor] = []
@@ -109,7 +106,7 @@ class TermBuilder:
         *,
         rho_mean: Means | None = None,
         center: Center = "learn",
-        likelihood: Likelihood | None = None,
+        likelihood: LikelihoodLike = None,
         outcome_transform: Standardize | _DefaultType | None = DEFAULT,
         input_transform: InputTransform | None = None,
     ) -> TermBuilder:
@@ -286,6 +283,30 @@ class TermBuilder:
         offset = sum(c * w for c, w in zip(self._centers, self._means, strict=True))
         mean_0 = (self._zero + known + offset - self._shift) / self._scale
         return self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+
+    def noise(self) -> Likelihood | None:
+        """The likelihood, after all terms are made; None for the model's own.
+
+        Of names, what they say of training rows is entered in ``sources``.
+        """
+        likelihood: Any = self.likelihood
+        if isinstance(likelihood, str | list | tuple):
+            from gpadjust.models.named_noise import named_noise
+
+            likelihood = named_noise(likelihood, self)
+        elif callable(likelihood) and not isinstance(likelihood, Module | type):
+            likelihood = likelihood(self)
+        if likelihood is None:
+            return None
+        if not isinstance(likelihood, _GaussianLikelihoodBase):
+            raise TypeError(f"Expected a Gaussian likelihood of GPyTorch, got {likelihood!r}.")
+        learnt = Noise(likelihood).learnt
+        if learnt is not None and learnt.shape[:-1] != self.batch_shape:
+            raise ValueError(
+                f"Expected a likelihood with batch_shape {tuple(self.batch_shape)}, one for each "
+                f"output, got {tuple(learnt.shape[:-1])}."
+            )
+        return likelihood
 
     def warn_of_physics(self, stacklevel: int) -> None:
         """Warn if the physics is obviously off at the training inputs, after all terms are made.

@@ -128,10 +128,11 @@ class VariationalCKA(TermsModel, GPyTorchModel):
             center=center,
             **options,
         )
-        if some.noise.selection(some.train_inputs[0]) is not None:
+        if some.noise.rows is not None or some.noise.selection(some.train_inputs[0]) is not None:
             raise ValueError(
-                f"Expected a likelihood with one variance, got {type(some.likelihood).__name__}; "
-                "CKA takes those with several."
+                "Expected a likelihood with one variance for all observations, got "
+                f"{type(some.likelihood).__name__}; CKA takes those with several, and those that "
+                "differ from row to row."
             )
         super().__init__()
         self.covar_module, self.likelihood = some.covar_module, some.likelihood
