@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gpadjust.emulation import EmulatedPhysics
     from gpadjust.inference import FitResult, SampleResult, fit
     from gpadjust.models import (
         AR1,
@@ -41,6 +42,7 @@ __all__ = [
     "BlackBoxPhysics",
     "CalibratedPhysics",
     "Comparison",
+    "EmulatedPhysics",
     "FitResult",
     "FunctionPhysics",
     "JoinedPhysics",
@@ -67,6 +69,7 @@ _ROOMS = (
     "models",
     "inference",
     "validation",
+    "emulation",
     "gp",
     "states",
     "files",

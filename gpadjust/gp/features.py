@@ -82,6 +82,8 @@ def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> 
         return []
     if isinstance(kernel, AdditiveKernel) and kernel.active_dims is None:
         return [m for part in kernel.kernels for m in _feature_maps(part, num_inputs, num_features)]
+    if hasattr(kernel, "features"):
+        return [kernel.features(num_features)]
     if isinstance(kernel, OrthogonalKernel):
         free = _feature_maps(kernel.base_kernel, num_inputs, num_features)
         return [OrthogonalFeatures(kernel, free)] if kernel.directions.shape[-1] else free

@@ -61,6 +61,7 @@ class _Part(NamedTuple):
         weight: Its basis at the current constant, ``... x n``, or None for 1.
         constant: The name of the constant that the basis is affine in, or None.
         slope: The derivative of the basis by it, ``... x n`` or what broadcasts to it.
+        error: The covariance of an error of the basis, ``... x n x n``, or None.
     """
 
     x: Tensor
@@ -70,6 +71,12 @@ class _Part(NamedTuple):
     weight: Tensor | None
     constant: str | None = None
     slope: Any = None
+    error: Tensor | None = None
+
+    def squares(self, weight: Tensor) -> Tensor:
+        """The expected products of the basis ``... x n`` at each two inputs, ``... x n x n``."""
+        products = weight.unsqueeze(-1) * weight.unsqueeze(-2)
+        return products if self.error is None else products + self.error
 
 
 @dataclass(eq=False)
@@ -77,7 +84,8 @@ class StationaryTerms:
     r"""The targets' distribution with :math:`K = \sum_t s_t B_t k_t(X / \ell_t) B_t + K_0 + S`.
 
     Each term has a stationary kernel, and a diagonal B for a basis, affine in at most one learnt
-    constant; :math:`K_0` is the covariance of random means, and S that of the noise. There is no
+    constant; :math:`K_0` is the covariance of random means and of errors of an f_p that is
+    emulated, and S that of the noise. There is no
     graph of autograd: :meth:`~gpadjust.gp.kernels.Pairs.pull_back` carries derivatives back.
 
     Args:
@@ -112,6 +120,13 @@ class StationaryTerms:
             covariance = pairs.covariance
             if weight is not None and part.constant is not None:
                 weight = weight + part.slope * (every[part.constant] - self.current[part.constant])
+            if weight is not None and part.error is not None:
+                squares = part.squares(weight)
+                covariance = covariance * squares
+                if part.constant is None:
+                    slope = None if pairs.slope is None else pairs.slope * squares
+                    pairs, weight = Pairs(covariance, slope, pairs.z), None
+            elif weight is not None and part.constant is not None:
                 covariance = (covariance * weight.unsqueeze(-1)).mul_(weight.unsqueeze(-2))
             elif weight is not None:  # a part of the kernel, as it stays
                 for factor in (weight.unsqueeze(-1), weight.unsqueeze(-2)):
@@ -146,6 +161,8 @@ class StationaryTerms:
                 result[self.noise] = values[self.noise].exp() * by_noise.sum(-2)
             for part, (pairs, weight) in zip(self.parts, found, strict=True):
                 by_length, by_scale, by_weight = pairs.pull_back(by, weight)
+                if part.error is not None and weight is not None:
+                    by_length, by_scale, _ = pairs.pull_back(by * part.squares(weight), None)
                 if part.lengthscale in values:
                     shape = values[part.lengthscale].shape
                     by_length = by_length if shape[-1] > 1 else by_length.sum(-1, keepdim=True)
@@ -186,13 +203,17 @@ def stationary_terms(
 
     likelihood, kernel, parts = Noise(model.likelihood), model.covar_module, []
     centerd = inputs - inputs.mean(-2, keepdim=True)
-    for term in kernel.terms:
+    errors: dict[str, Tensor] = {
+        term.scaled_by: term.covariance(inputs) for term in kernel.terms if term.scaled_by
+    }
+    for term in (term for term in kernel.terms if not term.scaled_by):
         form = None if term.kernel is None else stationary_parts(term.kernel, term.num_inputs)
         if form is not None:
             base, outer, profile = form
             x, constant = centerd[..., : term.num_inputs], getattr(term.basis, "learnt", None)
             scale = None if outer is None else enter(outer.raw_outputscale)
             part = _Part(x, profile, enter(base.raw_lengthscale), scale, term.weights(inputs))
+            part = part._replace(error=errors.get(term.name))
             if constant is not None:
                 part = part._replace(constant=enter(constant), slope=term.basis.slope(inputs))
             parts.append(part)
@@ -217,6 +238,10 @@ def stationary_terms(
         variances = [term.mean_variance for term in kernel.terms if term.learns_mean]
         root = basis * torch.stack(variances, dim=-1).sqrt()
         of_means, basis = root @ root.mT, None
+    for term in (term for term in kernel.terms if term.name in errors):
+        square = term.mean.square() + (term.mean_variance if random_means else 0.0)
+        of_error = errors[term.name] * square.unsqueeze(-1)
+        of_means = of_error if of_means is None else of_means + of_error
     shares = (None, None) if known_noise is not None else likelihood.shares(inputs, kept)
     selection, added = shares
     if share is not None and known_noise is None:

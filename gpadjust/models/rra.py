@@ -157,7 +157,13 @@ class RRA(TermsGP):
         make = TermBuilder.of_adjustment(
             train_X, train_Y, train_Yvar, physics, rho_mean=rho_mean, center=center, **options
         )
-        super().__init__(make, [*make.rhos(kernel), make.delta(kernel, delta_mean)])
+        rhos = make.rhos(kernel)
+        if any(term.scaled_by for term in rhos):
+            raise ValueError(
+                "The error of an emulated physics is no sum of features: take CKA, or "
+                "FunctionPhysics(physics), which takes the emulator's mean as exact."
+            )
+        super().__init__(make, [*rhos, make.delta(kernel, delta_mean)])
         self.num_features = num_features
 
     def _take(self, new: NewRows, forget: int | None) -> None:

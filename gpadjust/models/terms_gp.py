@@ -209,7 +209,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         Of a model that holds samples, with kernels in closed form and their lengthscales: as
         :class:`~gpadjust.models.local_errors.LocalErrors` says. :func:`~gpadjust.fit` does this.
         """
-        forms = [term.form for term in self.terms if term.kernel is not None]
+        learnt = [term for term in self.terms if term.scaled_by is None]
+        forms = [term.form for term in learnt if term.kernel is not None]
         lengthscales = [form.lengthscale for form in forms if isinstance(form, Stationary)]
         if self.num_samples is None or not forms or len(lengthscales) < len(forms):
             return
