@@ -127,8 +127,8 @@ class Recipe:
         with warnings.catch_warnings():
             if quiet:
                 warnings.simplefilter("ignore")
-            make, given = _own_modules(self.make), _copied(self.options)
-            model: TermsModel = make_model(make, *self._rows(data), kind=TermsModel, **given)
+            given = {n: v if n == "physics" else deepcopy(v) for n, v in self.options.items()}
+            model: TermsModel = make_model(self.make, *self._rows(data), kind=TermsModel, **given)
         model.input_names = self.targets.input_names
         model.output_names = self.targets.output_names
         return model
@@ -283,18 +283,3 @@ def check_enough_observed(spec: StateSpec, data: Trajectories) -> None:
 def made_by(make: Any) -> Any:
     """The function or class that a partial is of."""
     return made_by(make.func) if isinstance(make, partial) else make
-
-
-def _own_modules(make: ModelFactory) -> ModelFactory:
-    """The factory, with copies of the modules (kernels) that a partial holds."""
-    if not isinstance(make, partial):
-        return make
-    return partial(make.func, *make.args, **_copied(make.keywords))
-
-
-def _copied(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options with modules of their own, but for a physics."""
-    return {
-        name: deepcopy(value) if isinstance(value, Module) and name != "physics" else value
-        for name, value in options.items()
-    }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import partial
 from typing import Any
 
 from botorch.models.model import Model
@@ -12,13 +14,26 @@ ModelFactory = Callable[..., Model]
 further arguments, or a function."""
 
 
+def with_options(factory: ModelFactory, options: Mapping[str, Any]) -> ModelFactory:
+    """A model factory with further arguments, but for those that it has already.
+
+    Args:
+        factory: Makes a model.
+        options: Those of :class:`~gpadjust.models.term_builder.ModelOptions`, as a rule.
+    """
+    own = factory.keywords if isinstance(factory, partial) else {}
+    given = {name: value for name, value in options.items() if name not in own}
+    return partial(factory, **given) if given else factory
+
+
 def make_model(
     factory: ModelFactory, X: Any, Y: Any, *, kind: type[Model] = Model, **given: Any
 ) -> Any:
     """A new model of data.
 
     Args:
-        factory: Makes it.
+        factory: Makes it. What a ``functools.partial`` holds beside a physics (kernels, a
+            likelihood) is copied, so that each model has its own.
         X: Inputs, ``n x d``.
         Y: Targets, ``n x m``.
         kind: The class that the model has to be of.
@@ -33,6 +48,9 @@ def make_model(
             "Expected a callable (X, Y, **physics) that makes a model, such as CKA or "
             f"functools.partial(CKA, rho_mean=2.0), got {factory!r}."
         )
+    if isinstance(factory, partial):
+        own = {n: v if n == "physics" else deepcopy(v) for n, v in factory.keywords.items()}
+        factory = partial(factory.func, *factory.args, **own)
     model = factory(X, Y, **{name: value for name, value in given.items() if value is not None})
     if not isinstance(model, kind):
         raise TypeError(

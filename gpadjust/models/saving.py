@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from copy import deepcopy
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -213,7 +214,7 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     if not isinstance(model_class, type) or not issubclass(model_class, TermsModel):
         way = "has no such model" if module in sys.modules else "was not imported: do so first"
         raise ValueError(f"it is of the class {content['class']}, but the module {module!r} {way}.")
-    own = {name: each for name, each in objects.items() if name in content["missing"]}
+    own = {n: deepcopy(objects[n]) for n in content["missing"] if n != "physics"}
     if content["physics"] is not None:
         own["physics"] = _physics(content, objects)
     with warnings.catch_warnings():

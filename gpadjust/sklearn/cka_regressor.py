@@ -30,7 +30,7 @@ from gpadjust.models import (
     VariationalCKA,
     ZeroMeanGP,
 )
-from gpadjust.models.factory import ModelFactory, make_model
+from gpadjust.models.factory import ModelFactory, make_model, with_options
 from gpadjust.models.plausibility import is_standardised
 from gpadjust.models.training_data import column_names
 from gpadjust.physics import PhysicsWarning
@@ -81,6 +81,10 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             ``physics`` if there is one: a class of models, or ``functools.partial`` of one with
             further arguments, such as ``partial(CKA, delta_mean="learn")``, or
             ``partial(CKA, train_Yvar=0.01)`` for noise of known variance. Each fit takes a copy.
+        model_options: What the data are, as in :class:`~gpadjust.CKA`: ``likelihood``,
+            ``outcome_transform``, ``input_transform`` and others that all models share, such as
+            ``{"outcome_transform": Standardize(m=1)}``. Each fit takes copies. Those with a value
+            for each row are arguments of :meth:`fit`.
         fit_method: ``"bayes"`` or ``"map"``, as in :func:`gpadjust.fit`. None: the library's
             calibrated default, full Bayes where the model can have it.
         fit_options: Further arguments of :func:`gpadjust.fit`, such as ``{"num_samples": 32}``.
@@ -117,23 +121,29 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         physics: Any = None,
         *,
         model: str | ModelFactory = "cka",
+        model_options: dict[str, Any] | None = None,
         fit_method: Literal["bayes", "map"] | None = None,
         fit_options: dict[str, Any] | None = None,
         random_state: int | np.random.RandomState | None = None,
     ) -> None:
         self.physics = physics
         self.model = model
+        self.model_options = model_options
         self.fit_method = fit_method
         self.fit_options = fit_options
         self.random_state = random_state
 
-    def fit(self, X: Any, y: Any) -> Self:
+    def fit(self, X: Any, y: Any, train_Yvar: Any = None, train_Xvar: Any = None) -> Self:
         """Build the model on the data, and fit it.
 
         Args:
             X: Inputs, ``n x d``, ``n >= 2``, in the units that the physics reads.
             y: Targets, ``n`` or ``n x m``, in the units that it returns. Several columns make
                 independent outputs.
+            train_Yvar: Known variances of the observations, of the shape of y, as in
+                :class:`~gpadjust.CKA`; scikit-learn takes it apart with the rows, as
+                ``cross_val_score(..., params={"train_Yvar": variances})``.
+            train_Xvar: Known variances of the inputs, of the shape of X, likewise.
 
         Returns:
             The regressor.
@@ -153,7 +163,11 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
         )
         targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
-        model = self._build(X, targets)
+        rows = {"train_Yvar": train_Yvar, "train_Xvar": train_Xvar}
+        rows = {name: np.asarray(each) for name, each in rows.items() if each is not None}
+        if "train_Yvar" in rows and rows["train_Yvar"].shape == (len(y),):
+            rows["train_Yvar"] = rows["train_Yvar"].reshape(-1, 1)
+        model = self._build(X, targets, {**_checked(self.model_options), **rows})
         model.input_names = tuple(getattr(self, "feature_names_in_", model.input_names))
         model.output_names = names_of_y or model.output_names
         options = {"seed": _seed(self.random_state), **(self.fit_options or {})}
@@ -237,8 +251,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             draws = draws[torch.randperm(len(draws))[:n_samples]]
         return _array(draws.permute(1, 2, 0), dim=1)
 
-    def _build(self, X: Array, Y: Array) -> TermsModel:
-        """The model that the parameters say."""
+    def _build(self, X: Array, Y: Array, options: dict[str, Any]) -> TermsModel:
+        """The model that the parameters say, with further options."""
         factory: Any = self.model
         if isinstance(factory, str):
             if factory not in MODELS:
@@ -259,7 +273,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             physics = array_physics(self.physics, X)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
-            factory = deepcopy(factory)
+            factory = with_options(deepcopy(factory), options)
             model: TermsModel = make_model(factory, X, Y, kind=TermsModel, physics=physics)
         for each in caught:
             hints = _hints(X, Y) if issubclass(each.category, PhysicsWarning) else ""
@@ -297,6 +311,22 @@ def _hints(X: Array, Y: Array) -> str:
             "physics: leave it out, too."
         )
     return hints
+
+
+def _checked(options: Any) -> dict[str, Any]:
+    """The options of a model, by their names; a TypeError if they are something else."""
+    if options is not None and not isinstance(options, dict):
+        raise TypeError(
+            "Expected model_options as a dictionary of arguments that models share, such as "
+            f"{{'outcome_transform': None}}, got {options!r}."
+        )
+    for name in ("train_X", "train_Y", "physics"):
+        if name in (options or {}):
+            raise TypeError(
+                f"Found {name!r} in model_options, where it is an argument of its own, expected "
+                "what models share, such as 'outcome_transform'."
+            )
+    return {**(options or {})}
 
 
 def _array(values: Tensor, dim: int = -1) -> Array:

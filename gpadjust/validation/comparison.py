@@ -6,11 +6,10 @@ import warnings
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from botorch.exceptions.warnings import OptimizationWarning
-from botorch.models.transforms.input import InputTransform
 from torch import Tensor
 from tqdm import tqdm
 
@@ -18,9 +17,9 @@ from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SamplingWarning
 from gpadjust.inference.fitting import check_options, fit
 from gpadjust.models import CalibratedPhysics, StackedGP, TermsGP
-from gpadjust.models.factory import ModelFactory, make_model
+from gpadjust.models.factory import ModelFactory, make_model, with_options
 from gpadjust.models.hyperparameter_samples import take_samples
-from gpadjust.models.term_builder import PhysicsLike
+from gpadjust.models.term_builder import ModelOptions, PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
 from gpadjust.validation.advice import Gain, advice
@@ -158,12 +157,12 @@ def compare(
     physics: PhysicsLike,
     train_Yvar: ArrayLike = None,
     *,
-    input_transform: InputTransform | None = None,
     structures: Sequence[str | Structure | ModelFactory] | None = None,
     num_starts: int | None = None,
     num_screened: int | None = None,
     seed: int = 0,
     progress: bool = False,
+    **options: Unpack[ModelOptions],
 ) -> Comparison:
     r"""Fit models of several structures and rank them: how should this physics be adjusted?
 
@@ -205,7 +204,6 @@ def compare(
         physics: The physics f_p, or several, as in :class:`~gpadjust.CKA`. Each model has a copy of
             its own, where it has parameters.
         train_Yvar: Known observation variances, as in :class:`~gpadjust.CKA`.
-        input_transform: As in :class:`~gpadjust.CKA`; each model has a copy of its own.
         structures: Which to fit: names; callables that make a model of X, Y and ``physics``, such
             as ``RRA`` or ``functools.partial(CKA, rho_mean=2.0)``; or a :class:`Structure`, which
             says more of one. Default: those above.
@@ -213,6 +211,9 @@ def compare(
         num_screened: As in :func:`~gpadjust.fit`.
         seed: Seed of the fits.
         progress: Whether to show a progress bar.
+        options: What the data are, as in :class:`~gpadjust.CKA`: ``likelihood``,
+            ``outcome_transform``, ``input_transform`` and the others that all structures share.
+            Each model has a copy of its own; what a structure says itself, it keeps.
 
     Returns:
         The fitted models, the rankings, the recommended model, and advice in words: whether the
@@ -261,13 +262,12 @@ def compare(
             warnings.simplefilter("always", PhysicsWarning)
             try:
                 model = make_model(
-                    structure.model,
+                    with_options(structure.model, options),
                     train_X,
                     train_Y,
                     kind=TermsGP,
                     train_Yvar=train_Yvar,
                     physics=deepcopy(part) if structure.uses_physics else None,
-                    input_transform=deepcopy(input_transform),
                 )
                 warnings.simplefilter("ignore", OptimizationWarning)
                 warnings.simplefilter("ignore", SamplingWarning)  # the advice says so

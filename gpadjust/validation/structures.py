@@ -27,7 +27,8 @@ class Structure(NamedTuple):
         name: Its name.
         model: A callable that makes the model of ``X`` and ``Y``, of any number of outputs, each by
             itself: a class, or ``functools.partial`` of one. It is given as keywords the
-            ``physics``, if it uses that, and ``train_Yvar`` and ``input_transform``, if there are.
+            ``physics``, if it uses that, ``train_Yvar``, if there is one, and the options that are
+            given to :func:`~gpadjust.compare`.
         unknowns: Number of unknown constant means, for one physics.
         uses_physics: Whether it reads the physics at all.
         adjusts: Whether it does more than to take the physics as a mean.
