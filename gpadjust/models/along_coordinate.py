@@ -64,9 +64,7 @@ class AlongCoordinate(NamedTuple):
         variances = lam.unsqueeze(-1) * values.unsqueeze(-2) + noise.unsqueeze(-1)
         coefficients = vectors.mT @ (model.residuals @ basis)
         t = model.coordinate
-        return cls(
-            train, constant, vectors, basis, values, noise, variances, coefficients, t
-        )
+        return cls(train, constant, vectors, basis, values, noise, variances, coefficients, t)
 
     @staticmethod
     def learn(model: Any) -> Tensor:
@@ -127,9 +125,7 @@ class AlongCoordinate(NamedTuple):
         """Standard deviations along the basis at each point, ``... x S x q x r``, and the basis."""
         return self._projected(sought)[1].sqrt(), self.basis
 
-    def joint(
-        self, sought: WeightedSum, among: bool, idcs: list[int] | None = None
-    ) -> Tensor:
+    def joint(self, sought: WeightedSum, among: bool, idcs: list[int] | None = None) -> Tensor:
         """Covariances ``... x S x m x q x q``; ``among`` outputs, ``... x S x (q m) x (q m)``."""
         cross = (sought.cross(self.train, is_data=True) + self.constant) @ self.vectors
         prior = (sought.covariance() + self.constant).unsqueeze(-3)

@@ -279,7 +279,10 @@ class ParallelPartialGP(TermsModel):
         """Return lengthscales, noise and variances of all outputs, as a text."""
         sd = (self.scales.mean(0).sqrt() * self.unit).sort().values
         own = self.shared.summary().splitlines()[2:]
-        lines = [repr(self), "the kernel of all outputs, in units of each one's standard deviation:"]
+        lines = [
+            repr(self),
+            "the kernel of all outputs, in units of each one's standard deviation:",
+        ]
         lines += [line for line in own if not line.strip().startswith("log likelihood")]
         if self.coordinate is None:
             ends = f"{sd[0]:.3g} to {sd[-1]:.3g}"
@@ -395,7 +398,9 @@ class ParallelPartialGP(TermsModel):
                 if k:
                     away = self._away(f_p, cross)  # ... S x q x m x k
                     mean = mean + (self._columns_at(f_p) * weights.coefficients[:, None]).sum(-1)
-                    spread = torch.einsum("...sqmk,smkl,...sqml->...sqm", away, weights.spread, away)
+                    spread = torch.einsum(
+                        "...sqmk,smkl,...sqml->...sqm", away, weights.spread, away
+                    )
                     variance = variance + spread
             variance = variance * (self.scales * self.unit.square()).unsqueeze(-2)
             variance = variance + self._noise_of(observation_noise, f_p.shape[-2])
@@ -405,7 +410,11 @@ class ParallelPartialGP(TermsModel):
     def _inputs(self, X: ArrayLike) -> tuple[Tensor, Tensor]:
         """Transformed inputs ``... x S x q x d``, and f_p there, ``... x q x m``."""
         inputs = self.shared.model_inputs(X)
-        X = X if isinstance(X, Tensor) else torch.as_tensor(X.to_numpy() if hasattr(X, "to_numpy") else X)
+        X = (
+            X
+            if isinstance(X, Tensor)
+            else torch.as_tensor(X.to_numpy() if hasattr(X, "to_numpy") else X)
+        )
         return inputs, self._physics_at(X)
 
     def _columns_at(self, f_p: Tensor) -> Tensor:
@@ -481,7 +490,9 @@ class ParallelPartialGP(TermsModel):
                 noise = noise.expand(*noise.shape[:-2], mean.shape[-2], -1)[..., idcs]
                 covariance = covariance + torch.diag_embed(noise.expand(mean.shape).flatten(-2))
             operator = PosteriorCovariance(covariance)
-            found = HyperparameterMixture(ScaleFreePosterior(ScaleFreeMultitaskNormal(mean, operator)))
+            found = HyperparameterMixture(
+                ScaleFreePosterior(ScaleFreeMultitaskNormal(mean, operator))
+            )
         if posterior_transform is None:
             return found
         return ScaleFreePosterior.transformed(posterior_transform(posterior=found, X=X))
