@@ -20,11 +20,12 @@ from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.calibrate import calibrate
 from gpadjust.inference.optimise import FitResult, Search, maximise
+from gpadjust.inference.shared_kernel import fit_shared
 from gpadjust.inference.variational_fit import fit_variational
-from gpadjust.models import TermsGP, VariationalCKA
+from gpadjust.models import ParallelPartialGP, TermsGP, VariationalCKA
 from gpadjust.models.parameters import shared_parameters
 
-Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA
+Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA | ParallelPartialGP
 
 
 class FitOptions(TypedDict, total=False):
@@ -193,7 +194,7 @@ def fit(
             "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "
             f"ModelListGP of them, got {type(model).__name__}."
         )
-    if is_fully_bayesian(model) and not isinstance(model, TermsGP):
+    if is_fully_bayesian(model) and not isinstance(model, TermsGP | ParallelPartialGP):
         raise RuntimeError(
             f"The {type(model).__name__} holds samples of its hyper-parameters; build it again, to "
             "fit it."
@@ -203,6 +204,8 @@ def fit(
     check_options(method, own)
     search = Search(**{name: own.pop(name) for name in _SEARCH if name in own})
     with threads_for(model.train_targets.shape[-1]), _without_samples(model):
+        if isinstance(model, ParallelPartialGP):
+            return fit_shared(model, search, method == "bayes", **own)
         try:
             begin = time.perf_counter()
             if isinstance(model, TermsGP) and model.noise.rows is not None:
@@ -272,7 +275,7 @@ def _fit_list(
 def _can_be_sampled(model: Fittable) -> bool:
     """Return whether a model can hold samples, and has something to sample."""
     if not isinstance(model, TermsGP):
-        return False
+        return isinstance(model, ParallelPartialGP)
     try:
         model.check_can_be_sampled()
     except ValueError:

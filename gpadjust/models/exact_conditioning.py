@@ -71,9 +71,9 @@ class Factors(NamedTuple):
 
     def solve(self, residual: Tensor) -> Tensor:
         """Return :math:`K^{-1} r` for r, ``... x n``."""
-        return self._unwhiten(self.whiten(residual.unsqueeze(-2))).squeeze(-2)
+        return self.unwhiten(self.whiten(residual.unsqueeze(-2))).squeeze(-2)
 
-    def _unwhiten(self, white: Tensor) -> Tensor:
+    def unwhiten(self, white: Tensor) -> Tensor:
         r"""Return :math:`A L^{-1}` for :math:`A`, ``... x q x n``."""
         n_0 = self.base.shape[-1]
         first, rest = white[..., :n_0], white[..., n_0:]
@@ -114,7 +114,7 @@ class Factors(NamedTuple):
         before = torch.nn.functional.pad(self.rows, (0, k))
         rows = torch.cat([before.expand(*rows.shape[:-2], -1, -1), rows], dim=-2)
         last = torch.cholesky_solve(residual, chol).mT
-        first = self.alpha - self._unwhiten(last @ border).squeeze(-2)
+        first = self.alpha - self.unwhiten(last @ border).squeeze(-2)
         return Factors(self.base, rows, torch.cat([first, last.squeeze(-2)], dim=-1))
 
 
