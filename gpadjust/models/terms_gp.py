@@ -419,10 +419,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         r"""Take new observations, in place, at a cost that does not grow with their number.
 
         An :class:`~gpadjust.RRA` keeps its weights alone: each observation is a step of a Kalman
-        filter. With ``forget`` the weights wander between observations so that the covariance of
-        functions that are k observations apart has the factor :math:`e^{-k / \text{forget}}`:
-        what was observed fades, and where nothing is observed rho and delta return to their priors
-        (unknown constant means stay). Without it the answer is that of all observations together.
+        filter. With ``forget``, an observation of k steps ago counts as one whose noise has the
+        variance :math:`\sigma^2 e^{k / \text{forget}}`, so that where nothing is observed rho and
+        delta return to their priors, slowly. Without it the answer is that of all observations
+        together.
 
         Any other model keeps its last ``forget`` observations, and forgets those before.
 
