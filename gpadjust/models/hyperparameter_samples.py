@@ -12,14 +12,14 @@ from gpytorch.likelihoods.noise_models import FixedGaussianNoise
 from torch import Size, Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp import AppendedPhysics, OrthogonalKernel, Term
+from gpadjust.gp import AppendedPhysics, OrthogonalKernel, Term, VanishingKernel
 
 HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
     "`model.release_samples()` keeps the first."
 )
 # Modules whose buffers have the batch.
-_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term)
+_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term, VanishingKernel)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
