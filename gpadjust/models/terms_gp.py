@@ -18,6 +18,7 @@ from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior
 from torch import Size, Tensor
 
 import gpadjust
+from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
@@ -34,6 +35,7 @@ from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
+from gpadjust.models.updates import NewRows, keep_last
 
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
 _MANY = 5_000  # points, above which an exact fit takes long
@@ -383,10 +385,80 @@ class TermsGP(TermsModel, SingleTaskGP):
         X = self._new_inputs(X)
         return self.with_observations(X, Y, **kwargs)
 
-    def with_observations(
-        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
-    ) -> Self:
-        """Return a model of more observations, checked tensors of which whole rows may be NaN."""
+    def update(
+        self,
+        X: ArrayLike,
+        Y: ArrayLike,
+        noise: Tensor | None = None,
+        *,
+        forget: int | None = None,
+    ) -> None:
+        r"""Take new observations, in place, at a cost that does not grow with their number.
+
+        An :class:`~gpadjust.RRA` keeps its weights alone: each observation is a step of a Kalman
+        filter. With ``forget`` the weights wander between observations so that the covariance of
+        functions that are k observations apart has the factor :math:`e^{-k / \text{forget}}`:
+        what was observed fades, and where nothing is observed rho and delta return to their priors
+        (unknown constant means stay). Without it the answer is that of all observations together.
+
+        Any other model keeps its last ``forget`` observations, and forgets those before.
+
+        Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
+        observations; so do places of larger errors. To fit them again, build a model of recent
+        observations.
+
+        Args:
+            X: Raw inputs, ``k x d``, of ``k`` observations in their order.
+            Y: Observations, ``k x m``, in the user's units; NaN where an output was not observed.
+            noise: Their variances, of a model with known noise, as in
+                :meth:`condition_on_observations`.
+            forget: A number of observations, at least 1, as above. Default: never forget, which
+                an RRA alone can do.
+
+        Raises:
+            TypeError: If ``X``, ``Y`` or ``noise`` is not float64, or ``forget`` no whole number.
+            ValueError: As of :meth:`condition_on_observations`; or if a model that keeps its
+                observations is to forget none.
+            NotImplementedError: If the model adds rows of its own to the observations, as an AR1.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import RRA
+            >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = RRA(X, 2 * X.sin(), physics=torch.sin)
+            >>> model.update(X[:1], 2.1 * X[:1].sin(), forget=100)
+        """
+        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        if X.dim() > 2 or Y.dim() > 2:
+            raise ValueError(
+                f"Expected X of shape k x d and Y of shape k x m, got {tuple(X.shape)} and "
+                f"{tuple(Y.shape)}."
+            )
+        self._check_noise(noise, Y)
+        self.eval()
+        if forget is not None:
+            forget = checked_whole("forget", forget, 1)
+        with torch.no_grad():
+            self._take(NewRows.of(self, X, Y, noise), forget)
+
+    def _take(self, new: NewRows, forget: int | None) -> None:
+        """Take new observations, and forget others."""
+        name = type(self).__name__
+        if forget is None:
+            raise ValueError(
+                f"A {name} keeps its observations, so that its cost grows unless it forgets some: "
+                "pass forget=200 for the last 200. An RRA takes any number; "
+                "`condition_on_observations` returns a model of all."
+            )
+        if self.measured_rows(self.train_inputs[0])[1] != slice(None):
+            raise NotImplementedError(
+                f"A {name} has rows of its own among the observations, of which a window would "
+                "forget some: take a CKA, or build the model again."
+            )
+        keep_last(self, new, forget)
+
+    def _check_noise(self, noise: Tensor | None, Y: Tensor) -> None:
+        """Raise an error unless variances of new observations are given where they are known."""
         if self.noise.is_known and noise is None:
             raise ValueError(
                 "The model was built with known noise (train_Yvar), so that of new observations is "
@@ -399,6 +471,13 @@ class TermsGP(TermsModel, SingleTaskGP):
                     "The model learns its noise, which new observations have, too: leave `noise` "
                     "out, or build the model with known noise (train_Yvar)."
                 )
+
+    def with_observations(
+        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
+    ) -> Self:
+        """Return a model of more observations, checked tensors of which whole rows may be NaN."""
+        self._check_noise(noise, Y)
+        if noise is not None:
             transform = getattr(self, "outcome_transform", None)
             if transform is not None and fantasize_flag.off():
                 noise = noise / transform.stdvs.square()
