@@ -13,6 +13,7 @@ from torch import Size, Tensor
 from torch.nn import Parameter
 
 from gpadjust.gp import AppendedPhysics, OrthogonalKernel, Term, VanishingKernel
+from gpadjust.gp.noise import RowNoise
 from gpadjust.models.updates import UpdatedWeights
 
 HOLDS_SAMPLES = (
@@ -21,8 +22,8 @@ HOLDS_SAMPLES = (
 )
 # Modules whose buffers have the batch.
 _BATCHED = (
-    *(AppendedPhysics, OrthogonalKernel, RFFKernel, Term),
-    *(UpdatedWeights, VanishingKernel),
+    *(AppendedPhysics, OrthogonalKernel, RFFKernel, RowNoise),
+    *(Term, UpdatedWeights, VanishingKernel),
 )
 
 

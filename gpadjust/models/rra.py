@@ -63,7 +63,7 @@ class WeightConditioning(ExactConditioning):
         """
         train = self.kernel.at(self.train_inputs[0])
         design, residual = train.features(self.features), self.targets - train.mean()
-        noise = self.noise.at(train.x)
+        noise = self.noise.of_rows(self.noise.at(train.x))
         if self._known is None:
             return regression(design, residual, noise)
         mean, root, n = self._known
@@ -249,6 +249,8 @@ class RRA(TermsGP):
     def pyro_model(self, X: Tensor | None = None, Y: Tensor | None = None) -> Tensor:
         r"""The regression as a Pyro model, in the user's units, for NUTS, SVI or any guide.
 
+        Of outputs with a link (``outcome_transform="log"``) it is the model of their links.
+
         Its sample sites are ``"weights"``, ``(m) x 2D`` as in :meth:`weights`, and ``"Y"``,
         ``(m) x n``. Lengthscales, prior scales and noise stand as they are in the model.
 
@@ -275,10 +277,12 @@ class RRA(TermsGP):
         self.eval()
         shift, scale = self.units()
         with torch.no_grad():
+            Y = Y if Y is None or self.link is None else self.link.value(Y)
             obs = None if Y is None else self.outputs_first(Y)
             if X is None:
                 inputs: Tensor = self.train_inputs[0]
-                noise, obs = self.noise.at(inputs), self.train_targets * scale + shift
+                noise = self.noise.of_rows(self.noise.at(inputs))
+                obs = self.train_targets * scale + shift
             else:
                 inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)
                 noise = self.observation_noise(inputs)
@@ -385,7 +389,7 @@ class PaperRRA(RRA):
                 design @ design.mT + torch.eye(design.shape[-2]).to(design)
             )
             latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
-            return mean, latent + self.noise.at(train.x)
+            return mean, latent + self.noise.of_rows(self.noise.at(train.x))
 
 
 def fourier_kernel(

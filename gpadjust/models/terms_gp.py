@@ -12,15 +12,20 @@ from botorch.fit import _fit_fallback
 from botorch.models import SingleTaskGP
 from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.sampling.pathwise.update_strategies import GaussianUpdate
 from botorch.settings import validate_input_scaling
+from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.mlls import ExactMarginalLogLikelihood, MarginalLogLikelihood
+from gpytorch.models import ExactGP
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
+from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
 import gpadjust
 from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
+from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.kernels import Stationary
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
@@ -68,7 +73,7 @@ class TermsGP(TermsModel, SingleTaskGP):
     _learnt_noise = staticmethod(learnt_noise)
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
-        data, likelihood = made.data, made.likelihood
+        data, likelihood = made.data, made.noise()
         if likelihood is not None and data.Yvar is not None:
             raise ValueError("Expected train_Yvar or a likelihood, got both: give one of them.")
         unknown = sum(term.learns_mean for term in terms)
@@ -104,7 +109,11 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = made.units
+            self.outcome_transform = (
+                made.units if made.link is None else made.link.units(made.units)
+            )
+        if made.sources:
+            self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
@@ -161,10 +170,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
         train, (_, scale) = self.at(self.train_inputs[0]), self.units()
         residual = self.train_targets - train.mean()
-        covariance = train.covariance() + torch.diag_embed(self.noise.at(train.x))
+        noise = self.noise.of_rows(self.noise.at(train.x))
+        covariance = train.covariance() + torch.diag_embed(noise)
         value = negative_log_likelihood(residual, covariance).value
-        count = (~residual.isnan()).sum(-1)
-        return "log likelihood", -value - count * scale.squeeze(-1).log()
+        value, count = -value, (~residual.isnan()).sum(-1)
+        if self.link is not None:
+            value = value + self.outputs_first(self.link.log_slope(self.user_targets())).nansum(-1)
+        return "log likelihood", value - count * scale.squeeze(-1).log()
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Each training target predicted from all others, means and variances ``... x (m) x n``.
@@ -215,10 +227,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         inputs = self._original_train_inputs
         inputs = self.train_inputs[0] if inputs is None else inputs
         inputs = inputs.select(-3, 0) if self._num_outputs > 1 else inputs
-        shift, scale = self.units()
-        targets = self.outputs_last(self.train_targets * scale + shift)
-        noise = self.noise.known
+        targets, noise, scale = self.user_targets(), self.noise.known, self.units()[1]
         noise = None if noise is None else self.outputs_last(noise * scale.square())
+        if noise is not None and self.link is not None:
+            noise = noise / (2 * self.link.log_slope(targets)).exp().nan_to_num(nan=1.0)
         if self.num_samples is not None:
             inputs, targets = inputs[0], targets[0]
             if noise is not None and noise.shape != targets.shape:  # of later observations, too
@@ -479,6 +491,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         self._check_noise(noise, Y)
         if noise is not None:
             transform = getattr(self, "outcome_transform", None)
+            if self.link is not None and fantasize_flag.off():
+                noise = self.link(Y, noise)[1]
             if transform is not None and fantasize_flag.off():
                 noise = noise / transform.stdvs.square()
             kwargs["noise"] = noise.nan_to_num(nan=1.0, posinf=1.0)  # where nothing was observed
@@ -498,3 +512,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
         with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
             return super(TermsGP, shell).condition_on_observations(X, Y, **kwargs)
+
+
+@GaussianUpdate.register(TermsGP, _GaussianLikelihoodBase)  # type: ignore[untyped-decorator, unused-ignore]
+def _update(model: TermsGP, likelihood: _GaussianLikelihoodBase, **arguments: Any) -> Any:
+    """BoTorch's pathwise update, with the noise of each point."""
+    noise, update = model.noise, GaussianUpdate.dispatch(ExactGP, _GaussianLikelihoodBase)
+    if noise.rows is None and noise.selection(model.train_inputs[0]) is None:
+        return update(model, likelihood, **arguments)
+    variances = DiagLinearOperator(noise.of_rows(noise.at(model.train_inputs[0])))
+    return update(model, likelihood, **{"noise_covariance": variances, **arguments})

@@ -165,7 +165,8 @@ def advice(
             f"By the evidence of {name} with and without it, f_p is of use: {probability:.2f}."
             for name, probability in probable.items()
         ]
-        found += _spread(next(iter(left_out.values())).Y[:, j])
+        if not any(model.link for model in models.values()):
+            found += _spread(next(iter(left_out.values())).Y[:, j])
         found += _preferred(models[rows[0].structure], X, j)
         found += _unsampled(rows, converged, j)
         sentences += [where + sentence for sentence in found]
@@ -219,8 +220,8 @@ def _spread(y: Tensor) -> list[str]:
     decades = (y.max() / y.min()).log10().item()
     return [
         f"The output is positive and spans {decades:.1f} decades, so that its largest values "
-        "decide scale and noise: if errors are relative, fit its logarithm, with the logarithm of "
-        "the physics."
+        "decide scale and noise: if errors are relative, compare with "
+        'outcome_transform="log", which is of the logarithms of output and physics.'
     ]
 
 

@@ -191,8 +191,8 @@ def draw(runs: Sequence[Run], experiment: Vanishing) -> list[Path]:
             own = [r for r in runs if r["problem"] == problem and r["model"] == model]
             own = sorted(own, key=lambda r: r["seed"])[:12]
             x = np.arange(len(own)) + 0.2 * (offset - 1.5)
-            ends = np.array([r["interval"] for r in own]) / np.array([[r["true"]] for r in own])
-            ax.vlines(x, *ends.T, color=_COLORS[model], lw=2, label=label)
+            low, high = (np.array([r["interval"][i] / r["true"] for r in own]) for i in (0, 1))
+            ax.vlines(x, low, high, color=_COLORS[model], lw=2, label=label)
         ax.axhline(1.0, color="0.2", lw=1, ls="--")
         ax.set(xlabel="seed", ylabel="95 % interval over true value")
     axes[0].set_ylim(0.55, 1.45)
