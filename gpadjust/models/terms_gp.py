@@ -112,7 +112,9 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = made.units if made.link is None else made.link.units(made.units)
+            self.outcome_transform = (
+                made.units if made.link is None else made.link.units(made.units)
+            )
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
