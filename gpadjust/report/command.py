@@ -8,6 +8,7 @@ import warnings
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from gpadjust.inference import fit
 from gpadjust.models import CKA, TermsGP
@@ -20,6 +21,7 @@ from gpadjust.report.inputs import (
     pairs,
     read_csv,
 )
+from gpadjust.report.kinds import options_of
 from gpadjust.report.markup import listed, plural
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.sections import Origin, headline
@@ -45,13 +47,15 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
     variances = noise_variances(arguments.noise, outputs)
     marks = (_mark(arguments.delimiter), arguments.decimal)
-    data = read_csv(arguments.data, inputs, outputs, units, *marks)
+    categories = names_of(arguments.categories, "--categories") if arguments.categories else []
+    data = read_csv(arguments.data, inputs, outputs, units, *marks, categories)
+    options = options_of(arguments, inputs, data.levels)
     physics = named_physics(arguments.physics, data)
     names = (listed(data.Y.columns), listed(data.X.columns))
     _say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
-        model = _fitted(arguments, data, physics, variances)
+        model = _fitted(arguments, data, physics, variances, options)
         subject = subject_of(model, [f"line {line}" for line in data.lines])
     notes = tuple(
         dict.fromkeys(
@@ -89,13 +93,17 @@ def _comparing(command: Sequence[str]) -> str:
 
 
 def _fitted(
-    arguments: Namespace, data: CsvData, physics: NamedPhysics, variances: list[float] | None
+    arguments: Namespace,
+    data: CsvData,
+    physics: NamedPhysics,
+    variances: list[float] | None,
+    options: dict[str, Any],
 ) -> Comparison | TermsGP:
     X, Y, f_p = data.X, data.Y, physics.physics
     if arguments.fit == "compare":
-        return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True)
+        return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True, **options)
     _say(f"Fitting CKA by {arguments.fit!r} ...")
-    model = CKA(X, Y, variances, physics=f_p)
+    model = CKA(X, Y, variances, physics=f_p, **options)
     fit(model, arguments.fit, seed=arguments.seed)
     return model
 

@@ -18,6 +18,7 @@ from gpadjust.models import PhysicsParameters, StackedGP
 from gpadjust.models.saving import Saved
 from gpadjust.physics import PhysicsError
 from gpadjust.report import figures
+from gpadjust.report.kinds import assumed
 from gpadjust.report.markup import (
     Markup,
     bullets,
@@ -36,6 +37,7 @@ from gpadjust.report.markup import (
 )
 from gpadjust.report.subject import Adjusted, Subject
 from gpadjust.validation import Trust, trust
+from gpadjust.validation.hints import hints
 from gpadjust.validation.plots.drawing import quantile
 from gpadjust.validation.structures import ALONE, STACKED
 
@@ -193,7 +195,8 @@ def structures(subject: Subject) -> Markup:
 def advice(subject: Subject, notes: list[str]) -> Markup:
     """Further sentences of the comparison, and warnings of the fit."""
     told = [] if subject.comparison is None else subject.comparison.advice
-    sentences = [text.replace("+-", "±") for text in (*told, *notes)]
+    looks = hints(subject.model, subject.loo)
+    sentences = [text.replace("+-", "±") for text in (*told, *looks, *notes)]
     return bullets(sentences) if sentences else Markup()
 
 
@@ -469,6 +472,7 @@ def data(subject: Subject, origin: Origin) -> Markup:
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
     remarks = [f"{plural(len(subject.X), 'row')} of data.", *_repeats(subject), *origin.remarks]
+    remarks += assumed(subject.model)
     return join([table("Columns", head, rows), bullets(remarks)])
 
 
