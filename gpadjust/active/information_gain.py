@@ -205,7 +205,7 @@ class UnknownCovariance:
         if names is None and not self.constants:
             self.factors = conditioning.factors()
             return
-        covariance = torch.diag_embed(model.noise.at(self.train))
+        covariance = torch.diag_embed(model.noise.of_rows(model.noise.at(self.train)))
         if self.has_kernel:
             covariance = covariance + self.kernel.forward(self.train, self.train)
         self.factors = Factors.of(covariance, model.train_targets)

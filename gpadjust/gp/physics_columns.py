@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gpadjust.gp.kernels import Batched
-from gpadjust.physics import Physics
+from gpadjust.physics import Physics, PhysicsError
 
 
 class PhysicsInput(InputTransform):
@@ -24,6 +24,7 @@ class PhysicsInput(InputTransform):
         physics: The physics f_p, ``... x n x d`` to ``... x n x k``; of several, side by side.
         num_inputs: Number ``d`` of raw input columns.
         base: The user's input transform, or none.
+        link: A link of the outputs, through which f_p goes (``gpadjust.models.Logit``), or none.
 
     Attributes:
         coordinates: Those of the unknown parameters of the physics, if any, ``(S) x p``. The
@@ -36,11 +37,15 @@ class PhysicsInput(InputTransform):
     transform_on_train = transform_on_eval = transform_on_fantasize = True
 
     def __init__(
-        self, physics: Physics, num_inputs: int, base: InputTransform | None = None
+        self,
+        physics: Physics,
+        num_inputs: int,
+        base: InputTransform | None = None,
+        link: Any = None,
     ) -> None:
         super().__init__()
         check_one_to_one(base)
-        self.physics, self.num_inputs, self.base = physics, num_inputs, base
+        self.physics, self.num_inputs, self.base, self.link = physics, num_inputs, base, link
         if unknowns := physics.unknowns:
             start = unknowns.coordinates(unknowns.guess)
             self.register_parameter("coordinates", Parameter(start, requires_grad=False))
@@ -59,11 +64,13 @@ class PhysicsInput(InputTransform):
         self._check(X)
         unknowns = self.physics.unknowns
         values: Tensor = self.physics(X, *([unknowns.at(self.coordinates)] if unknowns else []))
-        return values
+        return values if self.link is None else self._linked(X, values)
 
     def at(self, X: Tensor, coordinates: Tensor) -> Tensor:
         """Return :meth:`transform` at coordinates ``... x p``; f_p is NaN where it fails."""
         f_p = self.physics.or_nan(X, self.physics.unknowns.at(coordinates))
+        if self.link is not None:
+            f_p = self.link.value(f_p).where(self.link.holds(f_p), torch.nan)
         return appended(self.base, X, f_p)
 
     def without_physics(self, X: Tensor) -> Tensor:
@@ -88,6 +95,8 @@ class PhysicsInput(InputTransform):
         if not isinstance(other, PhysicsInput) or self.physics is not other.physics:
             return False
         ours, theirs = self.base, other.base
+        if getattr(self.link, "bounds", None) != getattr(other.link, "bounds", None):
+            return False
         return ours is theirs or bool(ours and theirs and ours.equals(theirs))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
@@ -95,6 +104,22 @@ class PhysicsInput(InputTransform):
         if self.physics.unknowns and f"{prefix}draws" in state_dict:
             self.draws = torch.empty_like(state_dict[f"{prefix}draws"])
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def _linked(self, X: Tensor, values: Tensor) -> Tensor:
+        """The link of the physics' outputs; a PhysicsError where they are not within its bounds."""
+        outside = ~self.link.holds(values)
+        if outside.any():
+            rows = outside.any(-1).flatten().nonzero().flatten().tolist()
+            error = PhysicsError(
+                f"Physics {self.physics.name!r} returned {float(values[outside][0]):.4g}, expected "
+                f"values {self.link.where}, as {self.link.formula} is modelled. Correct it, or keep "
+                "it within: `lambda X: f_p(X).clamp(...)`.",
+                rows,
+            )
+            error.inputs = X.expand(*values.shape[:-1], -1).reshape(-1, X.shape[-1])[rows].detach()
+            raise error
+        linked: Tensor = self.link.value(values)
+        return linked
 
     def _check(self, X: Tensor) -> None:
         if not isinstance(X, Tensor) or X.dtype != torch.float64:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -86,6 +86,7 @@ class StationaryTerms:
         basis: As in :class:`Moments`.
         noise: The noise variances, ``... x n``; or the name of those that are learnt.
         selection: Which of those each target has, ``... x n x K``; None for the only one.
+        added: What is added to the variances, ``... x n``, or None.
     """
 
     parts: list[_Part]
@@ -95,6 +96,7 @@ class StationaryTerms:
     basis: Tensor | None
     noise: Tensor | str
     selection: Tensor | None
+    added: Tensor | None = None
 
     def __call__(self, values: Values, derivatives: bool = False) -> Moments:
         """Moments at values by name; see :class:`Moments`."""
@@ -122,6 +124,8 @@ class StationaryTerms:
             variances = every[variances].exp()
             if self.selection is not None:
                 variances = (self.selection * variances.unsqueeze(-2)).sum(-1)
+            if self.added is not None:
+                variances = variances + self.added
         if total.dim() <= variances.dim():  # only the noise is learnt
             total = total.expand(*variances.shape[:-1], *total.shape[-2:]).clone()
         elif total is found[0][0].covariance:
@@ -158,6 +162,7 @@ def stationary_terms(
     inputs: Tensor,
     known_noise: Tensor | None,
     random_means: bool,
+    kept: Any = slice(None),
 ) -> StationaryTerms | None:
     """The distribution of a model in closed form, or None if it has another form.
 
@@ -205,8 +210,8 @@ def stationary_terms(
         variances = [term.mean_variance for term in kernel.terms if term.learns_mean]
         root = basis * torch.stack(variances, dim=-1).sqrt()
         of_means, basis = root @ root.mT, None
-    selection = None if known_noise is not None else likelihood.selection(inputs)
-    return StationaryTerms(parts, current, mean, of_means, basis, noise, selection)
+    shares = (None, None) if known_noise is not None else likelihood.shares(inputs, kept)
+    return StationaryTerms(parts, current, mean, of_means, basis, noise, *shares)
 
 
 @dataclass(eq=False)
@@ -223,6 +228,7 @@ class ByModules:
             input transform are among those that are learnt.
         known_noise: The noise variances of these inputs, if they are known.
         random_means: Whether the prior variances of unknown constants are in the covariance.
+        kept: Which rows of the training data these are.
     """
 
     model: BatchedMultiOutputGPyTorchModel
@@ -230,6 +236,7 @@ class ByModules:
     inputs: Tensor
     known_noise: Tensor | None
     random_means: bool
+    kept: Any = field(default_factory=lambda: slice(None))
 
     def __call__(self, values: Values, derivatives: bool = False) -> Moments:
         """Moments at values by name; see :class:`Moments`."""
@@ -267,7 +274,9 @@ class ByModules:
         else:
             covariance = kernel.covariance(inputs, known_means=True)
             basis = kernel.basis_of_means(inputs)
-        noise = Noise(model.likelihood).at(inputs) if noise is None else noise
+        if noise is None:
+            likelihood = Noise(model.likelihood)
+            noise = likelihood.of_rows(likelihood.at(inputs), self.kept)
         noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
         mean = model.mean_module(inputs).expand(noise.shape)
         return mean, covariance + torch.diag_embed(noise), basis

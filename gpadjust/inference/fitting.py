@@ -68,6 +68,7 @@ METHODS = {
     "bayes": Method(sample, {"num_samples": 1, "num_draws": 16}),
 }
 """All methods by name: one more is an entry, which a module of its own can make."""
+_ROUNDS = 10  # of refinements of the noise, at most
 _SEARCH = {"num_starts": 1, "num_screened": 0, "max_iterations": 1, "seed": 0}  # least values
 
 
@@ -204,6 +205,8 @@ def fit(
     with threads_for(model.train_targets.shape[-1]), _without_samples(model):
         try:
             begin = time.perf_counter()
+            if isinstance(model, TermsGP) and model.noise.rows is not None:
+                _refine_noise(model, search)
             result = METHODS[method].run(model, search, **own)
             if isinstance(model, TermsGP):
                 model.was_fitted = True
@@ -215,6 +218,16 @@ def fit(
             return result
         finally:
             model.eval()
+
+
+def _refine_noise(model: TermsGP, search: Search) -> None:
+    """Bring what is said of the noise of training rows to rest, by cheap fits on the way."""
+    model.noise.rows.forget()
+    for _ in range(_ROUNDS):
+        most_likely(model, search)
+        if not model.noise.rows.refine(model):
+            return
+        search = search._replace(num_screened=0)  # goes on from there
 
 
 def check_options(method: str, options: dict[str, Any]) -> None:

@@ -84,9 +84,9 @@ class Target:
             inputs = model.transform_inputs(model.train_inputs[0])[..., kept, :]
         self._raw_inputs = model.train_inputs[0][..., kept, :]
         noise = Noise(model.likelihood).known
-        noise = None if noise is None else noise[..., kept]
+        noise = None if noise is None else Noise(model.likelihood).of_rows(noise)[..., kept]
         inputs = self._raw_inputs if self.parameters.learns_inputs else inputs
-        args = (model, self.parameters, inputs, noise, self.random_means)
+        args = (model, self.parameters, inputs, noise, self.random_means, kept)
         found = stationary_terms(*args) if self.parameters.is_batched else None
         self.distribution: StationaryTerms | ByModules = found or ByModules(*args)
         vague = self.of_logs and marginalized is None

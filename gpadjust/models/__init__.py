@@ -1,6 +1,7 @@
 """The BoTorch models: the adjustments, and what they are compared with."""
 
 from gpadjust.models.ar1 import AR1
+from gpadjust.models.links import Logit
 from gpadjust.models.parameters import orthogonal_rbf
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import Prediction, PredictiveModel
@@ -27,6 +28,7 @@ __all__ = [
     "RRA",
     "BiasGP",
     "CalibratedPhysics",
+    "Logit",
     "PaperRRA",
     "PhysicsMeanGP",
     "PhysicsParameters",

@@ -224,7 +224,7 @@ class ExactConditioning(DefaultPredictionStrategy):
         with torch.set_grad_enabled(torch.is_grad_enabled() and detach_test_caches.off()):
             train = self.kernel.at(self.train_inputs[0])
             covariance = train.covariance(self.kernel.known_means)
-            noise = self.noise.at(train.x)
+            noise = self.noise.of_rows(self.noise.at(train.x))
             # Not in place: kernels may share memory with what they return.
             covariance = covariance + torch.diag_embed(noise)
             factors = Factors.of(covariance, self.targets - train.mean())
@@ -267,7 +267,7 @@ class ExactConditioning(DefaultPredictionStrategy):
         (train,) = self.train_inputs
         # What the factors have beside the prior: the noise, and their nugget.
         added = self.factors().variance() - self.train.variance(self.kernel.known_means)
-        sd = added.maximum(self.noise.at(train)).sqrt()
+        sd = added.maximum(self.noise.of_rows(self.noise.at(train))).sqrt()
         noise = sd * torch.randn(len(prior), *train.shape[:-1]).to(train)
         return self.factors().solve((self.targets - prior - noise).nan_to_num(nan=0.0))
 

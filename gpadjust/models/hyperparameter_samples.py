@@ -13,13 +13,15 @@ from torch import Size, Tensor
 from torch.nn import Parameter
 
 from gpadjust.gp import AppendedPhysics, OrthogonalKernel, Term
+from gpadjust.gp.noise import RowNoise
+from gpadjust.models.updates import UpdatedWeights
 
 HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
     "`model.release_samples()` keeps the first."
 )
 # Modules whose buffers have the batch.
-_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term)
+_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, RowNoise, Term, UpdatedWeights)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:

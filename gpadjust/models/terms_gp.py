@@ -12,15 +12,21 @@ from botorch.fit import _fit_fallback
 from botorch.models import SingleTaskGP
 from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.sampling.pathwise.update_strategies import GaussianUpdate
 from botorch.settings import validate_input_scaling
+from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.mlls import ExactMarginalLogLikelihood, MarginalLogLikelihood
+from gpytorch.models import ExactGP
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
+from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
 import gpadjust
+from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
+from gpadjust.gp.noise import RowNoise
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -34,6 +40,7 @@ from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
+from gpadjust.models.updates import NewRows, keep_last
 
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
 _MANY = 5_000  # points, above which an exact fit takes long
@@ -66,7 +73,7 @@ class TermsGP(TermsModel, SingleTaskGP):
     _learnt_noise = staticmethod(learnt_noise)
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
-        data, likelihood = made.data, made.likelihood
+        data, likelihood = made.data, made.noise()
         if likelihood is not None and data.Yvar is not None:
             raise ValueError("Expected train_Yvar or a likelihood, got both: give one of them.")
         unknown = sum(term.learns_mean for term in terms)
@@ -102,7 +109,11 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = made.units
+            self.outcome_transform = (
+                made.units if made.link is None else made.link.units(made.units)
+            )
+        if made.sources:
+            self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
@@ -159,10 +170,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
         train, (_, scale) = self.at(self.train_inputs[0]), self.units()
         residual = self.train_targets - train.mean()
-        covariance = train.covariance() + torch.diag_embed(self.noise.at(train.x))
+        noise = self.noise.of_rows(self.noise.at(train.x))
+        covariance = train.covariance() + torch.diag_embed(noise)
         value = negative_log_likelihood(residual, covariance).value
-        count = (~residual.isnan()).sum(-1)
-        return "log likelihood", -value - count * scale.squeeze(-1).log()
+        value, count = -value, (~residual.isnan()).sum(-1)
+        if self.link is not None:
+            value = value + self.outputs_first(self.link.log_slope(self.user_targets())).nansum(-1)
+        return "log likelihood", value - count * scale.squeeze(-1).log()
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Each training target predicted from all others, means and variances ``... x (m) x n``.
@@ -213,10 +227,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         inputs = self._original_train_inputs
         inputs = self.train_inputs[0] if inputs is None else inputs
         inputs = inputs.select(-3, 0) if self._num_outputs > 1 else inputs
-        shift, scale = self.units()
-        targets = self.outputs_last(self.train_targets * scale + shift)
-        noise = self.noise.known
+        targets, noise, scale = self.user_targets(), self.noise.known, self.units()[1]
         noise = None if noise is None else self.outputs_last(noise * scale.square())
+        if noise is not None and self.link is not None:
+            noise = noise / (2 * self.link.log_slope(targets)).exp().nan_to_num(nan=1.0)
         if self.num_samples is not None:
             inputs, targets = inputs[0], targets[0]
             if noise is not None and noise.shape != targets.shape:  # of later observations, too
@@ -383,10 +397,80 @@ class TermsGP(TermsModel, SingleTaskGP):
         X = self._new_inputs(X)
         return self.with_observations(X, Y, **kwargs)
 
-    def with_observations(
-        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
-    ) -> Self:
-        """Return a model of more observations, checked tensors of which whole rows may be NaN."""
+    def update(
+        self,
+        X: ArrayLike,
+        Y: ArrayLike,
+        noise: Tensor | None = None,
+        *,
+        forget: int | None = None,
+    ) -> None:
+        r"""Take new observations, in place, at a cost that does not grow with their number.
+
+        An :class:`~gpadjust.RRA` keeps its weights alone: each observation is a step of a Kalman
+        filter. With ``forget`` the weights wander between observations so that the covariance of
+        functions that are k observations apart has the factor :math:`e^{-k / \text{forget}}`:
+        what was observed fades, and where nothing is observed rho and delta return to their priors
+        (unknown constant means stay). Without it the answer is that of all observations together.
+
+        Any other model keeps its last ``forget`` observations, and forgets those before.
+
+        Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
+        observations; so do places of larger errors. To fit them again, build a model of recent
+        observations.
+
+        Args:
+            X: Raw inputs, ``k x d``, of ``k`` observations in their order.
+            Y: Observations, ``k x m``, in the user's units; NaN where an output was not observed.
+            noise: Their variances, of a model with known noise, as in
+                :meth:`condition_on_observations`.
+            forget: A number of observations, at least 1, as above. Default: never forget, which
+                an RRA alone can do.
+
+        Raises:
+            TypeError: If ``X``, ``Y`` or ``noise`` is not float64, or ``forget`` no whole number.
+            ValueError: As of :meth:`condition_on_observations`; or if a model that keeps its
+                observations is to forget none.
+            NotImplementedError: If the model adds rows of its own to the observations, as an AR1.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import RRA
+            >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = RRA(X, 2 * X.sin(), physics=torch.sin)
+            >>> model.update(X[:1], 2.1 * X[:1].sin(), forget=100)
+        """
+        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        if X.dim() > 2 or Y.dim() > 2:
+            raise ValueError(
+                f"Expected X of shape k x d and Y of shape k x m, got {tuple(X.shape)} and "
+                f"{tuple(Y.shape)}."
+            )
+        self._check_noise(noise, Y)
+        self.eval()
+        if forget is not None:
+            forget = checked_whole("forget", forget, 1)
+        with torch.no_grad():
+            self._take(NewRows.of(self, X, Y, noise), forget)
+
+    def _take(self, new: NewRows, forget: int | None) -> None:
+        """Take new observations, and forget others."""
+        name = type(self).__name__
+        if forget is None:
+            raise ValueError(
+                f"A {name} keeps its observations, so that its cost grows unless it forgets some: "
+                "pass forget=200 for the last 200. An RRA takes any number; "
+                "`condition_on_observations` returns a model of all."
+            )
+        if self.measured_rows(self.train_inputs[0])[1] != slice(None):
+            raise NotImplementedError(
+                f"A {name} has rows of its own among the observations, of which a window would "
+                "forget some: take a CKA, or build the model again."
+            )
+        keep_last(self, new, forget)
+
+    def _check_noise(self, noise: Tensor | None, Y: Tensor) -> None:
+        """Raise an error unless variances of new observations are given where they are known."""
         if self.noise.is_known and noise is None:
             raise ValueError(
                 "The model was built with known noise (train_Yvar), so that of new observations is "
@@ -399,7 +483,16 @@ class TermsGP(TermsModel, SingleTaskGP):
                     "The model learns its noise, which new observations have, too: leave `noise` "
                     "out, or build the model with known noise (train_Yvar)."
                 )
+
+    def with_observations(
+        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
+    ) -> Self:
+        """Return a model of more observations, checked tensors of which whole rows may be NaN."""
+        self._check_noise(noise, Y)
+        if noise is not None:
             transform = getattr(self, "outcome_transform", None)
+            if self.link is not None and fantasize_flag.off():
+                noise = self.link(Y, noise)[1]
             if transform is not None and fantasize_flag.off():
                 noise = noise / transform.stdvs.square()
             kwargs["noise"] = noise.nan_to_num(nan=1.0, posinf=1.0)  # where nothing was observed
@@ -419,3 +512,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
         with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
             return super(TermsGP, shell).condition_on_observations(X, Y, **kwargs)
+
+
+@GaussianUpdate.register(TermsGP, _GaussianLikelihoodBase)  # type: ignore[untyped-decorator, unused-ignore]
+def _update(model: TermsGP, likelihood: _GaussianLikelihoodBase, **arguments: Any) -> Any:
+    """BoTorch's pathwise update, with the noise of each point."""
+    noise, update = model.noise, GaussianUpdate.dispatch(ExactGP, _GaussianLikelihoodBase)
+    if noise.rows is None and noise.selection(model.train_inputs[0]) is None:
+        return update(model, likelihood, **arguments)
+    variances = DiagLinearOperator(noise.of_rows(noise.at(model.train_inputs[0])))
+    return update(model, likelihood, **{"noise_covariance": variances, **arguments})

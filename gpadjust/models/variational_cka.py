@@ -128,10 +128,11 @@ class VariationalCKA(TermsModel, GPyTorchModel):
             center=center,
             **options,
         )
-        if some.noise.selection(some.train_inputs[0]) is not None:
+        if some.noise.rows is not None or some.noise.selection(some.train_inputs[0]) is not None:
             raise ValueError(
-                f"Expected a likelihood with one variance, got {type(some.likelihood).__name__}; "
-                "CKA takes those with several."
+                "Expected a likelihood with one variance for all observations, got "
+                f"{type(some.likelihood).__name__}; CKA takes those with several, and those that "
+                "differ from row to row."
             )
         super().__init__()
         self.covar_module, self.likelihood = some.covar_module, some.likelihood
@@ -169,7 +170,8 @@ class VariationalCKA(TermsModel, GPyTorchModel):
     def train_targets(self) -> Tensor:  # type: ignore[override]
         """Targets in model units, ``(m) x n``; NaN where one is missing."""
         shift, scale = self.units()
-        return (self.outputs_first(self._Y) - shift) / scale
+        Y = self._Y if self.link is None else self.link.value(self._Y)
+        return (self.outputs_first(Y) - shift) / scale
 
     @property
     def mean_module(self) -> TermsMean:
@@ -243,7 +245,8 @@ class VariationalCKA(TermsModel, GPyTorchModel):
 
     def _scale_known_noise(self) -> None:
         if self._Yvar is not None:
-            noise = self.outputs_first(self._Yvar) / self.units()[1].square()
+            Yvar = self._Yvar if self.link is None else self.link(self._Y, self._Yvar)[1]
+            noise = self.outputs_first(Yvar.nan_to_num(nan=1.0)) / self.units()[1].square()
             self.likelihood = FixedNoiseGaussianLikelihood(noise)
 
     def load_state_dict(
@@ -297,7 +300,10 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         if self.evidence.isnan().any():
             return "not fitted", None
         count = (~self.train_targets.isnan()).sum(-1)
-        return "evidence lower bound", self.evidence - count * self.units()[1].squeeze(-1).log()
+        value = self.evidence - count * self.units()[1].squeeze(-1).log()
+        if self.link is not None:
+            value = value + self.outputs_first(self.link.log_slope(self._Y)).nansum(-1)
+        return "evidence lower bound", value
 
 
 def _some_of_each_output(Y: Tensor, seed: int) -> tuple[Tensor, int]:

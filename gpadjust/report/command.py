@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 import warnings
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gpadjust.files import LARGEST
 from gpadjust.inference import fit
 from gpadjust.models import CKA, TermsGP
 from gpadjust.report.inputs import (
@@ -21,7 +23,6 @@ from gpadjust.report.inputs import (
     pairs,
     read_csv,
 )
-from gpadjust.report.kinds import options_of
 from gpadjust.report.markup import listed, plural
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.sections import Origin, headline
@@ -49,7 +50,7 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     marks = (_mark(arguments.delimiter), arguments.decimal)
     categories = names_of(arguments.categories, "--categories") if arguments.categories else []
     data = read_csv(arguments.data, inputs, outputs, units, *marks, categories)
-    options = options_of(arguments, inputs, data.levels)
+    options = _options(arguments, inputs, data.levels)
     physics = named_physics(arguments.physics, data)
     names = (listed(data.Y.columns), listed(data.X.columns))
     _say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
@@ -118,3 +119,62 @@ def _mark(text: str) -> str:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
+
+
+def _options(
+    arguments: Namespace,
+    inputs: Sequence[str],
+    levels: Mapping[str, Sequence[str]],
+) -> dict[str, Any]:
+    """The options of a model that a command line says, for the columns as the file names them.
+
+    Args:
+        arguments: A command line as parsed by :func:`gpadjust.__main__.parser`.
+        inputs: The names of the inputs there, in the order of the columns.
+        levels: The levels of the categories among the columns, by the names that models have.
+
+    Raises:
+        ValueError: If one is no number, or names what is no input.
+    """
+    found: dict[str, Any] = {}
+    noises = ["relative"] * (arguments.noise == "relative") + ["heavy-tailed"] * arguments.outliers
+    if noises:
+        found["likelihood"] = noises if len(noises) > 1 else noises[0]
+    if arguments.positive:
+        found["outcome_transform"] = "log"
+    if arguments.bounds is not None:
+        found["outcome_transform"] = _bounds(arguments.bounds)
+    if arguments.input_noise is not None:
+        found["train_Xvar"] = _variances(arguments.input_noise, inputs)
+    if levels:
+        found["categorical"] = dict(levels)
+    return found
+
+
+def _bounds(text: str) -> tuple[float, float]:
+    """The two numbers of ``"0,1"``."""
+    ends = [_number(each) for each in text.split(",")]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise ValueError(f"Expected --bounds as two numbers, the lower first: 0,1; found {text!r}.")
+    return ends[0], ends[1]
+
+
+def _variances(text: str, inputs: Sequence[str]) -> list[float]:
+    """The variance of each input, of the standard deviations that a command line has."""
+    given = pairs(text, "--input-noise")
+    if unknown := [name for name in given if name not in inputs]:
+        raise ValueError(f"--input-noise names {unknown[0]!r}, which is none of --inputs.")
+    sds = [_number(given.get(name, "0")) for name in inputs]
+    if not all(0 <= sd <= LARGEST for sd in sds):
+        raise ValueError(
+            "Expected --input-noise as standard deviations in the inputs' units, such as "
+            f"{inputs[0]}=0.5, found {text!r}."
+        )
+    return [sd**2 for sd in sds]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

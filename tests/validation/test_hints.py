@@ -53,12 +53,8 @@ def test_positive_outputs(noise):
     y = torch.tensor([0.15, 3.0, 262.0]).double()
     (sentence,) = _positive(y, y, 0.01 * y)
     assert "spans 3.2 decades" in sentence
-    assert (
-        _positive(-y, y, y)
-        == _positive(y + 100, y + 100, y)
-        == _positive(y[:2], y[:2], 0 * y[:2])
-        == []
-    )
+    for own in (-y, y + 100, y[:2]):
+        assert _positive(own, own, 0 * own) == []
     (sentence,) = _positive(y + 1, y, torch.full_like(y, 4.0))
     assert "2 of 3 left-out intervals reach below zero" in sentence
     assert "outcome_transform='log' (--positive)" in sentence
@@ -77,10 +73,9 @@ def test_copies_and_categories(noise):
 def test_of_a_comparison_each_output_has_its_own(noise):
     Y = torch.cat([truth(X) + noise, truth(X) + 100 + noise], -1)
     Y[7, 1] += 40
-    comparison = compare(
-        X, Y, lambda X: f_p(X).expand(-1, 2), structures=["zero mean", "CKA"], **QUICK
-    )
-    assert [each for each in comparison.hints if "farther" in each][0].startswith(
-        "y2: 1 observation"
-    )
-    assert comparison.hints[0] in str(comparison)
+    structures = ["zero mean", "CKA"]
+    comparison = compare(X, Y, lambda X: f_p(X).expand(-1, 2), structures=structures, **QUICK)
+    told = [hint for hint in comparison.hints if "farther" in hint]
+    assert len(told) == 1
+    assert told[0].startswith("y2: 1 observation is")
+    assert told[0] in str(comparison)
