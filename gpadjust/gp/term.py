@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -49,6 +50,8 @@ class Term(Batched):
         mean: The constant :math:`\bar g`, ``batch_shape x (m) x 1``.
         mean_variance: Its prior variance :math:`\kappa` to begin with; None if it is known.
         unit: The unit in which :meth:`~gpadjust.CKA.term` says g.
+        scaled_by: The name of another term that is the basis: that of the scaling of a physics, if
+            this term is an error of the physics, whose kernel then has no parameters.
     """
 
     basis: Any  # a module or None; it has `map_batches`, which mypy cannot know of a Module
@@ -63,9 +66,11 @@ class Term(Batched):
         mean: Tensor,
         mean_variance: Tensor | None = None,
         unit: Unit = Unit.DIFFERENCE,
+        scaled_by: str | None = None,
     ) -> None:
         super().__init__()
         self.name = name
+        self.scaled_by = scaled_by
         self.kernel = kernel
         self.num_inputs = num_inputs
         self.basis = basis
@@ -135,6 +140,8 @@ class WeightedSum:
     parts: Sequence[tuple[Term, Tensor | None]]  # the terms and their weights, ... x n, None for 1
     shift: Tensor | float = 0.0  # what the prior mean has beside that, ... x 1
     sister: Any = None  # what other machines taught of it, in the mean and covariance
+    # Of a term that another one scales, the product counts, where both are in the sum. Its mean is
+    # zero, so that it is correlated with neither, and its covariance is a product, too.
     _prepared: dict[tuple[str, ...], ToPoints] = field(default_factory=dict, init=False)
 
     def combine(self, values: Mapping[str, Tensor]) -> Tensor:
@@ -143,6 +150,7 @@ class WeightedSum:
         total = total if self.sister is None else total + self.sister.mean()
         for term, weight in self.parts:
             value = values[term.name]
+            weight = values.get(term.scaled_by or "", weight)
             total = total + (value if weight is None else weight * value)
         return total
 
@@ -154,9 +162,13 @@ class WeightedSum:
         """The prior variances, ``... x n``; ``known_means`` and ``data`` as in :meth:`cross`."""
         total, terms = torch.zeros_like(self.x[..., 0]), self._unknown(known_means)
         forms = {} if data is None else data._prepare(terms).forms
+        found: dict[str, Tensor] = {}
         for term, weight in terms:
             known = forms[term.name].variance() if term.name in forms else None
             part = term.covariance(self.x, None, True, known_means, known)
+            found[term.name] = part
+            if term.scaled_by and (mean := self._mean_of_scaling(term)) is not None:
+                part = part * (mean.square() + found.get(term.scaled_by or "", 0.0))
             total = total + (part if weight is None else part * weight.square())
         return total if self.sister is None else total + self.sister.covariance(self.sister, True)
 
@@ -175,8 +187,16 @@ class WeightedSum:
         kernels = other._prepare(terms)(self.x) if is_data else {}
         points = None if other is self else other.x
         total: Tensor | None = None
+        found: dict[str, Tensor] = {}
         for term, left in terms:
             part = term.covariance(self.x, points, False, known_means, kernels.get(term.name))
+            if any(other.scaled_by == term.name for other, _ in terms):
+                found[term.name] = part.clone()  # it is scaled in place
+            if term.scaled_by:
+                means = [self._mean_of_scaling(term), other._mean_of_scaling(term)]
+                known = [mean.unsqueeze(-1) for mean in means if mean is not None]
+                both = found.get(term.scaled_by, 0.0) if len(known) > 1 else 0.0
+                part = part * (math.prod(known) + both)
             for weight, dim in ((theirs[term.name], -2), (left, -1)):
                 part = part if weight is None else scaled(part, weight.unsqueeze(dim))
             total = part if total is None else total + part
@@ -191,12 +211,20 @@ class WeightedSum:
         phi = []
         for name, each in maps.items():
             features, weight = each(self.x), weights.get(name, self.x.new_zeros(1))
+            for term, _ in self.parts:
+                if term.name == name and term.scaled_by:
+                    weight = self._mean_of_scaling(term)
             phi.append(features if weight is None else features * weight.unsqueeze(-1))
         return side_by_side(phi)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is remembered, which can be made again."""
         return {**vars(self), "_prepared": {}}
+
+    def _mean_of_scaling(self, term: Term) -> Tensor | None:
+        """The prior mean of what scales a term, ``... x 1``, if both are in the sum."""
+        means = [other.mean for other, _ in self.parts if other.name == term.scaled_by]
+        return means[0] if means else None
 
     def _unknown(self, known_means: bool) -> list[tuple[Term, Tensor | None]]:
         return [
@@ -210,7 +238,7 @@ class WeightedSum:
         if names not in self._prepared:
             forms = {t.name: t.form for t, _ in parts}
             found = {name: form for name, form in forms.items() if isinstance(form, Stationary)}
-            num_inputs = max((t.num_inputs for t, _ in parts), default=0)
+            num_inputs = max((t.num_inputs for t, _ in parts if t.name in found), default=0)
             self._prepared[names] = ToPoints(found, self.x[..., :num_inputs])
         return self._prepared[names]
 

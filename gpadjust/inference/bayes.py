@@ -132,6 +132,8 @@ class _Draws(NamedTuple):
         """Posterior probability of this model beside one without the physics, ``B``."""
         parameters, targets = self.target.parameters, self.target.targets
         mean, *_ = self.target.distribution(parameters.unflatten(parameters.current()))
+        if self.target.repeats is not None:
+            mean = self.target.repeats.of_rows(mean)
         spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
         return probability(
             self.log_evidence(),

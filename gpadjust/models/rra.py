@@ -62,8 +62,8 @@ class WeightConditioning(ExactConditioning):
         After updates it is their weights that are known, and of observations those after them.
         """
         train = self.kernel.at(self.train_inputs[0])
-        design, residual = train.features(self.features), self.targets - train.mean()
-        noise = self.noise.at(train.x)
+        targets, noise, _ = self.observations()
+        design, residual = train.features(self.features), targets - train.mean()
         if self._known is None:
             return regression(design, residual, noise)
         mean, root, n = self._known
@@ -157,7 +157,13 @@ class RRA(TermsGP):
         make = TermBuilder.of_adjustment(
             train_X, train_Y, train_Yvar, physics, rho_mean=rho_mean, center=center, **options
         )
-        super().__init__(make, [*make.rhos(kernel), make.delta(kernel, delta_mean)])
+        rhos = make.rhos(kernel)
+        if any(term.scaled_by for term in rhos):
+            raise ValueError(
+                "The error of an emulated physics is no sum of features: take CKA, or "
+                "FunctionPhysics(physics), which takes the emulator's mean as exact."
+            )
+        super().__init__(make, [*rhos, make.delta(kernel, delta_mean)])
         self.num_features = num_features
 
     def _take(self, new: NewRows, forget: int | None) -> None:
@@ -243,6 +249,8 @@ class RRA(TermsGP):
     def pyro_model(self, X: Tensor | None = None, Y: Tensor | None = None) -> Tensor:
         r"""The regression as a Pyro model, in the user's units, for NUTS, SVI or any guide.
 
+        Of outputs with a link (``outcome_transform="log"``) it is the model of their links.
+
         Its sample sites are ``"weights"``, ``(m) x 2D`` as in :meth:`weights`, and ``"Y"``,
         ``(m) x n``. Lengthscales, prior scales and noise stand as they are in the model.
 
@@ -269,10 +277,12 @@ class RRA(TermsGP):
         self.eval()
         shift, scale = self.units()
         with torch.no_grad():
+            Y = Y if Y is None or self.link is None else self.link.value(Y)
             obs = None if Y is None else self.outputs_first(Y)
             if X is None:
                 inputs: Tensor = self.train_inputs[0]
-                noise, obs = self.noise.at(inputs), self.train_targets * scale + shift
+                noise = self.noise.of_rows(self.noise.at(inputs))
+                obs = self.train_targets * scale + shift
             else:
                 inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)
                 noise = self.observation_noise(inputs)
@@ -315,7 +325,9 @@ class PaperConditioning(WeightConditioning):
     def regress(self) -> tuple[Tensor, Tensor]:
         """The paper's mean and root of the covariance of weights."""
         design = self.kernel.at(self.train_inputs[0]).features(self.features)
-        _, root = regression(design, self.targets, torch.ones_like(design[..., 0]))
+        targets, _, means = self.observations()
+        ridge = torch.ones_like(design[..., 0]) if means is None else means.share
+        _, root = regression(design, targets, ridge)
         return super().regress()[0], root
 
 
@@ -379,7 +391,7 @@ class PaperRRA(RRA):
                 design @ design.mT + torch.eye(design.shape[-2]).to(design)
             )
             latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
-            return mean, latent + self.noise.at(train.x)
+            return mean, latent + self.noise.of_rows(self.noise.at(train.x))
 
 
 def fourier_kernel(

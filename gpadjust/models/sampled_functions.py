@@ -59,6 +59,7 @@ class SampledFunctions(Module):
     ) -> None:
         super().__init__()
         self.input_transform = deepcopy(getattr(model, "input_transform", None))
+        self.link = model.link
         self.has_outputs = model.num_outputs > 1
         self.batch_shape: Size = model.batch_shape
         # Together, as the features read the kernels of the terms.
@@ -118,6 +119,7 @@ class SampledFunctions(Module):
         X = X.unsqueeze(-3) if self.has_outputs else X
         inputs = X if self.input_transform is None else self.input_transform(X)
         values = self._values(inputs, extra) * self.scale + self.shift
+        values = values if self.link is None else self.link.inverse(values)
         return values.mT if self.has_outputs else values.unsqueeze(-1)
 
     def _values(self, inputs: Tensor, extra: int = 0, among_reached: bool = False) -> Tensor:

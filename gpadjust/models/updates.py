@@ -31,6 +31,8 @@ class NewRows(NamedTuple):
     def of(cls, model: Any, X: Tensor, Y: Tensor, noise: Tensor | None) -> NewRows:
         """Rows of checked tensors ``k x d`` and ``k x m``; ``noise`` is in the user's units."""
         shift, scale = model.units()
+        if model.link is not None:
+            Y, noise = model.link(Y, noise)
         lead, inputs = model.train_targets.shape[:-1], model.model_inputs(X)
         targets = (model.outputs_first(Y) - shift) / scale
         if noise is not None:
@@ -59,6 +61,9 @@ def keep_last(model: Any, new: NewRows, number: int) -> None:
     if new.noise is not None:
         holder = model.likelihood.noise_covar
         holder.noise = last(holder.noise.expand(*new.noise.shape[:-1], -1), new.noise, -1)
+    if (rows := model.noise.rows) is not None:
+        rows.factors = last(rows.factors, torch.ones_like(new.targets), -1)
+        rows.added = last(rows.added, torch.zeros_like(new.targets), -1)
     model.prediction_strategy = None
 
 
