@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -38,3 +38,74 @@ class Vanishing(Experiment):
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """A wrong place is of the vanishing delta alone."""
         return () if kind[0] == "misplaced" and kind[1] != "vanishing" else self.seeds
+
+
+@dataclass(frozen=True, kw_only=True)
+class SistersSettings:
+    """Settings that decide the numbers, fixed before the first run."""
+
+    points: int = 5
+    """measured points of pump B"""
+    known: int = 40
+    """measured points of each other machine"""
+    tests: int = 300
+    """points at which pump B is predicted"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sisters(Experiment):
+    """A pump of which five points are measured, with what other machines taught."""
+
+    runs: int = 30
+    """three times ten pumps, each once pump B"""
+    out: Path = Path("results/sisters")
+    settings: SistersSettings = field(default_factory=SistersSettings)
+
+    axes: ClassVar[Axes] = {
+        "prior": {
+            "one": "one other pump",
+            "three": "three other pumps",
+            "rough": "a machine that has nothing to do with it, rough",
+            "smooth": "a machine that has nothing to do with it, smooth",
+        }
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriftSettings:
+    """Settings that decide the numbers, fixed before the first run."""
+
+    hours: int = 4380
+    """observations, one an hour: half a year"""
+    first: int = 168
+    """of these before the first fit"""
+    refit_every: int = 24
+    """hours between refits of what is fitted again"""
+    window: int = 168
+    """observations that are fitted again, and that an exact model keeps"""
+    forget: int = 84
+    """observations in which an RRA forgets"""
+    check_every: int = 6
+    """hours between checks of the monitor"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(Experiment):
+    """Half a year of a pump that wears, predicted an hour ahead by models that are updated."""
+
+    runs: int = 3
+    """pumps"""
+    out: Path = Path("results/drift")
+    settings: DriftSettings = field(default_factory=DriftSettings)
+
+    axes: ClassVar[Axes] = {
+        "model": {
+            "never": "CKA, fitted once",
+            "rra": "RRA, updated",
+            "cka": "CKA, updated",
+            "refit": "CKA, updated each hour and fitted again each day",
+            "steady": "RRA, updated, of a pump that does not wear",
+        }
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.RRA")

@@ -61,12 +61,17 @@ class Pump:
 
 
 class OtherMachine:
-    """A machine whose head differs from the catalogue's by a function that has no cause here."""
+    """A machine whose head differs from the catalogue's by a function that has no cause here.
 
-    def __init__(self, generator: torch.Generator) -> None:
+    Args:
+        generator: Draws it.
+        lengths: Its lengthscales in flow and speed.
+    """
+
+    def __init__(self, generator: torch.Generator, lengths: tuple[float, float]) -> None:
         shape = (64, 2)
         self.frequencies = torch.randn(shape, generator=generator, dtype=torch.float64)
-        self.frequencies = self.frequencies / torch.tensor([0.4, 0.2], dtype=torch.float64)
+        self.frequencies = self.frequencies / torch.tensor(lengths, dtype=torch.float64)
         self.phases = 2 * math.pi * torch.rand(64, generator=generator, dtype=torch.float64)
         self.weights = torch.randn(64, generator=generator, dtype=torch.float64)
         self.constant = 3 * torch.randn(1, generator=generator, dtype=torch.float64)
