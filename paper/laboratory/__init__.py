@@ -76,25 +76,29 @@ class Sisters(Experiment):
 class DriftSettings:
     """Settings that decide the numbers, fixed before the first run."""
 
-    hours: int = 4380
-    """observations, one an hour: half a year"""
-    first: int = 168
-    """of these before the first fit"""
-    refit_every: int = 24
-    """hours between refits of what is fitted again"""
-    window: int = 168
-    """observations that are fitted again, and that an exact model keeps"""
-    forget: int = 84
+    steps: int = 2190
+    """observations, one each two hours: half a year"""
+    first: int = 84
+    """of these before the first fit: a week"""
+    refit_every: int = 12
+    """observations between refits of what is fitted again: a day"""
+    window: int = 84
+    """observations that are fitted again, and that an exact model keeps: a week"""
+    forget: int = 42
     """observations in which an RRA forgets"""
+    method: str = "map"
+    """of all fits"""
+    num_features: int = 64
+    """features of each term of an RRA"""
     check_every: int = 6
-    """hours between checks of the monitor"""
+    """observations between checks of the monitor"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drift(Experiment):
-    """Half a year of a pump that wears, predicted an hour ahead by models that are updated."""
+    """Half a year of a pump that wears, predicted a step ahead by models that are updated."""
 
-    runs: int = 3
+    runs: int = 4
     """pumps"""
     out: Path = Path("results/drift")
     settings: DriftSettings = field(default_factory=DriftSettings)
@@ -104,7 +108,7 @@ class Drift(Experiment):
             "never": "CKA, fitted once",
             "rra": "RRA, updated",
             "cka": "CKA, updated",
-            "refit": "CKA, updated each hour and fitted again each day",
+            "refit": "CKA, updated, and fitted again each day",
             "steady": "RRA, updated, of a pump that does not wear",
         }
     }
