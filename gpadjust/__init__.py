@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Physics,
         PhysicsError,
         PhysicsWarning,
+        SubprocessPhysics,
         Unknown,
     )
     from gpadjust.validation import Comparison, compare
@@ -54,6 +55,7 @@ __all__ = [
     "SampleResult",
     "ScaleGP",
     "StackedGP",
+    "SubprocessPhysics",
     "Unknown",
     "VariationalCKA",
     "ZeroMeanGP",
