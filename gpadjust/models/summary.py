@@ -36,6 +36,8 @@ def summary(model: Any) -> str:
     """The text of :meth:`~gpadjust.CKA.summary`."""
     model.eval()
     lines = [title(model)]
+    if model.link is not None:
+        lines.append(f"link: terms and noise are those of {model.link.formula}")
     if model.has_unknowns:
         lines += ["parameters of the physics:", *_of_physics(model)]
     for i, name in enumerate(model.output_names):
@@ -81,14 +83,14 @@ def _lines(model: Any) -> list[str]:
 
 def _alone(model: Any) -> list[str]:
     """Return a line on the error of each physics alone, at the observations of one output."""
-    shift, scale = model.units()
-    inputs, y = model.train_inputs[0], model.train_targets * scale + shift
+    inputs, y, link = model.train_inputs[0], model.outputs_first(model.user_targets()), model.link
     named = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
     fitted = ", with these parameters" if model.has_unknowns else ""
     lines = []
     for term in named:
         f_p = (inputs[..., term.basis.num_inputs :] * term.basis.select).sum(-1)
         f_p = f_p if model.num_samples is None else f_p.mean(0)
+        f_p = f_p if link is None else link.inverse(f_p)
         rmse = (y - f_p).square().nanmean().sqrt()
         spread = float(nanstd(y.reshape(-1, y.shape[-1]), dim=-1).mean())
         of = f" of {term.name.removeprefix('rho_')}" if len(named) > 1 else ""
