@@ -102,7 +102,8 @@ class SubprocessPhysics(BlackBoxPhysics):
             )
         if silent := [each for each in (unknowns or ()) if each not in asked]:
             raise ValueError(
-                f"The unknown parameter {silent[0]} has no placeholder in the command."
+                f"The command has no placeholder of the unknown parameter {silent[0]}: say where "
+                f"its value goes by {{{silent[0]}}}."
             )
         run = _Run(
             tuple(command),
