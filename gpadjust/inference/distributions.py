@@ -242,6 +242,10 @@ def stationary_terms(
         square = term.mean.square() + (term.mean_variance if random_means else 0.0)
         of_error = errors[term.name] * square.unsqueeze(-1)
         of_means = of_error if of_means is None else of_means + of_error
+    if kernel.sister is not None:  # of which nothing is learnt
+        taught = kernel.at(inputs).sister
+        of_sister = taught.covariance(taught)
+        of_means = of_sister if of_means is None else of_means + of_sister
     shares = (None, None) if known_noise is not None else likelihood.shares(inputs, kept)
     selection, added = shares
     if share is not None and known_noise is None:

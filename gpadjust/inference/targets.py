@@ -67,6 +67,7 @@ class Target:
 
     random_means: ClassVar[bool] = True
     of_logs: ClassVar[bool] = False
+    vague_trends: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -100,7 +101,8 @@ class Target:
         args = (model, self.parameters, inputs, noise, self.random_means, kept, share)
         found = stationary_terms(*args) if self.parameters.is_batched else None
         self.distribution: StationaryTerms | ByModules = found or ByModules(*args)
-        vague = self.of_logs and marginalized is None
+        taught = getattr(model.covar_module, "sister", None) is not None
+        vague = self.of_logs and self.vague_trends and marginalized is None and not taught
         self._trend = _trends(model, self._raw_inputs, self.targets) if vague else None
         if self.repeats is not None:
             rows = self.repeats.observed(self.targets)

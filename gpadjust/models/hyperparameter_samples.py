@@ -15,6 +15,7 @@ from torch.nn import Parameter
 from gpadjust.gp import AppendedPhysics, Term
 from gpadjust.gp.kernels import CompositeKernel
 from gpadjust.gp.noise import RowNoise
+from gpadjust.gp.sister import Sister
 from gpadjust.models.updates import UpdatedWeights
 
 HOLDS_SAMPLES = (
@@ -22,7 +23,7 @@ HOLDS_SAMPLES = (
     "`model.release_samples()` keeps the first."
 )
 # Modules whose buffers have the batch.
-_BATCHED = (AppendedPhysics, CompositeKernel, RFFKernel, RowNoise, Term, UpdatedWeights)
+_BATCHED = (AppendedPhysics, CompositeKernel, RFFKernel, RowNoise, Sister, Term, UpdatedWeights)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:

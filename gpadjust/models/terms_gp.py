@@ -26,9 +26,9 @@ import gpadjust
 from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
+from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.repeats import Repeats
-from gpadjust.gp.kernels import Stationary
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -113,7 +113,9 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = made.units if made.link is None else made.link.units(made.units)
+            self.outcome_transform = (
+                made.units if made.link is None else made.link.units(made.units)
+            )
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.noisy_inputs = made.noisy_inputs
@@ -439,10 +441,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         r"""Take new observations, in place, at a cost that does not grow with their number.
 
         An :class:`~gpadjust.RRA` keeps its weights alone: each observation is a step of a Kalman
-        filter. With ``forget`` the weights wander between observations so that the covariance of
-        functions that are k observations apart has the factor :math:`e^{-k / \text{forget}}`:
-        what was observed fades, and where nothing is observed rho and delta return to their priors
-        (unknown constant means stay). Without it the answer is that of all observations together.
+        filter. With ``forget``, an observation of k steps ago counts as one whose noise has the
+        variance :math:`\sigma^2 e^{k / \text{forget}}`, so that where nothing is observed rho and
+        delta return to their priors, slowly. Without it the answer is that of all observations
+        together.
 
         Any other model keeps its last ``forget`` observations, and forgets those before.
 
