@@ -1,5 +1,6 @@
 """The GPyTorch pieces: terms of a model, and what they are made of."""
 
+from gpadjust.gp.categories import CategoricalInput, GroupedRBFKernel, OffsetKernel
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.physics_columns import AppendedPhysics, PhysicsInput
 from gpadjust.gp.plain_gpytorch import PhysicsMean, PhysicsScaledKernel
@@ -7,6 +8,9 @@ from gpadjust.gp.term import SumOfTerms, Term, TermsMean, Unit, WeightedSum
 
 __all__ = [
     "AppendedPhysics",
+    "CategoricalInput",
+    "GroupedRBFKernel",
+    "OffsetKernel",
     "OrthogonalKernel",
     "PhysicsInput",
     "PhysicsMean",
