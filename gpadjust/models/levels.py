@@ -20,7 +20,7 @@ def texts_of(frame: Any, named: Sequence[str | int] = ()) -> Levels:
     Numbers in text, and texts that differ in most rows, are none, unless the column is named.
     """
     found: Levels = {}
-    for i, name in enumerate(getattr(frame, "columns", ())):
+    for i, name in enumerate(frame.columns if hasattr(frame, "iloc") else ()):
         column = frame.iloc[:, i]
         values = column.tolist()
         if not values or not all(isinstance(value, str) for value in values):
@@ -40,7 +40,7 @@ def coded(frame: Any, levels: Levels, batches: Sequence[int] = ()) -> Any:
     is a ValueError.
     """
     texts = {i: each for i, each in levels.items() if isinstance(each[0], str)}
-    if not texts or not hasattr(frame, "columns") or frame.shape[-1] <= max(texts):
+    if not texts or not hasattr(frame, "iloc") or frame.shape[-1] <= max(texts):
         return frame
     array = frame.to_numpy(dtype=object).copy()
     for i, each in texts.items():

@@ -104,9 +104,12 @@ class TermsGP(TermsModel, SingleTaskGP):
         if made.units is not None:  # not earlier: BoTorch would estimate it again
             units, link = made.units, made.link
             self.outcome_transform = units if link is None else link.units(units)
+            vars(self)["link"] = link  # no submodule, of which the class's None would be first
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
-        self.remember(data)
+        self.input_names, self.output_names = data.input_names, data.output_names
+        if data.levels:
+            self.remember_levels(data)
         set_initial_values(self, *made.given)
         self.was_fitted = False
 

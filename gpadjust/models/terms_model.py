@@ -91,13 +91,11 @@ class TermsModel(PredictiveModel):
         model.objects = [n for n, v in every.items() if not _is_plain(v)]
         return model
 
-    def remember(self, data: TrainingData) -> None:
-        """Remember the names of the data, and the levels of categories, for a file, too."""
-        self.input_names, self.output_names = data.input_names, data.output_names
-        if data.levels:
-            self.levels, self.batches = data.levels, tuple(data.batches)
-            self.options |= {"categorical": data.levels, "batch": list(data.batches)}
-            self.objects = [name for name in self.objects if name != "categorical"]
+    def remember_levels(self, data: TrainingData) -> None:
+        """Remember the levels of categories, for a file, too."""
+        self.levels, self.batches = data.levels, tuple(data.batches)
+        self.options |= {"categorical": data.levels, "batch": list(data.batches)}
+        self.objects = [name for name in self.objects if name != "categorical"]
 
     def __repr__(self) -> str:
         return title(self)

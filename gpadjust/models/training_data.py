@@ -82,7 +82,7 @@ def training_data(
     """
     name_X, name_Y = f"{prefix}_X", f"{prefix}_Y"
     levels: Levels = {}
-    if hasattr(train_X, "columns") or isinstance(categorical, Mapping):
+    if hasattr(train_X, "iloc") or isinstance(categorical, Mapping):
         own = column_names(train_X) or default_names("x", train_X.shape[-1])
         named = [*several(categorical), *several(batch)]
         levels = {**texts_of(train_X, named), **declared(categorical, own)}

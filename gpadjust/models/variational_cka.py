@@ -141,7 +141,10 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         self.input_transform = some.input_transform
         if hasattr(some, "outcome_transform"):
             self.outcome_transform = some.outcome_transform
-        self.remember(data)
+        vars(self)["link"] = some.link
+        self.input_names, self.output_names = data.input_names, data.output_names
+        if data.levels:
+            self.remember_levels(data)
         self._num_outputs, self._aug_batch_shape = some._num_outputs, some._aug_batch_shape
         d, zero = some.terms[-1].num_inputs, data.X.new_zeros(*self._aug_batch_shape, 1)
         kernel = scaled_rbf(d, self._aug_batch_shape).to(zero).requires_grad_(False)
