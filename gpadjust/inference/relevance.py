@@ -29,7 +29,7 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     functions that scale a physics and one :math:`\delta`, whose priors are the default ones.
     """
     scaled = [term for term in model.terms if is_scaled(term)]
-    rest = [term for term in model.terms if not is_scaled(term)]
+    rest = [term for term in model.terms if not is_scaled(term) and term.scaled_by is None]
     is_plain = bool(rest) and all(t.basis is None and t.kernel is not None for t in rest)
     if not (scaled and is_plain) or any(term.learns_mean for term in model.terms):
         return None

@@ -2,6 +2,7 @@
 
 from gpadjust.models.ar1 import AR1
 from gpadjust.models.links import Logit
+from gpadjust.models.parallel_partial import ParallelPartialGP
 from gpadjust.models.parameters import orthogonal_rbf
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import Prediction, PredictiveModel
@@ -20,6 +21,7 @@ from gpadjust.models.structures import (
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.terms_model import TermsModel
+from gpadjust.models.vanishing import vanishing_rbf
 from gpadjust.models.variational_cka import VariationalCKA
 
 __all__ = [
@@ -30,6 +32,7 @@ __all__ = [
     "CalibratedPhysics",
     "Logit",
     "PaperRRA",
+    "ParallelPartialGP",
     "PhysicsMeanGP",
     "PhysicsParameters",
     "Prediction",
@@ -45,4 +48,5 @@ __all__ = [
     "load",
     "orthogonal_rbf",
     "save",
+    "vanishing_rbf",
 ]

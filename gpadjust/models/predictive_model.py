@@ -74,6 +74,13 @@ class PredictiveModel(Model):
         """The functions of :meth:`sample_functions`."""
         raise NotImplementedError
 
+    def update(self, X: ArrayLike, Y: ArrayLike, *args: Any, **options: Any) -> None:
+        """Refuse: exact models take new observations in place, see :meth:`CKA.update`."""
+        raise NotImplementedError(
+            f"A {type(self).__name__} takes no observations in place: build it of all data and fit "
+            "it again, or take an RRA, or an exact CKA of some hundred."
+        )
+
     def posterior(
         self,
         X: ArrayLike,

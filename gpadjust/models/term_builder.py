@@ -18,9 +18,16 @@ from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import AppendedPhysics, CategoricalInput, PhysicsInput, Term, Unit
+from gpadjust.gp import (
+    AppendedPhysics,
+    CategoricalInput,
+    PhysicsInput,
+    Term,
+    Unit,
+    VanishingKernel,
+)
 from gpadjust.gp.gaussian import least_squares
-from gpadjust.gp.noise import Noise
+from gpadjust.gp.noise import Noise, RowSource
 from gpadjust.gp.physics_columns import check_one_to_one
 from gpadjust.models.levels import values_of
 from gpadjust.models.links import Logit
@@ -42,13 +49,16 @@ Kernels: TypeAlias = KernelLike | Sequence[KernelLike] | None
 Means = float | Sequence[float] | Literal["learn"]
 Center = float | Tensor | Literal["mean", "learn"]
 Columns = str | int | Sequence[str | int]
+LikelihoodLike: TypeAlias = (
+    Likelihood | str | Sequence[str] | Callable[["TermBuilder"], Likelihood] | None
+)
 Outcomes = OutcomeTransform | tuple[float, float] | str | _DefaultType | None
 
 
 class ModelOptions(TypedDict, total=False):
     """The arguments that all structures share, see :class:`~gpadjust.CKA`."""
 
-    likelihood: Likelihood | None
+    likelihood: LikelihoodLike
     outcome_transform: Outcomes
     input_transform: InputTransform | None
     categorical: Columns | Mapping[str | int, Sequence[str | float]] | None
@@ -63,12 +73,13 @@ class TermBuilder:
         input_transform: What makes the columns that terms read out of raw inputs, or None.
         units: Shift and scale of the targets, or None.
         num_inputs: Number ``d`` of these columns without those of the physics.
-        likelihood: The user's, or None.
+        likelihood: The user's, a function that makes it of the builder, names of ours, or None.
 
     Attributes:
         batch_shape: That of the model with its outputs last, for its kernels.
         f: Each physics at the training inputs, ``batch_shape x n x m``.
         given: What the user brought, whose parameters stay as they are.
+        sources: What sets the noise of training rows apart between fits.
         link: That of the targets, of which data and physics are then, or None.
         categories: The part of the input transform that is of categories, or None.
     """
@@ -82,31 +93,25 @@ class TermBuilder:
         input_transform: InputTransform | None,
         units: Standardize | None,
         num_inputs: int,
-        likelihood: Likelihood | None = None,
+        likelihood: LikelihoodLike = None,
     ) -> None:
-        if likelihood is not None and not isinstance(likelihood, _GaussianLikelihoodBase):
-            raise TypeError(f"Expected a Gaussian likelihood of GPyTorch, got {likelihood!r}.")
         self.data = data
         self.input_transform = input_transform
         self.units = units
         self.num_inputs = num_inputs
         self.likelihood = likelihood
         _, self.batch_shape = BatchedMultiOutputGPyTorchModel.get_batch_dimensions(data.X, data.Y)
-        learnt = None if likelihood is None else Noise(likelihood).learnt
-        if learnt is not None and learnt.shape[:-1] != self.batch_shape:
-            raise ValueError(
-                f"Expected a likelihood with batch_shape {tuple(self.batch_shape)}, one for each "
-                f"output, got {tuple(learnt.shape[:-1])}."
-            )
         m = data.Y.shape[-1]
         self._zero = torch.zeros_like(data.X[..., :1, :1]).expand(*data.X.shape[:-2], 1, m)
         self._shift = self._zero if units is None else units.means
         self._scale = self._zero + 1 if units is None else units.stdvs
         self.given: list[object] = [likelihood]
+        self.sources: list[RowSource] = []
         # Of each physics: its values, and the mean of its rho and its center, batch_shape x 1 x m.
         self.f: list[Tensor] = []
         self._means: list[Tensor] = []
         self._centers: list[Tensor] = []
+        self._rhos: list[Term] = []
         self._learns_mean = self._learns_center = self._learns_offset = False
         self._offset = 0.0
 
@@ -120,7 +125,7 @@ class TermBuilder:
         *,
         rho_mean: Means | None = None,
         center: Center = "learn",
-        likelihood: Likelihood | None = None,
+        likelihood: LikelihoodLike = None,
         outcome_transform: Outcomes = DEFAULT,
         input_transform: InputTransform | None = None,
         categorical: Columns | Mapping[str | int, Sequence[str | float]] | None = None,
@@ -155,6 +160,12 @@ class TermBuilder:
         transform = input_transform
         if physics is not None:
             physics = as_physics(physics)
+            if link is not None and physics.is_emulated:
+                raise ValueError(
+                    "An emulated physics is uncertain in the units of its runs, which a link would "
+                    "bend: emulate g(runs_Y), build the model of g(train_Y), and leave "
+                    "outcome_transform out."
+                )
             transform = PhysicsInput(physics, data.X.shape[-1], input_transform, link)
             k, unknowns = len(getattr(physics, "parts", [physics])), bool(physics.unknowns)
         X = transformed(data.X, transform)
@@ -165,6 +176,7 @@ class TermBuilder:
             )
         d = X.shape[-1] - k * m
         f = [X[..., d + i * m : d + (i + 1) * m] for i in range(k)]
+        d -= getattr(transform, "num_of_error", 0)
         means = _starting_means(rho_mean, data.Y, f)
         if isinstance(outcome_transform, _DefaultType):
             mean = sum((w * v for w, v in zip(means, f, strict=True)), torch.zeros_like(data.Y))
@@ -212,7 +224,8 @@ class TermBuilder:
             if made is None:
                 if isinstance(kernel, Module | type) or not callable(kernel):
                     raise TypeError(f"Expected {whose} to be a GPyTorch kernel, got {kernel!r}.")
-                made = kernel(d, shape)
+                of_data = getattr(kernel, "made_for", None)  # it asks for names and units
+                made = kernel(d, shape) if of_data is None else of_data(self)
                 if self.categories is not None:
                     made = self.categories.grouped(made)
             if made.batch_shape != shape:
@@ -257,7 +270,7 @@ class TermBuilder:
         several = getattr(self.input_transform.physics, "names", ())
         names = [f"rho_{name}" for name in several] if k > 1 else ["rho"]
         columns = torch.eye(k * m).to(self._zero).split(m)  # of each physics, m x (k m)
-        terms = []
+        terms, first = list[Term](), self.num_inputs + self.input_transform.num_of_error
         for i, f_p in enumerate(self.f):
             select = columns[i].unsqueeze(-2) if m > 1 else columns[i]
             select = select.expand(*self.batch_shape, 1, -1)
@@ -266,10 +279,32 @@ class TermBuilder:
                 spread = f_p.std(-2, keepdim=True)
                 rounding = 8 * torch.finfo(f_p.dtype).eps * f_p.abs().amax(-2, keepdim=True)
                 own += [spread * (spread > rounding), self._means[i]]
-            basis = AppendedPhysics(self.num_inputs, select, *map(self._of_outputs, own))
+            basis = AppendedPhysics(first, select, *map(self._of_outputs, own))
             mean, unknown = self._means[i], self._learns_mean
             terms.append(self.term(names[i], each[i], basis, mean, unknown, Unit.NONE))
-        return terms
+        self._rhos = terms
+        emulated = self.input_transform.physics.is_emulated
+        return [*terms, *self._errors(names)] if emulated else terms
+
+    def _errors(self, rhos: Sequence[str]) -> list[Term]:
+        """The terms of the errors of physics that are emulated, beside those that scale these."""
+        transform: Any = self.input_transform
+        physics = transform.physics
+        parts = getattr(physics, "parts", [physics])
+        d, unit = self.num_inputs, self._of_outputs(self._scale)
+        columns = range(d, d + transform.num_of_error)
+        return [
+            Term(
+                f"error{name.removeprefix('rho')}",
+                part.error_kernel(physics.unknowns, columns, unit),
+                columns.stop,
+                None,
+                torch.zeros_like(unit),
+                scaled_by=name,
+            )
+            for name, part in zip(rhos, parts, strict=True)
+            if part.is_emulated
+        ]
 
     def delta(
         self,
@@ -291,7 +326,40 @@ class TermBuilder:
         # f = sum rho_i (f_i - c_i) + delta_0, so that delta_0 has the mean sum rho_i c_i.
         offset = sum(c * w for c, w in zip(self._centers, self._means, strict=True))
         mean_0 = (self._zero + known + offset - self._shift) / self._scale
-        return self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+        term = self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+        centerd = self._learns_center or any(bool(each.any()) for each in self._centers)
+        stays = all(isinstance(t.kernel, VanishingKernel) and not t.learns_mean for t in self._rhos)
+        if isinstance(term.kernel, VanishingKernel) and centerd and not stays:
+            raise ValueError(
+                "Expected center=0.0 of a delta that vanishes somewhere beside a rho that does not "
+                "stay at a known mean there, as delta is delta_0 - center * rho; or give the rho "
+                "vanishing_rbf, too (rho_covar_module)."
+            )
+        return term
+
+    def noise(self) -> Likelihood | None:
+        """The likelihood, after all terms are made; None for the model's own.
+
+        Of names, what they say of training rows is entered in ``sources``.
+        """
+        likelihood: Any = self.likelihood
+        if isinstance(likelihood, str | list | tuple):
+            from gpadjust.models.named_noise import named_noise
+
+            likelihood = named_noise(likelihood, self)
+        elif callable(likelihood) and not isinstance(likelihood, Module | type):
+            likelihood = likelihood(self)
+        if likelihood is None:
+            return None
+        if not isinstance(likelihood, _GaussianLikelihoodBase):
+            raise TypeError(f"Expected a Gaussian likelihood of GPyTorch, got {likelihood!r}.")
+        learnt = Noise(likelihood).learnt
+        if learnt is not None and learnt.shape[:-1] != self.batch_shape:
+            raise ValueError(
+                f"Expected a likelihood with batch_shape {tuple(self.batch_shape)}, one for each "
+                f"output, got {tuple(learnt.shape[:-1])}."
+            )
+        return likelihood
 
     def offsets(self) -> list[Term]:
         """The terms of batches, one for each column: its name, and an offset for each level."""
