@@ -505,6 +505,11 @@ class TermsGP(TermsModel, SingleTaskGP):
                 f"A {name} has rows of its own among the observations, of which a window would "
                 "forget some: take a CKA, or build the model again."
             )
+        if self.noise.rows is not None and self.noise.rows.added.any():
+            raise NotImplementedError(
+                f"The inputs of this {name} are noisy (train_Xvar), and of new ones that is not "
+                "known: build the model again."
+            )
         keep_last(self, new, forget)
 
     def _check_noise(self, noise: Tensor | None, Y: Tensor) -> None:
