@@ -19,6 +19,7 @@ from tests.systems import line, wave
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
     *("checks", "physics", "states", "files", "gp", "models", "inference"),
+    "emulation",
     *(
         "validation",
         "report",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, RFFKernel, 
 from torch import Tensor
 from torch.nn import Module, ModuleDict, ModuleList
 
+from gpadjust.gp.kernels import stationary_parts
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.term import SumOfTerms, Term, side_by_side
 
@@ -82,6 +84,8 @@ def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> 
         return []
     if isinstance(kernel, AdditiveKernel) and kernel.active_dims is None:
         return [m for part in kernel.kernels for m in _feature_maps(part, num_inputs, num_features)]
+    if hasattr(kernel, "features"):
+        return [kernel.features(num_features)]
     if isinstance(kernel, OrthogonalKernel):
         free = _feature_maps(kernel.base_kernel, num_inputs, num_features)
         return [OrthogonalFeatures(kernel, free)] if kernel.directions.shape[-1] else free
@@ -118,9 +122,35 @@ class SumFeatures(FeatureMap):
         return self.kernel.at(x).features(self.maps)
 
 
+def sum_features(kernel: SumOfTerms, num_features: int) -> Any:
+    """Those of :func:`term_features`, and of ``sister``, if there is one."""
+    found = term_features(kernel.terms, num_features)
+    if kernel.sister is not None:
+        found["sister"] = SisterFeatures(kernel, num_features)
+    return found
+
+
 def term_features(terms: Sequence[Term], num_features: int) -> Any:
     """Random features of terms, by their names; see :class:`TermFeatures`."""
     return ModuleDict({term.name: TermFeatures(term, num_features) for term in terms})
+
+
+class SisterFeatures(Module):
+    """Random features of what other machines taught a sum of terms."""
+
+    def __init__(self, kernel: SumOfTerms, num_features: int) -> None:
+        super().__init__()
+        terms = [term for term in kernel.terms if term.kernel is not None]
+        forms = kernel.sister.forms([term.form.profile for term in terms])
+        maps: list[Module] = []
+        for term, form in zip(terms, forms, strict=True) if num_features else ():
+            own = deepcopy(term.kernel)
+            base, outer, _ = stationary_parts(own, term.num_inputs) or (own, None, None)
+            base.lengthscale, outer.outputscale = form.lengthscale, form.scale
+            maps += _feature_maps(own, term.num_inputs, num_features)
+        self.maps = ModuleList(maps)
+        size = kernel.sister.root.shape[-1] + len(maps) * num_features
+        self.num_features = size if num_features else 0
 
 
 @GenKernelFeatures.register(SumOfTerms)  # type: ignore[untyped-decorator, unused-ignore]

@@ -2,6 +2,7 @@
 
 from gpadjust.models.ar1 import AR1
 from gpadjust.models.links import Logit
+from gpadjust.models.parallel_partial import ParallelPartialGP
 from gpadjust.models.parameters import orthogonal_rbf
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import Prediction, PredictiveModel
@@ -30,6 +31,7 @@ __all__ = [
     "CalibratedPhysics",
     "Logit",
     "PaperRRA",
+    "ParallelPartialGP",
     "PhysicsMeanGP",
     "PhysicsParameters",
     "Prediction",

@@ -62,8 +62,8 @@ class WeightConditioning(ExactConditioning):
         After updates it is their weights that are known, and of observations those after them.
         """
         train = self.kernel.at(self.train_inputs[0])
-        design, residual = train.features(self.features), self.targets - train.mean()
-        noise = self.noise.of_rows(self.noise.at(train.x))
+        targets, noise, _ = self.observations()
+        design, residual = train.features(self.features), targets - train.mean()
         if self._known is None:
             return regression(design, residual, noise)
         mean, root, n = self._known
@@ -157,7 +157,13 @@ class RRA(TermsGP):
         make = TermBuilder.of_adjustment(
             train_X, train_Y, train_Yvar, physics, rho_mean=rho_mean, center=center, **options
         )
-        super().__init__(make, [*make.rhos(kernel), make.delta(kernel, delta_mean)])
+        rhos = make.rhos(kernel)
+        if any(term.scaled_by for term in rhos):
+            raise ValueError(
+                "The error of an emulated physics is no sum of features: take CKA, or "
+                "FunctionPhysics(physics), which takes the emulator's mean as exact."
+            )
+        super().__init__(make, [*rhos, make.delta(kernel, delta_mean)])
         self.num_features = num_features
 
     def _take(self, new: NewRows, forget: int | None) -> None:
@@ -167,25 +173,20 @@ class RRA(TermsGP):
                 f"The covariance of {type(self).__name__} is not that of a posterior, so that "
                 "there is nothing to update; take RRA."
             )
-        regression, kernel = self._regression(), self.covar_module
-        if not hasattr(kernel, "updated"):
-            mean, root = regression.weights()
-            rows = torch.full(mean.shape[:-1], self.train_targets.shape[-1], device=mean.device)
-            kernel.updated = UpdatedWeights(mean, root @ root.mT, rows)
+        conditioning, kernel = self._regression(), self.covar_module
+        before = getattr(kernel, "updated", None)
+        if before is None:
+            train = self.at(self.train_inputs[0])
+            design, n = train.features(conditioning.features), self.train_targets.shape[-1]
+            before = UpdatedWeights.of_prior(self._prior_sd().shape, n, design)
+            known, noise = self.train_targets - train.mean(), self.noise.at(train.x)
+            before.observe(design, known, noise, math.inf)
+            kernel.updated = before
         f = self.at(new.inputs)
         noise = self.noise.at(f.x) if new.noise is None else new.noise
-        kept = None if forget is None else self._wandering(math.exp(-1 / forget))
-        with torch.no_grad():
-            design, residual = f.features(regression.features), new.targets - f.mean()
-        kernel.updated.observe(design, residual, noise, kept)
+        design, residual = f.features(conditioning.features), new.targets - f.mean()
+        before.observe(design, residual, noise, math.inf if forget is None else forget)
         self.prediction_strategy = None
-
-    def _wandering(self, share: float) -> Tensor:
-        """The share that each weight keeps from one observation to the next; constants keep all."""
-        kept: list[float] = []
-        for term in self.terms:
-            kept += [share] * self.num_features + [1.0] * term.learns_mean
-        return self.train_targets.new_tensor(kept)
 
     def train(self, mode: bool = True) -> Self:
         """Put the model in train mode, or eval mode; after updates it is not trained."""
@@ -202,10 +203,9 @@ class RRA(TermsGP):
         self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
     ) -> Any:
         """Load parameters, and the weights of a model that was updated."""
-        if "covar_module.updated.mean" in state_dict and not hasattr(self.covar_module, "updated"):
-            zero = torch.zeros_like(self._prior_sd())
-            rows = torch.zeros(zero.shape[:-1], dtype=torch.long)
-            self.covar_module.updated = UpdatedWeights(zero, torch.diag_embed(zero), rows)
+        if "covar_module.updated.pull" in state_dict and not hasattr(self.covar_module, "updated"):
+            sd = self._prior_sd()
+            self.covar_module.updated = UpdatedWeights.of_prior(sd.shape, 0, sd)
         return super().load_state_dict(state_dict, strict, *args, **kwargs)
 
     def _check_no_updates(self) -> None:
@@ -325,7 +325,9 @@ class PaperConditioning(WeightConditioning):
     def regress(self) -> tuple[Tensor, Tensor]:
         """The paper's mean and root of the covariance of weights."""
         design = self.kernel.at(self.train_inputs[0]).features(self.features)
-        _, root = regression(design, self.targets, torch.ones_like(design[..., 0]))
+        targets, _, means = self.observations()
+        ridge = torch.ones_like(design[..., 0]) if means is None else means.share
+        _, root = regression(design, targets, ridge)
         return super().regress()[0], root
 
 

@@ -58,6 +58,10 @@ def _lines(model: Any) -> list[str]:
     evidence, value = model.log_evidence()
     lines = [*_alone(model), f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
     for term in model.terms:
+        if term.scaled_by is not None:
+            error = term.covariance(model.train_inputs[0], None, True).mean(-1).sqrt() * scale
+            lines.append(f"  {term.name} of the emulated physics: sd {_text(error)}")
+            continue
         variance = None if term.form is None else term.form.variance()
         is_left_out = isinstance(term.basis, AppendedPhysics) and not term.mean.any()
         is_left_out = is_left_out and bool(term.given_mean.any())

@@ -138,6 +138,12 @@ class TermBuilder:
         transform = input_transform
         if physics is not None:
             physics = as_physics(physics)
+            if link is not None and physics.is_emulated:
+                raise ValueError(
+                    "An emulated physics is uncertain in the units of its runs, which a link would "
+                    "bend: emulate g(runs_Y), build the model of g(train_Y), and leave "
+                    "outcome_transform out."
+                )
             transform = PhysicsInput(physics, data.X.shape[-1], input_transform, link)
             k, unknowns = len(getattr(physics, "parts", [physics])), bool(physics.unknowns)
         X = transformed(data.X, transform)
@@ -148,6 +154,7 @@ class TermBuilder:
             )
         d = X.shape[-1] - k * m
         f = [X[..., d + i * m : d + (i + 1) * m] for i in range(k)]
+        d -= getattr(transform, "num_of_error", 0)
         means = _starting_means(rho_mean, data.Y, f)
         if isinstance(outcome_transform, _DefaultType):
             mean = sum((w * v for w, v in zip(means, f, strict=True)), torch.zeros_like(data.Y))
@@ -238,7 +245,7 @@ class TermBuilder:
         several = getattr(self.input_transform.physics, "names", ())
         names = [f"rho_{name}" for name in several] if k > 1 else ["rho"]
         columns = torch.eye(k * m).to(self._zero).split(m)  # of each physics, m x (k m)
-        terms = []
+        terms, first = list[Term](), self.num_inputs + self.input_transform.num_of_error
         for i, f_p in enumerate(self.f):
             select = columns[i].unsqueeze(-2) if m > 1 else columns[i]
             select = select.expand(*self.batch_shape, 1, -1)
@@ -247,10 +254,31 @@ class TermBuilder:
                 spread = f_p.std(-2, keepdim=True)
                 rounding = 8 * torch.finfo(f_p.dtype).eps * f_p.abs().amax(-2, keepdim=True)
                 own += [spread * (spread > rounding), self._means[i]]
-            basis = AppendedPhysics(self.num_inputs, select, *map(self._of_outputs, own))
+            basis = AppendedPhysics(first, select, *map(self._of_outputs, own))
             mean, unknown = self._means[i], self._learns_mean
             terms.append(self.term(names[i], each[i], basis, mean, unknown, Unit.NONE))
-        return terms
+        emulated = self.input_transform.physics.is_emulated
+        return [*terms, *self._errors(names)] if emulated else terms
+
+    def _errors(self, rhos: Sequence[str]) -> list[Term]:
+        """The terms of the errors of physics that are emulated, beside those that scale these."""
+        transform: Any = self.input_transform
+        physics = transform.physics
+        parts = getattr(physics, "parts", [physics])
+        d, unit = self.num_inputs, self._of_outputs(self._scale)
+        columns = range(d, d + transform.num_of_error)
+        return [
+            Term(
+                f"error{name.removeprefix('rho')}",
+                part.error_kernel(physics.unknowns, columns, unit),
+                columns.stop,
+                None,
+                torch.zeros_like(unit),
+                scaled_by=name,
+            )
+            for name, part in zip(rhos, parts, strict=True)
+            if part.is_emulated
+        ]
 
     def delta(
         self,

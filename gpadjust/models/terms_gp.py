@@ -25,8 +25,9 @@ import gpadjust
 from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
-from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
+from gpadjust.gp.repeats import Repeats
+from gpadjust.gp.kernels import Stationary
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -43,6 +44,7 @@ from gpadjust.models.training_data import ArrayLike, check_noise, new_observatio
 from gpadjust.models.updates import NewRows, keep_last
 
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
+_DISTINCT = 0.75  # of the rows, at most, for equal ones to be taken together
 _MANY = 5_000  # points, above which an exact fit takes long
 # What a state has as many of as there were draws, samples or points.
 _OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions", "squares")
@@ -60,6 +62,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         terms: The terms of the model.
 
     Attributes:
+        has_repeats: Whether rows of equal inputs are taken together, by their means.
         was_fitted: Whether :func:`~gpadjust.fit` or ``load_state_dict`` gave it hyper-parameters;
             set it after training of your own.
 
@@ -109,16 +112,21 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = (
-                made.units if made.link is None else made.link.units(made.units)
-            )
+            self.outcome_transform = made.units if made.link is None else made.link.units(made.units)
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
         set_initial_values(self, *made.given)
-        self.was_fitted = False
+        self.was_fitted, rows = False, data.X.unique(dim=-2).shape[-2]
+        known = self.noise.known
+        weighs = self.noise.learnt is not None if known is None else bool((known > 0).all())
+        self.has_repeats = weighs and self.noise.rows is None and rows <= _DISTINCT * n
+        if rows < n:
+            from gpadjust.models.copies import warn_of_copies
+
+            warn_of_copies(data, stacklevel=3)
 
     @property
     def is_fitted(self) -> bool:
@@ -159,8 +167,11 @@ class TermsGP(TermsModel, SingleTaskGP):
     def conditioning(self) -> ExactConditioning:
         """Return the posterior of the terms; it is built if there is none."""
         if self.prediction_strategy is None:
+            inputs, raw = self.train_inputs[0], self._original_train_inputs
+            raw = raw if raw is not None and raw.shape[-2] == inputs.shape[-2] else inputs
+            repeats = Repeats.of(raw) if self.has_repeats else None
             self.prediction_strategy = self.conditioning_class(
-                self.train_inputs[0], self.train_targets, self.noise, self.covar_module
+                inputs, self.train_targets, self.noise, self.covar_module, repeats
             )
         strategy: ExactConditioning = self.prediction_strategy
         return strategy
@@ -168,12 +179,12 @@ class TermsGP(TermsModel, SingleTaskGP):
     @torch.no_grad()
     def log_evidence(self) -> tuple[str, Tensor]:
         """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
-        train, (_, scale) = self.at(self.train_inputs[0]), self.units()
-        residual = self.train_targets - train.mean()
-        noise = self.noise.of_rows(self.noise.at(train.x))
+        train, (_, scale) = self.conditioning().train, self.units()
+        targets, noise, means = self.conditioning().observations()
         covariance = train.covariance() + torch.diag_embed(noise)
-        value = negative_log_likelihood(residual, covariance).value
-        value, count = -value, (~residual.isnan()).sum(-1)
+        more = None if means is None else means.within.at(noise)
+        value = -negative_log_likelihood(targets - train.mean(), covariance, more=more).value
+        count = (~self.train_targets.isnan()).sum(-1)
         if self.link is not None:
             value = value + self.outputs_first(self.link.log_slope(self.user_targets())).nansum(-1)
         return "log likelihood", value - count * scale.squeeze(-1).log()
@@ -187,10 +198,9 @@ class TermsGP(TermsModel, SingleTaskGP):
         """
         if self.training:
             self.eval()
-        factors = self.conditioning().factors()
-        precision = factors.squared_columns()
+        alpha, precision = self.conditioning().of_rows()
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
-        return self.train_targets - factors.alpha * variance, variance
+        return self.train_targets - alpha * variance, variance
 
     @torch.no_grad()
     def learn_local_errors(self) -> None:
@@ -199,7 +209,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         Of a model that holds samples, with kernels in closed form and their lengthscales: as
         :class:`~gpadjust.models.local_errors.LocalErrors` says. :func:`~gpadjust.fit` does this.
         """
-        forms = [term.form for term in self.terms if term.kernel is not None]
+        learnt = [term for term in self.terms if term.scaled_by is None]
+        forms = [term.form for term in learnt if term.kernel is not None]
         lengthscales = [form.lengthscale for form in forms if isinstance(form, Stationary)]
         if self.num_samples is None or not forms or len(lengthscales) < len(forms):
             return
@@ -408,10 +419,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         r"""Take new observations, in place, at a cost that does not grow with their number.
 
         An :class:`~gpadjust.RRA` keeps its weights alone: each observation is a step of a Kalman
-        filter. With ``forget`` the weights wander between observations so that the covariance of
-        functions that are k observations apart has the factor :math:`e^{-k / \text{forget}}`:
-        what was observed fades, and where nothing is observed rho and delta return to their priors
-        (unknown constant means stay). Without it the answer is that of all observations together.
+        filter. With ``forget``, an observation of k steps ago counts as one whose noise has the
+        variance :math:`\sigma^2 e^{k / \text{forget}}`, so that where nothing is observed rho and
+        delta return to their priors, slowly. Without it the answer is that of all observations
+        together.
 
         Any other model keeps its last ``forget`` observations, and forgets those before.
 
@@ -450,6 +461,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         self.eval()
         if forget is not None:
             forget = checked_whole("forget", forget, 1)
+        if self.has_repeats:  # rows come and go from now on
+            self.has_repeats, self.prediction_strategy = False, None
         with torch.no_grad():
             self._take(NewRows.of(self, X, Y, noise), forget)
 

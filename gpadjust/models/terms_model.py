@@ -425,7 +425,7 @@ class TermsModel(PredictiveModel):
         for other in self._centerd() if term.unit is Unit.TARGET else ():
             parts.append((other, -other.basis.origin / other.basis.scale))
             shift = shift + other.basis.moved_mean
-        return WeightedSum(inputs, parts, shift)
+        return self.covar_module.weighted(inputs, parts, shift)
 
     def _centerd(self) -> list[Term]:
         """The terms from whose physics a center is taken."""

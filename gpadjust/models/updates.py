@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Size, Tensor
 from torch.nn import Module
 
 from gpadjust.gp.gaussian import cholesky
@@ -30,6 +31,8 @@ class NewRows(NamedTuple):
     def of(cls, model: Any, X: Tensor, Y: Tensor, noise: Tensor | None) -> NewRows:
         """Rows of checked tensors ``k x d`` and ``k x m``; ``noise`` is in the user's units."""
         shift, scale = model.units()
+        if model.link is not None:
+            Y, noise = model.link(Y, noise)
         lead, inputs = model.train_targets.shape[:-1], model.model_inputs(X)
         targets = (model.outputs_first(Y) - shift) / scale
         if noise is not None:
@@ -58,65 +61,75 @@ def keep_last(model: Any, new: NewRows, number: int) -> None:
     if new.noise is not None:
         holder = model.likelihood.noise_covar
         holder.noise = last(holder.noise.expand(*new.noise.shape[:-1], -1), new.noise, -1)
+    if (rows := model.noise.rows) is not None:
+        rows.factors = last(rows.factors, torch.ones_like(new.targets), -1)
+        rows.added = last(rows.added, torch.zeros_like(new.targets), -1)
     model.prediction_strategy = None
 
 
 class UpdatedWeights(Module):
-    r"""The posterior of the weights of features, after observations that are not kept.
+    r"""What observations say of the weights of features, without the observations.
 
-    In units of the weights' prior, N(0, I). An observation :math:`y = \varphi^T \beta + \epsilon`
-    is a step of a Kalman filter, :math:`g = P \varphi`, :math:`s = \varphi^T g + \sigma^2`,
+    In units of the weights' prior, N(0, I), it is their precision :math:`\Lambda`, and h of the
+    mean :math:`\Lambda^{-1} h`. An observation :math:`y = \varphi^T \beta + \epsilon` adds to
+    both; before, with :math:`\lambda = e^{-1 / \tau}`, what was observed fades, the prior does not
+    (stabilised forgetting, Kulhavy and Zarrop 1993):
 
-    .. math:: \mu \leftarrow \mu + g (y - \varphi^T \mu) / s, \quad P \leftarrow P - g g^T / s,
+    .. math:: \Lambda \leftarrow \lambda \Lambda + (1 - \lambda) I + \varphi \varphi^T /
+        \sigma^2, \quad h \leftarrow \lambda h + \varphi y / \sigma^2.
 
-    before which the weights of functions wander, with :math:`a = e^{-1 / \tau}`,
-
-    .. math:: \mu \leftarrow a \mu, \quad P \leftarrow a^2 P + (1 - a^2) I,
-
-    which is stationary with their prior: where no data come, they return to it in some
-    :math:`\tau` observations, and no variance grows beyond it.
+    It is a Kalman filter in its information form. An observation of :math:`k` steps ago counts as
+    one with the noise :math:`\sigma^2 e^{k / \tau}`; no variance grows beyond the prior's.
 
     Args:
-        mean: ``batch_shape x (m) x p``.
-        covariance: P, ``batch_shape x (m) x p x p``.
+        precision: ``batch_shape x (m) x p x p``.
+        pull: h, ``batch_shape x (m) x p``.
         rows: Number of the model's own observations in these, ``batch_shape x (m)``.
     """
 
-    mean: Tensor
-    covariance: Tensor
+    precision: Tensor
+    pull: Tensor
     rows: Tensor
 
-    def __init__(self, mean: Tensor, covariance: Tensor, rows: Tensor) -> None:
+    def __init__(self, precision: Tensor, pull: Tensor, rows: Tensor) -> None:
         super().__init__()
-        self.register_buffer("mean", mean)
-        self.register_buffer("covariance", covariance)
+        self.register_buffer("precision", precision)
+        self.register_buffer("pull", pull)
         self.register_buffer("rows", rows)
 
+    @classmethod
+    def of_prior(cls, shape: Size, num_rows: int, like: Tensor) -> UpdatedWeights:
+        """Before any observation, of ``batch_shape x (m) x p`` weights."""
+        rows = torch.full(shape[:-1], num_rows, device=like.device)
+        one = torch.eye(shape[-1]).to(like).expand(*shape, -1)
+        return cls(one.clone(), like.new_zeros(shape), rows)
+
     @torch.no_grad()
-    def observe(self, design: Tensor, residual: Tensor, noise: Tensor, kept: Tensor | None) -> None:
-        """Take observations one after the other.
+    def observe(self, design: Tensor, residual: Tensor, noise: Tensor, forget: float) -> None:
+        r"""Take observations, the last of which is the newest.
 
         Args:
             design: Their features, ``... x k x p``.
             residual: Targets less their prior mean, ``... x k``; NaN where one is missing.
             noise: Noise variances, ``... x k``.
-            kept: The share a of each weight, ``p``; None if they do not wander.
+            forget: :math:`\tau`; infinite for never.
         """
-        mean, P = self.mean, self.covariance  # not in place: others may read what was before
-        for i in range(residual.shape[-1]):
-            if kept is not None:
-                mean = kept * mean
-                P = P * kept * kept.unsqueeze(-1) + torch.diag(1 - kept.square())
-            phi, r = design[..., i, :].expand_as(mean), residual[..., i]
-            gain = (P @ phi.unsqueeze(-1)).squeeze(-1)
-            variance = (phi * gain).sum(-1) + noise[..., i]
-            missed = (r - (phi * mean).sum(-1)).nan_to_num(nan=0.0)
-            share = (~r.isnan()).to(P) / variance
-            mean = mean + gain * (share * missed).unsqueeze(-1)
-            P = P - gain.unsqueeze(-1) * (share.unsqueeze(-1) * gain).unsqueeze(-2)
-        self.mean, self.covariance = mean, P
+        k = residual.shape[-1]
+        left = torch.arange(k - 1, -1, -1).to(noise).div(-forget).exp()
+        weight = (left / noise).masked_fill(residual.isnan(), 0.0)
+        kept = math.exp(-k / forget)
+        weighted = (design * weight.unsqueeze(-1)).mT
+        # Not in place: others may read what was before.
+        precision = kept * self.precision + weighted @ design
+        precision.diagonal(dim1=-1, dim2=-2).add_(1 - kept)
+        self.precision = precision
+        pull = (weighted @ residual.nan_to_num(nan=0.0).unsqueeze(-1)).squeeze(-1)
+        self.pull = kept * self.pull + pull
 
     def moments(self) -> tuple[Tensor, Tensor, int]:
-        """The mean, a lower root of the covariance, and the number of the model's own rows."""
-        root, _ = cholesky(self.covariance.clone())
-        return self.mean, root, int(self.rows.max())
+        """The mean, a root of the covariance, and the number of the model's own rows."""
+        chol, _ = cholesky(self.precision.clone())
+        identity = torch.eye(chol.shape[-1]).to(chol).expand_as(chol)
+        root = torch.linalg.solve_triangular(chol, identity, upper=False).mT
+        mean = root @ (root.mT @ self.pull.unsqueeze(-1))
+        return mean.squeeze(-1), root, int(self.rows.max())

@@ -39,6 +39,7 @@ from gpadjust.validation.structures import (
 _DRAWS = (32, 256)  # of the hyper-parameters, the least and the most
 _MEMORY = 20_000  # observations times draws
 _HELD = 32  # samples of a model, and components of the stacked one
+_MOST_OUTPUTS = 64
 _ALL = 0.95  # weight of a structure that needs no others
 
 
@@ -252,6 +253,12 @@ def compare(
         raise ValueError(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
             "the data sets of a batch one by one."
+        )
+    if (m := data.Y.shape[-1]) > _MOST_OUTPUTS:
+        raise ValueError(
+            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got {m}: "
+            "compare some of them, or fit a ParallelPartialGP of all with the physics and one with "
+            "physics=None, and see the scores of `leave_one_out` of both."
         )
     given_physics = as_physics(physics)
     fitted_to = candidates(asked, given_physics, len(data.X))
