@@ -1,1 +1,35 @@
 """Data as laboratories have them: each kind beside what ignores it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from paper.common.experiment import Axes, Experiment
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hints(Experiment):
+    """Hints of `compare`: given where the data are of a kind, and not where they are clean?"""
+
+    runs: int = 5
+    """data sets of each problem and kind"""
+    out: Path = Path("results/hints")
+
+    axes: ClassVar[Axes] = {
+        "data": {
+            "exact": "exact",
+            "noisy": "noise of 5 % of the sd",
+            "outliers": "noise, one in twenty off by 10 to 100 sd of it",
+            "decades": "output over decades, noise of one size",
+            "relative": "output over decades, noise of 15 % of it",
+            "copies": "noise, three rows copied",
+            "rigs": "noise, and the number of a rig",
+        },
+        "problem": {
+            name: name
+            for name in ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.compare",)
