@@ -16,6 +16,7 @@ from torch.nn import Module, ModuleDict, ModuleList
 from gpadjust.gp.kernels import stationary_parts
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.term import SumOfTerms, Term, side_by_side
+from gpadjust.gp.vanishing_kernel import VanishingKernel
 
 
 class TermFeatures(Module):
@@ -78,6 +79,21 @@ class OrthogonalFeatures(Module):
         return side_by_side([each(x) for each in self.maps])
 
 
+class VanishingFeatures(Module):
+    """The features of a ``VanishingKernel``: those of its base kernel, less what they are there."""
+
+    def __init__(self, kernel: VanishingKernel, maps: Sequence[Module]) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.maps = ModuleList(maps)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return ``... x n x D``."""
+        weights = self.kernel.weights(x).movedim(-1, 0).unsqueeze(-1)  # p x ... x n x 1
+        there = side_by_side([each(self.kernel.moved(x)) for each in self.maps])
+        return side_by_side([each(x) for each in self.maps]) - (weights * there).sum(0)
+
+
 def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> list[Module]:
     """The feature maps of a kernel, whose features side by side are those of the kernel."""
     if kernel is None:
@@ -89,6 +105,9 @@ def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> 
     if isinstance(kernel, OrthogonalKernel):
         free = _feature_maps(kernel.base_kernel, num_inputs, num_features)
         return [OrthogonalFeatures(kernel, free)] if kernel.directions.shape[-1] else free
+    if isinstance(kernel, VanishingKernel):
+        free = _feature_maps(kernel.base_kernel, num_inputs, num_features)
+        return [VanishingFeatures(kernel, free)]
     scale = kernel if isinstance(kernel, ScaleKernel) else None
     base = kernel if scale is None else scale.base_kernel
     reads_all = base.active_dims is None and kernel.active_dims is None

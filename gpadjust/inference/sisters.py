@@ -105,7 +105,9 @@ def _sampled(
     weights = torch.full_like(positions[..., 0], 1 / len(positions))
     rows = representative(left_out(target, positions), positions, weights, number)
     raw = draws.raw(rows)
-    fixed = {name: values.expand(number, *values.shape[1:]) for name, values in _values(model).items()}
+    fixed = {
+        name: values.expand(number, *values.shape[1:]) for name, values in _values(model).items()
+    }
     return odds.sigmoid().reshape(model._aug_batch_shape), fixed | raw
 
 
@@ -193,7 +195,9 @@ def sister_of(model: TermsGP, others: Sequence[TermsGP]) -> Sister:
         covariance = covariance / len(each) + between * (1 + 1 / len(each))
     values, vectors = torch.linalg.eigh(covariance)
     root = vectors * values.clamp_min(0).sqrt().unsqueeze(-2)
-    own = [[model.term_mean(model.terms[i].name, j) for i in terms] for j in range(model.num_outputs)]
+    own = [
+        [model.term_mean(model.terms[i].name, j) for i in terms] for j in range(model.num_outputs)
+    ]
     own = mean.new_tensor(own).repeat_interleave(len(points), -1)
     mean = mean - own.reshape(mean.shape)
     lead = model._aug_batch_shape

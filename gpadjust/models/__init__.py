@@ -21,6 +21,7 @@ from gpadjust.models.structures import (
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.terms_model import TermsModel
+from gpadjust.models.vanishing import vanishing_rbf
 from gpadjust.models.variational_cka import VariationalCKA
 
 __all__ = [
@@ -47,4 +48,5 @@ __all__ = [
     "load",
     "orthogonal_rbf",
     "save",
+    "vanishing_rbf",
 ]

@@ -22,11 +22,9 @@ from gpadjust.models.posteriors import (
     PosteriorCovariance,
     ScaleFreeMultitaskNormal,
     ScaleFreePosterior,
-    correlation_root,
     mixture_moments,
 )
 from gpadjust.models.predictive_model import given_noise
-from gpadjust.models.sampled_functions import DRAWING, seeded
 from gpadjust.models.structures import ZeroMeanGP
 from gpadjust.models.term_builder import KernelLike, PhysicsLike
 from gpadjust.models.terms_model import TermsModel

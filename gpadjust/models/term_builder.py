@@ -18,7 +18,7 @@ from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import AppendedPhysics, PhysicsInput, Term, Unit
+from gpadjust.gp import AppendedPhysics, PhysicsInput, Term, Unit, VanishingKernel
 from gpadjust.gp.gaussian import least_squares
 from gpadjust.gp.noise import Noise, RowSource
 from gpadjust.gp.physics_columns import check_one_to_one
@@ -98,6 +98,7 @@ class TermBuilder:
         self.f: list[Tensor] = []
         self._means: list[Tensor] = []
         self._centers: list[Tensor] = []
+        self._rhos: list[Term] = []
         self._learns_mean = self._learns_center = self._learns_offset = False
         self._offset = 0.0
 
@@ -202,7 +203,8 @@ class TermBuilder:
             if made is None:
                 if isinstance(kernel, Module | type) or not callable(kernel):
                     raise TypeError(f"Expected {whose} to be a GPyTorch kernel, got {kernel!r}.")
-                made = kernel(d, shape)
+                of_data = getattr(kernel, "made_for", None)  # it asks for names and units
+                made = kernel(d, shape) if of_data is None else of_data(self)
             if made.batch_shape != shape:
                 raise ValueError(
                     f"Expected {whose} with batch_shape {tuple(shape)}, one for each output, got "
@@ -257,6 +259,7 @@ class TermBuilder:
             basis = AppendedPhysics(first, select, *map(self._of_outputs, own))
             mean, unknown = self._means[i], self._learns_mean
             terms.append(self.term(names[i], each[i], basis, mean, unknown, Unit.NONE))
+        self._rhos = terms
         emulated = self.input_transform.physics.is_emulated
         return [*terms, *self._errors(names)] if emulated else terms
 
@@ -300,7 +303,16 @@ class TermBuilder:
         # f = sum rho_i (f_i - c_i) + delta_0, so that delta_0 has the mean sum rho_i c_i.
         offset = sum(c * w for c, w in zip(self._centers, self._means, strict=True))
         mean_0 = (self._zero + known + offset - self._shift) / self._scale
-        return self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+        term = self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+        centerd = self._learns_center or any(bool(each.any()) for each in self._centers)
+        stays = all(isinstance(t.kernel, VanishingKernel) and not t.learns_mean for t in self._rhos)
+        if isinstance(term.kernel, VanishingKernel) and centerd and not stays:
+            raise ValueError(
+                "Expected center=0.0 of a delta that vanishes somewhere beside a rho that does not "
+                "stay at a known mean there, as delta is delta_0 - center * rho; or give the rho "
+                "vanishing_rbf, too (rho_covar_module)."
+            )
+        return term
 
     def noise(self) -> Likelihood | None:
         """The likelihood, after all terms are made; None for the model's own.

@@ -25,9 +25,9 @@ import gpadjust
 from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
+from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.repeats import Repeats
-from gpadjust.gp.kernels import Stationary
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -112,7 +112,9 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = made.units if made.link is None else made.link.units(made.units)
+            self.outcome_transform = (
+                made.units if made.link is None else made.link.units(made.units)
+            )
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)

@@ -163,6 +163,13 @@ def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     return None if name is None or isinstance(values, Tensor) else (str(name),)
 
 
+def with_names(X: Tensor, names: Sequence[str]) -> Tensor:
+    """A tensor with names of its columns, which :func:`column_names` finds as those of a frame."""
+    named = X.view_as(X)
+    named.columns = names  # type: ignore[attr-defined]
+    return named
+
+
 def check_order(values: ArrayLike, names: tuple[str, ...]) -> None:
     """Raise a ValueError if a frame has columns of these names in another order."""
     found = column_names(values)
