@@ -93,7 +93,7 @@ class TermsGP(TermsModel, SingleTaskGP):
                 stacklevel=3,
             )
         made.warn_of_physics(stacklevel=3)
-        covar_module = SumOfTerms(terms)
+        covar_module = SumOfTerms([*terms, *made.offsets()] if made.data.batches else terms)
         Y, Yvar = data.Y, data.Yvar
         noise = likelihood
         if likelihood is None and Yvar is None:
@@ -112,14 +112,16 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = (
-                made.units if made.link is None else made.link.units(made.units)
-            )
+            units, link = made.units, made.link
+            self.outcome_transform = units if link is None else link.units(units)
+            vars(self)["link"] = link  # no submodule, of which the class's None would be first
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
+        if data.levels:
+            self.remember_levels(data)
         set_initial_values(self, *made.given)
         self.was_fitted, rows = False, data.X.unique(dim=-2).shape[-2]
         known = self.noise.known
@@ -406,7 +408,8 @@ class TermsGP(TermsModel, SingleTaskGP):
                 rows or of outputs disagree, or ``noise`` is missing, negative, of another shape, or
                 given to a model that learns it.
         """
-        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        names, m = self.input_names, self.num_outputs
+        X, Y = new_observations(X, Y, names, m, self.levels, self.batches)
         X = self._new_inputs(X)
         return self.with_observations(X, Y, **kwargs)
 
