@@ -14,12 +14,16 @@ def named_noise(names: str | Sequence[str], make: Any) -> Likelihood | None:
     """The likelihood of names, for a builder of terms; None for the model's own.
 
     Raises:
-        ValueError: If there is no noise of a name.
+        TypeError: If there is no noise of a name.
     """
     names = [names] if isinstance(names, str) else [*names]
     if unknown := [name for name in names if name not in _NAMES]:
-        raise ValueError(
-            f"Expected likelihood as {' or '.join(map(repr, _NAMES))}, or both in a sequence, got "
-            f"{unknown[0]!r}."
+        raise TypeError(
+            f"Expected {', '.join(map(repr, _NAMES))}, a sequence of both, or a Gaussian likelihood "
+            f"of GPyTorch, got {unknown[0]!r}."
         )
+    if "heavy-tailed" in names:
+        from gpadjust.models.heavy_tails import HeavyTails
+
+        make.sources.append(HeavyTails())
     return None
