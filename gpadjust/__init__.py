@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gpadjust.emulation import EmulatedPhysics
     from gpadjust.inference import FitResult, SampleResult, fit
     from gpadjust.models import (
         AR1,
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
         RRA,
         BiasGP,
         CalibratedPhysics,
+        ParallelPartialGP,
         PhysicsMeanGP,
         ScaleGP,
         StackedGP,
@@ -41,10 +43,12 @@ __all__ = [
     "BlackBoxPhysics",
     "CalibratedPhysics",
     "Comparison",
+    "EmulatedPhysics",
     "FitResult",
     "FunctionPhysics",
     "JoinedPhysics",
     "ODEPhysics",
+    "ParallelPartialGP",
     "Physics",
     "PhysicsError",
     "PhysicsMeanGP",
@@ -67,6 +71,7 @@ _ROOMS = (
     "models",
     "inference",
     "validation",
+    "emulation",
     "gp",
     "states",
     "files",

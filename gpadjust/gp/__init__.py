@@ -4,6 +4,7 @@ from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.physics_columns import AppendedPhysics, PhysicsInput
 from gpadjust.gp.plain_gpytorch import PhysicsMean, PhysicsScaledKernel
 from gpadjust.gp.term import SumOfTerms, Term, TermsMean, Unit, WeightedSum
+from gpadjust.gp.vanishing_kernel import VanishingKernel
 
 __all__ = [
     "AppendedPhysics",
@@ -15,5 +16,6 @@ __all__ = [
     "Term",
     "TermsMean",
     "Unit",
+    "VanishingKernel",
     "WeightedSum",
 ]

@@ -16,6 +16,7 @@ from torch.nn.functional import pad
 
 _OUTLYING = 1e3  # times the variance of a new observation: a row that hardly counts
 
+
 class RowSource:
     """A reason why the noise of training rows differs from that of new observations there."""
 
@@ -66,11 +67,11 @@ class RowNoise(Module):
 
     def refine(self, model: Any) -> bool:
         """Let each source set the noise of rows after a rough fit; return whether to fit again."""
-        return any([source.refine(model, self) for source in self.sources])
+        return sum(source.refine(model, self) for source in self.sources) > 0
 
     def confirm(self, model: Any) -> bool:
         """The same after the fit that was asked for."""
-        return any([source.confirm(model, self) for source in self.sources])
+        return sum(source.confirm(model, self) for source in self.sources) > 0
 
 
 class Noise(NamedTuple):

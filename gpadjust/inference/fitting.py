@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
@@ -21,12 +21,13 @@ from gpadjust.inference.bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.calibrate import calibrate
 from gpadjust.inference.optimise import FitResult, Search, maximise, optima
 from gpadjust.inference.priors import register_priors
+from gpadjust.inference.shared_kernel import fit_shared
 from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.variational_fit import fit_variational
-from gpadjust.models import TermsGP, VariationalCKA
+from gpadjust.models import ParallelPartialGP, TermsGP, VariationalCKA
 from gpadjust.models.parameters import shared_parameters
 
-Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA
+Fittable: TypeAlias = BatchedMultiOutputGPyTorchModel | VariationalCKA | ParallelPartialGP
 
 
 class FitOptions(TypedDict, total=False):
@@ -41,6 +42,7 @@ class FitOptions(TypedDict, total=False):
     seed: int
     num_samples: int | None
     num_draws: int | None
+    prior: TermsGP | Sequence[TermsGP] | None
 
 
 class Method(NamedTuple):
@@ -195,23 +197,33 @@ def fit(
             "Expected a model of gpadjust, another BoTorch model with batched outputs, or a "
             f"ModelListGP of them, got {type(model).__name__}."
         )
-    if is_fully_bayesian(model) and not isinstance(model, TermsGP):
+    if is_fully_bayesian(model) and not isinstance(model, TermsGP | ParallelPartialGP):
         raise RuntimeError(
             f"The {type(model).__name__} holds samples of its hyper-parameters; build it again, to "
             "fit it."
         )
     method = method or ("bayes" if _can_be_sampled(model) else "map")
     own: dict[str, Any] = {**options}
+    prior = own.pop("prior", None)
     check_options(method, own)
     search = Search(**{name: own.pop(name) for name in _SEARCH if name in own})
     with threads_for(model.train_targets.shape[-1]), _without_samples(model):
+        if isinstance(model, ParallelPartialGP):
+            return fit_shared(model, search, method == "bayes", **own)
         try:
             begin = time.perf_counter()
             if isinstance(model, TermsGP) and model.noise.rows is not None:
                 _refine_noise(model, search)
-            result = METHODS[method].run(model, search, **own)
-            if isinstance(model, TermsGP) and _is_unconfirmed(model):
-                result = METHODS[method].run(model, search, **own)
+            for _ in range(2):
+                if prior is None:
+                    result = METHODS[method].run(model, search, **own)
+                else:
+                    from gpadjust.inference.sisters import fit_with_prior
+
+                    run = METHODS[method].run
+                    result = fit_with_prior(model, prior, method, run, search, **own)
+                if not (isinstance(model, TermsGP) and _is_unconfirmed(model)):
+                    break
             if isinstance(model, TermsGP):
                 model.was_fitted = True
                 model.eval()
@@ -301,7 +313,7 @@ def _fit_list(
 def _can_be_sampled(model: Fittable) -> bool:
     """Return whether a model can hold samples, and has something to sample."""
     if not isinstance(model, TermsGP):
-        return False
+        return isinstance(model, ParallelPartialGP)
     try:
         model.check_can_be_sampled()
     except ValueError:
@@ -313,8 +325,17 @@ def _can_be_sampled(model: Fittable) -> bool:
 @contextmanager
 def _without_samples(model: Fittable) -> Iterator[None]:
     """Let a model go of the samples that it holds; it holds them again if there is an error."""
-    if not isinstance(model, TermsGP) or model.num_samples is None:
+    if not isinstance(model, TermsGP):
         yield
+        return
+    kernel, sister = model.covar_module, model.covar_module.sister
+    if model.num_samples is None:
+        kernel.sister = None
+        try:
+            yield
+        except BaseException:
+            kernel.sister = sister
+            raise
         return
     samples = {
         name: parameter.detach().clone()
@@ -323,6 +344,7 @@ def _without_samples(model: Fittable) -> Iterator[None]:
     }
     errors = deepcopy(model.local_errors)
     model.release_samples()
+    sister, kernel.sister = kernel.sister, None
     with torch.no_grad():
         for basis in model.covar_module.modules():
             if isinstance(basis, AppendedPhysics) and basis.learnt is not None:
@@ -331,6 +353,7 @@ def _without_samples(model: Fittable) -> Iterator[None]:
         yield
     except BaseException:
         model.release_samples()
+        kernel.sister = sister
         model.hold_samples(samples)
         model.local_errors = errors
         raise

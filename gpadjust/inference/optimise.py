@@ -58,10 +58,12 @@ class FitResult:
             :class:`~gpadjust.VariationalCKA` the evidence lower bound of all observations.
         converged: Whether the optimiser converged, for each output, of the same shape; of a
             VariationalCKA, whose last search stops after 15 iterations, it seldom has.
+        sisters: Of a fit with ``prior=``: 1 where other machines help, else 0, of the same shape.
     """
 
     log_likelihood: Tensor
     converged: Tensor
+    sisters: Tensor | None = None
 
 
 class Differentiable(Protocol):

@@ -47,7 +47,9 @@ class HeavyTails(RowSource):
         best = values.argmax(0)
         z = (found.residual.abs() / found.variance.sqrt()).masked_fill(outlying, 0.0)
         suspect = z > _SUSPECT * math.sqrt(2 * math.log(n))
-        number = 1 + ((odds > 0) & suspect).sum(-1, keepdim=True) // 4  # neighbours of one may seem so
+        number = (
+            1 + ((odds > 0) & suspect).sum(-1, keepdim=True) // 4
+        )  # neighbours of one may seem so
         first = z.argsort(-1, descending=True).argsort(-1) < number
         following = (outlying & (odds > 0)) | (suspect & first)
         again = (sets == following).all(-1).any(0)
@@ -93,7 +95,9 @@ class _LeftOut(NamedTuple):
         residual = (model.train_targets - mean).nan_to_num(nan=0.0)
         noise = model.noise.at(model.train_inputs[0]).expand(mean.shape)
         in_fit = variance + model.noise.of_rows(noise) - noise
-        return cls(residual, variance, noise, _normal(residual, in_fit), model.num_samples is not None)
+        return cls(
+            residual, variance, noise, _normal(residual, in_fit), model.num_samples is not None
+        )
 
     def tails(self) -> Tensor:
         """Log densities of the residuals of outliers, with their share."""

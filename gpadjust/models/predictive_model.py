@@ -47,6 +47,16 @@ class PredictiveModel(Model):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
 
+    @property
+    def link(self) -> Any:
+        """The link of which :meth:`components` are, a :class:`Logit`; None without one."""
+        return getattr(getattr(self, "outcome_transform", None), "link", None)
+
+    @property
+    def joint_link(self) -> Any:
+        """That of :meth:`joint_moments`."""
+        return self.link
+
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances of each of the Gaussians, ``... x S x q x m``."""
         raise NotImplementedError
@@ -60,6 +70,13 @@ class PredictiveModel(Model):
     def draw_functions(self, num_functions: int, num_features: int) -> Module:
         """The functions of :meth:`sample_functions`."""
         raise NotImplementedError
+
+    def update(self, X: ArrayLike, Y: ArrayLike, *args: Any, **options: Any) -> None:
+        """Refuse: exact models take new observations in place, see :meth:`CKA.update`."""
+        raise NotImplementedError(
+            f"A {type(self).__name__} takes no observations in place: build it of all data and fit "
+            "it again, or take an RRA, or an exact CKA of some hundred."
+        )
 
     def posterior(
         self,
@@ -79,6 +96,8 @@ class PredictiveModel(Model):
                 noise = noise[..., list(output_indices)]
             return subset.posterior(X, None, noise, posterior_transform)
         posterior = self.as_posterior(*self.joint_moments(X, observation_noise))
+        if (link := self.joint_link) is not None:
+            posterior = link.posterior(posterior)
         if posterior_transform is None:
             return posterior
         return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))
@@ -111,7 +130,10 @@ class PredictiveModel(Model):
             >>> mean.shape
             torch.Size([1000, 1])
         """
-        return Prediction(*mixture_moments(*self.components(X, observation_noise)))
+        mean, variance = self.components(X, observation_noise)
+        if self.link is not None:
+            mean, variance = self.link.moments(mean, variance)
+        return Prediction(*mixture_moments(mean, variance))
 
     def interval(
         self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
@@ -124,8 +146,9 @@ class PredictiveModel(Model):
             observation_noise: As in :meth:`predict`.
         """
         check_level(level)
-        parts = self.components(X, observation_noise)
-        return mixture_quantile(*parts, (1 - level) / 2), mixture_quantile(*parts, (1 + level) / 2)
+        parts, link = self.components(X, observation_noise), self.link
+        lower, upper = (mixture_quantile(*parts, (1 + s * level) / 2, link) for s in (-1, 1))
+        return lower, upper
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024

@@ -8,6 +8,7 @@ from inspect import signature
 from typing import Any, ClassVar, Self
 
 import torch
+from botorch.models.transforms.outcome import OutcomeTransform
 from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.utils.datasets import SupervisedDataset
@@ -19,6 +20,7 @@ from gpadjust.checks import checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.links import plain
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
@@ -81,6 +83,8 @@ class TermsModel(PredictiveModel):
         if callable(variances := every.get("train_Yvar")) and not isinstance(variances, Tensor):
             raise TypeError("Got a function as train_Yvar: did you mean physics=...?")
         every = {n: v for n, v in every.items() if n not in (*cls.data_arguments, "physics")}
+        if isinstance(outcomes := every.get("outcome_transform"), OutcomeTransform):
+            every["outcome_transform"] = plain(outcomes)
         # Others than plain values are told by name alone, or they would have to pickle.
         model.options = {n: v for n, v in every.items() if _is_plain(v)}
         model.objects = [n for n, v in every.items() if not _is_plain(v)]
@@ -118,6 +122,12 @@ class TermsModel(PredictiveModel):
     def noise(self) -> Noise:
         """The noise of observations."""
         return Noise(self.likelihood)
+
+    @property
+    def has_heavy_tails(self) -> bool:
+        """True if observations may be outliers."""
+        rows = self.noise.rows
+        return rows is not None and any(source.has_outliers for source in rows.sources)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -257,6 +267,7 @@ class TermsModel(PredictiveModel):
         means = {t.name: t.mean if t.learns_mean else t.given_mean for t in self.terms}
         # The same for all samples of hyper-parameters but for rounding.
         values = self.outputs_last(self.at(inputs).combine(means) * scale + shift)
+        values = values if self.link is None else self.link.inverse(values)
         return values if self.num_samples is None else values.mean(MCMC_DIM)
 
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
@@ -272,6 +283,8 @@ class TermsModel(PredictiveModel):
                 variance = variance * wider
             if noise is not None:  # given variances are in the user's units
                 unit = scale.square() if observation_noise is True else 1.0
+                if self.link is not None and observation_noise is not True:
+                    unit = (2 * self.link.log_slope(self.link.inverse(mean))).exp()
                 variance = variance + noise * unit
             # Fantasies share their variances.
             mean, variance = (
@@ -397,6 +410,12 @@ class TermsModel(PredictiveModel):
         shift = shift if unit is Unit.TARGET else torch.zeros_like(shift)
         return shift, torch.ones_like(scale) if unit is Unit.NONE else scale
 
+    def user_targets(self) -> Tensor:
+        """Targets in the user's units, ``... x n x m``."""
+        shift, scale = self.units()
+        targets = self.outputs_last(self.train_targets * scale + shift)
+        return targets if self.link is None else self.link.inverse(targets)
+
     def outputs_last(self, values: Tensor) -> Tensor:
         """From ``... x (m) x q`` to ``... x q x m``."""
         return values.mT if self._num_outputs > 1 else values.unsqueeze(-1)
@@ -412,7 +431,7 @@ class TermsModel(PredictiveModel):
         for other in self._centerd() if term.unit is Unit.TARGET else ():
             parts.append((other, -other.basis.origin / other.basis.scale))
             shift = shift + other.basis.moved_mean
-        return WeightedSum(inputs, parts, shift)
+        return self.covar_module.weighted(inputs, parts, shift)
 
     def _centerd(self) -> list[Term]:
         """The terms from whose physics a center is taken."""

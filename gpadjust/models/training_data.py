@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from botorch.models.transforms.outcome import OutcomeTransform, Standardize
+from botorch.models.transforms.outcome import Standardize
 from torch import Tensor
 
 from gpadjust.checks import check_finite, check_observed, marked_rows
@@ -163,6 +163,13 @@ def column_names(values: ArrayLike) -> tuple[str, ...] | None:
     return None if name is None or isinstance(values, Tensor) else (str(name),)
 
 
+def with_names(X: Tensor, names: Sequence[str]) -> Tensor:
+    """A tensor with names of its columns, which :func:`column_names` finds as those of a frame."""
+    named = X.view_as(X)
+    named.columns = names  # type: ignore[attr-defined]
+    return named
+
+
 def check_order(values: ArrayLike, names: tuple[str, ...]) -> None:
     """Raise a ValueError if a frame has columns of these names in another order."""
     found = column_names(values)
@@ -232,15 +239,16 @@ def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
     return standardize(torch.zeros_like(scale), scale.where(scale > 1e-13 * size, tiny))
 
 
-def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Standardize | None:
+def estimated(transform: Any, Y: Tensor, X: Tensor) -> Standardize | None:
     """The user's outcome transform with shift and scale estimated from the targets."""
     if transform is None:
         return None
     if type(transform) is not Standardize:
         raise ValueError(
-            f"The outcome transform {type(transform).__name__} is not supported: it must be one "
-            "shift and scale per output, as the physics has the units of the targets. Use "
-            "Standardize, None, or the default; to model log(y), take both logarithms yourself."
+            f"The outcome transform {transform!r} is not supported: it must be one shift and scale "
+            "per output, Standardize, or None, or the default; or, but for AR1, a link, through "
+            "which the physics goes: 'log' for positive outputs, 'logit' for shares, a pair of "
+            "bounds."
         )
     transform.train()
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
 import torch
@@ -23,6 +23,7 @@ from gpadjust.models.term_builder import ModelOptions, PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
 from gpadjust.validation.advice import Gain, advice
+from gpadjust.validation.hints import hints
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, mixed
 from gpadjust.validation.ranking import Candidate, beside, ranking
 from gpadjust.validation.structures import (
@@ -38,6 +39,7 @@ from gpadjust.validation.structures import (
 _DRAWS = (32, 256)  # of the hyper-parameters, the least and the most
 _MEMORY = 20_000  # observations times draws
 _HELD = 32  # samples of a model, and components of the stacked one
+_MOST_OUTPUTS = 64
 _ALL = 0.95  # weight of a structure that needs no others
 
 
@@ -56,6 +58,8 @@ class Comparison:
             without it.
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
+        hints: What the data look like that the models were not told, each with the option to give:
+            outliers, relative noise, outputs that cannot be negative, copies of rows, categories.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
             candidates (:meth:`rows`), and no part of what is recommended.
     """
@@ -67,6 +71,7 @@ class Comparison:
     gain: dict[str, Gain] = field(default_factory=dict)
     left_out: dict[str, LeaveOneOut] = field(default_factory=dict)
     alone: dict[str, LeaveOneOut] = field(default_factory=dict)
+    hints: list[str] = field(default_factory=list)
 
     @property
     def chosen(self) -> str:
@@ -148,7 +153,7 @@ class Comparison:
                 )
             lines.append("")
         verdict = [text for name, gain in self.gain.items() for text in gain.sentences(name)]
-        return "\n".join([*lines, *verdict, *self.advice])
+        return "\n".join([*lines, *verdict, *self.advice, *self.hints])
 
 
 def compare(
@@ -249,15 +254,21 @@ def compare(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
             "the data sets of a batch one by one."
         )
+    if (m := data.Y.shape[-1]) > _MOST_OUTPUTS:
+        raise ValueError(
+            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got {m}: "
+            "compare some of them, or fit a ParallelPartialGP of all with the physics and one with "
+            "physics=None, and see the scores of `leave_one_out` of both."
+        )
     given_physics = as_physics(physics)
-    found = candidates(asked, given_physics, len(data.X))
+    fitted_to = candidates(asked, given_physics, len(data.X))
     models: dict[str, TermsGP] = {}
     left_out: dict[str, LeaveOneOut] = {}
     converged: dict[str, Tensor] = {}
     relevance: dict[str, Tensor] = {}
     said: set[str] = set()
     number = max(_DRAWS[0], min(_DRAWS[1], _MEMORY // len(data.X)))
-    for structure, part in tqdm(found, disable=not progress, unit="structure"):
+    for structure, part in tqdm(fitted_to, disable=not progress, unit="structure"):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             try:
@@ -289,14 +300,15 @@ def compare(
         if result.relevance is not None:
             relevance[structure.name] = result.relevance.flatten()
         models[structure.name] = _thinned(model)
-    prior = [structure.prior for structure, _ in found]
+    prior = [structure.prior for structure, _ in fitted_to]
     by_output = [ranking(left_out, j, prior) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))
     stacked = StackedGP(models, _weights(models, table), _HELD)
-    fitted = [structure for structure, _ in found]
+    fitted = [structure for structure, _ in fitted_to]
     gain, sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
     alone = physics_alone(given_physics, data)
-    return Comparison(models, stacked, table, sentences, gain, left_out, alone)
+    found = Comparison(models, stacked, table, sentences, gain, left_out, alone)
+    return replace(found, hints=hints(found.recommended, found.leave_one_out()))
 
 
 def _thinned(model: TermsGP) -> TermsGP:

@@ -24,7 +24,7 @@ from gpadjust.inference import bayes
 from gpadjust.models.training_data import training_data
 from gpadjust.physics import as_physics
 from gpadjust.validation import STRUCTURES, Gain, Structure, leave_one_out, stacking_weights
-from gpadjust.validation.advice import _scaling, _spread, physics_gain
+from gpadjust.validation.advice import _scaling, physics_gain
 from gpadjust.validation.ranking import ranking
 from gpadjust.validation.structures import candidates, physics_alone
 
@@ -344,13 +344,6 @@ class TestAdvice:
         finding, reason = gain.sentences("y")
         assert "elpd +8.0 +- 0.0 nats (CKA)" in finding
         assert "by the evidence of a model with and without the physics" in reason
-
-    def test_an_output_over_decades(self):
-        y = torch.tensor([0.15, 3.0, 262.0, torch.nan]).double()
-        (sentence,) = _spread(y)
-        assert "spans 3.2 decades" in sentence
-        assert "logarithm" in sentence
-        assert _spread(-y) == _spread(y + 100) == _spread(y[3:]) == []
 
     def test_one_physics_of_no_use_does_not_hide_another(self, X, noise):
         parts = {"good": crude, "unrelated": lambda X: (23 * X + 1).cos()}
