@@ -14,13 +14,18 @@ numbers themselves."""
 _IDS = 0.5  # levels for each row, from which on texts are no categories
 
 
+def is_frame(values: Any) -> bool:
+    """Return whether values are a DataFrame, whose columns may be texts."""
+    return hasattr(values, "iloc") and hasattr(values, "columns")
+
+
 def texts_of(frame: Any, named: Sequence[str | int] = ()) -> Levels:
     """The levels of the columns of a DataFrame that are texts or pandas categories, sorted.
 
     Numbers in text, and texts that differ in most rows, are none, unless the column is named.
     """
     found: Levels = {}
-    for i, name in enumerate(frame.columns if hasattr(frame, "iloc") else ()):
+    for i, name in enumerate(frame.columns if is_frame(frame) else ()):
         column = frame.iloc[:, i]
         values = column.tolist()
         if not values or not all(isinstance(value, str) for value in values):
@@ -40,7 +45,7 @@ def coded(frame: Any, levels: Levels, batches: Sequence[int] = ()) -> Any:
     is a ValueError.
     """
     texts = {i: each for i, each in levels.items() if isinstance(each[0], str)}
-    if not texts or not hasattr(frame, "iloc") or frame.shape[-1] <= max(texts):
+    if not texts or not is_frame(frame) or frame.shape[-1] <= max(texts):
         return frame
     array = frame.to_numpy(dtype=object).copy()
     for i, each in texts.items():

@@ -12,7 +12,15 @@ from botorch.models.transforms.outcome import Standardize
 from torch import Tensor
 
 from gpadjust.checks import check_finite, check_observed, marked_rows
-from gpadjust.models.levels import Levels, coded, declared, levels_of, several, texts_of
+from gpadjust.models.levels import (
+    Levels,
+    coded,
+    declared,
+    is_frame,
+    levels_of,
+    several,
+    texts_of,
+)
 
 ArrayLike = Any
 """A float64 tensor, or a NumPy array or pandas DataFrame of numbers."""
@@ -82,7 +90,7 @@ def training_data(
     """
     name_X, name_Y = f"{prefix}_X", f"{prefix}_Y"
     levels: Levels = {}
-    if hasattr(train_X, "iloc") or isinstance(categorical, Mapping):
+    if is_frame(train_X) or isinstance(categorical, Mapping):
         own = column_names(train_X) or default_names("x", train_X.shape[-1])
         named = [*several(categorical), *several(batch)]
         levels = {**texts_of(train_X, named), **declared(categorical, own)}
@@ -277,8 +285,10 @@ def estimated(transform: Any, Y: Tensor, X: Tensor) -> Standardize | None:
     if transform is None:
         return None
     if type(transform) is not Standardize:
+        is_plain = isinstance(transform, str | tuple | list)
+        name = repr(transform) if is_plain else type(transform).__name__
         raise ValueError(
-            f"The outcome transform {transform!r} is not supported: it must be one shift and scale "
+            f"The outcome transform {name} is not supported: it must be one shift and scale "
             "per output, Standardize, or None, or the default; or, but for AR1, a link, through "
             "which the physics goes: 'log' for positive outputs, 'logit' for shares, a pair of "
             "bounds."
