@@ -70,8 +70,8 @@ def told_of(model: TermsGP | StackedGP) -> dict[str, Any]:
     found |= {name: v for name, v in one.data().items() if name.endswith("var") and v is not None}
     if getattr(one, "link", None) is not None:
         found["link"] = one.link
-    if given.get("categorical") or getattr(one, "categories", None):
-        found["categorical"] = given.get("categorical") or one.categories
+    if one.levels:
+        found["categorical"] = [one.input_names[i] for i in one.levels]
     return found
 
 
