@@ -19,9 +19,8 @@ from tests.systems import line, wave
 ROOT = Path(gpadjust.__file__).parent
 FLOORS = [
     *("checks", "physics", "states", "files", "gp", "models", "inference"),
-    "emulation",
+    *("validation", "emulation"),
     *(
-        "validation",
         "report",
         "sklearn",
         "ax",

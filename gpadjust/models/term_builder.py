@@ -52,6 +52,7 @@ class ModelOptions(TypedDict, total=False):
     likelihood: LikelihoodLike
     outcome_transform: Outcomes
     input_transform: InputTransform | None
+    train_Xvar: ArrayLike | float | Sequence[float]
 
 
 class TermBuilder:
@@ -70,9 +71,11 @@ class TermBuilder:
         given: What the user brought, whose parameters stay as they are.
         sources: What sets the noise of training rows apart between fits.
         link: That of the targets, of which data and physics are then, or None.
+        noisy_inputs: The inputs as they were measured, if with noise, or None.
     """
 
     link: Any = None
+    noisy_inputs: Any = None
 
     def __init__(
         self,
@@ -115,6 +118,7 @@ class TermBuilder:
         likelihood: LikelihoodLike = None,
         outcome_transform: Outcomes = DEFAULT,
         input_transform: InputTransform | None = None,
+        train_Xvar: ArrayLike | float | Sequence[float] = None,
     ) -> TermBuilder:
         r"""The builder of the terms of :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`.
 
@@ -136,6 +140,12 @@ class TermBuilder:
             link = Logit.of(outcome_transform)
         if link is not None:
             data, outcome_transform = link.of_data(data), DEFAULT
+        noisy: Any = None
+        if train_Xvar is not None:
+            from gpadjust.models.noisy_inputs import NoisyInputs
+
+            noisy = NoisyInputs.of(train_Xvar, data)
+            data = data._replace(X=noisy.points)
         transform = input_transform
         if physics is not None:
             physics = as_physics(physics)
@@ -168,6 +178,8 @@ class TermBuilder:
             units = estimated(outcome_transform, data.Y, X)
         make = cls(data, transform, units, d, likelihood)
         make.link = link
+        if noisy is not None:
+            make.noisy_inputs, make.sources = noisy, [noisy]
         make.f, make._means, make._centers = f, means, [_center(center, v) for v in f]
         make._learns_mean = rho_mean == "learn" or (rho_mean is None and k > 1)
         make._learns_center = isinstance(center, str) and center == "learn"

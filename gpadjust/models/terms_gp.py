@@ -20,6 +20,7 @@ from gpytorch.models import ExactGP
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
+from torch.nn.functional import pad
 
 import gpadjust
 from gpadjust.checks import checked_whole
@@ -117,6 +118,7 @@ class TermsGP(TermsModel, SingleTaskGP):
             )
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
+        self.noisy_inputs = made.noisy_inputs
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
@@ -244,14 +246,24 @@ class TermsGP(TermsModel, SingleTaskGP):
         noise = None if noise is None else self.outputs_last(noise * scale.square())
         if noise is not None and self.link is not None:
             noise = noise / (2 * self.link.log_slope(targets)).exp().nan_to_num(nan=1.0)
+        given: Tensor | None = None
+        if self.noisy_inputs is not None:
+            inputs, _ = self.measured_rows(inputs)
+            given = self.noisy_inputs.variances
+            given = pad(given, (0, 0, 0, inputs.shape[-2] - len(given)))
         if self.num_samples is not None:
             inputs, targets = inputs[0], targets[0]
             if noise is not None and noise.shape != targets.shape:  # of later observations, too
                 noise = noise[0]
-        return {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
+        found = {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
+        return found if given is None else {**found, "train_Xvar": given}
 
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
         """Raw training inputs without what the model added to them, and the user's rows of them."""
+        own = None if self.noisy_inputs is None else self.noisy_inputs.measured
+        if own is not None and inputs.shape[-1] == own.shape[-1]:  # raw ones
+            later = inputs[..., len(own) :, :]
+            inputs = torch.cat([own.expand(*inputs.shape[:-2], *own.shape), later], dim=-2)
         return inputs, slice(None)
 
     def trend_inputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -348,7 +360,11 @@ class TermsGP(TermsModel, SingleTaskGP):
             self.hold_samples(samples)
         elif self.has_unknowns and self.num_samples is None:
             self.train()  # for inputs to be transformed again, with what is loaded
+        before = self.measured_targets()
         keys = super().load_state_dict(state_dict, strict, *args, **kwargs)
+        if self.noisy_inputs is not None:  # of which a fit moves the targets
+            self.train_targets = self.train_targets + before - self.measured_targets()
+            self.prediction_strategy = None
         self.was_fitted = True
         if self.num_samples is not None:
             transform_training_inputs(self)
@@ -377,6 +393,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         subset.output_names = tuple(self.output_names[i] for i in idcs)
         if m > 1:
             subset.local_errors = self.local_errors.of_outputs(idcs)
+            if self.noisy_inputs is not None:
+                old, subset.noisy_inputs = subset.noisy_inputs, self.noisy_inputs.of_outputs(idcs)
+                rows: Any = subset.noise.rows
+                rows.sources = [subset.noisy_inputs if s is old else s for s in rows.sources]
         match_parameters(subset)
         return subset
 

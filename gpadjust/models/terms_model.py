@@ -15,6 +15,7 @@ from botorch.utils.datasets import SupervisedDataset
 from gpytorch.settings import detach_test_caches
 from torch import Tensor
 from torch.nn import Module
+from torch.nn.functional import pad
 
 from gpadjust.checks import check_level, checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
@@ -71,7 +72,7 @@ class TermsModel(PredictiveModel):
     """
 
     not_sampled: ClassVar[str] = ""
-    data_arguments: ClassVar[tuple[str, ...]] = ("train_X", "train_Y", "train_Yvar")
+    data_arguments: ClassVar[tuple[str, ...]] = ("train_X", "train_Y", "train_Yvar", "train_Xvar")
     covar_module: SumOfTerms
     input_transform: Any
     likelihood: Any
@@ -467,10 +468,21 @@ class TermsModel(PredictiveModel):
         shift = shift if unit is Unit.TARGET else torch.zeros_like(shift)
         return shift, torch.ones_like(scale) if unit is Unit.NONE else scale
 
+    def measured_targets(self) -> Tensor:
+        """Targets as they were measured, in the model's units, ``... x (m) x n``.
+
+        Those of ``train_targets`` are without what the noise of inputs adds to their mean.
+        """
+        noisy = getattr(self, "noisy_inputs", None)
+        if noisy is None:
+            return self.train_targets
+        later = self.train_targets.shape[-1] - noisy.shift.shape[-1]
+        return self.train_targets + pad(noisy.shift, (0, later))
+
     def user_targets(self) -> Tensor:
         """Targets in the user's units, ``... x n x m``."""
         shift, scale = self.units()
-        targets = self.outputs_last(self.train_targets * scale + shift)
+        targets = self.outputs_last(self.measured_targets() * scale + shift)
         return targets if self.link is None else self.link.inverse(targets)
 
     def outputs_last(self, values: Tensor) -> Tensor:

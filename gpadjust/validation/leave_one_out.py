@@ -150,9 +150,10 @@ def leave_one_out(
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
         mean, variance = model.left_out() if isinstance(model, TermsGP) else _targets(model)
-        Y, mean, variance = (
-            _outputs_last(model, t)[..., rows, :] for t in (model.train_targets, mean, variance)
-        )
+        targets = model.train_targets
+        if isinstance(model, TermsGP):
+            targets, mean = model.measured_targets(), mean + model.measured_targets() - targets
+        Y, mean, variance = (_outputs_last(model, t)[..., rows, :] for t in (targets, mean, variance))
         # A missing observation is predicted from all that there are, but not compared.
         missing, link, own_pit = Y.isnan(), getattr(model, "link", None), None
         mean, variance = mean.masked_fill(missing, 0.0), variance.masked_fill(missing, 1.0)
@@ -235,7 +236,8 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
         return data["train_X"], data["train_Y"]
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
-        Y = _outputs_last(model, model.train_targets)
+        targets = model.measured_targets() if isinstance(model, TermsGP) else model.train_targets
+        Y = _outputs_last(model, targets)
         transform = getattr(model, "outcome_transform", None)
         Y = Y if transform is None else transform.untransform(Y)[0]
     X, Y = X[..., rows, :], Y[..., rows, :]
