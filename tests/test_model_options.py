@@ -36,6 +36,8 @@ KINDS = {
         {"outcome_transform": None},
         lambda model: getattr(model, "outcome_transform", None) is None,
     ),
+    "positive outputs": ({"outcome_transform": "log"}, lambda model: "log" in model.link.formula),
+    "bounded outputs": ({"outcome_transform": (0.0, 9.0)}, lambda model: "9" in model.link.formula),
 }
 QUICK = {"num_starts": 1, "num_screened": 8}
 MAP = {"method": "map", **QUICK}

@@ -149,6 +149,14 @@ def fit(
     up to 1,000 of its observations, and what it finds goes on by the evidence lower bound. The
     inducing points, the distribution there, and the sizes of ``rest`` and noise are found with it.
 
+    *What others taught* (``prior=``): fitted models of other machines of the same kind, of the same
+    class, inputs and outputs. Each term is then the sum of theirs and of a difference; of several
+    the spread between them says how much machines differ, and in which directions. Lengthscales and
+    noise have priors around theirs. Whether they help has the prior probability 0.1, and by the
+    evidence of the model's own data ``result.sisters`` is what is left; so large is the share of the
+    model's samples that have them, the others are those of a fit without. (``"map"`` takes the
+    likelier one.) The model keeps what it needs of the others.
+
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
     Small problems are computed with one thread; the user's setting is restored after.
 
@@ -218,7 +226,7 @@ def fit(
                 from gpadjust.inference.sisters import fit_with_prior
 
                 run = METHODS[method].run
-                result = fit_with_prior(model, prior, method, run, search, **own)
+                result = fit_with_prior(model, prior, run, search, **own)
             if isinstance(model, TermsGP):
                 model.was_fitted = True
                 model.eval()

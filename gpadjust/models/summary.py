@@ -9,7 +9,7 @@ from botorch.models.transforms.input import Normalize
 from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 
-from gpadjust.gp import AppendedPhysics, PhysicsInput, Unit
+from gpadjust.gp import AppendedPhysics, OffsetKernel, PhysicsInput, Unit
 from gpadjust.models.hyperparameter_samples import take_samples, uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
@@ -120,6 +120,8 @@ def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str
         limits = row.limits() if row.is_log else []
         if row.kind in ("outputscale", "scaling"):
             lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, limits)}")
+        elif isinstance(row.owner, OffsetKernel):
+            continue
         elif row.kind == "lengthscale":
             for j, (column, length) in enumerate(_columns(model, value.shape[-1], row.owner)):
                 at = _at_bound(value[..., j], [limit[..., j] for limit in limits])
@@ -131,6 +133,8 @@ def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str
 
 def _columns(model: Any, number: int, kernel: Any) -> list[tuple[str, float]]:
     """Return the names of a kernel's inputs, and a length of one in the user's units."""
+    if getattr(kernel, "names", ()):
+        return [(f" of {name}", 1.0) for name in kernel.names]
     base: Any = getattr(model, "input_transform", None)
     base, names = getattr(base, "base", base), model.input_names
     lengths = [1.0] * len(names)

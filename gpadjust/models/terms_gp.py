@@ -94,7 +94,7 @@ class TermsGP(TermsModel, SingleTaskGP):
                 stacklevel=3,
             )
         made.warn_of_physics(stacklevel=3)
-        covar_module = SumOfTerms(terms)
+        covar_module = SumOfTerms([*terms, *made.offsets()] if made.data.batches else terms)
         Y, Yvar = data.Y, data.Yvar
         noise = likelihood
         if likelihood is None and Yvar is None:
@@ -113,15 +113,17 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = (
-                made.units if made.link is None else made.link.units(made.units)
-            )
+            units, link = made.units, made.link
+            self.outcome_transform = units if link is None else link.units(units)
+            vars(self)["link"] = link  # no submodule, of which the class's None would be first
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.noisy_inputs = made.noisy_inputs
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
+        if data.levels:
+            self.remember_levels(data)
         set_initial_values(self, *made.given)
         self.was_fitted, rows = False, data.X.unique(dim=-2).shape[-2]
         known = self.noise.known
@@ -426,7 +428,8 @@ class TermsGP(TermsModel, SingleTaskGP):
                 rows or of outputs disagree, or ``noise`` is missing, negative, of another shape, or
                 given to a model that learns it.
         """
-        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        names, m = self.input_names, self.num_outputs
+        X, Y = new_observations(X, Y, names, m, self.levels, self.batches)
         X = self._new_inputs(X)
         return self.with_observations(X, Y, **kwargs)
 
@@ -501,6 +504,11 @@ class TermsGP(TermsModel, SingleTaskGP):
             raise NotImplementedError(
                 f"A {name} has rows of its own among the observations, of which a window would "
                 "forget some: take a CKA, or build the model again."
+            )
+        if self.noise.rows is not None and self.noise.rows.added.any():
+            raise NotImplementedError(
+                f"The inputs of this {name} are noisy (train_Xvar), and of new ones that is not "
+                "known: build the model again."
             )
         keep_last(self, new, forget)
 

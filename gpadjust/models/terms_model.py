@@ -21,6 +21,7 @@ from gpadjust.checks import check_level, checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.levels import coded
 from gpadjust.models.links import plain
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
@@ -29,7 +30,13 @@ from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.term_builder import ModelOptions
-from gpadjust.models.training_data import ArrayLike, as_given, check_order, to_tensor
+from gpadjust.models.training_data import (
+    ArrayLike,
+    TrainingData,
+    as_given,
+    check_order,
+    to_tensor,
+)
 from gpadjust.physics import Physics
 
 
@@ -106,6 +113,12 @@ class TermsModel(PredictiveModel):
         model.options = {n: v for n, v in every.items() if _is_plain(v)}
         model.objects = [n for n, v in every.items() if not _is_plain(v)]
         return model
+
+    def remember_levels(self, data: TrainingData) -> None:
+        """Remember the levels of categories, for a file, too."""
+        self.levels, self.batches = data.levels, tuple(data.batches)
+        self.options |= {"categorical": data.levels, "batch": list(data.batches)}
+        self.objects = [name for name in self.objects if name != "categorical"]
 
     def __repr__(self) -> str:
         return title(self)
@@ -431,7 +444,7 @@ class TermsModel(PredictiveModel):
         if self.training:
             self.eval()
         check_order(X, self.input_names)
-        X = to_tensor(X, "X")
+        X = to_tensor(coded(X, self.levels, self.batches) if self.levels else X, "X")
         d = len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:
             raise ValueError(
