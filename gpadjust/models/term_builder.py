@@ -349,6 +349,19 @@ class TermBuilder:
             )
         return term
 
+    @property
+    def means(self) -> Sequence[Tensor]:
+        """The prior mean of the rho of each physics, ``batch_shape x 1 x m`` or a number."""
+        return self._means
+
+    def prior_mean(self) -> Tensor:
+        """The sum of all physics with these at the training inputs, ``batch_shape x n x m``."""
+        return sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
+
+    def columns(self) -> Tensor:
+        """The training inputs that kernels read, ``batch_shape x n x d``."""
+        return transformed(self.data.X, self.input_transform)[..., : self.num_inputs]
+
     def noise(self) -> Likelihood | None:
         """The likelihood, after all terms are made; None for the model's own.
 

@@ -200,13 +200,37 @@ class TermsGP(TermsModel, SingleTaskGP):
 
         With :math:`\alpha = K^{-1} (y - m)` they are :math:`y_i - \alpha_i / [K^{-1}]_{ii}` and
         :math:`1 / [K^{-1}]_{ii}` (Rasmussen and Williams 2006, eqs. 5.10-5.12), in model units;
-        NaN where there is no observation.
+        NaN where there is no observation. Variances are those of an observation that is no outlier.
         """
         if self.training:
             self.eval()
         alpha, precision = self.conditioning().of_rows()
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
-        return self.train_targets - alpha * variance, variance
+        mean = self.train_targets - alpha * variance
+        if self.noise.rows is not None and self.noise.rows.outlying.any():
+            noise = self.noise.at(self.train_inputs[0])
+            outlying = self.noise.trusted(self.train_targets).isnan() & ~self.train_targets.isnan()
+            least = (variance + noise - self.noise.of_rows(noise)).maximum(noise)
+            variance = variance.where(~outlying, least)
+        return mean, variance
+
+    def outliers(self) -> Tensor:
+        """Return the probability of each observation to be an outlier, ``batch_shape x n x m``.
+
+        By the others, and by hyper-parameters that were fitted without those that are likelier
+        outliers; of a ``likelihood="heavy-tailed"``.
+
+        Raises:
+            ValueError: If the noise has no heavy tails.
+        """
+        if not self.has_heavy_tails:
+            raise ValueError(
+                "The noise of the model has no outliers; build it with likelihood='heavy-tailed'."
+            )
+        from gpadjust.models.heavy_tails import probabilities
+
+        self.eval()
+        return self.outputs_last(probabilities(self))
 
     @torch.no_grad()
     def learn_local_errors(self) -> None:
@@ -226,7 +250,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        squares = (self.train_targets - mean).square().mean(0) / variance.maximum(least).mean(0)
+        targets = self.noise.trusted(self.train_targets)
+        squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)
         found[..., rows] = squares[..., rows].nan_to_num(nan=1.0, posinf=1.0)
