@@ -159,7 +159,9 @@ def leave_one_out(
         targets = model.train_targets
         if isinstance(model, TermsGP):
             targets, mean = model.measured_targets(), mean + model.measured_targets() - targets
-        Y, mean, variance = (_outputs_last(model, t)[..., rows, :] for t in (targets, mean, variance))
+        Y, mean, variance = (
+            _outputs_last(model, t)[..., rows, :] for t in (targets, mean, variance)
+        )
         # A missing observation is predicted from all that there are, but not compared.
         missing, link, own_pit = Y.isnan(), getattr(model, "link", None), None
         mean, variance = mean.masked_fill(missing, 0.0), variance.masked_fill(missing, 1.0)
