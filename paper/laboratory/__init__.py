@@ -38,3 +38,47 @@ class Vanishing(Experiment):
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """A wrong place is of the vanishing delta alone."""
         return () if kind[0] == "misplaced" and kind[1] != "vanishing" else self.seeds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relative(Experiment):
+    """Noise that grows with an output over three decades: do intervals hold in each?"""
+
+    runs: int = 12
+    """cases of each problem"""
+    observations: int = 40
+    """training points"""
+    out: Path = Path("results/relative")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "rate": "rate: exponential",
+            "power": "power: a wrong exponent",
+            "plane": "plane: f_p lacks an input",
+        },
+        "structure": {"CKA": "CKA", "GP": "GP without physics"},
+        "noise": {"default": "one size", "relative": "relative"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outliers(Experiment):
+    """One in twenty observations is far off: errors beside those of clean data."""
+
+    runs: int = 8
+    """cases of each problem and size"""
+    out: Path = Path("results/outliers")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "wave": "wave: f_p lacks a slope",
+            "decay": "decay: a wrong rate",
+            "plane": "plane: two inputs",
+            "good": "good: f_p is 2 % off",
+            "misleading": "misleading: f_p is of no use",
+            "space": "space: three inputs",
+        },
+        "observations": {20: "20", 60: "60"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
