@@ -20,7 +20,7 @@ CHAPTERS = {
     "measuring": ("Active", "Optimisation", "Misled"),
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
-    "laboratory": ("Vanishing",),
+    "laboratory": ("Balldrop", "Drift", "Emulated", "Hints", "Sisters", "Vanishing"),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
 """Folders, and the classes of the experiments that they declare."""

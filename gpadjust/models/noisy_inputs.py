@@ -149,7 +149,10 @@ class NoisyInputs(Module):
                 step = torch.zeros_like(self.points)
                 step[:, j] = width * self.spread[:, j]
                 try:
-                    up, down = function(self.points + step) - here, function(self.points - step) - here
+                    up, down = (
+                        function(self.points + step) - here,
+                        function(self.points - step) - here,
+                    )
                     break
                 except PhysicsError:  # near the end of where f_p can be asked
                     if width == _SPREAD[-1]:

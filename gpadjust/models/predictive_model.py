@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from gpadjust.checks import check_level, checked_whole
+from gpadjust.models.levels import Levels
 from gpadjust.models.posteriors import (
     HyperparameterMixture,
     MarginalMixture,
@@ -41,16 +42,18 @@ class PredictiveModel(Model):
         num_samples: Number ``S`` of Gaussians; None for a single one.
         input_names: The names of the inputs.
         output_names: The names of the outputs.
+        levels: The levels of categorical inputs by the numbers of their columns, texts or numbers;
+            ``batches`` are the columns in which others are new levels.
+        link: The link of which :meth:`components` are, a :class:`Logit`; None without one.
     """
 
+    link: Any = None
+
+    levels: Levels = {}  # noqa: RUF012
+    batches: tuple[int, ...] = ()
     num_samples: int | None = None
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-
-    @property
-    def link(self) -> Any:
-        """The link of which :meth:`components` are, a :class:`Logit`; None without one."""
-        return getattr(getattr(self, "outcome_transform", None), "link", None)
 
     @property
     def joint_link(self) -> Any:

@@ -21,6 +21,7 @@ from gpadjust.checks import checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.levels import coded
 from gpadjust.models.links import plain
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
@@ -28,7 +29,7 @@ from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.term_builder import ModelOptions
-from gpadjust.models.training_data import ArrayLike, check_order, to_tensor
+from gpadjust.models.training_data import ArrayLike, TrainingData, check_order, to_tensor
 from gpadjust.physics import Physics
 
 _SHARED = "Unpack[ModelOptions]"  # how a constructor says that it takes these and no others
@@ -91,6 +92,12 @@ class TermsModel(PredictiveModel):
         model.objects = [n for n, v in every.items() if not _is_plain(v)]
         return model
 
+    def remember_levels(self, data: TrainingData) -> None:
+        """Remember the levels of categories, for a file, too."""
+        self.levels, self.batches = data.levels, tuple(data.batches)
+        self.options |= {"categorical": data.levels, "batch": list(data.batches)}
+        self.objects = [name for name in self.objects if name != "categorical"]
+
     def __repr__(self) -> str:
         return title(self)
 
@@ -123,6 +130,12 @@ class TermsModel(PredictiveModel):
     def noise(self) -> Noise:
         """The noise of observations."""
         return Noise(self.likelihood)
+
+    @property
+    def has_heavy_tails(self) -> bool:
+        """True if observations may be outliers."""
+        rows = self.noise.rows
+        return rows is not None and any(source.has_outliers for source in rows.sources)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -368,7 +381,7 @@ class TermsModel(PredictiveModel):
         if self.training:
             self.eval()
         check_order(X, self.input_names)
-        X = to_tensor(X, "X")
+        X = to_tensor(coded(X, self.levels, self.batches) if self.levels else X, "X")
         d = len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:
             raise ValueError(

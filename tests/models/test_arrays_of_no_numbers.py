@@ -24,7 +24,7 @@ TEXT = {
     "text as objects": ONE_TO_SIX.astype(str).astype(object),
     "one text among numbers": np.array([*ONE_TO_SIX[1:], "1.5"], dtype=object),
     "a column of text": pd.Series(ONE_TO_SIX.astype(str)),
-    "categories": pd.Series(pd.Categorical(["a", "b"] * 3)),
+    "text of each row": pd.Series(["a", "b", "c", "d", "e", "f"]),
 }
 COMPLEX = {
     "complex": ONE_TO_SIX + 1j,

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gpadjust.checks import checked_bounds, checked_tensor, checked_whole
+from gpadjust.models.levels import on_levels
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.drawing import (
     BLUE,
@@ -84,6 +85,7 @@ def plot_adjustment(
         x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
         X = base.repeat(num_points, 1)
         X[:, i] = x
+        X = on_levels(X, getattr(model, "levels", {}))
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
                 mean, half = mean_and_half_width(model.term(name, X), output, level)
@@ -143,6 +145,7 @@ def plot_adjustment_pair(
     grid = torch.meshgrid(*lines, indexing="xy")
     X = base.repeat(num_points**2, 1)
     X[:, i], X[:, j] = grid[0].flatten(), grid[1].flatten()
+    X = on_levels(X, getattr(model, "levels", {}))
     label = labels(model, "input", train_X.shape[-1])
     for row, name in zip(axes, names, strict=True):
         with torch.no_grad():
