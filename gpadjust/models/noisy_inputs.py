@@ -88,12 +88,12 @@ class NoisyInputs(Module):
                 f"(one for each input), or of the inputs' shape {tuple(X.shape)}, got "
                 f"{tuple(given.shape)}."
             )
-        check_finite("train_Xvar", given)
+        variances = given.expand(X.shape).clone()
+        check_finite("train_Xvar", variances)
         if (given < 0).any():
             raise ValueError(
                 f"Expected train_Xvar (variances) not to be negative, got {given.min():.3g}."
             )
-        variances = given.expand(X.shape).clone()
         if (bad := variances.mean(0) >= X.var(0)).logical_and(X.var(0) > 0).any():
             names = ", ".join(n for n, b in zip(data.input_names, bad.tolist(), strict=True) if b)
             raise ValueError(

@@ -204,7 +204,11 @@ class TermsGP(TermsModel, SingleTaskGP):
         """
         if self.training:
             self.eval()
-        alpha, precision = self.conditioning().of_rows()
+        conditioning = self.conditioning()
+        factors = conditioning.factors()
+        alpha, precision = factors.alpha, factors.squared_columns()
+        if conditioning.repeats is not None:
+            alpha, precision = conditioning.of_each(alpha, precision)
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
         mean = self.train_targets - alpha * variance
         if self.noise.rows is not None and self.noise.rows.outlying.any():
