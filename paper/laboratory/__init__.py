@@ -91,8 +91,8 @@ class BalldropSettings:
 class Balldrop(Experiment):
     """Drop times of three balls, and runs of a simulator: the fourth ball is predicted."""
 
-    runs: int = 1
-    """fits of each case"""
+    runs: int = 2
+    """fits of each case, by other seeds"""
     out: Path = Path("results/balldrop")
     settings: BalldropSettings = field(default_factory=BalldropSettings)
 
