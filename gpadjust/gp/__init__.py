@@ -1,5 +1,6 @@
 """The GPyTorch pieces: terms of a model, and what they are made of."""
 
+from gpadjust.gp.categories import CategoricalInput, GroupedRBFKernel, OffsetKernel
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.physics_columns import AppendedPhysics, PhysicsInput
 from gpadjust.gp.plain_gpytorch import PhysicsMean, PhysicsScaledKernel
@@ -8,6 +9,9 @@ from gpadjust.gp.vanishing_kernel import VanishingKernel
 
 __all__ = [
     "AppendedPhysics",
+    "CategoricalInput",
+    "GroupedRBFKernel",
+    "OffsetKernel",
     "OrthogonalKernel",
     "PhysicsInput",
     "PhysicsMean",

@@ -13,6 +13,7 @@ from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, RFFKernel, 
 from torch import Tensor
 from torch.nn import Module, ModuleDict, ModuleList
 
+from gpadjust.gp.categories import OffsetFeatures, OffsetKernel
 from gpadjust.gp.kernels import stationary_parts
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.term import SumOfTerms, Term, side_by_side
@@ -111,6 +112,8 @@ def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> 
     scale = kernel if isinstance(kernel, ScaleKernel) else None
     base = kernel if scale is None else scale.base_kernel
     reads_all = base.active_dims is None and kernel.active_dims is None
+    if isinstance(base, OffsetKernel):
+        return [OffsetFeatures(base, scale)]
     if isinstance(base, RFFKernel | ConstantKernel) and reads_all:
         return [KernelFeatures(base, scale)]
     try:
@@ -141,9 +144,9 @@ class SumFeatures(FeatureMap):
         return self.kernel.at(x).features(self.maps)
 
 
-def sum_features(kernel: SumOfTerms, num_features: int) -> Any:
-    """Those of :func:`term_features`, and of ``sister``, if there is one."""
-    found = term_features(kernel.terms, num_features)
+def sum_features(kernel: SumOfTerms, terms: Sequence[Term], num_features: int) -> Any:
+    """Those of :func:`term_features` of a model's terms, and of ``sister``, if there is one."""
+    found = term_features(terms, num_features)
     if kernel.sister is not None:
         found["sister"] = SisterFeatures(kernel, num_features)
     return found

@@ -130,8 +130,8 @@ class PhysicsInput(InputTransform):
             rows = outside.any(-1).flatten().nonzero().flatten().tolist()
             error = PhysicsError(
                 f"Physics {self.physics.name!r} returned {float(values[outside][0]):.4g}, expected "
-                f"values {self.link.where}, as {self.link.formula} is modelled. Correct it, or keep "
-                "it within: `lambda X: f_p(X).clamp(...)`.",
+                f"values {self.link.where}, as {self.link.formula} is modelled. Correct it, or "
+                "keep it within: `lambda X: f_p(X).clamp(...)`.",
                 rows,
             )
             error.inputs = X.expand(*values.shape[:-1], -1).reshape(-1, X.shape[-1])[rows].detach()

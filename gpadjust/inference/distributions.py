@@ -13,7 +13,7 @@ from linear_operator import to_dense
 from torch import Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp import SumOfTerms
+from gpadjust.gp import GroupedRBFKernel, SumOfTerms
 from gpadjust.gp.gaussian import LikelihoodValue, scaled
 from gpadjust.gp.kernels import Pairs, Profile, Stationary, stationary_parts
 from gpadjust.gp.noise import Noise
@@ -61,6 +61,7 @@ class _Part(NamedTuple):
         weight: Its basis at the current constant, ``... x n``, or None for 1.
         constant: The name of the constant that the basis is affine in, or None.
         slope: The derivative of the basis by it, ``... x n`` or what broadcasts to it.
+        groups: The kernel, if it has lengthscales of groups of inputs.
         error: The covariance of an error of the basis, ``... x n x n``, or None.
     """
 
@@ -71,6 +72,7 @@ class _Part(NamedTuple):
     weight: Tensor | None
     constant: str | None = None
     slope: Any = None
+    groups: GroupedRBFKernel | None = None
     error: Tensor | None = None
 
     def squares(self, weight: Tensor) -> Tensor:
@@ -115,6 +117,8 @@ class StationaryTerms:
         total: Any = self.constant
         for part in self.parts:
             lengthscale, weight = every[part.lengthscale].exp(), part.weight
+            if part.groups is not None:
+                lengthscale = part.groups.of_inputs(lengthscale)
             scale = lengthscale.new_ones(()) if part.scale is None else every[part.scale].exp()
             pairs = Stationary(lengthscale, scale, part.profile).pairs(part.x, derivatives)
             covariance = pairs.covariance
@@ -165,7 +169,10 @@ class StationaryTerms:
                     by_length, by_scale, _ = pairs.pull_back(by * part.squares(weight), None)
                 if part.lengthscale in values:
                     shape = values[part.lengthscale].shape
-                    by_length = by_length if shape[-1] > 1 else by_length.sum(-1, keepdim=True)
+                    if part.groups is not None:
+                        by_length = part.groups.of_groups(by_length)
+                    elif shape[-1] == 1:
+                        by_length = by_length.sum(-1, keepdim=True)
                     result[part.lengthscale] = by_length.reshape(shape)
                 if part.scale in values:
                     result[part.scale] = by_scale.reshape(values[part.scale].shape)
@@ -213,6 +220,8 @@ def stationary_terms(
             x, constant = centerd[..., : term.num_inputs], getattr(term.basis, "learnt", None)
             scale = None if outer is None else enter(outer.raw_outputscale)
             part = _Part(x, profile, enter(base.raw_lengthscale), scale, term.weights(inputs))
+            if isinstance(base, GroupedRBFKernel):
+                part = part._replace(groups=base)
             part = part._replace(error=errors.get(term.name))
             if constant is not None:
                 part = part._replace(constant=enter(constant), slope=term.basis.slope(inputs))

@@ -30,7 +30,7 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     """
     scaled = [term for term in model.terms if is_scaled(term)]
     rest = [term for term in model.terms if not is_scaled(term) and term.scaled_by is None]
-    is_plain = len(rest) == 1 and rest[0].basis is None and rest[0].kernel is not None
+    is_plain = bool(rest) and all(t.basis is None and t.kernel is not None for t in rest)
     if not (scaled and is_plain) or any(term.learns_mean for term in model.terms):
         return None
     centers = [term.basis for term in scaled if term.basis.learns_center]

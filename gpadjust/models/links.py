@@ -97,7 +97,8 @@ class Logit(OutcomeTransform):
         above = f"y - {self.lower:g}" if self.lower else "y"
         if math.isinf(self.upper):
             return f"log({above})"
-        return f"log(({above}) / ({self.upper:g} - y))"
+        above = f"({above})" if self.lower else above
+        return f"log({above} / ({self.upper:g} - y))"
 
     @property
     def where(self) -> str:
@@ -253,7 +254,9 @@ class LinkOfEach:
             for key, link in kinds.items():
                 index = [s for s, each in enumerate(links) if id(each) == key]
                 parts = [value[..., index, :] for value in own]
-                changed = parts if link is None else change(link, *parts)
+                changed = change(link, *parts) if link else parts
+                if link is None and change is Logit.log_slope:
+                    changed = torch.zeros_like(parts[0])
                 changed = [changed] if isinstance(changed, Tensor) else [*changed]
                 found = found or [torch.empty_like(own[0]) for _ in changed]
                 for whole, part in zip(found, changed, strict=True):
@@ -268,6 +271,10 @@ class LinkOfEach:
     def inverse(self, z: Tensor) -> Tensor:
         """The reverse of :meth:`value`."""
         return self._each(Logit.inverse, z)[0]
+
+    def log_slope(self, y: Tensor) -> Tensor:
+        """The logarithms of the links' derivatives."""
+        return self._each(Logit.log_slope, y)[0]
 
     def moments(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances in the user's units, of each component."""
@@ -313,6 +320,25 @@ class LinkedPosterior(TransformedPosterior):
         if not self.is_mixture:
             mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
         return mixture_quantile(mean, variance, float(value), self.link)
+
+    def judged(self, Y: Tensor) -> tuple[Tensor, Tensor]:
+        """The probability of less than values ``... x q x m`` at each, and their log density."""
+        mean, variance = self._posterior.mean, self._posterior.variance
+        if not self.is_mixture:
+            mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
+        Y = Y.unsqueeze(MCMC_DIM).expand_as(mean)
+        normal = torch.distributions.Normal(mean, variance.sqrt(), validate_args=False)
+        z = self.link.value(Y)
+        density = (normal.log_prob(z) + self.link.log_slope(Y)).logsumexp(MCMC_DIM)
+        return normal.cdf(z).mean(MCMC_DIM), density - math.log(mean.shape[MCMC_DIM])
+
+    @property
+    def distribution(self) -> Any:
+        """None: a NotImplementedError, as it is not normal."""
+        raise NotImplementedError(
+            "An output with a link has no normal posterior; take draws (`rsample`), `mean`, "
+            "`variance` and `quantile`, each point by itself."
+        )
 
     def _moments(self) -> tuple[Tensor, Tensor]:
         if not self.is_mixture:

@@ -112,6 +112,7 @@ class StackedGP(PredictiveModel):
         self.parts: Any = ModuleList(map(ModuleList, parts))
         self.num_samples = num_components
         self.input_names, self.output_names = first.input_names, first.output_names
+        self.levels, self.batches = first.levels, first.batches
         self._structures = [*models]
         self._made_of: dict[str, TermsGP] | None = {**models}
         # An order of components for each output, in which pairs of outputs fill a square evenly.
@@ -258,7 +259,8 @@ class StackedGP(PredictiveModel):
 
         The errors are those of :meth:`CKA.condition_on_observations`.
         """
-        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        names, m = self.input_names, self.num_outputs
+        X, Y = new_observations(X, Y, names, m, self.levels, self.batches)
         if X.dim() + Y.dim() > 4:
             raise ValueError(
                 f"Expected X of shape k x d and Y of shape k x {self.num_outputs}, got "

@@ -9,7 +9,7 @@ from botorch.models.transforms.input import Normalize
 from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 
-from gpadjust.gp import AppendedPhysics, PhysicsInput, Unit
+from gpadjust.gp import AppendedPhysics, OffsetKernel, PhysicsInput, Unit
 from gpadjust.models.hyperparameter_samples import take_samples, uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
@@ -78,7 +78,17 @@ def _lines(model: Any) -> list[str]:
         lines += _of_kernel(model, [row for row in rows if id(row.raw) in own], unit)
     noise = model.noise.at(model.train_inputs[0]).mean(-1)
     at = [_at_bound(noise, row.limits()) for row in rows if row.kind == "noise"]
-    return [*lines, f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}"]
+    if hasattr(model.likelihood, "said"):
+        constant, relative = model.likelihood.said(scale)
+        of = "f_p" if model.likelihood.weights.shape[-1] else "the mean"
+        lines.append(f"  noise: sd {_text(constant)}, and {_text(100 * relative)} % of {of}")
+    else:
+        lines.append(f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}")
+    if model.has_heavy_tails:
+        rows = (model.outliers().squeeze(-1) > 0.5).reshape(-1, model.train_targets.shape[-1])[0]
+        numbers = ", ".join(map(str, rows.nonzero().flatten().tolist()))
+        lines.append(f"  outliers: {f'rows {numbers}' if numbers else 'none'}")
+    return lines
 
 
 def _alone(model: Any) -> list[str]:
@@ -120,6 +130,8 @@ def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str
         limits = row.limits() if row.is_log else []
         if row.kind in ("outputscale", "scaling"):
             lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, limits)}")
+        elif isinstance(row.owner, OffsetKernel):
+            continue
         elif row.kind == "lengthscale":
             for j, (column, length) in enumerate(_columns(model, value.shape[-1], row.owner)):
                 at = _at_bound(value[..., j], [limit[..., j] for limit in limits])
@@ -131,6 +143,8 @@ def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str
 
 def _columns(model: Any, number: int, kernel: Any) -> list[tuple[str, float]]:
     """Return the names of a kernel's inputs, and a length of one in the user's units."""
+    if getattr(kernel, "names", ()):
+        return [(f" of {name}", 1.0) for name in kernel.names]
     base: Any = getattr(model, "input_transform", None)
     base, names = getattr(base, "base", base), model.input_names
     lengths = [1.0] * len(names)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeAlias, TypedDict
 
 import torch
@@ -18,12 +18,20 @@ from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import AppendedPhysics, PhysicsInput, Term, Unit, VanishingKernel
+from gpadjust.gp import (
+    AppendedPhysics,
+    CategoricalInput,
+    PhysicsInput,
+    Term,
+    Unit,
+    VanishingKernel,
+)
 from gpadjust.gp.gaussian import least_squares
 from gpadjust.gp.noise import Noise, RowSource
 from gpadjust.gp.physics_columns import check_one_to_one
+from gpadjust.models.levels import values_of
 from gpadjust.models.links import Logit
-from gpadjust.models.parameters import scaled_rbf
+from gpadjust.models.parameters import scaled_offsets, scaled_rbf
 from gpadjust.models.plausibility import complaint
 from gpadjust.models.training_data import (
     ArrayLike,
@@ -40,6 +48,7 @@ KernelLike: TypeAlias = Kernel | Callable[[int, Size], Kernel]
 Kernels: TypeAlias = KernelLike | Sequence[KernelLike] | None
 Means = float | Sequence[float] | Literal["learn"]
 Center = float | Tensor | Literal["mean", "learn"]
+Columns = str | int | Sequence[str | int]
 LikelihoodLike: TypeAlias = (
     Likelihood | str | Sequence[str] | Callable[["TermBuilder"], Likelihood] | None
 )
@@ -52,6 +61,9 @@ class ModelOptions(TypedDict, total=False):
     likelihood: LikelihoodLike
     outcome_transform: Outcomes
     input_transform: InputTransform | None
+    train_Xvar: ArrayLike | float | Sequence[float]
+    categorical: Columns | Mapping[str | int, Sequence[str | float]] | None
+    batch: Columns | None
 
 
 class TermBuilder:
@@ -70,9 +82,13 @@ class TermBuilder:
         given: What the user brought, whose parameters stay as they are.
         sources: What sets the noise of training rows apart between fits.
         link: That of the targets, of which data and physics are then, or None.
+        noisy_inputs: The inputs as they were measured, if with noise, or None.
+        categories: The part of the input transform that is of categories, or None.
     """
 
     link: Any = None
+    noisy_inputs: Any = None
+    categories: Any = None
 
     def __init__(
         self,
@@ -115,6 +131,9 @@ class TermBuilder:
         likelihood: LikelihoodLike = None,
         outcome_transform: Outcomes = DEFAULT,
         input_transform: InputTransform | None = None,
+        train_Xvar: ArrayLike | float | Sequence[float] = None,
+        categorical: Columns | Mapping[str | int, Sequence[str | float]] | None = None,
+        batch: Columns | None = None,
     ) -> TermBuilder:
         r"""The builder of the terms of :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`.
 
@@ -128,14 +147,26 @@ class TermBuilder:
         The arguments are those of :class:`~gpadjust.CKA`; a model without physics has None.
         """
         check_one_to_one(input_transform)
-        data = training_data(train_X, train_Y, train_Yvar)
+        data = training_data(train_X, train_Y, train_Yvar, categorical=categorical, batch=batch)
+        if data.levels:
+            input_transform = CategoricalInput(
+                values_of(data.levels),
+                data.batches,
+                data.X.shape[-1],
+                data.input_names,
+                input_transform,
+            )
         m, k, unknowns, link = data.Y.shape[-1], 0, False, None
-        if not (
-            outcome_transform is None or type(outcome_transform) in (_DefaultType, Standardize)
-        ):
+        if not isinstance(outcome_transform, _DefaultType | None):
             link = Logit.of(outcome_transform)
         if link is not None:
             data, outcome_transform = link.of_data(data), DEFAULT
+        noisy: Any = None
+        if train_Xvar is not None:
+            from gpadjust.models.noisy_inputs import NoisyInputs
+
+            noisy = NoisyInputs.of(train_Xvar, data)
+            data = data._replace(X=noisy.points)
         transform = input_transform
         if physics is not None:
             physics = as_physics(physics)
@@ -167,7 +198,9 @@ class TermBuilder:
         else:
             units = estimated(outcome_transform, data.Y, X)
         make = cls(data, transform, units, d, likelihood)
-        make.link = link
+        make.link, make.categories = link, input_transform if data.levels else None
+        if noisy is not None:
+            make.noisy_inputs, make.sources = noisy, [noisy]
         make.f, make._means, make._centers = f, means, [_center(center, v) for v in f]
         make._learns_mean = rho_mean == "learn" or (rho_mean is None and k > 1)
         make._learns_center = isinstance(center, str) and center == "learn"
@@ -205,6 +238,8 @@ class TermBuilder:
                     raise TypeError(f"Expected {whose} to be a GPyTorch kernel, got {kernel!r}.")
                 of_data = getattr(kernel, "made_for", None)  # it asks for names and units
                 made = kernel(d, shape) if of_data is None else of_data(self)
+                if self.categories is not None:
+                    made = self.categories.grouped(made)
             if made.batch_shape != shape:
                 raise ValueError(
                     f"Expected {whose} with batch_shape {tuple(shape)}, one for each output, got "
@@ -314,6 +349,19 @@ class TermBuilder:
             )
         return term
 
+    @property
+    def means(self) -> Sequence[Tensor]:
+        """The prior mean of the rho of each physics, ``batch_shape x 1 x m`` or a number."""
+        return self._means
+
+    def prior_mean(self) -> Tensor:
+        """The sum of all physics with these at the training inputs, ``batch_shape x n x m``."""
+        return sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
+
+    def columns(self) -> Tensor:
+        """The training inputs that kernels read, ``batch_shape x n x d``."""
+        return transformed(self.data.X, self.input_transform)[..., : self.num_inputs]
+
     def noise(self) -> Likelihood | None:
         """The likelihood, after all terms are made; None for the model's own.
 
@@ -337,6 +385,15 @@ class TermBuilder:
                 f"output, got {tuple(learnt.shape[:-1])}."
             )
         return likelihood
+
+    def offsets(self) -> list[Term]:
+        """The terms of batches, one for each column: its name, and an offset for each level."""
+        found = []
+        for i in self.data.batches:
+            columns = [j for j, group in enumerate(self.categories.groups) if group == i]
+            kernel = scaled_offsets(columns, self.num_inputs, self.batch_shape)
+            found.append(self.term(self.data.input_names[i], kernel))
+        return found
 
     def warn_of_physics(self, stacklevel: int) -> None:
         """Warn if the physics is obviously off at the training inputs, after all terms are made.

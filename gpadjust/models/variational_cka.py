@@ -108,7 +108,10 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         seed: int = 0,
         **options: Unpack[ModelOptions],
     ) -> None:
-        data = training_data(train_X, train_Y, train_Yvar)
+        categorical, batch = options.get("categorical"), options.get("batch")
+        data = training_data(train_X, train_Y, train_Yvar, categorical=categorical, batch=batch)
+        if data.levels:  # of all rows
+            options |= {"categorical": data.levels, "batch": [*data.batches]}
         if data.X.dim() > 2:
             raise ValueError(
                 f"Expected train_X of one data set, n x d, got shape {tuple(data.X.shape)}; make a "
@@ -145,7 +148,10 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         self.input_transform = some.input_transform
         if hasattr(some, "outcome_transform"):
             self.outcome_transform = some.outcome_transform
+        vars(self)["link"] = some.link
         self.input_names, self.output_names = data.input_names, data.output_names
+        if data.levels:
+            self.remember_levels(data)
         self._num_outputs, self._aug_batch_shape = some._num_outputs, some._aug_batch_shape
         d, zero = some.terms[-1].num_inputs, data.X.new_zeros(*self._aug_batch_shape, 1)
         kernel = scaled_rbf(d, self._aug_batch_shape).to(zero).requires_grad_(False)

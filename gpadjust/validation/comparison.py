@@ -131,6 +131,22 @@ class Comparison:
         beneath = beside(self.alone, self.left_out, [*self.table].index(output))
         return [*self.table[output], *beneath]
 
+    def to_dataframe(self) -> Any:
+        """All tables as a pandas DataFrame: a row for each output and candidate, best first.
+
+        Its columns are ``output`` and those of :class:`Candidate`; rows of a physics alone have no
+        weight. An ImportError without pandas.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError as error:
+            raise ImportError("to_dataframe() needs pandas; run `pip install pandas`.") from error
+        rows = [{"output": name, **r._asdict()} for name in self.table for r in self.rows(name)]
+        for row in rows:
+            if str(row["structure"]).startswith(ALONE):
+                row["weight"] = float("nan")
+        return DataFrame(rows)
+
     def __str__(self) -> str:
         shown = {output: self.rows(output) for output in self.table}
         width = max(len(row.structure) for rows in shown.values() for row in rows)
@@ -248,7 +264,8 @@ def compare(
     asked = known_structures(STRUCTURES if structures is None else structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
-    data = training_data(train_X, train_Y, train_Yvar)
+    categories = {name: options.get(name) for name in ("categorical", "batch")}
+    data = training_data(train_X, train_Y, train_Yvar, **categories)
     if data.X.dim() > 2:
         raise ValueError(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
