@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gpadjust.emulation import EmulatedPhysics
     from gpadjust.inference import FitResult, SampleResult, fit
     from gpadjust.models import (
         AR1,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
         Physics,
         PhysicsError,
         PhysicsWarning,
+        SubprocessPhysics,
         Unknown,
     )
     from gpadjust.validation import Comparison, compare
@@ -42,6 +44,7 @@ __all__ = [
     "BlackBoxPhysics",
     "CalibratedPhysics",
     "Comparison",
+    "EmulatedPhysics",
     "FitResult",
     "FunctionPhysics",
     "JoinedPhysics",
@@ -54,6 +57,7 @@ __all__ = [
     "SampleResult",
     "ScaleGP",
     "StackedGP",
+    "SubprocessPhysics",
     "Unknown",
     "VariationalCKA",
     "ZeroMeanGP",
@@ -69,6 +73,7 @@ _ROOMS = (
     "models",
     "inference",
     "validation",
+    "emulation",
     "gp",
     "states",
     "files",

@@ -57,7 +57,18 @@ def parser() -> ArgumentParser:
         "these names",
     )
     add("--units", metavar="a=m,y=Pa", help='units, of columns that do not say them, as "a [m]"')
-    add("--noise", metavar="0.1", help="known standard deviation of the outputs; or y=0.1,z=2")
+    add(
+        "--noise",
+        metavar="0.1",
+        help="known standard deviation of the outputs; or y=0.1,z=2; or relative, which grows with "
+        "the physics and is learnt",
+    )
+    add("--outliers", action="store_true", help="some measurements may be far off")
+    add("--input-noise", metavar="a=0.5", help="standard deviations of inputs that are noisy, too")
+    ends = report.add_mutually_exclusive_group()
+    ends.add_argument("--positive", action="store_true", help="the outputs cannot be negative")
+    ends.add_argument("--bounds", metavar="0,1", help="the outputs are between these numbers")
+    add("--categories", metavar="a,b", help="inputs that are names, not sizes: numbers or text")
     add(
         "--fit",
         choices=("compare", "bayes", "map"),

@@ -197,7 +197,7 @@ class UnknownCovariance:
 
     def __init__(self, model: TermsGP, names: tuple[str, ...] | None = None) -> None:
         conditioning = model.conditioning()
-        (self.train,) = model.train_inputs
+        (self.train,) = conditioning.train_inputs
         self.terms = [t for t in model.terms if names is None or t.name in names]
         self.constants = [term for term in self.terms if term.learns_mean]
         self.kernel = SumOfTerms(self.terms, known_means=True)
@@ -205,10 +205,11 @@ class UnknownCovariance:
         if names is None and not self.constants:
             self.factors = conditioning.factors()
             return
-        covariance = torch.diag_embed(model.noise.at(self.train))
+        targets, noise, _ = conditioning.observations()
+        covariance = torch.diag_embed(noise)
         if self.has_kernel:
             covariance = covariance + self.kernel.forward(self.train, self.train)
-        self.factors = Factors.of(covariance, model.train_targets)
+        self.factors = Factors.of(covariance, targets)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Return ``... x q x q`` without noise, at transformed inputs ``... x q x d``."""

@@ -104,6 +104,21 @@ class CsvColumns:
                 self._refuse(line, column, "a text", "")
         return texts
 
+    def categories(self, name: str) -> tuple[Tensor, tuple[float, ...] | tuple[str, ...]]:
+        """The categories of a column: numbers, ``N``, and the levels, sorted.
+
+        Where a field is no number the levels are the texts, and the numbers are theirs, from 0.
+
+        Raises:
+            ValueError: If there is no such column, or several, or a field is empty.
+        """
+        texts = self.texts(name)
+        values = [self._number(text) for text in texts]
+        if all(map(math.isfinite, values)):
+            return torch.tensor(values, dtype=torch.float64), tuple(sorted({*values}))
+        levels = tuple(sorted({*texts}))
+        return torch.tensor([levels.index(t) for t in texts], dtype=torch.float64), levels
+
     def numbers(self, name: str, *, may_miss: bool = False) -> Tensor:
         """The numbers of a column, ``N``, in float64.
 

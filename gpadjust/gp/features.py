@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -12,8 +13,11 @@ from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, RFFKernel, 
 from torch import Tensor
 from torch.nn import Module, ModuleDict, ModuleList
 
+from gpadjust.gp.categories import OffsetFeatures, OffsetKernel
+from gpadjust.gp.kernels import stationary_parts
 from gpadjust.gp.orthogonal_kernel import OrthogonalKernel
 from gpadjust.gp.term import SumOfTerms, Term, side_by_side
+from gpadjust.gp.vanishing_kernel import VanishingKernel
 
 
 class TermFeatures(Module):
@@ -76,18 +80,40 @@ class OrthogonalFeatures(Module):
         return side_by_side([each(x) for each in self.maps])
 
 
+class VanishingFeatures(Module):
+    """The features of a ``VanishingKernel``: those of its base kernel, less what they are there."""
+
+    def __init__(self, kernel: VanishingKernel, maps: Sequence[Module]) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.maps = ModuleList(maps)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return ``... x n x D``."""
+        weights = self.kernel.weights(x).movedim(-1, 0).unsqueeze(-1)  # p x ... x n x 1
+        there = side_by_side([each(self.kernel.moved(x)) for each in self.maps])
+        return side_by_side([each(x) for each in self.maps]) - (weights * there).sum(0)
+
+
 def _feature_maps(kernel: Kernel | None, num_inputs: int, num_features: int) -> list[Module]:
     """The feature maps of a kernel, whose features side by side are those of the kernel."""
     if kernel is None:
         return []
     if isinstance(kernel, AdditiveKernel) and kernel.active_dims is None:
         return [m for part in kernel.kernels for m in _feature_maps(part, num_inputs, num_features)]
+    if hasattr(kernel, "features"):
+        return [kernel.features(num_features)]
     if isinstance(kernel, OrthogonalKernel):
         free = _feature_maps(kernel.base_kernel, num_inputs, num_features)
         return [OrthogonalFeatures(kernel, free)] if kernel.directions.shape[-1] else free
+    if isinstance(kernel, VanishingKernel):
+        free = _feature_maps(kernel.base_kernel, num_inputs, num_features)
+        return [VanishingFeatures(kernel, free)]
     scale = kernel if isinstance(kernel, ScaleKernel) else None
     base = kernel if scale is None else scale.base_kernel
     reads_all = base.active_dims is None and kernel.active_dims is None
+    if isinstance(base, OffsetKernel):
+        return [OffsetFeatures(base, scale)]
     if isinstance(base, RFFKernel | ConstantKernel) and reads_all:
         return [KernelFeatures(base, scale)]
     try:
@@ -118,9 +144,35 @@ class SumFeatures(FeatureMap):
         return self.kernel.at(x).features(self.maps)
 
 
+def sum_features(kernel: SumOfTerms, terms: Sequence[Term], num_features: int) -> Any:
+    """Those of :func:`term_features` of a model's terms, and of ``sister``, if there is one."""
+    found = term_features(terms, num_features)
+    if kernel.sister is not None:
+        found["sister"] = SisterFeatures(kernel, num_features)
+    return found
+
+
 def term_features(terms: Sequence[Term], num_features: int) -> Any:
     """Random features of terms, by their names; see :class:`TermFeatures`."""
     return ModuleDict({term.name: TermFeatures(term, num_features) for term in terms})
+
+
+class SisterFeatures(Module):
+    """Random features of what other machines taught a sum of terms."""
+
+    def __init__(self, kernel: SumOfTerms, num_features: int) -> None:
+        super().__init__()
+        terms = [term for term in kernel.terms if term.kernel is not None]
+        forms = kernel.sister.forms([term.form.profile for term in terms])
+        maps: list[Module] = []
+        for term, form in zip(terms, forms, strict=True) if num_features else ():
+            own = deepcopy(term.kernel)
+            base, outer, _ = stationary_parts(own, term.num_inputs) or (own, None, None)
+            base.lengthscale, outer.outputscale = form.lengthscale, form.scale
+            maps += _feature_maps(own, term.num_inputs, num_features)
+        self.maps = ModuleList(maps)
+        size = kernel.sister.root.shape[-1] + len(maps) * num_features
+        self.num_features = size if num_features else 0
 
 
 @GenKernelFeatures.register(SumOfTerms)  # type: ignore[untyped-decorator, unused-ignore]

@@ -2,15 +2,76 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from gpytorch.distributions import MultivariateNormal
 from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, GaussianLikelihood
 from gpytorch.likelihoods.noise_models import _HomoskedasticNoiseBase
 from linear_operator.operators import DiagLinearOperator
-from torch import Tensor
-from torch.nn import Parameter
+from torch import Size, Tensor
+from torch.nn import Module, Parameter
+from torch.nn.functional import pad
+
+_OUTLYING = 1e3  # times the variance of a new observation: a row that hardly counts
+
+
+class RowSource:
+    """A reason why the noise of training rows differs from that of new observations there."""
+
+    has_outliers: ClassVar[bool] = False
+
+    def refine(self, model: Any, rows: RowNoise) -> bool:
+        """Set ``rows`` by what a model shows after a rough fit; return whether to fit again."""
+        return False
+
+    def confirm(self, model: Any, rows: RowNoise) -> bool:
+        """The same after the fit that was asked for, which is made once more at most."""
+        return False
+
+
+class RowNoise(Module):
+    """The noise of the training rows, beside that of new observations at their inputs.
+
+    A submodule ``rows`` of any likelihood. Rows that came later than the training data have the
+    noise of new observations.
+
+    Args:
+        sources: The reasons, which set ``factors`` or ``added`` between fits.
+        shape: ``batch_shape x (m) x n``.
+
+    Attributes:
+        factors: Multiples of the variance of each training target, of this shape (of a model that
+            holds samples ``S x`` it).
+        added: What is added to the variances after that, in the square of the model's units.
+    """
+
+    factors: Tensor
+    added: Tensor
+
+    def __init__(self, sources: Sequence[RowSource], shape: Size) -> None:
+        super().__init__()
+        self.sources = sources
+        self.register_buffer("factors", torch.ones(shape, dtype=torch.float64))
+        self.register_buffer("added", torch.zeros(shape, dtype=torch.float64))
+
+    @property
+    def outlying(self) -> Tensor:
+        """Mask of the rows that hardly count, outliers, of the shape of ``factors``."""
+        return self.factors > _OUTLYING
+
+    def forget(self) -> None:
+        """Let training rows have the noise of new observations."""
+        self.factors, self.added = torch.ones_like(self.factors), torch.zeros_like(self.added)
+
+    def refine(self, model: Any) -> bool:
+        """Let each source set the noise of rows after a rough fit; return whether to fit again."""
+        return sum(source.refine(model, self) for source in self.sources) > 0
+
+    def confirm(self, model: Any) -> bool:
+        """The same after the fit that was asked for."""
+        return sum(source.confirm(model, self) for source in self.sources) > 0
 
 
 class Noise(NamedTuple):
@@ -63,6 +124,50 @@ class Noise(NamedTuple):
         silent = MultivariateNormal(nothing, DiagLinearOperator(nothing))
         noisy = self.likelihood(silent, [inputs], **given)
         return noisy.lazy_covariance_matrix.diagonal(dim1=-1, dim2=-2)
+
+    @property
+    def rows(self) -> RowNoise | None:
+        """What tells the training rows from new observations, or None."""
+        rows: RowNoise | None = getattr(self.likelihood, "rows", None)
+        return rows
+
+    def of_rows(self, variances: Tensor, kept: Any = slice(None)) -> Tensor:
+        """The variances of training targets (those ``kept``) and of targets that came later.
+
+        Args:
+            variances: Those of new observations there, ``... x n``.
+            kept: Which rows of the training data these are.
+        """
+        if self.rows is None:
+            return variances
+        factors, added = self.rows.factors[..., kept], self.rows.added[..., kept]
+        later = (0, variances.shape[-1] - factors.shape[-1])
+        return variances * pad(factors, later, value=1.0) + pad(added, later)
+
+    def trusted(self, values: Tensor) -> Tensor:
+        """Values at the training rows, ``... x (m) x n``, with NaN at outliers."""
+        if self.rows is None or not self.rows.outlying.any():
+            return values
+        later = (0, values.shape[-1] - self.rows.factors.shape[-1])
+        return values.masked_fill(pad(self.rows.outlying, later), torch.nan)
+
+    def shares(
+        self, inputs: Tensor, kept: Any = slice(None)
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """The shares of learnt variances in those of training targets, and what is added to them.
+
+        Args:
+            inputs: Transformed training inputs, or some rows of them, ``... x n x d``.
+            kept: Which rows these are.
+
+        Returns:
+            ``... x n x K``, None for one variance in full; and ``... x n``, None for nothing.
+        """
+        selection = self.selection(inputs)
+        if self.rows is None:
+            return selection, None
+        factors = self.rows.factors[..., kept].unsqueeze(-1)
+        return factors if selection is None else selection * factors, self.rows.added[..., kept]
 
     def typical(self, observed: Tensor) -> Tensor:
         """The mean of the given variances of observations, ``... x n`` booleans: ``... x 1``."""

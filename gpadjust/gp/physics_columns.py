@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gpadjust.gp.kernels import Batched
-from gpadjust.physics import Physics
+from gpadjust.physics import Physics, PhysicsError
 
 
 class PhysicsInput(InputTransform):
@@ -19,13 +19,16 @@ class PhysicsInput(InputTransform):
 
     The physics sees the user's raw ``X``, once; the user's own input transform (``Normalize``, say)
     acts on the other columns. What bypasses a model's ``forward`` in BoTorch is then right, too.
+    Before an f_p that is emulated are columns for the kernel of its error: ``X``, and parameters.
 
     Args:
         physics: The physics f_p, ``... x n x d`` to ``... x n x k``; of several, side by side.
         num_inputs: Number ``d`` of raw input columns.
         base: The user's input transform, or none.
+        link: A link of the outputs, through which f_p goes (``gpadjust.models.Logit``), or none.
 
     Attributes:
+        num_of_error: The number of columns for the kernel of an error of f_p, if it is emulated.
         coordinates: Those of the unknown parameters of the physics, if any, ``(S) x p``. The
             guesses at first.
         draws: Draws from what is known of them, ``K x p``, in their units; likewise.
@@ -36,11 +39,16 @@ class PhysicsInput(InputTransform):
     transform_on_train = transform_on_eval = transform_on_fantasize = True
 
     def __init__(
-        self, physics: Physics, num_inputs: int, base: InputTransform | None = None
+        self,
+        physics: Physics,
+        num_inputs: int,
+        base: InputTransform | None = None,
+        link: Any = None,
     ) -> None:
         super().__init__()
         check_one_to_one(base)
-        self.physics, self.num_inputs, self.base = physics, num_inputs, base
+        self.physics, self.num_inputs, self.base, self.link = physics, num_inputs, base, link
+        self.num_of_error = (num_inputs + len(physics.unknowns)) * physics.is_emulated
         if unknowns := physics.unknowns:
             start = unknowns.coordinates(unknowns.guess)
             self.register_parameter("coordinates", Parameter(start, requires_grad=False))
@@ -48,29 +56,45 @@ class PhysicsInput(InputTransform):
 
     def transform(self, X: Tensor) -> Tensor:
         """Map raw ``X`` (``... x n x d``) to ``... x n x (d' + k)``."""
-        return appended(self.base, X, self.values(X))
+        f_p = self.values(X)
+        return appended(self.base, X, self._of_error(X, f_p) if self.num_of_error else f_p)
 
     def preprocess_transform(self, X: Tensor) -> Tensor:
         """Return :meth:`transform` with the preprocessing of the base transform."""
-        return appended(self.base, X, self.values(X), preprocess=True)
+        f_p = self.values(X)
+        columns = self._of_error(X, f_p) if self.num_of_error else f_p
+        return appended(self.base, X, columns, preprocess=True)
 
     def values(self, X: Tensor) -> Tensor:
         """Outputs of the physics, ``... x n x k``, by what was learnt of its parameters."""
         self._check(X)
         unknowns = self.physics.unknowns
         values: Tensor = self.physics(X, *([unknowns.at(self.coordinates)] if unknowns else []))
-        return values
+        return values if self.link is None else self._linked(X, values)
+
+    def _of_error(self, X: Tensor, f_p: Tensor, theta: Tensor | None = None) -> Tensor:
+        """Columns of f_p, ``... x n x k``, behind those for the kernel of its error."""
+        unknowns = self.physics.unknowns
+        if unknowns and theta is None:
+            theta = unknowns.at(self.coordinates)
+        parts = [X, *([] if theta is None else [theta.unsqueeze(-2)]), f_p]
+        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*shape, -1) for part in parts], dim=-1)
 
     def at(self, X: Tensor, coordinates: Tensor) -> Tensor:
         """Return :meth:`transform` at coordinates ``... x p``; f_p is NaN where it fails."""
-        f_p = self.physics.or_nan(X, self.physics.unknowns.at(coordinates))
-        return appended(self.base, X, f_p)
+        theta = self.physics.unknowns.at(coordinates)
+        f_p = self.physics.or_nan(X, theta)
+        if self.link is not None:
+            f_p = self.link.value(f_p).where(self.link.holds(f_p), torch.nan)
+        return appended(self.base, X, self._of_error(X, f_p, theta) if self.num_of_error else f_p)
 
     def without_physics(self, X: Tensor) -> Tensor:
         """Like :meth:`transform`, with zeros in place of f_p, which is then not evaluated."""
         self._check(X)
         # The number of outputs is known: f_p was evaluated at the training inputs.
-        return appended(self.base, X, X.new_zeros(self.physics.num_outputs or 0))
+        zeros = X.new_zeros(self.physics.num_outputs or 0)
+        return appended(self.base, X, self._of_error(X, zeros) if self.num_of_error else zeros)
 
     def remember(self, coordinates: Tensor) -> dict[str, Tensor]:
         """Remember draws of the parameters at coordinates ``K x p``; return them by their names."""
@@ -80,7 +104,8 @@ class PhysicsInput(InputTransform):
 
     def untransform(self, X: Tensor) -> Tensor:
         """Map ``... x n x (d' + k)`` back to raw ``... x n x d``."""
-        inputs = X[..., : X.shape[-1] - (self.physics.num_outputs or 0)]
+        added = (self.physics.num_outputs or 0) + self.num_of_error
+        inputs = X[..., : X.shape[-1] - added]
         return inputs if self.base is None else self.base.untransform(inputs)
 
     def equals(self, other: InputTransform) -> bool:
@@ -88,6 +113,8 @@ class PhysicsInput(InputTransform):
         if not isinstance(other, PhysicsInput) or self.physics is not other.physics:
             return False
         ours, theirs = self.base, other.base
+        if getattr(self.link, "bounds", None) != getattr(other.link, "bounds", None):
+            return False
         return ours is theirs or bool(ours and theirs and ours.equals(theirs))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
@@ -95,6 +122,22 @@ class PhysicsInput(InputTransform):
         if self.physics.unknowns and f"{prefix}draws" in state_dict:
             self.draws = torch.empty_like(state_dict[f"{prefix}draws"])
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def _linked(self, X: Tensor, values: Tensor) -> Tensor:
+        """The link of the physics' outputs; a PhysicsError where they are not within its bounds."""
+        outside = ~self.link.holds(values)
+        if outside.any():
+            rows = outside.any(-1).flatten().nonzero().flatten().tolist()
+            error = PhysicsError(
+                f"Physics {self.physics.name!r} returned {float(values[outside][0]):.4g}, expected "
+                f"values {self.link.where}, as {self.link.formula} is modelled. Correct it, or "
+                "keep it within: `lambda X: f_p(X).clamp(...)`.",
+                rows,
+            )
+            error.inputs = X.expand(*values.shape[:-1], -1).reshape(-1, X.shape[-1])[rows].detach()
+            raise error
+        linked: Tensor = self.link.value(values)
+        return linked
 
     def _check(self, X: Tensor) -> None:
         if not isinstance(X, Tensor) or X.dtype != torch.float64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -49,6 +50,8 @@ class Term(Batched):
         mean: The constant :math:`\bar g`, ``batch_shape x (m) x 1``.
         mean_variance: Its prior variance :math:`\kappa` to begin with; None if it is known.
         unit: The unit in which :meth:`~gpadjust.CKA.term` says g.
+        scaled_by: The name of another term that is the basis: that of the scaling of a physics, if
+            this term is an error of the physics, whose kernel then has no parameters.
     """
 
     basis: Any  # a module or None; it has `map_batches`, which mypy cannot know of a Module
@@ -63,9 +66,11 @@ class Term(Batched):
         mean: Tensor,
         mean_variance: Tensor | None = None,
         unit: Unit = Unit.DIFFERENCE,
+        scaled_by: str | None = None,
     ) -> None:
         super().__init__()
         self.name = name
+        self.scaled_by = scaled_by
         self.kernel = kernel
         self.num_inputs = num_inputs
         self.basis = basis
@@ -134,13 +139,18 @@ class WeightedSum:
     x: Tensor  # ... x n x (d + k)
     parts: Sequence[tuple[Term, Tensor | None]]  # the terms and their weights, ... x n, None for 1
     shift: Tensor | float = 0.0  # what the prior mean has beside that, ... x 1
+    sister: Any = None  # what other machines taught of it, in the mean and covariance
+    # Of a term that another one scales, the product counts, where both are in the sum. Its mean is
+    # zero, so that it is correlated with neither, and its covariance is a product, too.
     _prepared: dict[tuple[str, ...], ToPoints] = field(default_factory=dict, init=False)
 
     def combine(self, values: Mapping[str, Tensor]) -> Tensor:
         """Sum values of the terms by their names, ``k x ... x n``, times weights, and the shift."""
         total = torch.zeros_like(self.x[..., 0]) + self.shift
+        total = total if self.sister is None else total + self.sister.mean()
         for term, weight in self.parts:
             value = values[term.name]
+            weight = values.get(term.scaled_by or "", weight)
             total = total + (value if weight is None else weight * value)
         return total
 
@@ -152,11 +162,15 @@ class WeightedSum:
         """The prior variances, ``... x n``; ``known_means`` and ``data`` as in :meth:`cross`."""
         total, terms = torch.zeros_like(self.x[..., 0]), self._unknown(known_means)
         forms = {} if data is None else data._prepare(terms).forms
+        found: dict[str, Tensor] = {}
         for term, weight in terms:
             known = forms[term.name].variance() if term.name in forms else None
             part = term.covariance(self.x, None, True, known_means, known)
+            found[term.name] = part
+            if term.scaled_by and (mean := self._mean_of_scaling(term)) is not None:
+                part = part * (mean.square() + found.get(term.scaled_by or "", 0.0))
             total = total + (part if weight is None else part * weight.square())
-        return total
+        return total if self.sister is None else total + self.sister.covariance(self.sister, True)
 
     def covariance(self, known_means: bool = False) -> Tensor:
         """The prior covariance, ``... x n x n``."""
@@ -173,11 +187,22 @@ class WeightedSum:
         kernels = other._prepare(terms)(self.x) if is_data else {}
         points = None if other is self else other.x
         total: Tensor | None = None
+        found: dict[str, Tensor] = {}
         for term, left in terms:
             part = term.covariance(self.x, points, False, known_means, kernels.get(term.name))
+            if any(other.scaled_by == term.name for other, _ in terms):
+                found[term.name] = part.clone()  # it is scaled in place
+            if term.scaled_by:
+                means = [self._mean_of_scaling(term), other._mean_of_scaling(term)]
+                known = [mean.unsqueeze(-1) for mean in means if mean is not None]
+                both = found.get(term.scaled_by, 0.0) if len(known) > 1 else 0.0
+                part = part * (math.prod(known) + both)
             for weight, dim in ((theirs[term.name], -2), (left, -1)):
                 part = part if weight is None else scaled(part, weight.unsqueeze(dim))
             total = part if total is None else total + part
+        if self.sister is not None:
+            taught = self.sister.covariance(other.sister)
+            total = taught if total is None else total + taught
         return self.x.new_zeros(*self.x.shape[:-1], other.x.shape[-2]) if total is None else total
 
     def features(self, maps: Mapping[str, Module]) -> Tensor:
@@ -186,12 +211,20 @@ class WeightedSum:
         phi = []
         for name, each in maps.items():
             features, weight = each(self.x), weights.get(name, self.x.new_zeros(1))
+            for term, _ in self.parts:
+                if term.name == name and term.scaled_by:
+                    weight = self._mean_of_scaling(term)
             phi.append(features if weight is None else features * weight.unsqueeze(-1))
         return side_by_side(phi)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is remembered, which can be made again."""
         return {**vars(self), "_prepared": {}}
+
+    def _mean_of_scaling(self, term: Term) -> Tensor | None:
+        """The prior mean of what scales a term, ``... x 1``, if both are in the sum."""
+        means = [other.mean for other, _ in self.parts if other.name == term.scaled_by]
+        return means[0] if means else None
 
     def _unknown(self, known_means: bool) -> list[tuple[Term, Tensor | None]]:
         return [
@@ -205,7 +238,7 @@ class WeightedSum:
         if names not in self._prepared:
             forms = {t.name: t.form for t, _ in parts}
             found = {name: form for name, form in forms.items() if isinstance(form, Stationary)}
-            num_inputs = max((t.num_inputs for t, _ in parts), default=0)
+            num_inputs = max((t.num_inputs for t, _ in parts if t.name in found), default=0)
             self._prepared[names] = ToPoints(found, self.x[..., :num_inputs])
         return self._prepared[names]
 
@@ -225,6 +258,7 @@ class SumOfTerms(CompositeKernel):
     """
 
     terms: Any  # a ModuleList, of which mypy would not know that it holds terms
+    sister: Any  # what other machines taught, a gpadjust.gp.sister.Sister, or None
 
     def __init__(self, terms: Sequence[Term], known_means: bool = False) -> None:
         super().__init__()
@@ -239,6 +273,7 @@ class SumOfTerms(CompositeKernel):
             )
         self.terms = ModuleList(terms)
         self.known_means = known_means
+        self.sister = None
 
     @property
     def batch_shape(self) -> Size:
@@ -251,7 +286,14 @@ class SumOfTerms(CompositeKernel):
         shift: Any = 0.0
         for term in terms:
             shift = shift + getattr(term.basis, "moved_mean", 0.0)
-        return WeightedSum(x, [(term, term.weights(x)) for term in terms], shift)
+        return self.weighted(x, [(term, term.weights(x)) for term in terms], shift)
+
+    def weighted(
+        self, x: Tensor, parts: Sequence[tuple[Term, Tensor | None]], shift: Tensor | float
+    ) -> WeightedSum:
+        """The terms with weights of their own, see :class:`WeightedSum`."""
+        taught = None if self.sister is None else self.sister.at(x, parts, self.terms)
+        return WeightedSum(x, parts, shift, taught)
 
     def covariance(self, x: Tensor, known_means: bool = False) -> Tensor:
         """Return ``... x n x n``; see :class:`WeightedSum`."""
@@ -277,7 +319,9 @@ class SumOfTerms(CompositeKernel):
 
     def map_batches(self, change: Callable[[Any], Any]) -> Self:
         """A copy whose terms are changed along their batch dimensions."""
-        return type(self)([term.map_batches(change) for term in self.terms], self.known_means)
+        new = type(self)([term.map_batches(change) for term in self.terms], self.known_means)
+        new.sister = None if self.sister is None else self.sister.map_batches(change)
+        return new
 
 
 class TermsMean(Mean):

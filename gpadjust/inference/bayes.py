@@ -7,7 +7,7 @@ import warnings
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -73,6 +73,8 @@ class SampleResult:
             same shape; None of a model that is not weighed without it.
         num_samples: How many samples the model holds, and ``seconds`` what the fit took on the
             wall clock; :func:`~gpadjust.fit` says both.
+        sisters: Posterior probability that the models given as ``prior=`` help, of the same shape;
+            None without them. ``relevance`` is then what it is where they do not.
 
     Example:
         >>> import torch
@@ -88,6 +90,22 @@ class SampleResult:
     relevance: Tensor | None = None
     num_samples: int | None = None
     seconds: float | None = None
+    sisters: Tensor | None = None
+
+    def to_arviz(self) -> Any:
+        """The draws as ArviZ has them: a DataTree with the group ``posterior``, of one chain.
+
+        The draws are equally likely, and not in the order of a chain. An ImportError without
+        ArviZ, ``pip install "gpadjust[arviz]"``.
+        """
+        try:
+            from arviz_base import from_dict
+        except ImportError as error:
+            raise ImportError(
+                'to_arviz() needs arviz-base; run `pip install "gpadjust[arviz]"`.'
+            ) from error
+        draws = {name: each.detach().cpu().numpy()[None] for name, each in self.draws.items()}
+        return from_dict({"posterior": draws})
 
     def __repr__(self) -> str:
         """A sentence; of several outputs with their least effective size."""
@@ -100,6 +118,9 @@ class SampleResult:
         if self.relevance is not None:
             shares = ", ".join(f"{share:.2g}" for share in self.relevance.flatten().tolist())
             parts.append(f"the physics is of use with probability {shares}")
+        if self.sisters is not None:
+            shares = ", ".join(f"{share:.2g}" for share in self.sisters.flatten().tolist())
+            parts.append(f"other machines help with probability {shares}")
         if self.seconds is not None:
             parts.append(f"{self.seconds:.1f} s")
         return ", ".join(parts)
@@ -126,6 +147,8 @@ class _Draws(NamedTuple):
         """Posterior probability of this model beside one without the physics, ``B``."""
         parameters, targets = self.target.parameters, self.target.targets
         mean, *_ = self.target.distribution(parameters.unflatten(parameters.current()))
+        if self.target.repeats is not None:
+            mean = self.target.repeats.of_rows(mean)
         spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1).sqrt()
         return probability(
             self.log_evidence(),

@@ -128,6 +128,7 @@ class Calibration(Misfit):
             i for i, term in enumerate(model.terms) if isinstance(term.kernel, OrthogonalKernel)
         ]
         scaled = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
+        scaled += [term for term in model.terms if term.scaled_by is not None]
         self.moves_covariance = bool(self._orthogonal) or not all(t.is_known for t in scaled)
 
     @property

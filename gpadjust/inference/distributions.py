@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +13,7 @@ from linear_operator import to_dense
 from torch import Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp import SumOfTerms
+from gpadjust.gp import GroupedRBFKernel, SumOfTerms
 from gpadjust.gp.gaussian import LikelihoodValue, scaled
 from gpadjust.gp.kernels import Pairs, Profile, Stationary, stationary_parts
 from gpadjust.gp.noise import Noise
@@ -40,12 +40,14 @@ class Moments(NamedTuple):
         covariance: With noise, ``... x n x n``; it may be overwritten.
         basis: The bases of unknown constants that are not in these, ``... x n x q``, or None.
         pull_back: Carries derivatives of a likelihood back to the hyper-parameters, if asked for.
+        noise: The noise in the covariance, ``... x n``.
     """
 
     mean: Tensor
     covariance: Tensor
     basis: Tensor | None
     pull_back: Callable[[LikelihoodValue], Values] | None
+    noise: Tensor
 
 
 class _Part(NamedTuple):
@@ -59,6 +61,8 @@ class _Part(NamedTuple):
         weight: Its basis at the current constant, ``... x n``, or None for 1.
         constant: The name of the constant that the basis is affine in, or None.
         slope: The derivative of the basis by it, ``... x n`` or what broadcasts to it.
+        groups: The kernel, if it has lengthscales of groups of inputs.
+        error: The covariance of an error of the basis, ``... x n x n``, or None.
     """
 
     x: Tensor
@@ -68,6 +72,13 @@ class _Part(NamedTuple):
     weight: Tensor | None
     constant: str | None = None
     slope: Any = None
+    groups: GroupedRBFKernel | None = None
+    error: Tensor | None = None
+
+    def squares(self, weight: Tensor) -> Tensor:
+        """The expected products of the basis ``... x n`` at each two inputs, ``... x n x n``."""
+        products = weight.unsqueeze(-1) * weight.unsqueeze(-2)
+        return products if self.error is None else products + self.error
 
 
 @dataclass(eq=False)
@@ -75,7 +86,8 @@ class StationaryTerms:
     r"""The targets' distribution with :math:`K = \sum_t s_t B_t k_t(X / \ell_t) B_t + K_0 + S`.
 
     Each term has a stationary kernel, and a diagonal B for a basis, affine in at most one learnt
-    constant; :math:`K_0` is the covariance of random means, and S that of the noise. There is no
+    constant; :math:`K_0` is the covariance of random means and of errors of an f_p that is
+    emulated, and S that of the noise. There is no
     graph of autograd: :meth:`~gpadjust.gp.kernels.Pairs.pull_back` carries derivatives back.
 
     Args:
@@ -86,6 +98,7 @@ class StationaryTerms:
         basis: As in :class:`Moments`.
         noise: The noise variances, ``... x n``; or the name of those that are learnt.
         selection: Which of those each target has, ``... x n x K``; None for the only one.
+        added: What is added to the variances, ``... x n``, or None.
     """
 
     parts: list[_Part]
@@ -95,6 +108,7 @@ class StationaryTerms:
     basis: Tensor | None
     noise: Tensor | str
     selection: Tensor | None
+    added: Tensor | None = None
 
     def __call__(self, values: Values, derivatives: bool = False) -> Moments:
         """Moments at values by name; see :class:`Moments`."""
@@ -103,11 +117,20 @@ class StationaryTerms:
         total: Any = self.constant
         for part in self.parts:
             lengthscale, weight = every[part.lengthscale].exp(), part.weight
+            if part.groups is not None:
+                lengthscale = part.groups.of_inputs(lengthscale)
             scale = lengthscale.new_ones(()) if part.scale is None else every[part.scale].exp()
             pairs = Stationary(lengthscale, scale, part.profile).pairs(part.x, derivatives)
             covariance = pairs.covariance
             if weight is not None and part.constant is not None:
                 weight = weight + part.slope * (every[part.constant] - self.current[part.constant])
+            if weight is not None and part.error is not None:
+                squares = part.squares(weight)
+                covariance = covariance * squares
+                if part.constant is None:
+                    slope = None if pairs.slope is None else pairs.slope * squares
+                    pairs, weight = Pairs(covariance, slope, pairs.z), None
+            elif weight is not None and part.constant is not None:
                 covariance = (covariance * weight.unsqueeze(-1)).mul_(weight.unsqueeze(-2))
             elif weight is not None:  # a part of the kernel, as it stays
                 for factor in (weight.unsqueeze(-1), weight.unsqueeze(-2)):
@@ -122,6 +145,8 @@ class StationaryTerms:
             variances = every[variances].exp()
             if self.selection is not None:
                 variances = (self.selection * variances.unsqueeze(-2)).sum(-1)
+            if self.added is not None:
+                variances = variances + self.added
         if total.dim() <= variances.dim():  # only the noise is learnt
             total = total.expand(*variances.shape[:-1], *total.shape[-2:]).clone()
         elif total is found[0][0].covariance:
@@ -132,14 +157,22 @@ class StationaryTerms:
             by: Any = likelihood.by_covariance
             result: Values = {}
             if isinstance(self.noise, str) and self.noise in values:
-                by_noise = by.diagonal(dim1=-1, dim2=-2).unsqueeze(-1)
+                by_noise = by.diagonal(dim1=-1, dim2=-2)
+                if likelihood.by_noise is not None:
+                    by_noise = by_noise + likelihood.by_noise
+                by_noise = by_noise.unsqueeze(-1)
                 by_noise = by_noise if self.selection is None else by_noise * self.selection
                 result[self.noise] = values[self.noise].exp() * by_noise.sum(-2)
             for part, (pairs, weight) in zip(self.parts, found, strict=True):
                 by_length, by_scale, by_weight = pairs.pull_back(by, weight)
+                if part.error is not None and weight is not None:
+                    by_length, by_scale, _ = pairs.pull_back(by * part.squares(weight), None)
                 if part.lengthscale in values:
                     shape = values[part.lengthscale].shape
-                    by_length = by_length if shape[-1] > 1 else by_length.sum(-1, keepdim=True)
+                    if part.groups is not None:
+                        by_length = part.groups.of_groups(by_length)
+                    elif shape[-1] == 1:
+                        by_length = by_length.sum(-1, keepdim=True)
                     result[part.lengthscale] = by_length.reshape(shape)
                 if part.scale in values:
                     result[part.scale] = by_scale.reshape(values[part.scale].shape)
@@ -148,7 +181,8 @@ class StationaryTerms:
                     result[part.constant] = by_constant.reshape(values[part.constant].shape)
             return result
 
-        return Moments(self.mean, total, self.basis, pull_back if derivatives else None)
+        given = pull_back if derivatives else None
+        return Moments(self.mean, total, self.basis, given, variances)
 
 
 @torch.no_grad()
@@ -158,6 +192,8 @@ def stationary_terms(
     inputs: Tensor,
     known_noise: Tensor | None,
     random_means: bool,
+    kept: Any = slice(None),
+    share: Tensor | None = None,
 ) -> StationaryTerms | None:
     """The distribution of a model in closed form, or None if it has another form.
 
@@ -174,13 +210,19 @@ def stationary_terms(
 
     likelihood, kernel, parts = Noise(model.likelihood), model.covar_module, []
     centerd = inputs - inputs.mean(-2, keepdim=True)
-    for term in kernel.terms:
+    errors: dict[str, Tensor] = {
+        term.scaled_by: term.covariance(inputs) for term in kernel.terms if term.scaled_by
+    }
+    for term in (term for term in kernel.terms if not term.scaled_by):
         form = None if term.kernel is None else stationary_parts(term.kernel, term.num_inputs)
         if form is not None:
             base, outer, profile = form
             x, constant = centerd[..., : term.num_inputs], getattr(term.basis, "learnt", None)
             scale = None if outer is None else enter(outer.raw_outputscale)
             part = _Part(x, profile, enter(base.raw_lengthscale), scale, term.weights(inputs))
+            if isinstance(base, GroupedRBFKernel):
+                part = part._replace(groups=base)
+            part = part._replace(error=errors.get(term.name))
             if constant is not None:
                 part = part._replace(constant=enter(constant), slope=term.basis.slope(inputs))
             parts.append(part)
@@ -205,8 +247,20 @@ def stationary_terms(
         variances = [term.mean_variance for term in kernel.terms if term.learns_mean]
         root = basis * torch.stack(variances, dim=-1).sqrt()
         of_means, basis = root @ root.mT, None
-    selection = None if known_noise is not None else likelihood.selection(inputs)
-    return StationaryTerms(parts, current, mean, of_means, basis, noise, selection)
+    for term in (term for term in kernel.terms if term.name in errors):
+        square = term.mean.square() + (term.mean_variance if random_means else 0.0)
+        of_error = errors[term.name] * square.unsqueeze(-1)
+        of_means = of_error if of_means is None else of_means + of_error
+    if kernel.sister is not None:  # of which nothing is learnt
+        taught = kernel.at(inputs).sister
+        of_sister = taught.covariance(taught)
+        of_means = of_sister if of_means is None else of_means + of_sister
+    shares = (None, None) if known_noise is not None else likelihood.shares(inputs, kept)
+    selection, added = shares
+    if share is not None and known_noise is None:
+        each = share.unsqueeze(-1)
+        selection = each if selection is None else selection * each
+    return StationaryTerms(parts, current, mean, of_means, basis, noise, selection, added)
 
 
 @dataclass(eq=False)
@@ -223,6 +277,9 @@ class ByModules:
             input transform are among those that are learnt.
         known_noise: The noise variances of these inputs, if they are known.
         random_means: Whether the prior variances of unknown constants are in the covariance.
+        kept: Which rows of the training data these are.
+        share: The share of the noise of one observation that each input has, ``... x n``, if its
+            target is a mean; None for all of it.
     """
 
     model: BatchedMultiOutputGPyTorchModel
@@ -230,20 +287,23 @@ class ByModules:
     inputs: Tensor
     known_noise: Tensor | None
     random_means: bool
+    kept: Any = field(default_factory=lambda: slice(None))
+    share: Tensor | None = None
 
     def __call__(self, values: Values, derivatives: bool = False) -> Moments:
         """Moments at values by name; see :class:`Moments`."""
         if derivatives:
             values = {name: value.detach().requires_grad_() for name, value in values.items()}
         with torch.set_grad_enabled(derivatives), lazily_evaluate_kernels(False):
-            mean, covariance, basis = self.parameters.call_at(values, self._moments)
+            mean, covariance, basis, noise = self.parameters.call_at(values, self._moments)
 
         def pull_back(found: LikelihoodValue) -> Values:
             by: list[Any] = [(covariance, found.by_covariance), (mean, found.by_mean)]
             if found.by_mean is not None and found.coefficients is not None:
                 # The estimates minimise, so that no derivative goes through them.
                 by.append((basis, found.by_mean.unsqueeze(-1) * found.coefficients.unsqueeze(-2)))
-            by = [(moment, each) for moment, each in by if moment.requires_grad]
+            by.append((noise, found.by_noise))
+            by = [(m, each) for m, each in by if each is not None and m.requires_grad]
             moments, each = zip(*by, strict=True)
             slopes = torch.autograd.grad(moments, list(values.values()), each, allow_unused=True)
             return {
@@ -252,12 +312,13 @@ class ByModules:
             }
 
         if not derivatives:
-            return Moments(mean, covariance, basis, None)
+            return Moments(mean, covariance, basis, None, noise)
         fixed = None if basis is None else basis.detach()
-        return Moments(mean.detach(), covariance.detach().clone(), fixed, pull_back)
+        covariances = covariance.detach().clone()
+        return Moments(mean.detach(), covariances, fixed, pull_back, noise.detach())
 
-    def _moments(self) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Mean, covariance and basis at the model's parameters."""
+    def _moments(self) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+        """Mean, covariance, basis and noise at the model's parameters."""
         model, inputs, noise = self.model, self.inputs, self.known_noise
         if self.parameters.learns_inputs:
             inputs = model.transform_inputs(inputs)
@@ -267,7 +328,11 @@ class ByModules:
         else:
             covariance = kernel.covariance(inputs, known_means=True)
             basis = kernel.basis_of_means(inputs)
-        noise = Noise(model.likelihood).at(inputs) if noise is None else noise
+        if noise is None:
+            likelihood = Noise(model.likelihood)
+            noise = likelihood.at(inputs)
+            alone = self.share is None
+            noise = likelihood.of_rows(noise, self.kept) if alone else noise * self.share
         noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
         mean = model.mean_module(inputs).expand(noise.shape)
-        return mean, covariance + torch.diag_embed(noise), basis
+        return mean, covariance + torch.diag_embed(noise), basis, noise

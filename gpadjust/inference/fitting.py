@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
@@ -19,8 +19,10 @@ from gpadjust.gp import AppendedPhysics
 from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.calibrate import calibrate
-from gpadjust.inference.optimise import FitResult, Search, maximise
+from gpadjust.inference.optimise import FitResult, Search, maximise, optima
+from gpadjust.inference.priors import register_priors
 from gpadjust.inference.shared_kernel import fit_shared
+from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.variational_fit import fit_variational
 from gpadjust.models import ParallelPartialGP, TermsGP, VariationalCKA
 from gpadjust.models.parameters import shared_parameters
@@ -40,6 +42,7 @@ class FitOptions(TypedDict, total=False):
     seed: int
     num_samples: int | None
     num_draws: int | None
+    prior: TermsGP | Sequence[TermsGP] | None
 
 
 class Method(NamedTuple):
@@ -69,6 +72,7 @@ METHODS = {
     "bayes": Method(sample, {"num_samples": 1, "num_draws": 16}),
 }
 """All methods by name: one more is an entry, which a module of its own can make."""
+_ROUNDS = 30  # of refinements of the noise, at most
 _SEARCH = {"num_starts": 1, "num_screened": 0, "max_iterations": 1, "seed": 0}  # least values
 
 
@@ -147,6 +151,14 @@ def fit(
     up to 1,000 of its observations, and what it finds goes on by the evidence lower bound. The
     inducing points, the distribution there, and the sizes of ``rest`` and noise are found with it.
 
+    *What others taught* (``prior=``): fitted models of other machines of the same kind, of the same
+    class, inputs and outputs. Each term is then the sum of theirs and of a difference; of several
+    the spread between them says how much machines differ, and in which directions. Lengthscales and
+    noise have priors around theirs. Whether they help has the prior probability 0.1, and by the
+    evidence of the model's own data ``result.sisters`` is what is left; so large is the share of the
+    model's samples that have them, the others are those of a fit without. (``"map"`` takes the
+    likelier one.) The model keeps what it needs of the others.
+
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
     Small problems are computed with one thread; the user's setting is restored after.
 
@@ -200,6 +212,7 @@ def fit(
         )
     method = method or ("bayes" if _can_be_sampled(model) else "map")
     own: dict[str, Any] = {**options}
+    prior = own.pop("prior", None)
     check_options(method, own)
     search = Search(**{name: own.pop(name) for name in _SEARCH if name in own})
     with threads_for(model.train_targets.shape[-1]), _without_samples(model):
@@ -207,7 +220,18 @@ def fit(
             return fit_shared(model, search, method == "bayes", **own)
         try:
             begin = time.perf_counter()
-            result = METHODS[method].run(model, search, **own)
+            if isinstance(model, TermsGP) and model.noise.rows is not None:
+                _refine_noise(model, search)
+            for _ in range(2):
+                if prior is None:
+                    result = METHODS[method].run(model, search, **own)
+                else:
+                    from gpadjust.inference.sisters import fit_with_prior
+
+                    run = METHODS[method].run
+                    result = fit_with_prior(model, prior, run, search, **own)
+                if not (isinstance(model, TermsGP) and _is_unconfirmed(model)):
+                    break
             if isinstance(model, TermsGP):
                 model.was_fitted = True
                 model.eval()
@@ -218,6 +242,41 @@ def fit(
             return result
         finally:
             model.eval()
+
+
+def _refine_noise(model: TermsGP, search: Search) -> None:
+    """Bring what is said of the noise of training rows to rest, by rough fits of a copy."""
+    copy = deepcopy(model)
+    copy.noise.rows.forget()
+    search = search._replace(num_starts=4, num_screened=64)
+    if not model.has_unknowns:
+        register_priors(copy)
+    for _ in range(_ROUNDS):
+        if model.has_unknowns:
+            most_likely(copy, search)
+        else:
+            target = LogPosterior(copy)
+            vectors, values = optima(target, search)
+            target.assign(vectors[values.argmin(0), torch.arange(values.shape[1])])
+            copy.eval()
+        if not copy.noise.rows.refine(copy):
+            break
+    for own, found in (
+        (model.likelihood, copy.likelihood),
+        (model.noise.rows, copy.noise.rows),
+    ):
+        for name, buffer in found.named_buffers(recurse=False):
+            setattr(own, name, buffer)
+
+
+def _is_unconfirmed(model: TermsGP) -> bool:
+    """Return whether a fit contradicts the noise of its rows; then they are others, for another."""
+    rows = model.noise.rows
+    if rows is None or not rows.confirm(model.eval()):
+        return False
+    if model.num_samples is not None:
+        model.release_samples()
+    return True
 
 
 def check_options(method: str, options: dict[str, Any]) -> None:
@@ -274,8 +333,17 @@ def _can_be_sampled(model: Fittable) -> bool:
 @contextmanager
 def _without_samples(model: Fittable) -> Iterator[None]:
     """Let a model go of the samples that it holds; it holds them again if there is an error."""
-    if not isinstance(model, TermsGP) or model.num_samples is None:
+    if not isinstance(model, TermsGP):
         yield
+        return
+    kernel, sister = model.covar_module, model.covar_module.sister
+    if model.num_samples is None:
+        kernel.sister = None
+        try:
+            yield
+        except BaseException:
+            kernel.sister = sister
+            raise
         return
     samples = {
         name: parameter.detach().clone()
@@ -284,6 +352,7 @@ def _without_samples(model: Fittable) -> Iterator[None]:
     }
     errors = deepcopy(model.local_errors)
     model.release_samples()
+    sister, kernel.sister = kernel.sister, None
     with torch.no_grad():
         for basis in model.covar_module.modules():
             if isinstance(basis, AppendedPhysics) and basis.learnt is not None:
@@ -292,6 +361,7 @@ def _without_samples(model: Fittable) -> Iterator[None]:
         yield
     except BaseException:
         model.release_samples()
+        kernel.sister = sister
         model.hold_samples(samples)
         model.local_errors = errors
         raise

@@ -29,8 +29,8 @@ def without_physics(model: TermsGP) -> TermsGP | None:
     functions that scale a physics and one :math:`\delta`, whose priors are the default ones.
     """
     scaled = [term for term in model.terms if is_scaled(term)]
-    rest = [term for term in model.terms if not is_scaled(term)]
-    is_plain = len(rest) == 1 and rest[0].basis is None and rest[0].kernel is not None
+    rest = [term for term in model.terms if not is_scaled(term) and term.scaled_by is None]
+    is_plain = bool(rest) and all(t.basis is None and t.kernel is not None for t in rest)
     if not (scaled and is_plain) or any(term.learns_mean for term in model.terms):
         return None
     centers = [term.basis for term in scaled if term.basis.learns_center]
@@ -50,7 +50,7 @@ def without_physics(model: TermsGP) -> TermsGP | None:
             row.raw.copy_(row.to_raw(row.log_of(torch.full_like(row.raw, _NONE))))
     mean = model.train_targets.nanmean(-1, keepdim=True)
     for term in other.terms:
-        term.mean.copy_(torch.zeros_like(mean) if is_scaled(term) else mean)
+        term.mean.copy_(mean if term.name == rest[0].name else torch.zeros_like(mean))
         term.given_mean.copy_(term.mean)  # of which typical sizes are
         if is_scaled(term) and term.basis.learns_center:
             term.basis.center.zero_()  # or it would move the mean

@@ -1,6 +1,7 @@
 """The BoTorch models: the adjustments, and what they are compared with."""
 
 from gpadjust.models.ar1 import AR1
+from gpadjust.models.links import Logit
 from gpadjust.models.parallel_partial import ParallelPartialGP
 from gpadjust.models.parameters import orthogonal_rbf
 from gpadjust.models.physics_parameters import PhysicsParameters
@@ -20,6 +21,7 @@ from gpadjust.models.structures import (
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.terms_model import TermsModel
+from gpadjust.models.vanishing import vanishing_rbf
 from gpadjust.models.variational_cka import VariationalCKA
 
 __all__ = [
@@ -28,6 +30,7 @@ __all__ = [
     "RRA",
     "BiasGP",
     "CalibratedPhysics",
+    "Logit",
     "PaperRRA",
     "ParallelPartialGP",
     "PhysicsMeanGP",
@@ -45,4 +48,5 @@ __all__ = [
     "load",
     "orthogonal_rbf",
     "save",
+    "vanishing_rbf",
 ]

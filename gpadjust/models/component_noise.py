@@ -6,14 +6,12 @@ from abc import abstractmethod
 from typing import Any
 
 import torch
-from botorch.sampling.pathwise.update_strategies import GaussianUpdate
 from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.likelihoods.noise_models import MultitaskHomoskedasticNoise
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
 
 from gpadjust.models.parameters import LogInterval
-from gpadjust.models.terms_gp import TermsGP
 
 
 class ComponentNoise(_GaussianLikelihoodBase):
@@ -52,11 +50,3 @@ class ComponentNoise(_GaussianLikelihoodBase):
         inputs = params[0] if isinstance(params[0], Tensor) else params[0][0]
         noise = (self.selection(inputs) * self.noise.unsqueeze(-2)).sum(-1)
         return DiagLinearOperator(noise.expand(torch.broadcast_shapes(noise.shape, base_shape)))
-
-
-@GaussianUpdate.register(TermsGP, ComponentNoise)  # type: ignore[untyped-decorator, unused-ignore]
-def _update(model: TermsGP, likelihood: ComponentNoise, **arguments: Any) -> Any:
-    """BoTorch's pathwise update, with the noise of each point."""
-    noise = DiagLinearOperator(model.noise.at(model.train_inputs[0]))
-    update = GaussianUpdate.dispatch(type(model), _GaussianLikelihoodBase)
-    return update(model, likelihood, **{"noise_covariance": noise, **arguments})

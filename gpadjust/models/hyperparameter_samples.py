@@ -12,14 +12,28 @@ from gpytorch.likelihoods.noise_models import FixedGaussianNoise
 from torch import Size, Tensor
 from torch.nn import Parameter
 
-from gpadjust.gp import AppendedPhysics, OrthogonalKernel, Term
+from gpadjust.gp import AppendedPhysics, Term
+from gpadjust.gp.kernels import CompositeKernel
+from gpadjust.gp.noise import RowNoise
+from gpadjust.gp.sister import Sister
+from gpadjust.models.relative_noise import RelativeNoise
+from gpadjust.models.updates import UpdatedWeights
 
 HOLDS_SAMPLES = (
     "The model holds samples of its hyper-parameters; `gpadjust.fit` lets go of them, "
     "`model.release_samples()` keeps the first."
 )
 # Modules whose buffers have the batch.
-_BATCHED = (AppendedPhysics, OrthogonalKernel, RFFKernel, Term)
+_BATCHED = (
+    AppendedPhysics,
+    CompositeKernel,
+    RFFKernel,
+    RelativeNoise,
+    RowNoise,
+    Sister,
+    Term,
+    UpdatedWeights,
+)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:
@@ -108,7 +122,8 @@ def _change(model: Any, change: Callable[[Tensor], Tensor], num_samples: int | N
             shared = num_samples is not None and noise.dim() < len(of_each)
             module.noise = noise if shared else change(noise.expand(of_each))
         for name, buffer in [*module.named_buffers(recurse=False)] * isinstance(module, _BATCHED):
-            setattr(module, name, change(buffer))
+            if name != "active_dims":  # GPyTorch's, which has no batch
+                setattr(module, name, change(buffer))
         for name, parameter in [*module.named_parameters(recurse=False)]:
             if parameter.shape[: len(outputs)] == outputs:
                 new = Parameter(change(parameter), requires_grad=parameter.requires_grad)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,14 @@ from gpytorch.likelihoods import GaussianLikelihood, Likelihood
 from torch import Size, Tensor
 from torch.nn import Module, Parameter
 
-from gpadjust.gp import OrthogonalKernel, PhysicsScaledKernel, SumOfTerms, Unit
+from gpadjust.gp import (
+    GroupedRBFKernel,
+    OffsetKernel,
+    OrthogonalKernel,
+    PhysicsScaledKernel,
+    SumOfTerms,
+    Unit,
+)
 from gpadjust.gp.noise import Noise
 
 
@@ -96,6 +104,13 @@ def scaled_rbf(num_inputs: int, batch_shape: Size) -> ScaleKernel:
 def orthogonal_rbf(num_inputs: int, batch_shape: Size) -> OrthogonalKernel:
     """The same, orthogonal to what unknown parameters of the physics explain: for a delta."""
     return OrthogonalKernel(scaled_rbf(num_inputs, batch_shape))
+
+
+def scaled_offsets(columns: Sequence[int], num_inputs: int, batch_shape: Size) -> ScaleKernel:
+    """Independent offsets of the levels that some input columns stand for."""
+    own: Any = {"batch_shape": batch_shape, "lengthscale_constraint": LogInterval()}
+    base = OffsetKernel(columns, num_inputs, **own)
+    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=LogInterval())
 
 
 def learnt_noise(batch_shape: Size) -> Likelihood:
@@ -187,6 +202,7 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
         mean = kernel.at(inputs).combine({term.name: term.given_mean for term in kernel.terms})
     else:
         mean = model.mean_module(inputs)
+    targets = Noise(model.likelihood).trusted(targets)
     unit = (targets - mean).square().nanmean(-1)
     # A physics that misleads says nothing of how large functions and noise are.
     spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1)
@@ -267,6 +283,7 @@ def _enter(
     if isinstance(module, Kernel) and module.has_lengthscale:
         raw = module.raw_lengthscale
         size = ranges if raw.shape[-1] == ranges.shape[-1] else ranges.mean(-1, keepdim=True)
+        size = module.sizes(ranges) if isinstance(module, GroupedRBFKernel) else size
         found[id(raw)] = ("lengthscale", size.expand(raw.shape))
     for child in module.children():
         _enter(found, child, inputs, ranges, scale, variance, isinstance(module, ScaleKernel))

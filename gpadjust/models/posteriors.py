@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from botorch.posteriors import GPyTorchPosterior, Posterior
@@ -189,13 +190,19 @@ def mixture_moments(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     return mean.mean(MCMC_DIM), variance.mean(MCMC_DIM) + spread
 
 
-def mixture_quantile(mean: Tensor, variance: Tensor, level: float) -> Tensor:
-    """The quantile ``... x q x m`` of mixtures of Gaussians ``... x S x q x m``, by bisection."""
+def mixture_quantile(mean: Tensor, variance: Tensor, level: float, link: Any = None) -> Tensor:
+    """The quantile ``... x q x m`` of mixtures of Gaussians ``... x S x q x m``, by bisection.
+
+    With a link it is that of values whose links are such mixtures.
+    """
     sd = variance.sqrt()
     z = math.sqrt(2) * float(torch.erfinv(torch.tensor(2 * level - 1, dtype=torch.float64)))
-    low, high = (mean + z * sd).amin(MCMC_DIM), (mean + z * sd).amax(MCMC_DIM)
+    ends = mean + z * sd if link is None else link.inverse(mean + z * sd)
+    low, high = ends.amin(MCMC_DIM), ends.amax(MCMC_DIM)
     for _ in range(60 if mean.shape[MCMC_DIM] > 1 else 0):
         middle = (low + high) / 2
-        below = torch.special.ndtr((middle.unsqueeze(MCMC_DIM) - mean) / sd).mean(MCMC_DIM) < level
+        each = middle.unsqueeze(MCMC_DIM).expand_as(mean)
+        each = each if link is None else link.value(each)
+        below = torch.special.ndtr((each - mean) / sd).mean(MCMC_DIM) < level
         low, high = torch.where(below, middle, low), torch.where(below, high, middle)
     return (low + high) / 2

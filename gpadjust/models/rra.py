@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, Literal, Unpack, cast
+from typing import Any, Literal, Self, Unpack, cast
 
 import torch
 from botorch.models.transforms.input import InputTransform
@@ -16,12 +18,13 @@ from torch import Size, Tensor
 from gpadjust.checks import checked_whole
 from gpadjust.gp import WeightedSum
 from gpadjust.gp.features import term_features
-from gpadjust.models.exact_conditioning import ExactConditioning
+from gpadjust.models.exact_conditioning import ExactConditioning, Factors
 from gpadjust.models.parameters import LogInterval
 from gpadjust.models.sampled_functions import SampledFunctions, check_num_features
 from gpadjust.models.term_builder import Center, Means, ModelOptions, PhysicsLike, TermBuilder
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.training_data import ArrayLike
+from gpadjust.models.updates import NewRows, UpdatedWeights
 
 
 class WeightConditioning(ExactConditioning):
@@ -31,6 +34,8 @@ class WeightConditioning(ExactConditioning):
         super().__init__(*args)
         self.features: Any = term_features(self.kernel.terms, 2)
         self._weights: tuple[Tensor, Tensor] | None = None
+        updated = getattr(self.kernel, "updated", None)
+        self._known = None if updated is None else updated.moments()
 
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Posterior means and variances at each point by itself, ``... x q``."""
@@ -52,10 +57,47 @@ class WeightConditioning(ExactConditioning):
         return self._weights
 
     def regress(self) -> tuple[Tensor, Tensor]:
-        """Regress the targets on the features, see :func:`regression`."""
+        """Regress the targets on the features, see :func:`regression`.
+
+        After updates it is their weights that are known, and of observations those after them.
+        """
         train = self.kernel.at(self.train_inputs[0])
-        residual = self.targets - train.mean()
-        return regression(train.features(self.features), residual, self.noise.at(train.x))
+        targets, noise, _ = self.observations()
+        design, residual = train.features(self.features), targets - train.mean()
+        if self._known is None:
+            return regression(design, residual, noise)
+        mean, root, n = self._known
+        design, residual = design[..., n:, :], residual[..., n:]
+        residual = residual - (design @ mean.unsqueeze(-1)).squeeze(-1)
+        more, narrower = regression(design @ root, residual, noise[..., n:])
+        return mean + (root @ more.unsqueeze(-1)).squeeze(-1), root @ narrower
+
+    def factors(self) -> Factors:
+        """Return the factors of the observations; an error after updates, which are not kept."""
+        if self._known is not None:
+            raise RuntimeError(
+                "The RRA knows observations by `update` that it does not keep: none can be left "
+                "out, and GPyTorch's own prediction has none. Take `posterior` or `predict`; for "
+                "leave-one-out build a model of the observations that you have."
+            )
+        return super().factors()
+
+    def get_fantasy_strategy(
+        self,
+        inputs: Any,
+        targets: Tensor,
+        full_inputs: Any,
+        full_targets: Tensor,
+        *args: Any,
+        **kwargs: Any,
+    ) -> ExactConditioning:
+        """GPyTorch's hook for further observations."""
+        if self._known is None:
+            given = (inputs, targets, full_inputs, full_targets, *args)
+            return super().get_fantasy_strategy(*given, **kwargs)
+        strategy = type(self)(full_inputs[0], full_targets, self.noise.after(**kwargs), self.kernel)
+        strategy._known = self._known
+        return strategy
 
     def _push_forward(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Mean ``... x q`` and a root ``... x q x p`` of the covariance of a sum of terms."""
@@ -115,8 +157,66 @@ class RRA(TermsGP):
         make = TermBuilder.of_adjustment(
             train_X, train_Y, train_Yvar, physics, rho_mean=rho_mean, center=center, **options
         )
-        super().__init__(make, [*make.rhos(kernel), make.delta(kernel, delta_mean)])
+        rhos = make.rhos(kernel)
+        if any(term.scaled_by for term in rhos):
+            raise ValueError(
+                "The error of an emulated physics is no sum of features: take CKA, or "
+                "FunctionPhysics(physics), which takes the emulator's mean as exact."
+            )
+        super().__init__(make, [*rhos, make.delta(kernel, delta_mean)])
         self.num_features = num_features
+
+    def _take(self, new: NewRows, forget: int | None) -> None:
+        """Take new observations by a step of a Kalman filter for each, which keeps no row."""
+        if self.conditioning_class is not WeightConditioning:
+            raise NotImplementedError(
+                f"The covariance of {type(self).__name__} is not that of a posterior, so that "
+                "there is nothing to update; take RRA."
+            )
+        conditioning, kernel = self._regression(), self.covar_module
+        before = getattr(kernel, "updated", None)
+        if before is None:
+            train = self.at(self.train_inputs[0])
+            design, n = train.features(conditioning.features), self.train_targets.shape[-1]
+            before = UpdatedWeights.of_prior(self._prior_sd().shape, n, design)
+            known = self.train_targets - train.mean()
+            noise = self.noise.of_rows(self.noise.at(train.x))
+            before.observe(design, known, noise, math.inf)
+            kernel.updated = before
+        f = self.at(new.inputs)
+        noise = self.noise.at(f.x) if new.noise is None else new.noise
+        design, residual = f.features(conditioning.features), new.targets - f.mean()
+        before.observe(design, residual, noise, math.inf if forget is None else forget)
+        self.prediction_strategy = None
+
+    def train(self, mode: bool = True) -> Self:
+        """Put the model in train mode, or eval mode; after updates it is not trained."""
+        if mode:
+            self._check_no_updates()
+        return super().train(mode)
+
+    def release_samples(self) -> None:
+        """Reverse :meth:`hold_samples`, with the first sample; not after updates."""
+        self._check_no_updates()
+        super().release_samples()
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
+    ) -> Any:
+        """Load parameters, and the weights of a model that was updated."""
+        if "covar_module.updated.pull" in state_dict and not hasattr(self.covar_module, "updated"):
+            sd = self._prior_sd()
+            self.covar_module.updated = UpdatedWeights.of_prior(sd.shape, 0, sd)
+        return super().load_state_dict(state_dict, strict, *args, **kwargs)
+
+    def _check_no_updates(self) -> None:
+        updated = getattr(self.covar_module, "updated", None)
+        if updated is not None and updated.rows.any():  # none before they are loaded
+            raise RuntimeError(
+                "The RRA knows observations by `update` that it does not keep, so that its "
+                "hyper-parameters cannot be fitted to them: build a model of the observations that "
+                "you have, and fit that."
+            )
 
     def weights(self) -> MultivariateNormal:
         r"""The posterior of the weights :math:`\beta = [\beta_\rho, \beta_\delta]`.
@@ -150,6 +250,8 @@ class RRA(TermsGP):
     def pyro_model(self, X: Tensor | None = None, Y: Tensor | None = None) -> Tensor:
         r"""The regression as a Pyro model, in the user's units, for NUTS, SVI or any guide.
 
+        Of outputs with a link (``outcome_transform="log"``) it is the model of their links.
+
         Its sample sites are ``"weights"``, ``(m) x 2D`` as in :meth:`weights`, and ``"Y"``,
         ``(m) x n``. Lengthscales, prior scales and noise stand as they are in the model.
 
@@ -176,10 +278,12 @@ class RRA(TermsGP):
         self.eval()
         shift, scale = self.units()
         with torch.no_grad():
+            Y = Y if Y is None or self.link is None else self.link.value(Y)
             obs = None if Y is None else self.outputs_first(Y)
             if X is None:
                 inputs: Tensor = self.train_inputs[0]
-                noise, obs = self.noise.at(inputs), self.train_targets * scale + shift
+                noise = self.noise.of_rows(self.noise.at(inputs))
+                obs = self.train_targets * scale + shift
             else:
                 inputs = self.model_inputs(X).expand(*self._aug_batch_shape, -1, -1)
                 noise = self.observation_noise(inputs)
@@ -222,7 +326,9 @@ class PaperConditioning(WeightConditioning):
     def regress(self) -> tuple[Tensor, Tensor]:
         """The paper's mean and root of the covariance of weights."""
         design = self.kernel.at(self.train_inputs[0]).features(self.features)
-        _, root = regression(design, self.targets, torch.ones_like(design[..., 0]))
+        targets, _, means = self.observations()
+        ridge = torch.ones_like(design[..., 0]) if means is None else means.share
+        _, root = regression(design, targets, ridge)
         return super().regress()[0], root
 
 
@@ -286,7 +392,7 @@ class PaperRRA(RRA):
                 design @ design.mT + torch.eye(design.shape[-2]).to(design)
             )
             latent = precision.diagonal(dim1=-1, dim2=-2).reciprocal() - 1
-            return mean, latent + self.noise.at(train.x)
+            return mean, latent + self.noise.of_rows(self.noise.at(train.x))
 
 
 def fourier_kernel(

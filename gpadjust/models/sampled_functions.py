@@ -14,7 +14,7 @@ from torch.nn import Module, ModuleDict
 
 from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, WeightedSum
-from gpadjust.gp.features import term_features
+from gpadjust.gp.features import sum_features
 
 DRAWING = RLock()
 """Held by the thread that draws functions, as the generator is the process's."""
@@ -59,10 +59,13 @@ class SampledFunctions(Module):
     ) -> None:
         super().__init__()
         self.input_transform = deepcopy(getattr(model, "input_transform", None))
+        self.link = model.link
         self.has_outputs = model.num_outputs > 1
         self.batch_shape: Size = model.batch_shape
         # Together, as the features read the kernels of the terms.
-        self.sum, self.features = deepcopy((SumOfTerms(model.terms), features))
+        total = SumOfTerms(model.terms)
+        total.sister = model.covar_module.sister
+        self.sum, self.features = deepcopy((total, features))
         self._reached = {term.name for term in model.covar_module.terms}
         tensors = (*model.units(), weights, update, train, alpha)
         names = ("shift", "scale", "weights", "update", "points", "alpha")
@@ -78,7 +81,7 @@ class SampledFunctions(Module):
         conditioning = model.conditioning()
         (train,) = conditioning.train_inputs
         with torch.no_grad():
-            features: Any = term_features(model.terms, num_features)
+            features: Any = sum_features(model.covar_module, model.terms, num_features)
             shape = (num_functions, *model._aug_batch_shape)
             sizes = [each.num_features for each in features.values()]
             drawn = [torch.randn(*shape, size, dtype=torch.float64) for size in sizes]
@@ -95,7 +98,7 @@ class SampledFunctions(Module):
         conditioning = model.conditioning()
         with torch.no_grad():
             alpha = conditioning.mean_cache.unsqueeze(0)
-            features = term_features(model.terms, 0)
+            features = sum_features(model.covar_module, model.terms, 0)
             return cls(model, features, alpha[..., :0], conditioning.train_inputs[0], alpha)
 
     def forward(self, X: Tensor) -> Tensor:
@@ -116,6 +119,7 @@ class SampledFunctions(Module):
         X = X.unsqueeze(-3) if self.has_outputs else X
         inputs = X if self.input_transform is None else self.input_transform(X)
         values = self._values(inputs, extra) * self.scale + self.shift
+        values = values if self.link is None else self.link.inverse(values)
         return values.mT if self.has_outputs else values.unsqueeze(-1)
 
     def _values(self, inputs: Tensor, extra: int = 0, among_reached: bool = False) -> Tensor:
@@ -130,6 +134,9 @@ class SampledFunctions(Module):
             for (term, _), weights in zip(sought.parts, parts, strict=False)
         }
         total = sought.combine(values)
+        if sought.sister is not None and parts[-1].shape[-1]:
+            taught = sought.sister.features(self.features["sister"].maps)
+            total = total + _product(taught, parts[-1], extra)
         if self.points is not None:
             if self._data is None or self._data.x is not self.points:  # also after .to(device)
                 self._data = self.sum.at(self.points, self._reached)

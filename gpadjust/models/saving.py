@@ -16,6 +16,7 @@ from gpytorch.kernels import Kernel
 from gpadjust.gp import PhysicsInput
 from gpadjust.models.stacked import StackedGP
 from gpadjust.models.terms_model import TermsModel
+from gpadjust.models.training_data import with_names
 from gpadjust.physics import JoinedPhysics, Physics, PhysicsError, PhysicsWarning, as_physics
 from gpadjust.physics.import_path import import_path, physics_from_path
 
@@ -220,6 +221,7 @@ def _model(content: dict[str, Any], objects: dict[str, Any]) -> TermsModel:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # it was said when the model was built
         data = {name: value for name, value in content["data"].items() if value is not None}
+        data["train_X"] = with_names(data["train_X"], content["names"][0])  # kernels may use them
         model: TermsModel = model_class(**data, **{**content["options"], **own})
     if (found := _kernels(model)) != content["kernels"]:
         raise ValueError(

@@ -16,6 +16,7 @@ from torch.quasirandom import SobolEngine
 
 from gpadjust.checks import checked_whole
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.links import LinkOfEach
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import check_each
 from gpadjust.models.terms_gp import TermsGP
@@ -111,6 +112,7 @@ class StackedGP(PredictiveModel):
         self.parts: Any = ModuleList(map(ModuleList, parts))
         self.num_samples = num_components
         self.input_names, self.output_names = first.input_names, first.output_names
+        self.levels, self.batches = first.levels, first.batches
         self._structures = [*models]
         self._made_of: dict[str, TermsGP] | None = {**models}
         # An order of components for each output, in which pairs of outputs fill a square evenly.
@@ -169,6 +171,29 @@ class StackedGP(PredictiveModel):
         ]
         return "\n".join([repr(self), *lines])
 
+    @property
+    def link(self) -> Any:
+        """The links of :meth:`components`, if there are any."""
+        return self._links([[*range(self.num_samples)]] * self.num_outputs)
+
+    @property
+    def joint_link(self) -> Any:
+        """Those of :meth:`joint_moments`."""
+        return self._links([torch.as_tensor(order).tolist() for order in self._orders])
+
+    def _links(self, orders: list[list[int]]) -> Any:
+        links = [[p.model.link for p in parts for _ in range(p.number)] for parts in self.parts]
+        if not any(link for each in links for link in each):
+            return None
+        return LinkOfEach([[own[i] for i in o] for own, o in zip(links, orders, strict=True)])
+
+    def _check_no_link(self) -> None:
+        if self.link is not None:
+            raise ValueError(
+                "Variances as observation_noise have a meaning for each model of a mixture with "
+                "links apart; ask one of them, `stacked.made_of`, or pass True for learnt noise."
+            )
+
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances of all components, ``... x S x q x m``."""
         outputs = []
@@ -179,6 +204,7 @@ class StackedGP(PredictiveModel):
             outputs.append([torch.cat(moments, MCMC_DIM) for moments in each])
         mean, variance = (torch.cat(moments, -1) for moments in zip(*outputs, strict=True))
         if not isinstance(observation_noise, bool):
+            self._check_no_link()
             noise = given_noise(observation_noise, mean.shape[-2], self.num_outputs)
             variance = variance + noise.unsqueeze(MCMC_DIM)
         return mean, variance
@@ -195,6 +221,7 @@ class StackedGP(PredictiveModel):
         moments = zip(zip(*outputs, strict=True), (-2, -3), strict=True)
         mean, covariance = (torch.stack(each, dim) for each, dim in moments)
         if not isinstance(observation_noise, bool):
+            self._check_no_link()
             noise = given_noise(observation_noise, mean.shape[-1], self.num_outputs)
             noise = noise.mT.unsqueeze(MCMC_DIM).expand(mean.shape)
             covariance = covariance + torch.diag_embed(noise)
@@ -232,7 +259,8 @@ class StackedGP(PredictiveModel):
 
         The errors are those of :meth:`CKA.condition_on_observations`.
         """
-        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        names, m = self.input_names, self.num_outputs
+        X, Y = new_observations(X, Y, names, m, self.levels, self.batches)
         if X.dim() + Y.dim() > 4:
             raise ValueError(
                 f"Expected X of shape k x d and Y of shape k x {self.num_outputs}, got "

@@ -62,7 +62,10 @@ class CKA(TermsGP):
         likelihood: A Gaussian likelihood. Default: learnt noise, with a standard deviation of at
             least three millionths of the root mean square of ``train_Y - f_p``.
         outcome_transform: ``Standardize`` or None. Default: division by the root mean square of
-            ``train_Y - f_p``. Hyper-parameters are in the units after it.
+            ``train_Y - f_p``. Hyper-parameters are in the units after it. Or a link of bounded
+            outputs, through which f_p goes, too: ``"log"`` (BoTorch's ``Log()``) of positive ones,
+            ``"logit"`` of shares, or bounds ``(lower, upper)``, see
+            :class:`~gpadjust.models.Logit`; rho, delta and noise are then of its values.
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
 
     Warns:

@@ -9,7 +9,7 @@ from botorch.models.transforms.input import Normalize
 from botorch.models.transforms.outcome import nanstd
 from torch import Tensor
 
-from gpadjust.gp import AppendedPhysics, PhysicsInput, Unit
+from gpadjust.gp import AppendedPhysics, OffsetKernel, PhysicsInput, Unit
 from gpadjust.models.hyperparameter_samples import take_samples, uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
@@ -36,6 +36,8 @@ def summary(model: Any) -> str:
     """The text of :meth:`~gpadjust.CKA.summary`."""
     model.eval()
     lines = [title(model)]
+    if model.link is not None:
+        lines.append(f"link: terms and noise are those of {model.link.formula}")
     if model.has_unknowns:
         lines += ["parameters of the physics:", *_of_physics(model)]
     for i, name in enumerate(model.output_names):
@@ -56,6 +58,10 @@ def _lines(model: Any) -> list[str]:
     evidence, value = model.log_evidence()
     lines = [*_alone(model), f"  {evidence}" + ("" if value is None else f" {_text(value)}")]
     for term in model.terms:
+        if term.scaled_by is not None:
+            error = term.covariance(model.train_inputs[0], None, True).mean(-1).sqrt() * scale
+            lines.append(f"  {term.name} of the emulated physics: sd {_text(error)}")
+            continue
         variance = None if term.form is None else term.form.variance()
         is_left_out = isinstance(term.basis, AppendedPhysics) and not term.mean.any()
         is_left_out = is_left_out and bool(term.given_mean.any())
@@ -72,19 +78,29 @@ def _lines(model: Any) -> list[str]:
         lines += _of_kernel(model, [row for row in rows if id(row.raw) in own], unit)
     noise = model.noise.at(model.train_inputs[0]).mean(-1)
     at = [_at_bound(noise, row.limits()) for row in rows if row.kind == "noise"]
-    return [*lines, f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}"]
+    if hasattr(model.likelihood, "said"):
+        constant, relative = model.likelihood.said(scale)
+        of = "f_p" if model.likelihood.weights.shape[-1] else "the mean"
+        lines.append(f"  noise: sd {_text(constant)}, and {_text(100 * relative)} % of {of}")
+    else:
+        lines.append(f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}")
+    if model.has_heavy_tails:
+        rows = (model.outliers().squeeze(-1) > 0.5).reshape(-1, model.train_targets.shape[-1])[0]
+        numbers = ", ".join(map(str, rows.nonzero().flatten().tolist()))
+        lines.append(f"  outliers: {f'rows {numbers}' if numbers else 'none'}")
+    return lines
 
 
 def _alone(model: Any) -> list[str]:
     """Return a line on the error of each physics alone, at the observations of one output."""
-    shift, scale = model.units()
-    inputs, y = model.train_inputs[0], model.train_targets * scale + shift
+    inputs, y, link = model.train_inputs[0], model.outputs_first(model.user_targets()), model.link
     named = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
     fitted = ", with these parameters" if model.has_unknowns else ""
     lines = []
     for term in named:
         f_p = (inputs[..., term.basis.num_inputs :] * term.basis.select).sum(-1)
         f_p = f_p if model.num_samples is None else f_p.mean(0)
+        f_p = f_p if link is None else link.inverse(f_p)
         rmse = (y - f_p).square().nanmean().sqrt()
         spread = float(nanstd(y.reshape(-1, y.shape[-1]), dim=-1).mean())
         of = f" of {term.name.removeprefix('rho_')}" if len(named) > 1 else ""
@@ -114,6 +130,8 @@ def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str
         limits = row.limits() if row.is_log else []
         if row.kind in ("outputscale", "scaling"):
             lines.append(f"    sd {_text(value.sqrt() * unit)}{_at_bound(value, limits)}")
+        elif isinstance(row.owner, OffsetKernel):
+            continue
         elif row.kind == "lengthscale":
             for j, (column, length) in enumerate(_columns(model, value.shape[-1], row.owner)):
                 at = _at_bound(value[..., j], [limit[..., j] for limit in limits])
@@ -125,6 +143,8 @@ def _of_kernel(model: Any, rows: list[Hyperparameter], unit: Tensor) -> list[str
 
 def _columns(model: Any, number: int, kernel: Any) -> list[tuple[str, float]]:
     """Return the names of a kernel's inputs, and a length of one in the user's units."""
+    if getattr(kernel, "names", ()):
+        return [(f" of {name}", 1.0) for name in kernel.names]
     base: Any = getattr(model, "input_transform", None)
     base, names = getattr(base, "base", base), model.input_names
     lengths = [1.0] * len(names)

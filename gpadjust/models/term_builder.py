@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Literal, TypeAlias, TypedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, TypeAlias, TypedDict
 
 import torch
 from botorch.exceptions.errors import BotorchTensorDimensionError
 from botorch.models.gpytorch import BatchedMultiOutputGPyTorchModel
 from botorch.models.transforms.input import InputTransform
-from botorch.models.transforms.outcome import Standardize
+from botorch.models.transforms.outcome import OutcomeTransform, Standardize
 from botorch.utils.types import DEFAULT, _DefaultType
 from gpytorch.kernels import Kernel
 from gpytorch.likelihoods import Likelihood
@@ -18,11 +18,20 @@ from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from torch import Size, Tensor
 from torch.nn import Module
 
-from gpadjust.gp import AppendedPhysics, PhysicsInput, Term, Unit
+from gpadjust.gp import (
+    AppendedPhysics,
+    CategoricalInput,
+    PhysicsInput,
+    Term,
+    Unit,
+    VanishingKernel,
+)
 from gpadjust.gp.gaussian import least_squares
-from gpadjust.gp.noise import Noise
+from gpadjust.gp.noise import Noise, RowSource
 from gpadjust.gp.physics_columns import check_one_to_one
-from gpadjust.models.parameters import scaled_rbf
+from gpadjust.models.levels import values_of
+from gpadjust.models.links import Logit
+from gpadjust.models.parameters import scaled_offsets, scaled_rbf
 from gpadjust.models.plausibility import complaint
 from gpadjust.models.training_data import (
     ArrayLike,
@@ -39,14 +48,22 @@ KernelLike: TypeAlias = Kernel | Callable[[int, Size], Kernel]
 Kernels: TypeAlias = KernelLike | Sequence[KernelLike] | None
 Means = float | Sequence[float] | Literal["learn"]
 Center = float | Tensor | Literal["mean", "learn"]
+Columns = str | int | Sequence[str | int]
+LikelihoodLike: TypeAlias = (
+    Likelihood | str | Sequence[str] | Callable[["TermBuilder"], Likelihood] | None
+)
+Outcomes = OutcomeTransform | tuple[float, float] | str | _DefaultType | None
 
 
 class ModelOptions(TypedDict, total=False):
     """The arguments that all structures share, see :class:`~gpadjust.CKA`."""
 
-    likelihood: Likelihood | None
-    outcome_transform: Standardize | _DefaultType | None
+    likelihood: LikelihoodLike
+    outcome_transform: Outcomes
     input_transform: InputTransform | None
+    train_Xvar: ArrayLike | float | Sequence[float]
+    categorical: Columns | Mapping[str | int, Sequence[str | float]] | None
+    batch: Columns | None
 
 
 class TermBuilder:
@@ -57,13 +74,21 @@ class TermBuilder:
         input_transform: What makes the columns that terms read out of raw inputs, or None.
         units: Shift and scale of the targets, or None.
         num_inputs: Number ``d`` of these columns without those of the physics.
-        likelihood: The user's, or None.
+        likelihood: The user's, a function that makes it of the builder, names of ours, or None.
 
     Attributes:
         batch_shape: That of the model with its outputs last, for its kernels.
         f: Each physics at the training inputs, ``batch_shape x n x m``.
         given: What the user brought, whose parameters stay as they are.
+        sources: What sets the noise of training rows apart between fits.
+        link: That of the targets, of which data and physics are then, or None.
+        noisy_inputs: The inputs as they were measured, if with noise, or None.
+        categories: The part of the input transform that is of categories, or None.
     """
+
+    link: Any = None
+    noisy_inputs: Any = None
+    categories: Any = None
 
     def __init__(
         self,
@@ -71,31 +96,25 @@ class TermBuilder:
         input_transform: InputTransform | None,
         units: Standardize | None,
         num_inputs: int,
-        likelihood: Likelihood | None = None,
+        likelihood: LikelihoodLike = None,
     ) -> None:
-        if likelihood is not None and not isinstance(likelihood, _GaussianLikelihoodBase):
-            raise TypeError(f"Expected a Gaussian likelihood of GPyTorch, got {likelihood!r}.")
         self.data = data
         self.input_transform = input_transform
         self.units = units
         self.num_inputs = num_inputs
         self.likelihood = likelihood
         _, self.batch_shape = BatchedMultiOutputGPyTorchModel.get_batch_dimensions(data.X, data.Y)
-        learnt = None if likelihood is None else Noise(likelihood).learnt
-        if learnt is not None and learnt.shape[:-1] != self.batch_shape:
-            raise ValueError(
-                f"Expected a likelihood with batch_shape {tuple(self.batch_shape)}, one for each "
-                f"output, got {tuple(learnt.shape[:-1])}."
-            )
         m = data.Y.shape[-1]
         self._zero = torch.zeros_like(data.X[..., :1, :1]).expand(*data.X.shape[:-2], 1, m)
         self._shift = self._zero if units is None else units.means
         self._scale = self._zero + 1 if units is None else units.stdvs
         self.given: list[object] = [likelihood]
+        self.sources: list[RowSource] = []
         # Of each physics: its values, and the mean of its rho and its center, batch_shape x 1 x m.
         self.f: list[Tensor] = []
         self._means: list[Tensor] = []
         self._centers: list[Tensor] = []
+        self._rhos: list[Term] = []
         self._learns_mean = self._learns_center = self._learns_offset = False
         self._offset = 0.0
 
@@ -109,9 +128,12 @@ class TermBuilder:
         *,
         rho_mean: Means | None = None,
         center: Center = "learn",
-        likelihood: Likelihood | None = None,
-        outcome_transform: Standardize | _DefaultType | None = DEFAULT,
+        likelihood: LikelihoodLike = None,
+        outcome_transform: Outcomes = DEFAULT,
         input_transform: InputTransform | None = None,
+        train_Xvar: ArrayLike | float | Sequence[float] = None,
+        categorical: Columns | Mapping[str | int, Sequence[str | float]] | None = None,
+        batch: Columns | None = None,
     ) -> TermBuilder:
         r"""The builder of the terms of :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`.
 
@@ -125,12 +147,36 @@ class TermBuilder:
         The arguments are those of :class:`~gpadjust.CKA`; a model without physics has None.
         """
         check_one_to_one(input_transform)
-        data = training_data(train_X, train_Y, train_Yvar)
-        m, k, unknowns = data.Y.shape[-1], 0, False
+        data = training_data(train_X, train_Y, train_Yvar, categorical=categorical, batch=batch)
+        if data.levels:
+            input_transform = CategoricalInput(
+                values_of(data.levels),
+                data.batches,
+                data.X.shape[-1],
+                data.input_names,
+                input_transform,
+            )
+        m, k, unknowns, link = data.Y.shape[-1], 0, False, None
+        if not isinstance(outcome_transform, _DefaultType | None):
+            link = Logit.of(outcome_transform)
+        if link is not None:
+            data, outcome_transform = link.of_data(data), DEFAULT
+        noisy: Any = None
+        if train_Xvar is not None:
+            from gpadjust.models.noisy_inputs import NoisyInputs
+
+            noisy = NoisyInputs.of(train_Xvar, data)
+            data = data._replace(X=noisy.points)
         transform = input_transform
         if physics is not None:
             physics = as_physics(physics)
-            transform = PhysicsInput(physics, data.X.shape[-1], input_transform)
+            if link is not None and physics.is_emulated:
+                raise ValueError(
+                    "An emulated physics is uncertain in the units of its runs, which a link would "
+                    "bend: emulate g(runs_Y), build the model of g(train_Y), and leave "
+                    "outcome_transform out."
+                )
+            transform = PhysicsInput(physics, data.X.shape[-1], input_transform, link)
             k, unknowns = len(getattr(physics, "parts", [physics])), bool(physics.unknowns)
         X = transformed(data.X, transform)
         if isinstance(physics, Physics) and physics.num_outputs != k * m:
@@ -140,6 +186,7 @@ class TermBuilder:
             )
         d = X.shape[-1] - k * m
         f = [X[..., d + i * m : d + (i + 1) * m] for i in range(k)]
+        d -= getattr(transform, "num_of_error", 0)
         means = _starting_means(rho_mean, data.Y, f)
         if isinstance(outcome_transform, _DefaultType):
             mean = sum((w * v for w, v in zip(means, f, strict=True)), torch.zeros_like(data.Y))
@@ -151,6 +198,9 @@ class TermBuilder:
         else:
             units = estimated(outcome_transform, data.Y, X)
         make = cls(data, transform, units, d, likelihood)
+        make.link, make.categories = link, input_transform if data.levels else None
+        if noisy is not None:
+            make.noisy_inputs, make.sources = noisy, [noisy]
         make.f, make._means, make._centers = f, means, [_center(center, v) for v in f]
         make._learns_mean = rho_mean == "learn" or (rho_mean is None and k > 1)
         make._learns_center = isinstance(center, str) and center == "learn"
@@ -186,7 +236,10 @@ class TermBuilder:
             if made is None:
                 if isinstance(kernel, Module | type) or not callable(kernel):
                     raise TypeError(f"Expected {whose} to be a GPyTorch kernel, got {kernel!r}.")
-                made = kernel(d, shape)
+                of_data = getattr(kernel, "made_for", None)  # it asks for names and units
+                made = kernel(d, shape) if of_data is None else of_data(self)
+                if self.categories is not None:
+                    made = self.categories.grouped(made)
             if made.batch_shape != shape:
                 raise ValueError(
                     f"Expected {whose} with batch_shape {tuple(shape)}, one for each output, got "
@@ -229,7 +282,7 @@ class TermBuilder:
         several = getattr(self.input_transform.physics, "names", ())
         names = [f"rho_{name}" for name in several] if k > 1 else ["rho"]
         columns = torch.eye(k * m).to(self._zero).split(m)  # of each physics, m x (k m)
-        terms = []
+        terms, first = list[Term](), self.num_inputs + self.input_transform.num_of_error
         for i, f_p in enumerate(self.f):
             select = columns[i].unsqueeze(-2) if m > 1 else columns[i]
             select = select.expand(*self.batch_shape, 1, -1)
@@ -238,10 +291,32 @@ class TermBuilder:
                 spread = f_p.std(-2, keepdim=True)
                 rounding = 8 * torch.finfo(f_p.dtype).eps * f_p.abs().amax(-2, keepdim=True)
                 own += [spread * (spread > rounding), self._means[i]]
-            basis = AppendedPhysics(self.num_inputs, select, *map(self._of_outputs, own))
+            basis = AppendedPhysics(first, select, *map(self._of_outputs, own))
             mean, unknown = self._means[i], self._learns_mean
             terms.append(self.term(names[i], each[i], basis, mean, unknown, Unit.NONE))
-        return terms
+        self._rhos = terms
+        emulated = self.input_transform.physics.is_emulated
+        return [*terms, *self._errors(names)] if emulated else terms
+
+    def _errors(self, rhos: Sequence[str]) -> list[Term]:
+        """The terms of the errors of physics that are emulated, beside those that scale these."""
+        transform: Any = self.input_transform
+        physics = transform.physics
+        parts = getattr(physics, "parts", [physics])
+        d, unit = self.num_inputs, self._of_outputs(self._scale)
+        columns = range(d, d + transform.num_of_error)
+        return [
+            Term(
+                f"error{name.removeprefix('rho')}",
+                part.error_kernel(physics.unknowns, columns, unit),
+                columns.stop,
+                None,
+                torch.zeros_like(unit),
+                scaled_by=name,
+            )
+            for name, part in zip(rhos, parts, strict=True)
+            if part.is_emulated
+        ]
 
     def delta(
         self,
@@ -263,7 +338,62 @@ class TermBuilder:
         # f = sum rho_i (f_i - c_i) + delta_0, so that delta_0 has the mean sum rho_i c_i.
         offset = sum(c * w for c, w in zip(self._centers, self._means, strict=True))
         mean_0 = (self._zero + known + offset - self._shift) / self._scale
-        return self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+        term = self.term(name, kernel, None, mean_0, mean == "learn", Unit.TARGET, "delta")
+        centerd = self._learns_center or any(bool(each.any()) for each in self._centers)
+        stays = all(isinstance(t.kernel, VanishingKernel) and not t.learns_mean for t in self._rhos)
+        if isinstance(term.kernel, VanishingKernel) and centerd and not stays:
+            raise ValueError(
+                "Expected center=0.0 of a delta that vanishes somewhere beside a rho that does not "
+                "stay at a known mean there, as delta is delta_0 - center * rho; or give the rho "
+                "vanishing_rbf, too (rho_covar_module)."
+            )
+        return term
+
+    @property
+    def means(self) -> Sequence[Tensor]:
+        """The prior mean of the rho of each physics, ``batch_shape x 1 x m`` or a number."""
+        return self._means
+
+    def prior_mean(self) -> Tensor:
+        """The sum of all physics with these at the training inputs, ``batch_shape x n x m``."""
+        return sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
+
+    def columns(self) -> Tensor:
+        """The training inputs that kernels read, ``batch_shape x n x d``."""
+        return transformed(self.data.X, self.input_transform)[..., : self.num_inputs]
+
+    def noise(self) -> Likelihood | None:
+        """The likelihood, after all terms are made; None for the model's own.
+
+        Of names, what they say of training rows is entered in ``sources``.
+        """
+        likelihood: Any = self.likelihood
+        if isinstance(likelihood, str | list | tuple):
+            from gpadjust.models.named_noise import named_noise
+
+            likelihood = named_noise(likelihood, self)
+        elif callable(likelihood) and not isinstance(likelihood, Module | type):
+            likelihood = likelihood(self)
+        if likelihood is None:
+            return None
+        if not isinstance(likelihood, _GaussianLikelihoodBase):
+            raise TypeError(f"Expected a Gaussian likelihood of GPyTorch, got {likelihood!r}.")
+        learnt = Noise(likelihood).learnt
+        if learnt is not None and learnt.shape[:-1] != self.batch_shape:
+            raise ValueError(
+                f"Expected a likelihood with batch_shape {tuple(self.batch_shape)}, one for each "
+                f"output, got {tuple(learnt.shape[:-1])}."
+            )
+        return likelihood
+
+    def offsets(self) -> list[Term]:
+        """The terms of batches, one for each column: its name, and an offset for each level."""
+        found = []
+        for i in self.data.batches:
+            columns = [j for j, group in enumerate(self.categories.groups) if group == i]
+            kernel = scaled_offsets(columns, self.num_inputs, self.batch_shape)
+            found.append(self.term(self.data.input_names[i], kernel))
+        return found
 
     def warn_of_physics(self, stacklevel: int) -> None:
         """Warn if the physics is obviously off at the training inputs, after all terms are made.
@@ -281,7 +411,9 @@ class TermBuilder:
             return
         with torch.no_grad():
             f = sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
-            f, Y = (physics.in_user_units(v) for v in (f + self._offset, self.data.Y))
+            f, Y = f + self._offset, self.data.Y
+            f, Y = (v if self.link is None else self.link.inverse(v) for v in (f, Y))
+            f, Y = (physics.in_user_units(v) for v in (f, Y))
             data = self.data._replace(Y=Y)
             text = complaint(data, f, self._learns_mean, self._learns_offset)
         if text:

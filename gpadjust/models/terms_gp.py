@@ -12,15 +12,23 @@ from botorch.fit import _fit_fallback
 from botorch.models import SingleTaskGP
 from botorch.models.utils import fantasize as fantasize_flag
 from botorch.posteriors.fully_bayesian import MCMC_DIM
+from botorch.sampling.pathwise.update_strategies import GaussianUpdate
 from botorch.settings import validate_input_scaling
+from gpytorch.likelihoods.gaussian_likelihood import _GaussianLikelihoodBase
 from gpytorch.mlls import ExactMarginalLogLikelihood, MarginalLogLikelihood
+from gpytorch.models import ExactGP
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
+from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
+from torch.nn.functional import pad
 
 import gpadjust
+from gpadjust.checks import checked_whole
 from gpadjust.gp import SumOfTerms, Term, TermsMean
 from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
+from gpadjust.gp.noise import RowNoise
+from gpadjust.gp.repeats import Repeats
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -34,8 +42,10 @@ from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
+from gpadjust.models.updates import NewRows, keep_last
 
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
+_DISTINCT = 0.75  # of the rows, at most, for equal ones to be taken together
 _MANY = 5_000  # points, above which an exact fit takes long
 # What a state has as many of as there were draws, samples or points.
 _OF_ANY_NUMBER = ("draws", "coordinates", "points", "directions", "squares")
@@ -53,6 +63,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         terms: The terms of the model.
 
     Attributes:
+        has_repeats: Whether rows of equal inputs are taken together, by their means.
         was_fitted: Whether :func:`~gpadjust.fit` or ``load_state_dict`` gave it hyper-parameters;
             set it after training of your own.
 
@@ -66,7 +77,7 @@ class TermsGP(TermsModel, SingleTaskGP):
     _learnt_noise = staticmethod(learnt_noise)
 
     def __init__(self, made: TermBuilder, terms: Sequence[Term]) -> None:
-        data, likelihood = made.data, made.likelihood
+        data, likelihood = made.data, made.noise()
         if likelihood is not None and data.Yvar is not None:
             raise ValueError("Expected train_Yvar or a likelihood, got both: give one of them.")
         unknown = sum(term.learns_mean for term in terms)
@@ -83,7 +94,7 @@ class TermsGP(TermsModel, SingleTaskGP):
                 stacklevel=3,
             )
         made.warn_of_physics(stacklevel=3)
-        covar_module = SumOfTerms(terms)
+        covar_module = SumOfTerms([*terms, *made.offsets()] if made.data.batches else terms)
         Y, Yvar = data.Y, data.Yvar
         noise = likelihood
         if likelihood is None and Yvar is None:
@@ -102,12 +113,26 @@ class TermsGP(TermsModel, SingleTaskGP):
                 input_transform=made.input_transform,
             )
         if made.units is not None:  # not earlier: BoTorch would estimate it again
-            self.outcome_transform = made.units
+            units, link = made.units, made.link
+            self.outcome_transform = units if link is None else link.units(units)
+            vars(self)["link"] = link  # no submodule, of which the class's None would be first
+        if made.sources:
+            self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
+        self.noisy_inputs = made.noisy_inputs
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
+        if data.levels:
+            self.remember_levels(data)
         set_initial_values(self, *made.given)
-        self.was_fitted = False
+        self.was_fitted, rows = False, data.X.unique(dim=-2).shape[-2]
+        known = self.noise.known
+        weighs = self.noise.learnt is not None if known is None else bool((known > 0).all())
+        self.has_repeats = weighs and self.noise.rows is None and rows <= _DISTINCT * n
+        if rows < n:
+            from gpadjust.models.copies import warn_of_copies
+
+            warn_of_copies(data, stacklevel=3)
 
     @property
     def is_fitted(self) -> bool:
@@ -148,8 +173,11 @@ class TermsGP(TermsModel, SingleTaskGP):
     def conditioning(self) -> ExactConditioning:
         """Return the posterior of the terms; it is built if there is none."""
         if self.prediction_strategy is None:
+            inputs, raw = self.train_inputs[0], self._original_train_inputs
+            raw = raw if raw is not None and raw.shape[-2] == inputs.shape[-2] else inputs
+            repeats = Repeats.of(raw) if self.has_repeats else None
             self.prediction_strategy = self.conditioning_class(
-                self.train_inputs[0], self.train_targets, self.noise, self.covar_module
+                inputs, self.train_targets, self.noise, self.covar_module, repeats
             )
         strategy: ExactConditioning = self.prediction_strategy
         return strategy
@@ -157,26 +185,56 @@ class TermsGP(TermsModel, SingleTaskGP):
     @torch.no_grad()
     def log_evidence(self) -> tuple[str, Tensor]:
         """The log marginal likelihood of the observations, in the user's units, ``... x (m)``."""
-        train, (_, scale) = self.at(self.train_inputs[0]), self.units()
-        residual = self.train_targets - train.mean()
-        covariance = train.covariance() + torch.diag_embed(self.noise.at(train.x))
-        value = negative_log_likelihood(residual, covariance).value
-        count = (~residual.isnan()).sum(-1)
-        return "log likelihood", -value - count * scale.squeeze(-1).log()
+        train, (_, scale) = self.conditioning().train, self.units()
+        targets, noise, means = self.conditioning().observations()
+        covariance = train.covariance() + torch.diag_embed(noise)
+        more = None if means is None else means.within.at(noise)
+        value = -negative_log_likelihood(targets - train.mean(), covariance, more=more).value
+        count = (~self.train_targets.isnan()).sum(-1)
+        if self.link is not None:
+            value = value + self.outputs_first(self.link.log_slope(self.user_targets())).nansum(-1)
+        return "log likelihood", value - count * scale.squeeze(-1).log()
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         r"""Each training target predicted from all others, means and variances ``... x (m) x n``.
 
         With :math:`\alpha = K^{-1} (y - m)` they are :math:`y_i - \alpha_i / [K^{-1}]_{ii}` and
         :math:`1 / [K^{-1}]_{ii}` (Rasmussen and Williams 2006, eqs. 5.10-5.12), in model units;
-        NaN where there is no observation.
+        NaN where there is no observation. Variances are those of an observation that is no outlier.
         """
         if self.training:
             self.eval()
-        factors = self.conditioning().factors()
-        precision = factors.squared_columns()
+        conditioning = self.conditioning()
+        factors = conditioning.factors()
+        alpha, precision = factors.alpha, factors.squared_columns()
+        if conditioning.repeats is not None:
+            alpha, precision = conditioning.of_each(alpha, precision)
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
-        return self.train_targets - factors.alpha * variance, variance
+        mean = self.train_targets - alpha * variance
+        if self.noise.rows is not None and self.noise.rows.outlying.any():
+            noise = self.noise.at(self.train_inputs[0])
+            outlying = self.noise.trusted(self.train_targets).isnan() & ~self.train_targets.isnan()
+            least = (variance + noise - self.noise.of_rows(noise)).maximum(noise)
+            variance = variance.where(~outlying, least)
+        return mean, variance
+
+    def outliers(self) -> Tensor:
+        """Return the probability of each observation to be an outlier, ``batch_shape x n x m``.
+
+        By the others, and by hyper-parameters that were fitted without those that are likelier
+        outliers; of a ``likelihood="heavy-tailed"``.
+
+        Raises:
+            ValueError: If the noise has no heavy tails.
+        """
+        if not self.has_heavy_tails:
+            raise ValueError(
+                "The noise of the model has no outliers; build it with likelihood='heavy-tailed'."
+            )
+        from gpadjust.models.heavy_tails import probabilities
+
+        self.eval()
+        return self.outputs_last(probabilities(self))
 
     @torch.no_grad()
     def learn_local_errors(self) -> None:
@@ -185,7 +243,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         Of a model that holds samples, with kernels in closed form and their lengthscales: as
         :class:`~gpadjust.models.local_errors.LocalErrors` says. :func:`~gpadjust.fit` does this.
         """
-        forms = [term.form for term in self.terms if term.kernel is not None]
+        learnt = [term for term in self.terms if term.scaled_by is None]
+        forms = [term.form for term in learnt if term.kernel is not None]
         lengthscales = [form.lengthscale for form in forms if isinstance(form, Stationary)]
         if self.num_samples is None or not forms or len(lengthscales) < len(forms):
             return
@@ -195,7 +254,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        squares = (self.train_targets - mean).square().mean(0) / variance.maximum(least).mean(0)
+        targets = self.noise.trusted(self.train_targets)
+        squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)
         found[..., rows] = squares[..., rows].nan_to_num(nan=1.0, posinf=1.0)
@@ -213,18 +273,28 @@ class TermsGP(TermsModel, SingleTaskGP):
         inputs = self._original_train_inputs
         inputs = self.train_inputs[0] if inputs is None else inputs
         inputs = inputs.select(-3, 0) if self._num_outputs > 1 else inputs
-        shift, scale = self.units()
-        targets = self.outputs_last(self.train_targets * scale + shift)
-        noise = self.noise.known
+        targets, noise, scale = self.user_targets(), self.noise.known, self.units()[1]
         noise = None if noise is None else self.outputs_last(noise * scale.square())
+        if noise is not None and self.link is not None:
+            noise = noise / (2 * self.link.log_slope(targets)).exp().nan_to_num(nan=1.0)
+        given: Tensor | None = None
+        if self.noisy_inputs is not None:
+            inputs, _ = self.measured_rows(inputs)
+            given = self.noisy_inputs.variances
+            given = pad(given, (0, 0, 0, inputs.shape[-2] - len(given)))
         if self.num_samples is not None:
             inputs, targets = inputs[0], targets[0]
             if noise is not None and noise.shape != targets.shape:  # of later observations, too
                 noise = noise[0]
-        return {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
+        found = {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
+        return found if given is None else {**found, "train_Xvar": given}
 
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
         """Raw training inputs without what the model added to them, and the user's rows of them."""
+        own = None if self.noisy_inputs is None else self.noisy_inputs.measured
+        if own is not None and inputs.shape[-1] == own.shape[-1]:  # raw ones
+            later = inputs[..., len(own) :, :]
+            inputs = torch.cat([own.expand(*inputs.shape[:-2], *own.shape), later], dim=-2)
         return inputs, slice(None)
 
     def trend_inputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -321,7 +391,11 @@ class TermsGP(TermsModel, SingleTaskGP):
             self.hold_samples(samples)
         elif self.has_unknowns and self.num_samples is None:
             self.train()  # for inputs to be transformed again, with what is loaded
+        before = self.measured_targets()
         keys = super().load_state_dict(state_dict, strict, *args, **kwargs)
+        if self.noisy_inputs is not None:  # of which a fit moves the targets
+            self.train_targets = self.train_targets + before - self.measured_targets()
+            self.prediction_strategy = None
         self.was_fitted = True
         if self.num_samples is not None:
             transform_training_inputs(self)
@@ -350,6 +424,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         subset.output_names = tuple(self.output_names[i] for i in idcs)
         if m > 1:
             subset.local_errors = self.local_errors.of_outputs(idcs)
+            if self.noisy_inputs is not None:
+                old, subset.noisy_inputs = subset.noisy_inputs, self.noisy_inputs.of_outputs(idcs)
+                rows: Any = subset.noise.rows
+                rows.sources = [subset.noisy_inputs if s is old else s for s in rows.sources]
         match_parameters(subset)
         return subset
 
@@ -379,14 +457,92 @@ class TermsGP(TermsModel, SingleTaskGP):
                 rows or of outputs disagree, or ``noise`` is missing, negative, of another shape, or
                 given to a model that learns it.
         """
-        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        names, m = self.input_names, self.num_outputs
+        X, Y = new_observations(X, Y, names, m, self.levels, self.batches)
         X = self._new_inputs(X)
         return self.with_observations(X, Y, **kwargs)
 
-    def with_observations(
-        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
-    ) -> Self:
-        """Return a model of more observations, checked tensors of which whole rows may be NaN."""
+    def update(
+        self,
+        X: ArrayLike,
+        Y: ArrayLike,
+        noise: Tensor | None = None,
+        *,
+        forget: int | None = None,
+    ) -> None:
+        r"""Take new observations, in place, at a cost that does not grow with their number.
+
+        An :class:`~gpadjust.RRA` keeps its weights alone: each observation is a step of a Kalman
+        filter. With ``forget``, an observation of k steps ago counts as one whose noise has the
+        variance :math:`\sigma^2 e^{k / \text{forget}}`, so that where nothing is observed rho and
+        delta return to their priors, slowly. Without it the answer is that of all observations
+        together.
+
+        Any other model keeps its last ``forget`` observations, and forgets those before.
+
+        Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
+        observations; so do places of larger errors. To fit them again, build a model of recent
+        observations.
+
+        Args:
+            X: Raw inputs, ``k x d``, of ``k`` observations in their order.
+            Y: Observations, ``k x m``, in the user's units; NaN where an output was not observed.
+            noise: Their variances, of a model with known noise, as in
+                :meth:`condition_on_observations`.
+            forget: A number of observations, at least 1, as above. Default: never forget, which
+                an RRA alone can do.
+
+        Raises:
+            TypeError: If ``X``, ``Y`` or ``noise`` is not float64, or ``forget`` no whole number.
+            ValueError: As of :meth:`condition_on_observations`; or if a model that keeps its
+                observations is to forget none.
+            NotImplementedError: If the model adds rows of its own to the observations, as an AR1.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import RRA
+            >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = RRA(X, 2 * X.sin(), physics=torch.sin)
+            >>> model.update(X[:1], 2.1 * X[:1].sin(), forget=100)
+        """
+        X, Y = new_observations(X, Y, self.input_names, self.num_outputs)
+        if X.dim() > 2 or Y.dim() > 2:
+            raise ValueError(
+                f"Expected X of shape k x d and Y of shape k x m, got {tuple(X.shape)} and "
+                f"{tuple(Y.shape)}."
+            )
+        self._check_noise(noise, Y)
+        self.eval()
+        if forget is not None:
+            forget = checked_whole("forget", forget, 1)
+        if self.has_repeats:  # rows come and go from now on
+            self.has_repeats, self.prediction_strategy = False, None
+        with torch.no_grad():
+            self._take(NewRows.of(self, X, Y, noise), forget)
+
+    def _take(self, new: NewRows, forget: int | None) -> None:
+        """Take new observations, and forget others."""
+        name = type(self).__name__
+        if forget is None:
+            raise ValueError(
+                f"A {name} keeps its observations, so that its cost grows unless it forgets some: "
+                "pass forget=200 for the last 200. An RRA takes any number; "
+                "`condition_on_observations` returns a model of all."
+            )
+        if self.measured_rows(self.train_inputs[0])[1] != slice(None):
+            raise NotImplementedError(
+                f"A {name} has rows of its own among the observations, of which a window would "
+                "forget some: take a CKA, or build the model again."
+            )
+        if self.noise.rows is not None and self.noise.rows.added.any():
+            raise NotImplementedError(
+                f"The inputs of this {name} are noisy (train_Xvar), and of new ones that is not "
+                "known: build the model again."
+            )
+        keep_last(self, new, forget)
+
+    def _check_noise(self, noise: Tensor | None, Y: Tensor) -> None:
+        """Raise an error unless variances of new observations are given where they are known."""
         if self.noise.is_known and noise is None:
             raise ValueError(
                 "The model was built with known noise (train_Yvar), so that of new observations is "
@@ -399,7 +555,16 @@ class TermsGP(TermsModel, SingleTaskGP):
                     "The model learns its noise, which new observations have, too: leave `noise` "
                     "out, or build the model with known noise (train_Yvar)."
                 )
+
+    def with_observations(
+        self, X: Tensor, Y: Tensor, noise: Tensor | None = None, **kwargs: Any
+    ) -> Self:
+        """Return a model of more observations, checked tensors of which whole rows may be NaN."""
+        self._check_noise(noise, Y)
+        if noise is not None:
             transform = getattr(self, "outcome_transform", None)
+            if self.link is not None and fantasize_flag.off():
+                noise = self.link(Y, noise)[1]
             if transform is not None and fantasize_flag.off():
                 noise = noise / transform.stdvs.square()
             kwargs["noise"] = noise.nan_to_num(nan=1.0, posinf=1.0)  # where nothing was observed
@@ -419,3 +584,13 @@ class TermsGP(TermsModel, SingleTaskGP):
         # GPyTorch would cut the gradient to X, which look-ahead acquisition functions need.
         with detach_test_caches(not X.requires_grad), lazily_evaluate_kernels():
             return super(TermsGP, shell).condition_on_observations(X, Y, **kwargs)
+
+
+@GaussianUpdate.register(TermsGP, _GaussianLikelihoodBase)  # type: ignore[untyped-decorator, unused-ignore]
+def _update(model: TermsGP, likelihood: _GaussianLikelihoodBase, **arguments: Any) -> Any:
+    """BoTorch's pathwise update, with the noise of each point."""
+    noise, update = model.noise, GaussianUpdate.dispatch(ExactGP, _GaussianLikelihoodBase)
+    if noise.rows is None and noise.selection(model.train_inputs[0]) is None:
+        return update(model, likelihood, **arguments)
+    variances = DiagLinearOperator(noise.of_rows(noise.at(model.train_inputs[0])))
+    return update(model, likelihood, **{"noise_covariance": variances, **arguments})

@@ -5,28 +5,54 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from inspect import signature
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
+from botorch.models.transforms.outcome import OutcomeTransform
 from botorch.posteriors import Posterior
 from botorch.posteriors.fully_bayesian import MCMC_DIM
 from botorch.utils.datasets import SupervisedDataset
 from gpytorch.settings import detach_test_caches
 from torch import Tensor
 from torch.nn import Module
+from torch.nn.functional import pad
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import check_level, checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
+from gpadjust.models.levels import coded
+from gpadjust.models.links import plain
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
+from gpadjust.models.posteriors import mixture_moments, mixture_quantile
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.term_builder import ModelOptions
-from gpadjust.models.training_data import ArrayLike, check_order, to_tensor
+from gpadjust.models.training_data import (
+    ArrayLike,
+    TrainingData,
+    as_given,
+    check_order,
+    to_tensor,
+)
 from gpadjust.physics import Physics
+
+
+class Adjustment(NamedTuple):
+    """A rho or a delta at some points, as :meth:`TermsModel.adjustments` returns it.
+
+    Args:
+        mean: Posterior means, ``q x m``; of a rho without units, else in the targets'.
+        lower: Lower ends of the intervals.
+        upper: Upper ends.
+    """
+
+    mean: Any
+    lower: Any
+    upper: Any
+
 
 _SHARED = "Unpack[ModelOptions]"  # how a constructor says that it takes these and no others
 
@@ -53,7 +79,7 @@ class TermsModel(PredictiveModel):
     """
 
     not_sampled: ClassVar[str] = ""
-    data_arguments: ClassVar[tuple[str, ...]] = ("train_X", "train_Y", "train_Yvar")
+    data_arguments: ClassVar[tuple[str, ...]] = ("train_X", "train_Y", "train_Yvar", "train_Xvar")
     covar_module: SumOfTerms
     input_transform: Any
     likelihood: Any
@@ -81,10 +107,18 @@ class TermsModel(PredictiveModel):
         if callable(variances := every.get("train_Yvar")) and not isinstance(variances, Tensor):
             raise TypeError("Got a function as train_Yvar: did you mean physics=...?")
         every = {n: v for n, v in every.items() if n not in (*cls.data_arguments, "physics")}
+        if isinstance(outcomes := every.get("outcome_transform"), OutcomeTransform):
+            every["outcome_transform"] = plain(outcomes)
         # Others than plain values are told by name alone, or they would have to pickle.
         model.options = {n: v for n, v in every.items() if _is_plain(v)}
         model.objects = [n for n, v in every.items() if not _is_plain(v)]
         return model
+
+    def remember_levels(self, data: TrainingData) -> None:
+        """Remember the levels of categories, for a file, too."""
+        self.levels, self.batches = data.levels, tuple(data.batches)
+        self.options |= {"categorical": data.levels, "batch": list(data.batches)}
+        self.objects = [name for name in self.objects if name != "categorical"]
 
     def __repr__(self) -> str:
         return title(self)
@@ -118,6 +152,12 @@ class TermsModel(PredictiveModel):
     def noise(self) -> Noise:
         """The noise of observations."""
         return Noise(self.likelihood)
+
+    @property
+    def has_heavy_tails(self) -> bool:
+        """True if observations may be outliers."""
+        rows = self.noise.rows
+        return rows is not None and any(source.has_outliers for source in rows.sources)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -210,6 +250,53 @@ class TermsModel(PredictiveModel):
             covariance = covariance * scale.square().unsqueeze(-1)
             return self.as_posterior(mean * scale + shift, covariance, mixed)
 
+    def adjustments(self, X: ArrayLike, level: float = 0.95) -> Any:
+        r"""Every :math:`\rho` and :math:`\delta` with its interval, at each point by itself.
+
+        The moments of :meth:`term`, without the covariances between points, so that there may be
+        many of them.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            level: The probability that an interval holds.
+
+        Returns:
+            Of tensors and arrays, an :class:`Adjustment` for each of ``term_names``, by name: mean,
+            lower and upper, ``q x m``. Of a frame, one frame with columns such as ``rho mean``,
+            ``rho lower``, ``rho upper`` and ``delta mean``, of several outputs ``rho of head
+            mean``, and the index of X.
+
+        Raises:
+            ValueError: If ``level`` is not between 0 and 1.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import CKA
+            >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = CKA(X, X.sin(), physics=lambda X: X)
+            >>> rho, delta = model.adjustments(X).values()
+            >>> bool((rho.lower < rho.mean).all()), delta.upper.shape
+            (True, torch.Size([8, 1]))
+        """
+        check_level(level)
+        found: dict[str, Adjustment] = {}
+        with self._graph_for(X):
+            inputs = self.model_inputs(X, with_basis=False)
+            for term in (term for term in self.terms if term.name in self.term_names):
+                shift, scale = self.units(term.unit)
+                mean, variance = self.conditioning().marginals(self._at(term, inputs))
+                moments = torch.broadcast_tensors(mean * scale + shift, variance * scale.square())
+                parts = [self.outputs_last(each) for each in moments]
+                if self.num_samples is None:
+                    parts = [each.unsqueeze(MCMC_DIM) for each in parts]
+                ends = (mixture_quantile(*parts, (1 + side * level) / 2) for side in (-1, 1))
+                found[term.name] = Adjustment(mixture_moments(*parts)[0], *ends)
+        if not hasattr(X, "columns"):
+            return {n: Adjustment(*(as_given(v, X, ()) for v in a)) for n, a in found.items()}
+        of = [f" of {name}" if self.num_outputs > 1 else "" for name in self.output_names]
+        names = [f"{n}{each} {k}" for n in found for k in Adjustment._fields for each in of]
+        return as_given(torch.cat([v for a in found.values() for v in a], -1), X, names)
+
     def rho_name(self, physics: str | int | None = None) -> str:
         """The name of the term that scales a physics, which is given by name or number."""
         names = self.rho_names
@@ -257,6 +344,7 @@ class TermsModel(PredictiveModel):
         means = {t.name: t.mean if t.learns_mean else t.given_mean for t in self.terms}
         # The same for all samples of hyper-parameters but for rounding.
         values = self.outputs_last(self.at(inputs).combine(means) * scale + shift)
+        values = values if self.link is None else self.link.inverse(values)
         return values if self.num_samples is None else values.mean(MCMC_DIM)
 
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
@@ -272,6 +360,8 @@ class TermsModel(PredictiveModel):
                 variance = variance * wider
             if noise is not None:  # given variances are in the user's units
                 unit = scale.square() if observation_noise is True else 1.0
+                if self.link is not None and observation_noise is not True:
+                    unit = (2 * self.link.log_slope(self.link.inverse(mean))).exp()
                 variance = variance + noise * unit
             # Fantasies share their variances.
             mean, variance = (
@@ -360,7 +450,7 @@ class TermsModel(PredictiveModel):
         if self.training:
             self.eval()
         check_order(X, self.input_names)
-        X = to_tensor(X, "X")
+        X = to_tensor(coded(X, self.levels, self.batches) if self.levels else X, "X")
         d = len(self.input_names)
         if X.dim() < 2 or X.shape[-1] != d:
             raise ValueError(
@@ -397,6 +487,23 @@ class TermsModel(PredictiveModel):
         shift = shift if unit is Unit.TARGET else torch.zeros_like(shift)
         return shift, torch.ones_like(scale) if unit is Unit.NONE else scale
 
+    def measured_targets(self) -> Tensor:
+        """Targets as they were measured, in the model's units, ``... x (m) x n``.
+
+        Those of ``train_targets`` are without what the noise of inputs adds to their mean.
+        """
+        noisy = getattr(self, "noisy_inputs", None)
+        if noisy is None:
+            return self.train_targets
+        later = self.train_targets.shape[-1] - noisy.shift.shape[-1]
+        return self.train_targets + pad(noisy.shift, (0, later))
+
+    def user_targets(self) -> Tensor:
+        """Targets in the user's units, ``... x n x m``."""
+        shift, scale = self.units()
+        targets = self.outputs_last(self.measured_targets() * scale + shift)
+        return targets if self.link is None else self.link.inverse(targets)
+
     def outputs_last(self, values: Tensor) -> Tensor:
         """From ``... x (m) x q`` to ``... x q x m``."""
         return values.mT if self._num_outputs > 1 else values.unsqueeze(-1)
@@ -412,7 +519,7 @@ class TermsModel(PredictiveModel):
         for other in self._centerd() if term.unit is Unit.TARGET else ():
             parts.append((other, -other.basis.origin / other.basis.scale))
             shift = shift + other.basis.moved_mean
-        return WeightedSum(inputs, parts, shift)
+        return self.covar_module.weighted(inputs, parts, shift)
 
     def _centerd(self) -> list[Term]:
         """The terms from whose physics a center is taken."""

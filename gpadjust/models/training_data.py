@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date, time, timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from botorch.models.transforms.outcome import OutcomeTransform, Standardize
+from botorch.models.transforms.outcome import Standardize
 from torch import Tensor
 
 from gpadjust.checks import check_finite, check_observed, marked_rows
+from gpadjust.models.levels import (
+    Levels,
+    coded,
+    declared,
+    levels_of,
+    several,
+    texts_of,
+)
 
 ArrayLike = Any
 """A float64 tensor, or a NumPy array or pandas DataFrame of numbers."""
 
 # What NumPy would turn into numbers: its kinds of arrays, types of objects, and the way out.
 _NO_NUMBERS: dict[str, tuple[str, tuple[type, ...], str]] = {
-    "text": ("SU", (str, bytes), "convert numbers in text with `.astype(float)`, drop other text"),
+    "text": (
+        "SU",
+        (str, bytes),
+        "convert numbers in text with `.astype(float)`, drop other text that is no category of "
+        "inputs in a DataFrame (`categorical=` names one)",
+    ),
     "complex numbers": ("c", (complex, np.complexfloating), "give both parts, or take `.real`"),
     "dates or times": (
         "mM",
@@ -37,6 +50,8 @@ class TrainingData(NamedTuple):
         Yvar: Known observation variances of the shape of ``Y``, or None.
         input_names: The names of the columns of ``X``.
         output_names: Those of ``Y``.
+        levels: The levels of categorical columns of ``X``, by their numbers, and which of these
+            are ``batches``.
     """
 
     X: Tensor
@@ -44,10 +59,17 @@ class TrainingData(NamedTuple):
     Yvar: Tensor | None
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
+    levels: Levels = {}  # noqa: RUF012
+    batches: Sequence[int] = ()
 
 
 def training_data(
-    train_X: ArrayLike, train_Y: ArrayLike, train_Yvar: ArrayLike = None, prefix: str = "train"
+    train_X: ArrayLike,
+    train_Y: ArrayLike,
+    train_Yvar: ArrayLike = None,
+    prefix: str = "train",
+    categorical: Any = None,
+    batch: Any = None,
 ) -> TrainingData:
     """Bring the data of a model into the form of tensors, and check them.
 
@@ -58,12 +80,20 @@ def training_data(
         train_Yvar: Expected of the shape of ``train_Y``, or one number, or one for each output;
             not negative; or None.
         prefix: What the names of the three begin with in errors.
+        categorical: As in :class:`~gpadjust.CKA`.
+        batch: Likewise.
 
     Raises:
         TypeError: If one of them is neither a float64 tensor nor an array or frame of numbers.
         ValueError: If shapes disagree, there are fewer than 2 points, or values are not finite.
     """
     name_X, name_Y = f"{prefix}_X", f"{prefix}_Y"
+    levels: Levels = {}
+    if hasattr(train_X, "iloc") or isinstance(categorical, Mapping):
+        own = column_names(train_X) or default_names("x", train_X.shape[-1])
+        named = [*several(categorical), *several(batch)]
+        levels = {**texts_of(train_X, named), **declared(categorical, own)}
+        train_X = coded(train_X, levels)
     X, Y = to_tensor(train_X, name_X), to_tensor(train_Y, name_Y)
     for name, tensor in ((name_X, X), (name_Y, Y)):
         if tensor.dim() < 2:
@@ -90,15 +120,25 @@ def training_data(
             f"column(s) {marked_rows(seldom)}; leave these out."
         )
     Yvar = None if train_Yvar is None else _variances(train_Yvar, Y, f"{prefix}_Yvar")
-    names = column_names(train_X) or default_names("x", X.shape[-1])
-    return TrainingData(X, Y, Yvar, names, column_names(train_Y) or default_names("y", Y.shape[-1]))
+    names = own if levels else column_names(train_X) or default_names("x", X.shape[-1])
+    outputs = column_names(train_Y) or default_names("y", Y.shape[-1])
+    batches: Sequence[int] = ()
+    if levels or categorical is not None or batch is not None:
+        levels, batches = levels_of(categorical, batch, X, names, levels)
+    return TrainingData(X, Y, Yvar, names, outputs, levels, batches)
 
 
 def new_observations(
-    X: ArrayLike, Y: ArrayLike, input_names: tuple[str, ...], num_outputs: int
+    X: ArrayLike,
+    Y: ArrayLike,
+    input_names: tuple[str, ...],
+    num_outputs: int,
+    levels: Levels | None = None,
+    batches: Sequence[int] = (),
 ) -> tuple[Tensor, Tensor]:
     """Further observations of a model as tensors ``... x k x d`` and ``... x k x m``, checked."""
     check_order(X, input_names)
+    X = coded(X, levels, batches) if levels else X
     X, Y = to_tensor(X, "X"), to_tensor(Y, "Y")
     check_finite("X", X)
     rows = X.dim() > 1 and Y.dim() > 1 and X.shape[-2] == Y.shape[-2]
@@ -132,15 +172,7 @@ def to_tensor(values: ArrayLike, name: str) -> Tensor:
             f"Expected {name} to be a torch tensor, a NumPy array or a DataFrame, got "
             f"{type(values).__name__}; convert it with `torch.tensor({name}, dtype=torch.float64)`."
         )
-    if np.ma.is_masked(array):
-        raise ValueError(
-            f"Expected {name} without masked values, found {np.ma.count_masked(array)}. Leave "
-            f"their rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
-        )
-    found = {type(each) for each in array.flat} if array.dtype.kind == "O" else set()
-    for what, (kinds, types, _) in _NO_NUMBERS.items():
-        if array.dtype.kind in kinds or any(issubclass(each, types) for each in found):
-            raise TypeError(_not_numbers(name, what))
+    check_array(array, name)
     try:
         return torch.as_tensor(np.array(array, dtype=np.float64))
     except (TypeError, ValueError) as error:
@@ -148,6 +180,20 @@ def to_tensor(values: ArrayLike, name: str) -> Tensor:
             f"Expected {name} to hold numbers only, but {error}. Select the numeric columns, and "
             "encode or drop the others."
         ) from error
+
+
+def check_array(array: Any, name: str, what: Sequence[str] = tuple(_NO_NUMBERS)) -> None:
+    """Raise an error if an array has masked values, or what NumPy would turn into numbers."""
+    if np.ma.is_masked(array):
+        raise ValueError(
+            f"Expected {name} without masked values, found {np.ma.count_masked(array)}. Leave "
+            f"their rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
+        )
+    found = {type(value) for value in array.flat} if array.dtype.kind == "O" else set()
+    for each in what:
+        kinds, types, _ = _NO_NUMBERS[each]
+        if array.dtype.kind in kinds or any(issubclass(kind, types) for kind in found):
+            raise TypeError(_not_numbers(name, each))
 
 
 def _not_numbers(name: str, found: str) -> str:
@@ -161,6 +207,26 @@ def column_names(values: ArrayLike) -> tuple[str, ...] | None:
         return tuple(map(str, columns))
     name = getattr(values, "name", None)
     return None if name is None or isinstance(values, Tensor) else (str(name),)
+
+
+def with_names(X: Tensor, names: Sequence[str]) -> Tensor:
+    """A tensor with names of its columns, which :func:`column_names` finds as those of a frame."""
+    named = X.view_as(X)
+    named.columns = names  # type: ignore[attr-defined]
+    return named
+
+
+def as_given(values: Tensor, X: ArrayLike, names: Sequence[str]) -> Any:
+    """Values ``... x q x m`` as X came: a tensor, an array, or a frame of pandas or polars.
+
+    A frame has these names of columns, and pandas' the index of X.
+    """
+    if isinstance(X, Tensor):
+        return values
+    array, library = values.detach().cpu().numpy(), type(X).__module__.partition(".")[0]
+    if library == "pandas":
+        return type(X)(array, index=X.index, columns=list(names))
+    return type(X)(array, schema=list(names)) if library == "polars" else array
 
 
 def check_order(values: ArrayLike, names: tuple[str, ...]) -> None:
@@ -232,15 +298,18 @@ def residual_scale(Y: Tensor, mean: Tensor) -> Standardize:
     return standardize(torch.zeros_like(scale), scale.where(scale > 1e-13 * size, tiny))
 
 
-def estimated(transform: OutcomeTransform | None, Y: Tensor, X: Tensor) -> Standardize | None:
+def estimated(transform: Any, Y: Tensor, X: Tensor) -> Standardize | None:
     """The user's outcome transform with shift and scale estimated from the targets."""
     if transform is None:
         return None
     if type(transform) is not Standardize:
+        is_plain = isinstance(transform, str | tuple | list)
+        name = repr(transform) if is_plain else type(transform).__name__
         raise ValueError(
-            f"The outcome transform {type(transform).__name__} is not supported: it must be one "
-            "shift and scale per output, as the physics has the units of the targets. Use "
-            "Standardize, None, or the default; to model log(y), take both logarithms yourself."
+            f"The outcome transform {name} is not supported: it must be one shift and scale "
+            "per output, Standardize, or None, or the default; or, but for AR1, a link, through "
+            "which the physics goes: 'log' for positive outputs, 'logit' for shares, a pair of "
+            "bounds."
         )
     transform.train()
     try:

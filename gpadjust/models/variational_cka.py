@@ -16,7 +16,7 @@ from torch import Size, Tensor
 from torch.nn import Buffer
 
 from gpadjust.checks import checked_whole
-from gpadjust.gp import Term, TermsMean, Unit, WeightedSum
+from gpadjust.gp import Term, TermsMean, Unit, VanishingKernel, WeightedSum
 from gpadjust.models.parameters import scaled_rbf
 from gpadjust.models.sparse_conditioning import SparseConditioning
 from gpadjust.models.structures import CKA
@@ -31,7 +31,7 @@ from gpadjust.models.term_builder import (
 )
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.terms_model import TermsModel
-from gpadjust.models.training_data import ArrayLike, TrainingData, training_data
+from gpadjust.models.training_data import ArrayLike, TrainingData, training_data, with_names
 
 _SEARCHED = 1000  # observations that an exact model of some takes
 NOTHING = -60.0
@@ -108,7 +108,10 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         seed: int = 0,
         **options: Unpack[ModelOptions],
     ) -> None:
-        data = training_data(train_X, train_Y, train_Yvar)
+        categorical, batch = options.get("categorical"), options.get("batch")
+        data = training_data(train_X, train_Y, train_Yvar, categorical=categorical, batch=batch)
+        if data.levels:  # of all rows
+            options |= {"categorical": data.levels, "batch": [*data.batches]}
         if data.X.dim() > 2:
             raise ValueError(
                 f"Expected train_X of one data set, n x d, got shape {tuple(data.X.shape)}; make a "
@@ -119,7 +122,8 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         rows = order[:searched]
         # An exact model of some rows makes terms, units and noise.
         some = CKA(
-            *(None if given is None else given[rows] for given in data[:3]),
+            with_names(data.X[rows], data.input_names),
+            *(None if given is None else given[rows] for given in data[1:3]),
             physics=physics,
             rho_covar_module=rho_covar_module,
             delta_covar_module=delta_covar_module,
@@ -128,17 +132,26 @@ class VariationalCKA(TermsModel, GPyTorchModel):
             center=center,
             **options,
         )
-        if some.noise.selection(some.train_inputs[0]) is not None:
+        if some.noise.rows is not None or some.noise.selection(some.train_inputs[0]) is not None:
             raise ValueError(
-                f"Expected a likelihood with one variance, got {type(some.likelihood).__name__}; "
-                "CKA takes those with several."
+                "Expected a likelihood with one variance for all observations, got "
+                f"{type(some.likelihood).__name__}; CKA takes those with several, and those that "
+                "differ from row to row."
+            )
+        if any(isinstance(part, VanishingKernel) for part in some.modules()):
+            raise ValueError(
+                "Expected kernels that vanish nowhere, got vanishing_rbf: what inducing points "
+                "cannot show of delta would not vanish. CKA takes it."
             )
         super().__init__()
         self.covar_module, self.likelihood = some.covar_module, some.likelihood
         self.input_transform = some.input_transform
         if hasattr(some, "outcome_transform"):
             self.outcome_transform = some.outcome_transform
+        vars(self)["link"] = some.link
         self.input_names, self.output_names = data.input_names, data.output_names
+        if data.levels:
+            self.remember_levels(data)
         self._num_outputs, self._aug_batch_shape = some._num_outputs, some._aug_batch_shape
         d, zero = some.terms[-1].num_inputs, data.X.new_zeros(*self._aug_batch_shape, 1)
         kernel = scaled_rbf(d, self._aug_batch_shape).to(zero).requires_grad_(False)
@@ -169,7 +182,8 @@ class VariationalCKA(TermsModel, GPyTorchModel):
     def train_targets(self) -> Tensor:  # type: ignore[override]
         """Targets in model units, ``(m) x n``; NaN where one is missing."""
         shift, scale = self.units()
-        return (self.outputs_first(self._Y) - shift) / scale
+        Y = self._Y if self.link is None else self.link.value(self._Y)
+        return (self.outputs_first(Y) - shift) / scale
 
     @property
     def mean_module(self) -> TermsMean:
@@ -243,7 +257,8 @@ class VariationalCKA(TermsModel, GPyTorchModel):
 
     def _scale_known_noise(self) -> None:
         if self._Yvar is not None:
-            noise = self.outputs_first(self._Yvar) / self.units()[1].square()
+            Yvar = self._Yvar if self.link is None else self.link(self._Y, self._Yvar)[1]
+            noise = self.outputs_first(Yvar.nan_to_num(nan=1.0)) / self.units()[1].square()
             self.likelihood = FixedNoiseGaussianLikelihood(noise)
 
     def load_state_dict(
@@ -297,7 +312,10 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         if self.evidence.isnan().any():
             return "not fitted", None
         count = (~self.train_targets.isnan()).sum(-1)
-        return "evidence lower bound", self.evidence - count * self.units()[1].squeeze(-1).log()
+        value = self.evidence - count * self.units()[1].squeeze(-1).log()
+        if self.link is not None:
+            value = value + self.outputs_first(self.link.log_slope(self._Y)).nansum(-1)
+        return "evidence lower bound", value
 
 
 def _some_of_each_output(Y: Tensor, seed: int) -> tuple[Tensor, int]:

@@ -36,6 +36,8 @@ class Physics(torch.nn.Module, ABC):
     Attributes:
         num_outputs: ``m``; None until the first call if it is not known before.
         unknowns: The unknown parameters, ``p`` of them.
+        is_emulated: Whether its outputs are estimates, whose errors have a kernel
+            (``error_kernel``), as of :class:`~gpadjust.EmulatedPhysics`.
 
     Raises:
         TypeError: If ``inputs`` are no whole numbers.
@@ -50,6 +52,8 @@ class Physics(torch.nn.Module, ABC):
         tensor([[-0.5000],
                 [-2.0000]])
     """
+
+    is_emulated = False
 
     def __init__(
         self,

@@ -114,6 +114,7 @@ class JoinedPhysics(Physics):
             if part is not origin:  # a wrapper of ours
                 part.name = own
         self.parts = torch.nn.ModuleList(parts)
+        self.is_emulated = any(part.is_emulated for part in parts)
 
     def evaluate(self, X: Tensor, *parameters: ParameterValues) -> Tensor:
         """The outputs ``N x (k m)`` of the parts, those of the first part first."""

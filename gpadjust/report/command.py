@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 import warnings
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from gpadjust.files import LARGEST
 from gpadjust.inference import fit
 from gpadjust.models import CKA, TermsGP
 from gpadjust.report.inputs import (
@@ -45,13 +48,15 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
     variances = noise_variances(arguments.noise, outputs)
     marks = (_mark(arguments.delimiter), arguments.decimal)
-    data = read_csv(arguments.data, inputs, outputs, units, *marks)
+    categories = names_of(arguments.categories, "--categories") if arguments.categories else []
+    data = read_csv(arguments.data, inputs, outputs, units, *marks, categories)
+    options = _options(arguments, inputs, data.levels)
     physics = named_physics(arguments.physics, data)
     names = (listed(data.Y.columns), listed(data.X.columns))
     _say(f"{arguments.data}: {plural(len(data.lines), 'row')}, {names[0]} from {names[1]}.")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
-        model = _fitted(arguments, data, physics, variances)
+        model = _fitted(arguments, data, physics, variances, options)
         subject = subject_of(model, [f"line {line}" for line in data.lines])
     notes = tuple(
         dict.fromkeys(
@@ -89,13 +94,17 @@ def _comparing(command: Sequence[str]) -> str:
 
 
 def _fitted(
-    arguments: Namespace, data: CsvData, physics: NamedPhysics, variances: list[float] | None
+    arguments: Namespace,
+    data: CsvData,
+    physics: NamedPhysics,
+    variances: list[float] | None,
+    options: dict[str, Any],
 ) -> Comparison | TermsGP:
     X, Y, f_p = data.X, data.Y, physics.physics
     if arguments.fit == "compare":
-        return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True)
+        return compare(X, Y, f_p, variances, seed=arguments.seed, progress=True, **options)
     _say(f"Fitting CKA by {arguments.fit!r} ...")
-    model = CKA(X, Y, variances, physics=f_p)
+    model = CKA(X, Y, variances, physics=f_p, **options)
     fit(model, arguments.fit, seed=arguments.seed)
     return model
 
@@ -110,3 +119,62 @@ def _mark(text: str) -> str:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
+
+
+def _options(
+    arguments: Namespace,
+    inputs: Sequence[str],
+    levels: Mapping[str, Sequence[str]],
+) -> dict[str, Any]:
+    """The options of a model that a command line says, for the columns as the file names them.
+
+    Args:
+        arguments: A command line as parsed by :func:`gpadjust.__main__.parser`.
+        inputs: The names of the inputs there, in the order of the columns.
+        levels: The levels of the categories among the columns, by the names that models have.
+
+    Raises:
+        ValueError: If one is no number, or names what is no input.
+    """
+    found: dict[str, Any] = {}
+    noises = ["relative"] * (arguments.noise == "relative") + ["heavy-tailed"] * arguments.outliers
+    if noises:
+        found["likelihood"] = noises if len(noises) > 1 else noises[0]
+    if arguments.positive:
+        found["outcome_transform"] = "log"
+    if arguments.bounds is not None:
+        found["outcome_transform"] = _bounds(arguments.bounds)
+    if arguments.input_noise is not None:
+        found["train_Xvar"] = _variances(arguments.input_noise, inputs)
+    if levels:
+        found["categorical"] = dict(levels)
+    return found
+
+
+def _bounds(text: str) -> tuple[float, float]:
+    """The two numbers of ``"0,1"``."""
+    ends = [_number(each) for each in text.split(",")]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise ValueError(f"Expected --bounds as two numbers, the lower first: 0,1; found {text!r}.")
+    return ends[0], ends[1]
+
+
+def _variances(text: str, inputs: Sequence[str]) -> list[float]:
+    """The variance of each input, of the standard deviations that a command line has."""
+    given = pairs(text, "--input-noise")
+    if unknown := [name for name in given if name not in inputs]:
+        raise ValueError(f"--input-noise names {unknown[0]!r}, which is none of --inputs.")
+    sds = [_number(given.get(name, "0")) for name in inputs]
+    if not all(0 <= sd <= LARGEST for sd in sds):
+        raise ValueError(
+            "Expected --input-noise as standard deviations in the inputs' units, such as "
+            f"{inputs[0]}=0.5, found {text!r}."
+        )
+    return [sd**2 for sd in sds]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

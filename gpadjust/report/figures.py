@@ -9,6 +9,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from gpadjust.models.levels import on_levels
 from gpadjust.physics import PhysicsError
 from gpadjust.report.markup import Markup, image, name_and_unit, number, with_unit
 from gpadjust.report.subject import Subject
@@ -162,7 +163,7 @@ def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
     pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
     X = subject.base.repeat(number_of_points, 1)
     X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points, dtype=X.dtype)
-    return X
+    return on_levels(X, subject.model.levels)
 
 
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:

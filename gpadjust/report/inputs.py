@@ -60,6 +60,8 @@ class CsvData(NamedTuple):
         lines: The line of each row in the file.
         remarks: Rows left out and outputs missing, in sentences.
         digest: The beginning of the file's SHA-256.
+        levels: The levels of the categories among the inputs, by name: numbers, or texts, whose
+            numbers from 0 the inputs have.
     """
 
     X: Columns
@@ -67,6 +69,7 @@ class CsvData(NamedTuple):
     lines: tuple[int, ...]
     remarks: tuple[str, ...]
     digest: str
+    levels: dict[str, tuple[Any, ...]]
 
 
 class NamedPhysics(NamedTuple):
@@ -90,6 +93,7 @@ def read_csv(
     units: dict[str, str],
     delimiter: str = ",",
     decimal: str = ".",
+    categories: Sequence[str] = (),
 ) -> CsvData:
     """Read columns of a CSV file; an output may be missing in some rows.
 
@@ -100,6 +104,7 @@ def read_csv(
         units: Units of columns whose names do not have them.
         delimiter: The mark between two fields.
         decimal: The decimal mark.
+        categories: The inputs that are categories, which may be texts.
 
     Raises:
         OSError: If the file cannot be read.
@@ -125,8 +130,16 @@ def read_csv(
             f"Expected different columns as inputs and outputs, got {again[0]!r} more than once."
         )
     d = len(inputs)
-    values = [table.numbers(name, may_miss=i >= d) for i, name in enumerate(headers)]
+    if unknown := [name for name in categories if name not in inputs]:
+        raise ValueError(f"--categories names {unknown[0]!r}, which is none of --inputs.")
     names = _with_units(headers, asked, units)
+    values, levels = [], {}
+    for i, name in enumerate(headers):
+        if asked[i] in categories:
+            column, levels[names[i]] = table.categories(name)
+        else:
+            column = table.numbers(name, may_miss=i >= d)
+        values.append(column)
     X, Y = torch.stack(values[:d], -1), torch.stack(values[d:], -1)
     seen = ~Y.isnan().all(-1)
     remarks = []
@@ -146,9 +159,13 @@ def read_csv(
             f"{plural(missing, 'output')} missing in rows that have others: each output learns "
             "from its own rows."
         )
+    for name, own in levels.items():
+        if isinstance(own[0], str):
+            told = listed(f"{k} is {level}" for k, level in enumerate(own))
+            remarks.append(f"The physics reads {name_and_unit(name)[0]} as a number: {told}.")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     columns = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
-    return CsvData(*columns, tuple(lines.tolist()), tuple(remarks), digest)
+    return CsvData(*columns, tuple(lines.tolist()), tuple(remarks), digest, levels)
 
 
 def names_of(text: str, option: str) -> list[str]:
@@ -182,7 +199,7 @@ def pairs(text: str, option: str) -> dict[str, str]:
 
 def noise_variances(text: str | None, outputs: Sequence[str]) -> list[float] | None:
     """The variances of outputs, of the standard deviations that a command line has."""
-    if text is None:
+    if text is None or text == "relative":
         return None
     given = pairs(text, "--noise") if "=" in text else dict.fromkeys(outputs, text)
     if unknown := [name for name in given if name not in outputs]:

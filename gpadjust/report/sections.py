@@ -14,7 +14,7 @@ from scipy.stats import binom
 from torch import Tensor
 
 import gpadjust
-from gpadjust.models import PhysicsParameters, StackedGP
+from gpadjust.models import PhysicsParameters, StackedGP, TermsGP
 from gpadjust.models.saving import Saved
 from gpadjust.physics import PhysicsError
 from gpadjust.report import figures
@@ -36,6 +36,7 @@ from gpadjust.report.markup import (
 )
 from gpadjust.report.subject import Adjusted, Subject
 from gpadjust.validation import Trust, trust
+from gpadjust.validation.hints import hints, told_of
 from gpadjust.validation.plots.drawing import quantile
 from gpadjust.validation.structures import ALONE, STACKED
 
@@ -193,7 +194,8 @@ def structures(subject: Subject) -> Markup:
 def advice(subject: Subject, notes: list[str]) -> Markup:
     """Further sentences of the comparison, and warnings of the fit."""
     told = [] if subject.comparison is None else subject.comparison.advice
-    sentences = [text.replace("+-", "±") for text in (*told, *notes)]
+    looks = hints(subject.model, subject.loo)
+    sentences = [text.replace("+-", "±") for text in (*told, *looks, *notes)]
     return bullets(sentences) if sentences else Markup()
 
 
@@ -469,7 +471,32 @@ def data(subject: Subject, origin: Origin) -> Markup:
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
     remarks = [f"{plural(len(subject.X), 'row')} of data.", *_repeats(subject), *origin.remarks]
+    remarks += _assumed(subject.model)
     return join([table("Columns", head, rows), bullets(remarks)])
+
+
+def _assumed(model: TermsGP | StackedGP) -> list[str]:
+    """What a model takes its data for, in sentences."""
+    told = told_of(model)
+    outputs, found = listed(name_and_unit(name)[0] for name in model.output_names), []
+    if "relative" in told:
+        found.append("noise that grows with the physics, beside a constant one (relative)")
+    if "heavy-tailed" in told:
+        found.append("noise with heavy tails, so that outliers count for little")
+    if "train_Yvar" in told:
+        found.append("noise of known variance")
+    if (variances := told.get("train_Xvar")) is not None:
+        sds = variances.reshape(-1, len(model.input_names)).mean(0).sqrt().tolist()
+        noisy = zip(model.input_names, sds, strict=True)
+        each = [f"{name_and_unit(n)[0]} by {with_unit(number(sd), n)}" for n, sd in noisy if sd > 0]
+        found.append(f"inputs that are noisy themselves: {listed(each)} (standard deviations)")
+    if (link := told.get("link")) is not None:
+        found.append(f"{outputs} {getattr(link, 'where', 'within bounds')}")
+    if "categorical" in told:
+        found.append(f"categories in {listed(map(str, told['categorical']))}")
+    if not found:
+        return ["Assumed: noise of one size, exact inputs, numbers that may be of any size."]
+    return [f"Assumed: {'; '.join(found)}."]
 
 
 def _repeats(subject: Subject) -> list[str]:

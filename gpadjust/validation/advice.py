@@ -17,7 +17,6 @@ from gpadjust.validation.ranking import ENOUGH, SURE, Candidate, densities, diff
 from gpadjust.validation.structures import Structure
 
 _COUNTS = 0.05  # weight with which a structure is a part of what is recommended
-_DECADES = 1000.0  # ratio of an output's ends from which on a logarithm is advised
 _ANSWERS = {1: "Yes", 0: "Not shown", -1: "No"}
 
 
@@ -165,7 +164,6 @@ def advice(
             f"By the evidence of {name} with and without it, f_p is of use: {probability:.2f}."
             for name, probability in probable.items()
         ]
-        found += _spread(next(iter(left_out.values())).Y[:, j])
         found += _preferred(models[rows[0].structure], X, j)
         found += _unsampled(rows, converged, j)
         sentences += [where + sentence for sentence in found]
@@ -209,19 +207,6 @@ def _scaling(
 def _elpd(value: float, error: float, better: str, otherwise: str, worse: str) -> str:
     nats = f"{round(value, 1) + 0.0:+.1f} +- {error:.1f} nats"
     return f"elpd {nats} ({better}) over that {otherwise} ({worse})"
-
-
-def _spread(y: Tensor) -> list[str]:
-    """A hint at logarithms, for a positive output over decades."""
-    y = y[~y.isnan()]
-    if not len(y) or (y <= 0).any() or y.max() < _DECADES * y.min():
-        return []
-    decades = (y.max() / y.min()).log10().item()
-    return [
-        f"The output is positive and spans {decades:.1f} decades, so that its largest values "
-        "decide scale and noise: if errors are relative, fit its logarithm, with the logarithm of "
-        "the physics."
-    ]
 
 
 def _unsampled(rows: list[Candidate], converged: dict[str, Tensor], output: int) -> list[str]:

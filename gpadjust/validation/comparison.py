@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
 import torch
@@ -23,6 +23,7 @@ from gpadjust.models.term_builder import ModelOptions, PhysicsLike
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import PhysicsWarning, as_physics
 from gpadjust.validation.advice import Gain, advice
+from gpadjust.validation.hints import hints
 from gpadjust.validation.leave_one_out import LeaveOneOut, leave_one_out, mixed
 from gpadjust.validation.ranking import Candidate, beside, ranking
 from gpadjust.validation.structures import (
@@ -57,6 +58,8 @@ class Comparison:
             without it.
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
+        hints: What the data look like that the models were not told, each with the option to give:
+            outliers, relative noise, outputs that cannot be negative, copies of rows, categories.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
             candidates (:meth:`rows`), and no part of what is recommended.
     """
@@ -68,6 +71,7 @@ class Comparison:
     gain: dict[str, Gain] = field(default_factory=dict)
     left_out: dict[str, LeaveOneOut] = field(default_factory=dict)
     alone: dict[str, LeaveOneOut] = field(default_factory=dict)
+    hints: list[str] = field(default_factory=list)
 
     @property
     def chosen(self) -> str:
@@ -127,6 +131,22 @@ class Comparison:
         beneath = beside(self.alone, self.left_out, [*self.table].index(output))
         return [*self.table[output], *beneath]
 
+    def to_dataframe(self) -> Any:
+        """All tables as a pandas DataFrame: a row for each output and candidate, best first.
+
+        Its columns are ``output`` and those of :class:`Candidate`; rows of a physics alone have no
+        weight. An ImportError without pandas.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError as error:
+            raise ImportError("to_dataframe() needs pandas; run `pip install pandas`.") from error
+        rows = [{"output": name, **r._asdict()} for name in self.table for r in self.rows(name)]
+        for row in rows:
+            if str(row["structure"]).startswith(ALONE):
+                row["weight"] = float("nan")
+        return DataFrame(rows)
+
     def __str__(self) -> str:
         shown = {output: self.rows(output) for output in self.table}
         width = max(len(row.structure) for rows in shown.values() for row in rows)
@@ -149,7 +169,7 @@ class Comparison:
                 )
             lines.append("")
         verdict = [text for name, gain in self.gain.items() for text in gain.sentences(name)]
-        return "\n".join([*lines, *verdict, *self.advice])
+        return "\n".join([*lines, *verdict, *self.advice, *self.hints])
 
 
 def compare(
@@ -244,7 +264,8 @@ def compare(
     asked = known_structures(STRUCTURES if structures is None else structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
-    data = training_data(train_X, train_Y, train_Yvar)
+    categories = {name: options.get(name) for name in ("categorical", "batch")}
+    data = training_data(train_X, train_Y, train_Yvar, **categories)
     if data.X.dim() > 2:
         raise ValueError(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
@@ -257,14 +278,14 @@ def compare(
             "physics=None, and see the scores of `leave_one_out` of both."
         )
     given_physics = as_physics(physics)
-    found = candidates(asked, given_physics, len(data.X))
+    fitted_to = candidates(asked, given_physics, len(data.X))
     models: dict[str, TermsGP] = {}
     left_out: dict[str, LeaveOneOut] = {}
     converged: dict[str, Tensor] = {}
     relevance: dict[str, Tensor] = {}
     said: set[str] = set()
     number = max(_DRAWS[0], min(_DRAWS[1], _MEMORY // len(data.X)))
-    for structure, part in tqdm(found, disable=not progress, unit="structure"):
+    for structure, part in tqdm(fitted_to, disable=not progress, unit="structure"):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             try:
@@ -296,14 +317,15 @@ def compare(
         if result.relevance is not None:
             relevance[structure.name] = result.relevance.flatten()
         models[structure.name] = _thinned(model)
-    prior = [structure.prior for structure, _ in found]
+    prior = [structure.prior for structure, _ in fitted_to]
     by_output = [ranking(left_out, j, prior) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))
     stacked = StackedGP(models, _weights(models, table), _HELD)
-    fitted = [structure for structure, _ in found]
+    fitted = [structure for structure, _ in fitted_to]
     gain, sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
     alone = physics_alone(given_physics, data)
-    return Comparison(models, stacked, table, sentences, gain, left_out, alone)
+    found = Comparison(models, stacked, table, sentences, gain, left_out, alone)
+    return replace(found, hints=hints(found.recommended, found.leave_one_out()))
 
 
 def _thinned(model: TermsGP) -> TermsGP:

@@ -19,8 +19,9 @@ from torch import Tensor
 from gpadjust.gp.noise import Noise
 from gpadjust.models import ParallelPartialGP, StackedGP, TermsGP, VariationalCKA
 from gpadjust.models.exact_conditioning import Factors
+from gpadjust.models.heavy_tails import with_tails
 from gpadjust.models.stacked import Part
-from gpadjust.validation.scores import Scores
+from gpadjust.validation.scores import Scores, central_share
 
 ROUNDING = 1e-8  # of the observations' standard deviation; to predict better shows nothing
 
@@ -39,6 +40,11 @@ class LeaveOneOut:
             deviations of at least 1e-8 of that of the observations, as less is rounding. NaN where
             there is no observation.
         output_names: The names of the outputs; empty if the model has none.
+        pit: The predicted probabilities of less than was observed, of outputs with a link, whose
+            predictions are not Gaussian; else None.
+        is_outlier: Mask of the observations that count as outliers of a noise with heavy tails, of
+            the shape of ``Y``; None of other noise. Mean and variance are of an observation that is
+            none; the density allows that it may be one. Scores leave them out, but for the density.
     """
 
     X: Tensor
@@ -47,11 +53,22 @@ class LeaveOneOut:
     variance: Tensor
     log_density: Tensor
     output_names: tuple[str, ...] = ()
+    pit: Tensor | None = None
+    is_outlier: Tensor | None = None
 
     @property
     def residuals(self) -> Tensor:
-        """Standardized residuals, ``(Y - mean) / sd``, ``batch_shape x n x m``."""
+        """Standardized residuals, ``(Y - mean) / sd``, ``batch_shape x n x m``.
+
+        Of outputs with a link they are those of normal numbers of the same probability.
+        """
+        if self.pit is not None:
+            return torch.special.ndtri(self.pit.clamp(1e-15, 1 - 1e-15))
         return (self.Y - self.mean) / self.variance.sqrt()
+
+    def below(self) -> Tensor:
+        """The predicted probabilities of less than was observed, ``batch_shape x n x m``."""
+        return torch.special.ndtr(self.residuals) if self.pit is None else self.pit
 
     def score(self, level: float = 0.95) -> Scores:
         """The scores of the predictions; the density is that of a mixture where they are one.
@@ -60,7 +77,10 @@ class LeaveOneOut:
             level: Nominal coverage, between 0 and 1.
         """
         names = self.output_names
-        scores = Scores.of(self.mean, self.variance, self.Y, level=level, output_names=names)
+        Y = self.Y if self.is_outlier is None else self.Y.masked_fill(self.is_outlier, torch.nan)
+        scores = Scores.of(self.mean, self.variance, Y, level=level, output_names=names)
+        if self.pit is not None:
+            scores = replace(scores, pit=self.pit, coverage=central_share(self.pit, level))
         return replace(scores, nlpd=-self.log_density.nanmean(-2))
 
 
@@ -136,24 +156,39 @@ def leave_one_out(
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
         mean, variance = model.left_out() if isinstance(model, TermsGP) else _targets(model)
+        targets = model.train_targets
+        if isinstance(model, TermsGP):
+            targets, mean = model.measured_targets(), mean + model.measured_targets() - targets
         Y, mean, variance = (
-            _outputs_last(model, t)[..., rows, :] for t in (model.train_targets, mean, variance)
+            _outputs_last(model, t)[..., rows, :] for t in (targets, mean, variance)
         )
         # A missing observation is predicted from all that there are, but not compared.
-        missing = Y.isnan()
+        missing, link, own_pit = Y.isnan(), getattr(model, "link", None), None
         mean, variance = mean.masked_fill(missing, 0.0), variance.masked_fill(missing, 1.0)
         if transform is not None:
-            Y, mean = transform.untransform(Y)[0], transform.untransform(mean)[0]
+            # Of a model with a link these are in its units.
+            Y, mean = (Standardize.untransform(transform, values)[0] for values in (Y, mean))
             variance = variance * transform.stdvs.square()
         if is_fully_bayesian(model):
             X, Y = X.select(MCMC_DIM, 0), Y.select(MCMC_DIM, 0)
         else:
             mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
-        density = log_densities(mean, variance, Y)
-        mean, variance, density = _mixture_of(mean, variance, density, _without_each(density))
+        density, is_outlier = log_densities(mean, variance, Y), None
+        if isinstance(model, TermsGP) and model.has_heavy_tails:
+            density = with_tails(density, Y.unsqueeze(MCMC_DIM) - mean, variance)
+            kept = _outputs_last(model, model.noise.trusted(model.train_targets))[..., rows, :]
+            kept = kept.select(MCMC_DIM, 0) if is_fully_bayesian(model) else kept
+            is_outlier = kept.isnan() & ~Y.isnan()
+        weight = _without_each(density)
+        if link is not None:
+            below = torch.special.ndtr((Y.unsqueeze(MCMC_DIM) - mean) / variance.sqrt())
+            own_pit = (weight * below).sum(MCMC_DIM).masked_fill(Y.isnan(), torch.nan)
+            (mean, variance), Y = link.moments(mean, variance), link.inverse(Y)
+            density = density + link.log_slope(Y).unsqueeze(MCMC_DIM)
+        mean, variance, density = _mixture_of(mean, variance, density, weight)
     X, Y = X[..., rows, :].expand(*mean.shape[:-1], X.shape[-1]), Y.expand(mean.shape)
     names = getattr(model, "output_names", ())
-    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, density, names)
+    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, density, names, own_pit, is_outlier)
 
 
 def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:
@@ -193,7 +228,10 @@ def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
     parts = ((loo.mean, loo.variance, loo.log_density) for loo in each)
     mean, variance, density = (torch.stack(p, MCMC_DIM) for p in zip(*parts, strict=True))
     mean, variance, density = _mixture_of(mean, variance, density, weight)
-    return replace(each[0], mean=mean, variance=variance, log_density=density)
+    pit = None
+    if any(loo.pit is not None for loo in each):
+        pit = (weight * torch.stack([loo.below() for loo in each], MCMC_DIM)).sum(MCMC_DIM)
+    return replace(each[0], mean=mean, variance=variance, log_density=density, pit=pit)
 
 
 def observations(model: Any) -> tuple[Tensor, Tensor]:
@@ -211,7 +249,8 @@ def observations(model: Any) -> tuple[Tensor, Tensor]:
         return data["train_X"], data["train_Y"]
     with _evaluating(model), torch.no_grad():
         X, rows = _measurements(model)
-        Y = _outputs_last(model, model.train_targets)
+        targets = model.measured_targets() if isinstance(model, TermsGP) else model.train_targets
+        Y = _outputs_last(model, targets)
         transform = getattr(model, "outcome_transform", None)
         Y = Y if transform is None else transform.untransform(Y)[0]
     X, Y = X[..., rows, :], Y[..., rows, :]
@@ -268,4 +307,6 @@ def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
     columns = ((part.Y, part.mean, part.variance, part.log_density) for part in parts)
     Y, mean, variance, density = (torch.cat(each, dim=-1) for each in zip(*columns, strict=True))
     names = tuple(name for part in parts for name in part.output_names)
-    return LeaveOneOut(X, Y, mean, variance, density, names)
+    linked = any(part.pit is not None for part in parts)
+    pit = torch.cat([part.below() for part in parts], dim=-1) if linked else None
+    return LeaveOneOut(X, Y, mean, variance, density, names, pit)

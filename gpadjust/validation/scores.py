@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.distributions import Normal
 
 from gpadjust.checks import check_columns, check_level
+from gpadjust.models.links import LinkedPosterior
 
 
 def rmse(mean: Tensor, y: Tensor, *, mixture_dim: int | None = None) -> Tensor:
@@ -260,7 +261,8 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
 
     Args:
         posterior: Any BoTorch posterior that is Gaussian at each point; that of a fully Bayesian
-            model (``GaussianMixturePosterior``) is judged as the mixture that it is.
+            model (``GaussianMixturePosterior``) is judged as the mixture that it is. That of an
+            output with a link is judged as it is, but for ``crps``, by its mean and variance.
         Y: Observations, ``... x n x m``, NaN where there is none.
         level: Nominal coverage, between 0 and 1.
 
@@ -281,6 +283,12 @@ def score(posterior: Posterior, Y: Tensor, level: float = 0.95) -> Scores:
         >>> scores.rmse.shape, scores.pit.shape
         (torch.Size([1]), torch.Size([20, 1]))
     """
+    if isinstance(posterior, LinkedPosterior):
+        of_moments = Scores.of(posterior.mixture_mean, posterior.mixture_variance, Y, level=level)
+        below, density = posterior.judged(Y)
+        nlpd_ = -_mean_over_observed(density, Y)
+        share = central_share(below, level)
+        return replace(of_moments, nlpd=nlpd_, pit=below, coverage=share)
     dim = MCMC_DIM if isinstance(posterior, GaussianMixturePosterior) else None
     mean, variance = getattr(posterior, "mean", None), getattr(posterior, "variance", None)
     if not (isinstance(mean, Tensor) and isinstance(variance, Tensor)):

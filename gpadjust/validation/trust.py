@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_level, checked_whole
 from gpadjust.models import StackedGP, TermsModel
+from gpadjust.models.levels import coded, on_levels
 from gpadjust.models.training_data import ArrayLike, to_tensor
 from gpadjust.validation.leave_one_out import observations
 
@@ -132,7 +133,9 @@ def trust(
         )
     with torch.no_grad():
         train_X, train_Y = observations(model)
-        X = _points(train_X, num_points) if X is None else to_tensor(X, "X")
+        if X is None:
+            X = on_levels(_points(train_X, num_points), model.levels)
+        X = to_tensor(coded(X, model.levels, model.batches), "X")
         if X.dim() != 2 or not len(X):
             raise ValueError(f"Expected X of shape n x d, one point or more, got {tuple(X.shape)}.")
         mean, variance = model.predict(X)

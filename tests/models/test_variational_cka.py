@@ -376,5 +376,5 @@ def test_several_variances_are_refused():
             left = (inputs[..., 0] < 0.5).to(inputs)
             return torch.stack([left, 1 - left], dim=-1)
 
-    with pytest.raises(ValueError, match="one variance, got Halves"):
+    with pytest.raises(ValueError, match="one variance for all observations, got Halves"):
         VariationalCKA(*problem(30), physics=wave, num_inducing=5, likelihood=Halves(2, Size()))

@@ -24,7 +24,7 @@ from gpadjust.inference import bayes
 from gpadjust.models.training_data import training_data
 from gpadjust.physics import as_physics
 from gpadjust.validation import STRUCTURES, Gain, Structure, leave_one_out, stacking_weights
-from gpadjust.validation.advice import _scaling, _spread, physics_gain
+from gpadjust.validation.advice import _scaling, physics_gain
 from gpadjust.validation.ranking import ranking
 from gpadjust.validation.structures import candidates, physics_alone
 
@@ -345,13 +345,6 @@ class TestAdvice:
         assert "elpd +8.0 +- 0.0 nats (CKA)" in finding
         assert "by the evidence of a model with and without the physics" in reason
 
-    def test_an_output_over_decades(self):
-        y = torch.tensor([0.15, 3.0, 262.0, torch.nan]).double()
-        (sentence,) = _spread(y)
-        assert "spans 3.2 decades" in sentence
-        assert "logarithm" in sentence
-        assert _spread(-y) == _spread(y + 100) == _spread(y[3:]) == []
-
     def test_one_physics_of_no_use_does_not_hide_another(self, X, noise):
         parts = {"good": crude, "unrelated": lambda X: (23 * X + 1).cos()}
         comparison = compare(X, 2 * crude(X) + X + noise, parts, **QUICK)
@@ -470,6 +463,19 @@ class TestWeights:
         assert [row.structure for row in rows] == ["good", "bad"]
         assert math.isfinite(rows[1].elpd_diff)
         assert [row.weight for row in rows] == pytest.approx([1, 0], abs=0.01)
+
+
+def test_as_a_frame(scaled, monkeypatch):
+    found = compare(*scaled, crude, structures=["physics mean", "CKA"])
+    table = found.to_dataframe()
+    rows = found.rows("y")
+    assert [*table["structure"]] == [each.structure for each in rows]
+    assert {*table["output"]} == {"y"}
+    assert table["elpd"].tolist() == [each.elpd for each in rows]
+    assert table["weight"].isna().tolist() == [n == "physics alone" for n in table["structure"]]
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas"):
+        found.to_dataframe()
 
 
 def test_bad_input(scaled):

@@ -1,0 +1,183 @@
+"""Categories among the inputs, and batches of which each has an offset."""
+
+import math
+
+import pandas as pd
+import pytest
+import torch
+from gpytorch.kernels import MaternKernel, ScaleKernel
+
+from gpadjust import (
+    CKA,
+    RRA,
+    PhysicsMeanGP,
+    StackedGP,
+    VariationalCKA,
+    ZeroMeanGP,
+    compare,
+    fit,
+    load,
+    save,
+)
+from gpadjust.gp import GroupedRBFKernel
+from gpadjust.gp.gaussian import LikelihoodValue
+from gpadjust.inference.distributions import ByModules, stationary_terms
+from gpadjust.inference.vectors import Parameters
+from gpadjust.sklearn import CKARegressor
+from gpadjust.validation import leave_one_out, trust
+
+GENERATOR = torch.Generator().manual_seed(0)
+N = 30
+FLOW = 2 * torch.rand(N, generator=GENERATOR, dtype=torch.float64)
+MATERIAL, RIG = (torch.randint(k, (N,), generator=GENERATOR) for k in (3, 4))
+OFFSETS = torch.tensor([0.5, -0.6, 0.1, 0.3], dtype=torch.float64)
+HEAD = torch.tensor([1.0, 2.0, 1.4], dtype=torch.float64)
+NAMES = ["brass", "iron", "steel"]
+NOISE = 0.03 * torch.randn(N, generator=GENERATOR, dtype=torch.float64)
+Y = (HEAD[MATERIAL] * (3 - FLOW.square()) + OFFSETS[RIG] + NOISE).unsqueeze(-1)
+FRAME = pd.DataFrame(
+    {
+        "flow": FLOW.numpy(),
+        "material": pd.Categorical([NAMES[i] for i in MATERIAL]),
+        "rig": [f"R{i}" for i in RIG.tolist()],
+    }
+)
+X = torch.stack([FLOW, MATERIAL.double(), RIG.double()], -1)
+NEW = FRAME[:4].assign(rig="R9")
+
+
+def head(X):
+    return 0.9 * HEAD[X[:, 1].long()] * (3 - X[:, 0].square())
+
+
+@pytest.fixture(scope="module")
+def model():
+    model = CKA(FRAME, Y, physics=head, batch="rig")
+    fit(model, num_samples=8)
+    return model
+
+
+def test_the_covariance_is_exchangeable():
+    model = ZeroMeanGP(X, Y, categorical=[1], batch=2)
+    f, rig = model.terms
+    f.kernel.base_kernel.lengthscale = torch.tensor([[0.7, 1.5]])
+    variances = [f.kernel.outputscale, rig.kernel.outputscale]
+    inputs = model.transform_inputs(X)
+    found = model.covar_module.at(inputs).covariance()
+    same = [(X[:, None, i] == X[:, i]).double() for i in (1, 2)]
+    near = (-((FLOW[:, None] - FLOW) / 0.7).square() / 2 - (1 - same[0]) / (2 * 1.5**2)).exp()
+    torch.testing.assert_close(found, variances[0] * near + variances[1] * same[1])
+    plain = model.covar_module(inputs).to_dense()
+    torch.testing.assert_close(plain, found)
+
+
+def test_closed_form_and_autograd_agree():
+    model = CKA(X, Y, physics=head, categorical=[1], batch=[2]).train()
+    parameters = Parameters(model)
+    inputs = model.transform_inputs(X)
+    closed = stationary_terms(model, parameters, inputs, None, False)
+    values = {row.name: row.value().unsqueeze(0) + 0.1 for row in parameters.rows}
+    other = ByModules(model, parameters, inputs, None, False)
+    found, expected = closed(values, True), other(values, True)
+    torch.testing.assert_close(found.covariance.squeeze(0), expected.covariance.squeeze(0))
+    lengthscales = [n for n in parameters.names if "raw_lengthscale" in n]
+    assert [values[n].shape[-1] for n in lengthscales] == [2, 2]  # of rho and delta, none of rigs
+    by = torch.rand(N, N, generator=GENERATOR, dtype=torch.float64)
+
+    zero = torch.zeros(1, dtype=torch.float64)
+    value = LikelihoodValue(zero, zero, torch.zeros(1, N).double(), (by + by.T).unsqueeze(0))
+    ours, theirs = found.pull_back(value), expected.pull_back(value)
+    for name in lengthscales:
+        torch.testing.assert_close(ours[name].flatten(), theirs[name].flatten())
+
+
+def test_a_frame_is_taken_as_it_is(model):
+    assert model.levels == {1: ("brass", "iron", "steel"), 2: ("R0", "R1", "R2", "R3")}
+    torch.testing.assert_close(model.data()["train_X"], X)
+    torch.testing.assert_close(model.predict(FRAME).mean, model.predict(X).mean)
+    assert (model.predict(FRAME).mean - Y).std() < 0.05
+    offsets = model.term("rig", FRAME)
+    found = torch.stack([offsets.mean[i == RIG][0, 0] for i in range(4)])
+    torch.testing.assert_close(found - found.mean(), OFFSETS - OFFSETS.mean(), rtol=0, atol=0.1)
+    assert "lengthscale of material" in model.summary()
+    assert "rig: mean 0" in model.summary()
+
+
+def test_a_new_rig_has_the_variance_of_offsets(model):
+    known, new = model.predict(FRAME[:4]).variance, model.predict(NEW).variance
+    rig = model.terms[-1].kernel.outputscale.mean() * model.units()[1].square().mean()
+    assert (new > 20 * known).all()
+    torch.testing.assert_close(model.term("rig", NEW).variance.mean(), rig)
+    functions = model.sample_functions(600, seed=0)(torch.cat([X[:4, :2], X[:4, 2:] * 0 + 9], -1))
+    torch.testing.assert_close(functions.var(0), new, rtol=0.3, atol=0)
+    conditioned = model.condition_on_observations(NEW[:1], Y[:1])
+    assert (conditioned.predict(NEW).variance < 0.1 * new).all()
+
+
+def test_files_scores_and_stacking(model, tmp_path):
+    save(model, tmp_path / "model.pt")
+    again = load(tmp_path / "model.pt")
+    torch.testing.assert_close(again.predict(NEW).mean, model.predict(NEW).mean)
+    assert (again.levels, again.batches) == (model.levels, (2,))
+    stacked = StackedGP({"CKA": model}, [[1.0]], 4)
+    assert stacked.condition_on_observations(NEW, Y[:4]).predict(NEW).mean.shape == (4, 1)
+    assert leave_one_out(model).score().coverage > 0.8
+    assert trust(model).X[:, 1].unique().numel() == 3
+    comparison = compare(
+        FRAME, Y, head, structures=["physics mean", "zero mean"], batch="rig", num_starts=2
+    )
+    assert comparison.recommended.predict(NEW).mean.isfinite().all()
+
+
+@pytest.mark.parametrize("kind", [RRA, VariationalCKA])
+def test_other_models(kind):
+    model = kind(FRAME, Y, physics=head, batch="rig")
+    fit(model, "map", num_starts=2)
+    assert (model.predict(FRAME).mean - Y).std() < 0.1
+    assert (model.predict(NEW).variance > model.predict(FRAME[:4]).variance).all()
+    assert model.predict(X).mean.isfinite().all()
+
+
+def test_arrays_outputs_and_declared_levels():
+    both = torch.cat([Y, -Y], -1)
+    levels = {"material": ["steel", "iron", "brass", "zinc"]}
+    model = ZeroMeanGP(FRAME, both, categorical=levels, batch="rig")
+    torch.testing.assert_close(model.data()["train_X"][:, 1], 2 - MATERIAL.double())
+    fit(model, "map", num_starts=2)
+    zinc = model.predict(FRAME[:4].assign(material="zinc"))
+    assert (zinc.variance > model.predict(FRAME[:4]).variance).all()
+    assert model.subset_output([1]).predict(NEW).mean.shape == (4, 1)
+    numbers = X + torch.tensor([0.0, 10.0, 0.0])
+    regressor = CKARegressor(model=lambda X, Y: ZeroMeanGP(X, Y, categorical=[1]), random_state=0)
+    regressor.set_params(fit_method="map").fit(numbers.numpy(), Y.flatten().numpy())
+    assert regressor.model_.levels == {1: (10.0, 11.0, 12.0)}
+    other = ZeroMeanGP(
+        X, Y, categorical=1, covar_module=lambda d, shape: ScaleKernel(MaternKernel())
+    )
+    assert not any(isinstance(each, GroupedRBFKernel) for each in other.modules())
+    inputs = other.input_transform
+    torch.testing.assert_close(inputs.untransform(inputs(X)), X)
+    assert math.isclose(float(inputs(X)[0, 1:4].norm()), 0.5**0.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"categorical": "colour"}, "columns of flow, material, rig, got 'colour'"),
+        ({"batch": 7}, "got 7"),
+        ({"categorical": {"material": ["iron", "iron"]}}, "different levels"),
+        ({"categorical": {"material": ["iron", "steel"]}}, "one of iron, steel, got 'brass'"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        PhysicsMeanGP(FRAME, Y, physics=head, **options)
+
+
+def test_bad_levels(model):
+    with pytest.raises(ValueError, match="brass, iron, steel, got 'wood'"):
+        model.predict(FRAME[:2].assign(material="wood"))
+    with pytest.raises(ValueError, match=r"material to be one of \[0.0, 1.0, 2.0\].*got 1.5"):
+        model.transform_inputs(torch.tensor([[1.0, 1.5, 0.0]]).double())
+    with pytest.raises(ValueError, match="an input beside batches"):
+        ZeroMeanGP(X[:, 2:], Y, batch=0)

@@ -1,0 +1,147 @@
+"""A formula that is right somewhere, through the whole library."""
+
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from botorch.models.transforms import Normalize
+
+from gpadjust import CKA, PhysicsMeanGP, ScaleGP, VariationalCKA, compare, fit, load, save
+from gpadjust.models import vanishing_rbf
+from gpadjust.physics import FunctionPhysics, Unknown
+from gpadjust.sklearn import CKARegressor
+from gpadjust.validation import leave_one_out
+
+OPEN = vanishing_rbf({"valve": 1.0})
+
+
+def law(X, p):
+    return p.friction * X[:, 1] ** 2
+
+
+PIPE = FunctionPhysics(law, unknowns={"friction": Unknown(1.0, factor=2.0)})
+
+
+@pytest.fixture
+def valve(uniform):
+    """Loss of pressure in a pipe and a valve, whose loss f_p does not have."""
+    X = uniform(16, 2, low=0.2)
+    noise = 0.01 * torch.randn(16, 1, generator=torch.Generator().manual_seed(3)).double()
+    Y = 2 * X[:, 1:] ** 2 + 0.5 * (1 / X[:, :1] - 1) * X[:, 1:] ** 2 + noise
+    return pd.DataFrame(X.numpy(), columns=["valve", "flow"]), pd.DataFrame({"loss": Y[:, 0]})
+
+
+@pytest.fixture
+def at_open(uniform):
+    X = uniform(7, 2)
+    X[:, 0] = 1.0
+    return X
+
+
+def test_the_whole_house(valve, at_open, tmp_path, uniform):
+    model = PhysicsMeanGP(*valve, physics=PIPE, covar_module=OPEN)
+    fit(model, num_samples=8)
+    lower, upper = model.physics_parameters.interval()
+    assert lower < 2 < upper
+    assert upper - lower < 0.6
+    delta = model.delta(at_open)
+    assert delta.mean.abs().max() < 1e-9
+    assert delta.variance.max() < 1e-9
+    assert model.delta(at_open - torch.tensor([0.5, 0.0])).variance.min() > 1e-6
+    Z = uniform(5, 2, low=0.2, seed=5)
+    values = model.sample_functions(1000, seed=0)(Z)
+    mean, variance = model.predict(Z)
+    assert (values.mean(0) - mean).abs().max() < 0.2 * variance.max().sqrt()
+    torch.testing.assert_close(values.std(0), variance.sqrt(), rtol=0.15, atol=0)
+    assert torch.isfinite(leave_one_out(model).mean).all()
+    more = model.condition_on_observations(at_open[:2], 2 * at_open[:2, 1:] ** 2)
+    assert more.delta(at_open).variance.max() < 1e-9
+    assert "friction" in model.summary()
+    saved = save(model, tmp_path / "model.pt")
+    assert "covar_module" in saved.missing
+    again = load(saved.path, physics=PIPE, covar_module=OPEN)
+    torch.testing.assert_close(again.predict(Z).mean, mean)
+    with pytest.raises(ValueError, match="zero elsewhere"):
+        load(saved.path, physics=PIPE, covar_module=vanishing_rbf({"valve": 0.5}))
+
+
+@pytest.mark.slow
+def test_compared_reported_and_in_scikit_learn(valve, at_open, tmp_path):
+    from gpadjust.report import report
+
+    vanishing = partial(CKA, delta_covar_module=OPEN, rho_covar_module=OPEN)
+    found = compare(*valve, PIPE, structures=["CKA", vanishing], num_starts=1, num_screened=4)
+    assert len(found.models) == 2
+    page = report(found, tmp_path / "page.html")
+    assert "valve" in page.read_text()
+    options = {"num_samples": 8}
+    regressor = CKARegressor(PIPE, model=partial(PhysicsMeanGP, covar_module=vanishing_rbf({0: 1})))
+    regressor.set_params(fit_options=options).fit(valve[0], valve[1].to_numpy()[:, 0])
+    assert regressor.model_.delta(at_open).variance.max() < 1e-9
+
+
+@pytest.mark.parametrize("structure", ["CKA", "ScaleGP"])
+def test_rho_is_its_mean_there(structure, valve, at_open):
+    X, Y = valve
+    if structure == "ScaleGP":
+        model = ScaleGP(X, Y, physics=lambda X: X[:, 1] ** 2, covar_module=OPEN)
+    else:
+        kernels = {"rho_covar_module": OPEN, "delta_covar_module": OPEN}
+        model = CKA(X, Y, physics=lambda X: X[:, 1] ** 2, **kernels)
+        mean, variance = model.predict(at_open)
+        torch.testing.assert_close(mean, at_open[:, 1:] ** 2, rtol=0, atol=1e-7)
+        assert variance.max() < 1e-9
+    rho = model.rho(at_open)
+    assert (rho.mean - 1).abs().max() < 1e-9
+    assert rho.variance.max() < 1e-9
+
+
+def test_several_outputs_and_a_transform_of_inputs(valve, at_open):
+    X, Y = valve
+    both = np.concatenate([Y, 2 * Y], 1)
+    options = {"physics": lambda X: X[:, :2], "delta_covar_module": OPEN, "center": 0.0}
+    model = CKA(X, both, input_transform=Normalize(2), **options)
+    fit(model, num_samples=2)
+    assert model.delta(at_open).variance.max() < 1e-9
+    assert model.sample_functions(2, seed=0)(at_open).shape == (2, 7, 2)
+
+
+def test_places_as_frames_arrays_and_numbers():
+    names = ("valve", "flow")
+    for where, expected in [
+        ({"flow": [0.0, 1.0]}, [[None, 0.0], [None, 1.0]]),
+        ({1: 0.0, "valve": 2}, [[2.0, 0.0]]),
+        ({-1: 3}, [[None, 3.0]]),
+        (np.array([[1.0, 2.0]]), [[1.0, 2.0]]),
+        ([[1.0, 2.0]], [[1.0, 2.0]]),
+        (pd.DataFrame({"flow": [4.0]}), [[None, 4.0]]),
+    ]:
+        found = vanishing_rbf(where)._raw(names)
+        numbers = [[None if v != v else v for v in row] for row in found.tolist()]
+        assert numbers == expected
+
+
+def test_bad_places(valve):
+    X, Y = valve
+    for where, message in [
+        ({}, "each column a number"),
+        ({"valve": [0.0, 1.0], "flow": [1.0, 2.0, 3.0]}, "each column a number"),
+        ({"valve": float("nan")}, "finite"),
+        (np.zeros(3), r"points p x d.*\(3,\)"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            vanishing_rbf(where)
+    for where, message in [
+        ({"vane": 1.0}, "columns of valve, flow.*'vane'"),
+        ({2: 1.0}, "numbers from 0 to 1, got 2"),
+        (np.zeros((1, 3)), "points with 2 columns"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            CKA(X, Y, physics=lambda X: X[:, 0], delta_covar_module=vanishing_rbf(where))
+    one = {"physics": lambda X: X[:, 1], "delta_covar_module": OPEN}
+    with pytest.raises(ValueError, match=r"center=0.0.*rho_covar_module"):
+        CKA(X, Y, **one)
+    with pytest.raises(ValueError, match=r"vanish nowhere.*CKA takes it"):
+        VariationalCKA(X, Y, rho_covar_module=OPEN, **one)
