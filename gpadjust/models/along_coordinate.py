@@ -28,8 +28,8 @@ class AlongCoordinate(NamedTuple):
 
     With :math:`K_x = U \Lambda U^T` and :math:`A K_t A = V M V^T`, whose rank is at most 128 (a
     Nystrom approximation at evenly spaced outputs), the coefficients :math:`U^T E V` are
-    independent, with variances :math:`\lambda_i \mu_k + s` (Stegle et al. 2011), and what is not in the span of V
-    is noise.
+    independent, with variances :math:`\lambda_i \mu_k + s` (Stegle et al. 2011), and what
+    is not in the span of V is noise.
 
     Attributes:
         train: The kernel's sum at the training inputs.
