@@ -21,6 +21,7 @@ CHAPTERS = {
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
     "laboratory": (
+        "Curves",
         "Balldrop",
         "Categories",
         "Curves",
