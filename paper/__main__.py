@@ -21,7 +21,6 @@ CHAPTERS = {
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
     "laboratory": (
-        "Curves",
         "Balldrop",
         "Categories",
         "Curves",
