@@ -21,8 +21,10 @@ CHAPTERS = {
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
     "laboratory": (
-        *("Balldrop", "Drift", "Emulated", "Hints"),
-        *("Noisyinputs", "Repeats", "Sisters", "Vanishing"),
+    "laboratory": (
+        *("Balldrop", "Categories", "Drift", "Emulated", "Hints", "Links"),
+        *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
+    ),
     ),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }

@@ -51,6 +51,26 @@ class Balldrop(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Categories(Experiment):
+    """Pumps of three materials on five rigs, of which each has an offset."""
+
+    runs: int = 24
+    """sets of pumps"""
+    out: Path = Path("results/categories")
+
+    axes: ClassVar[Axes] = {
+        "model": {
+            "ignored": "material and rig ignored",
+            "each": "a model of each material",
+            "numbers": "codes as numbers",
+            "onehot": "one-hot columns as numbers",
+            "ours": "categorical, batch",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
+
+
+@dataclass(frozen=True, kw_only=True)
 class DriftSettings:
     """Settings that decide the numbers, fixed before the first run."""
 
@@ -150,6 +170,70 @@ class Hints(Experiment):
         },
     }
     calls: ClassVar[tuple[str, ...]] = ("gpadjust.compare",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Links(Experiment):
+    """Positive and bounded outputs: a link, with the physics through it, beside none."""
+
+    runs: int = 24
+    """cases of each problem"""
+    out: Path = Path("results/links")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "rate": "reaction rate, 4 decades",
+            "diode": "current of a diode, 6 decades",
+            "pump": "efficiency of a pump, 0 to 1",
+            "reactor": "conversion in a reactor, 0 to 1",
+        },
+        "model": {"default": "CKA", "gp": "GP with the link", "linked": "CKA with the link"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outliers(Experiment):
+    """One in twenty observations is far off: errors beside those of clean data."""
+
+    runs: int = 8
+    """cases of each problem and size"""
+    out: Path = Path("results/outliers")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "wave": "wave: f_p lacks a slope",
+            "decay": "decay: a wrong rate",
+            "plane": "plane: two inputs",
+            "good": "good: f_p is 2 % off",
+            "misleading": "misleading: f_p is of no use",
+            "space": "space: three inputs",
+        },
+        "observations": {20: "20", 60: "60"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relative(Experiment):
+    """Noise that grows with an output over three decades: do intervals hold in each?"""
+
+    runs: int = 12
+    """cases of each problem"""
+    observations: int = 40
+    """training points"""
+    out: Path = Path("results/relative")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "rate": "rate: exponential",
+            "power": "power: a wrong exponent",
+            "plane": "plane: f_p lacks an input",
+        },
+        "structure": {"CKA": "CKA", "GP": "GP without physics"},
+        "noise": {"default": "one size", "relative": "relative"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
 
 
 @dataclass(frozen=True, kw_only=True)
