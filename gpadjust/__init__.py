@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         Physics,
         PhysicsError,
         PhysicsWarning,
+        SubprocessPhysics,
         Unknown,
     )
     from gpadjust.validation import Comparison, compare
@@ -56,6 +57,7 @@ __all__ = [
     "SampleResult",
     "ScaleGP",
     "StackedGP",
+    "SubprocessPhysics",
     "Unknown",
     "VariationalCKA",
     "ZeroMeanGP",

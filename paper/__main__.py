@@ -20,7 +20,18 @@ CHAPTERS = {
     "measuring": ("Active", "Optimisation", "Misled"),
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
-    "laboratory": ("Vanishing", "Links", "Categories"),
+    "laboratory": (
+        "Balldrop",
+        "Categories",
+        "Drift",
+        "Emulated",
+        "Hints",
+        "Links",
+        "Outliers",
+        "Relative",
+        "Sisters",
+        "Vanishing",
+    ),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
 """Folders, and the classes of the experiments that they declare."""

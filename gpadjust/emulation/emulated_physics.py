@@ -8,17 +8,21 @@ from typing import Any
 import numpy as np
 import torch
 from botorch.models.transforms.outcome import Standardize
-from torch import Tensor
+from gpytorch.kernels import MaternKernel, ScaleKernel
+from torch import Size, Tensor
 
 from gpadjust.emulation.error_kernel import ErrorKernel
 from gpadjust.inference import fit
 from gpadjust.inference.fitting import FitOptions
 from gpadjust.models import ZeroMeanGP
 from gpadjust.models.factory import ModelFactory, make_model
+from gpadjust.models.parameters import LogInterval, scaled_rbf
+from gpadjust.models.term_builder import KernelLike
 from gpadjust.models.terms_gp import TermsGP
 from gpadjust.models.training_data import ArrayLike, training_data
 from gpadjust.physics import Physics, Unknown
 from gpadjust.physics.unknown import ParameterValues, Unknowns
+from gpadjust.validation import leave_one_out
 
 
 class EmulatedPhysics(Physics):
@@ -45,8 +49,9 @@ class EmulatedPhysics(Physics):
             Default: all.
         unknowns: The unknown parameters by name.
         model_factory: Makes the emulator of ``X`` and ``Y``. Default: :class:`~gpadjust.ZeroMeanGP`
-            of standardised outputs. ``functools.partial(CKA, physics=...)`` of a formula of the
-            simulator's inputs needs fewer runs.
+            of standardised outputs, with an RBF kernel or one of Matern (5/2), whichever predicts
+            runs that are left out with the higher density. ``functools.partial(CKA, physics=...)``
+            of a formula of the simulator's inputs needs fewer runs.
         fit_options: Options of its :func:`~gpadjust.fit`, such as ``{"method": "map"}``.
         name: The name in messages. Default: the class's.
 
@@ -112,9 +117,13 @@ class EmulatedPhysics(Physics):
                 f"The runs have {self.num_inputs} input(s) beside the unknown parameters, but "
                 f"inputs={self.inputs} names {len(self.inputs)} columns of the data."
             )
-        factory = model_factory or _default_emulator
-        emulator = make_model(factory, runs_X, runs_Y, kind=TermsGP)
-        fit(emulator, **(fit_options or {}))
+        factories = [model_factory] if model_factory else [*map(_standardised, _KERNELS)]
+        fitted = []
+        for factory in factories:
+            emulator = make_model(factory, runs_X, runs_Y, kind=TermsGP)
+            fit(emulator, **(fit_options or {}))
+            fitted.append(emulator)
+        emulator = max(fitted, key=_left_out_density) if len(fitted) > 1 else fitted[0]
         self.num_outputs = emulator.num_outputs
         # In a tuple, no submodule: it is no part of a model that a fit changes, or a copy copies.
         self._emulator = (emulator, emulator.mean_functions())
@@ -146,9 +155,29 @@ class EmulatedPhysics(Physics):
         return ErrorKernel(self, self.emulator, unknowns, columns, unit)
 
 
-def _default_emulator(X: Any, Y: Any) -> ZeroMeanGP:
-    m = 1 if len(Y.shape) < 2 else Y.shape[-1]
-    return ZeroMeanGP(X, Y, outcome_transform=Standardize(m))
+def _matern(num_inputs: int, batch_shape: Size) -> ScaleKernel:
+    """A Matern kernel with one lengthscale per input and an outputscale."""
+    base = MaternKernel(
+        2.5, ard_num_dims=num_inputs, batch_shape=batch_shape, lengthscale_constraint=LogInterval()
+    )
+    return ScaleKernel(base, batch_shape=batch_shape, outputscale_constraint=LogInterval())
+
+
+_KERNELS: tuple[KernelLike, ...] = (scaled_rbf, _matern)
+
+
+def _standardised(kernel: KernelLike) -> ModelFactory:
+    """A factory of models of standardised outputs with a kernel."""
+
+    def make(X: Any, Y: Any) -> ZeroMeanGP:
+        transform = Standardize(Y.shape[-1])
+        return ZeroMeanGP(X, Y, covar_module=kernel, outcome_transform=transform)
+
+    return make
+
+
+def _left_out_density(emulator: TermsGP) -> float:
+    return float(leave_one_out(emulator).log_density.nansum())
 
 
 def _missing_rows(Y: Any) -> Tensor:

@@ -144,9 +144,9 @@ class SumFeatures(FeatureMap):
         return self.kernel.at(x).features(self.maps)
 
 
-def sum_features(kernel: SumOfTerms, num_features: int) -> Any:
-    """Those of :func:`term_features`, and of ``sister``, if there is one."""
-    found = term_features(kernel.terms, num_features)
+def sum_features(kernel: SumOfTerms, terms: Sequence[Term], num_features: int) -> Any:
+    """Those of :func:`term_features` of a model's terms, and of ``sister``, if there is one."""
+    found = term_features(terms, num_features)
     if kernel.sister is not None:
         found["sister"] = SisterFeatures(kernel, num_features)
     return found

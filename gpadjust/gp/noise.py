@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from gpytorch.distributions import MultivariateNormal
@@ -14,13 +14,21 @@ from torch import Size, Tensor
 from torch.nn import Module, Parameter
 from torch.nn.functional import pad
 
+_OUTLYING = 1e3  # times the variance of a new observation: a row that hardly counts
 
-class RowSource(Protocol):
+
+class RowSource:
     """A reason why the noise of training rows differs from that of new observations there."""
 
+    has_outliers: ClassVar[bool] = False
+
     def refine(self, model: Any, rows: RowNoise) -> bool:
-        """Set ``rows`` by what a model shows after a fit; return whether that changed anything."""
-        ...
+        """Set ``rows`` by what a model shows after a rough fit; return whether to fit again."""
+        return False
+
+    def confirm(self, model: Any, rows: RowNoise) -> bool:
+        """The same after the fit that was asked for, which is made once more at most."""
+        return False
 
 
 class RowNoise(Module):
@@ -34,9 +42,9 @@ class RowNoise(Module):
         shape: ``batch_shape x (m) x n``.
 
     Attributes:
-        factors: What the variance of each training target is multiplied by, of this shape (of a
-            model that holds samples ``S x`` it).
-        added: What is added to it after that, in the square of the model's units.
+        factors: Multiples of the variance of each training target, of this shape (of a model that
+            holds samples ``S x`` it).
+        added: What is added to the variances after that, in the square of the model's units.
     """
 
     factors: Tensor
@@ -48,13 +56,22 @@ class RowNoise(Module):
         self.register_buffer("factors", torch.ones(shape, dtype=torch.float64))
         self.register_buffer("added", torch.zeros(shape, dtype=torch.float64))
 
+    @property
+    def outlying(self) -> Tensor:
+        """Mask of the rows that hardly count, outliers, of the shape of ``factors``."""
+        return self.factors > _OUTLYING
+
     def forget(self) -> None:
         """Let training rows have the noise of new observations."""
         self.factors, self.added = torch.ones_like(self.factors), torch.zeros_like(self.added)
 
     def refine(self, model: Any) -> bool:
-        """Let each source set the noise of rows, after a fit; return whether any changed it."""
-        return any([source.refine(model, self) for source in self.sources])
+        """Let each source set the noise of rows after a rough fit; return whether to fit again."""
+        return sum(source.refine(model, self) for source in self.sources) > 0
+
+    def confirm(self, model: Any) -> bool:
+        """The same after the fit that was asked for."""
+        return sum(source.confirm(model, self) for source in self.sources) > 0
 
 
 class Noise(NamedTuple):
@@ -126,6 +143,13 @@ class Noise(NamedTuple):
         factors, added = self.rows.factors[..., kept], self.rows.added[..., kept]
         later = (0, variances.shape[-1] - factors.shape[-1])
         return variances * pad(factors, later, value=1.0) + pad(added, later)
+
+    def trusted(self, values: Tensor) -> Tensor:
+        """Values at the training rows, ``... x (m) x n``, with NaN at outliers."""
+        if self.rows is None or not self.rows.outlying.any():
+            return values
+        later = (0, values.shape[-1] - self.rows.factors.shape[-1])
+        return values.masked_fill(pad(self.rows.outlying, later), torch.nan)
 
     def shares(
         self, inputs: Tensor, kept: Any = slice(None)

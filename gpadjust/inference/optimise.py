@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -63,7 +63,7 @@ class FitResult:
 
     log_likelihood: Tensor
     converged: Tensor
-    sisters: Tensor | None = None
+    sisters: Tensor | None = field(default=None, repr=False)
 
 
 class Differentiable(Protocol):

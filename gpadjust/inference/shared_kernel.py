@@ -81,7 +81,7 @@ class SharedPosterior(LogPosterior):
         self, vectors: Tensor, least: Tensor | None, derivatives: bool
     ) -> tuple[LikelihoodValue, Tensor]:
         values = self.parameters.unflatten(vectors)
-        _, covariance, _, pull_back = self.distribution(values, derivatives)
+        _, covariance, _, pull_back, _ = self.distribution(values, derivatives)
         found = self._of_outputs(covariance, least, derivatives)
         if pull_back is None:
             return found, torch.zeros_like(vectors)

@@ -24,15 +24,17 @@ from gpadjust.models import RRA, TermsGP
 from gpadjust.models.hyperparameter_samples import uses_physics
 from gpadjust.models.parameters import Hyperparameter, hyperparameters
 
-_HELPS = 0.7  # prior probability that other machines help
+_HELPS = 0.1  # prior probability that other machines help: they must show it
+_ODDS = math.log(_HELPS / (1 - _HELPS))
 _MOST = 64  # points at which their functions are known
 _WIDER = {"lengthscale": 0.7, "noise": 1.0}  # spread of logarithms between machines
-_DIFFERENCE = 0.1, 3.0  # variance of a difference in that of the term: median, spread of its log
+# Variance in that of the term of others, of a difference and of a machine that is none of them:
+_DIFFERENCE, _ALONE = (0.1, 3.0), (1.0, 1.5)  # median, and spread of the logarithm
 _ON = "covar_module.sister.on"
 
 
 class _Proper(LogPosterior):
-    """A posterior in which trends cost what they do, as it is compared with that of a prior."""
+    """A posterior in which trends cost what they do, for an evidence beside that of others."""
 
     vague_trends = False
 
@@ -40,7 +42,6 @@ class _Proper(LogPosterior):
 def fit_with_prior(
     model: TermsGP,
     prior: Any,
-    method: str,
     run: Callable[..., FitResult | bayes.SampleResult],
     search: Search,
     **own: Any,
@@ -51,10 +52,12 @@ def fit_with_prior(
     result = run(plain, search, **own)
     model.covar_module.sister = None
     taught.covar_module.sister = sister_of(model, others)
-    if method == "bayes":
-        share, samples = _sampled(taught, others, search, **own)
+    if isinstance(result, FitResult):
+        found = run(taught, search, **own)
+        share = (found.log_likelihood + _ODDS > result.log_likelihood).to(model.train_targets)
+        samples = _values(taught)
     else:
-        share, samples = _most_likely(taught, result, run, search, **own)
+        share, samples = _sampled(taught, others, search, **own)
     held = _values(plain)
     (number,) = {len(values) for values in held.values()}
     kept = (number * share).round()
@@ -64,13 +67,16 @@ def fit_with_prior(
         is_on = ends.floor().diff(dim=0) > 0  # spread evenly, as others are in an order
         held = {name: _where(is_on, samples[name], values) for name, values in held.items()}
         held[_ON] = is_on.unsqueeze(-1).to(model.train_targets)
-    if method == "bayes":
+    if plain.num_samples is not None:
         model.hold_samples(held)
     else:
         named = dict(model.named_parameters())
         with torch.no_grad():
             for name, values in held.items():
                 named[name].copy_(values[0])
+    if isinstance(result, FitResult):
+        chosen = torch.where(share > 0, found.log_likelihood, result.log_likelihood)
+        return replace(result, log_likelihood=chosen, sisters=share)
     return replace(result, sisters=share)
 
 
@@ -95,13 +101,13 @@ def _sampled(
     number = own.get("num_samples") or bayes.default_num_samples(n)
     alone = deepcopy(model)
     alone.covar_module.sister = None
-    register_priors(alone)
+    _register_priors(alone, others, _ALONE)
     without = bayes._draw(_Proper(alone), search, num_draws // 2, generator)
-    _register_priors(model, others)
+    _register_priors(model, others, _DIFFERENCE)
     target = LogPosterior(model)
     draws = bayes._draw(target, search, num_draws, generator)
-    odds = draws.log_evidence() - without.log_evidence() + math.log(_HELPS / (1 - _HELPS))
     positions = draws.particles.positions
+    odds = draws.log_evidence() - without.log_evidence() + _ODDS
     weights = torch.full_like(positions[..., 0], 1 / len(positions))
     rows = representative(left_out(target, positions), positions, weights, number)
     raw = draws.raw(rows)
@@ -111,18 +117,11 @@ def _sampled(
     return odds.sigmoid().reshape(model._aug_batch_shape), fixed | raw
 
 
-def _most_likely(
-    model: TermsGP, result: Any, run: Callable[..., Any], search: Search, **own: Any
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Whether others help, 0 or 1, ``(m)``, and the most likely values if they do."""
-    found = run(model, search, **own)
-    better = found.log_likelihood + math.log(_HELPS / (1 - _HELPS)) > result.log_likelihood
-    return better.to(model.train_targets), _values(model)
-
-
 @torch.no_grad()
-def _register_priors(model: TermsGP, others: Sequence[TermsGP]) -> None:
-    """Register priors of the differences, and of the noise, by what others have."""
+def _register_priors(
+    model: TermsGP, others: Sequence[TermsGP], variance: tuple[float, float]
+) -> None:
+    """Register priors by what others have, with a variance of functions in units of theirs."""
     rows = {row.name: row for row in hyperparameters(model) if row.is_log and row.raw.requires_grad}
     for name, row in rows.items():
         logs = torch.stack([_logs(other, name, model) for other in others])
@@ -132,7 +131,8 @@ def _register_priors(model: TermsGP, others: Sequence[TermsGP]) -> None:
         if row.kind in _WIDER:
             sd = (inner + spread.square() + _WIDER[row.kind] ** 2).sqrt()
         else:
-            middle, sd = middle + math.log(_DIFFERENCE[0]), torch.full_like(middle, _DIFFERENCE[1])
+            middle = middle + math.log(variance[0])
+            sd = (inner + spread.square() + variance[1] ** 2).sqrt()
         _register(row, middle, sd)
     register_priors(model)
 

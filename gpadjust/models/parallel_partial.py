@@ -209,7 +209,7 @@ class ParallelPartialGP(TermsModel):
         return self.shared.covar_module
 
     @property
-    def likelihood(self) -> Any:  # type: ignore[override]
+    def likelihood(self) -> Any:
         """The noise, in units of each output's variance."""
         return self.shared.likelihood
 
@@ -389,7 +389,7 @@ class ParallelPartialGP(TermsModel):
             if self.coordinate is not None:
                 mean, variance = self._coupled().marginals(sought)
             else:
-                weights, (m, k) = self._weights(), self.precision.shape
+                weights, (_m, k) = self._weights(), self.precision.shape
                 variance = conditioning.marginals(sought)[1].unsqueeze(-1)
                 cross = sought.cross(conditioning.train, is_data=True)
                 mean = cross @ weights.mean

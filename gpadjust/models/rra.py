@@ -179,7 +179,8 @@ class RRA(TermsGP):
             train = self.at(self.train_inputs[0])
             design, n = train.features(conditioning.features), self.train_targets.shape[-1]
             before = UpdatedWeights.of_prior(self._prior_sd().shape, n, design)
-            known, noise = self.train_targets - train.mean(), self.noise.at(train.x)
+            known = self.train_targets - train.mean()
+            noise = self.noise.of_rows(self.noise.at(train.x))
             before.observe(design, known, noise, math.inf)
             kernel.updated = before
         f = self.at(new.inputs)

@@ -81,7 +81,7 @@ class SampledFunctions(Module):
         conditioning = model.conditioning()
         (train,) = conditioning.train_inputs
         with torch.no_grad():
-            features: Any = sum_features(model.covar_module, num_features)
+            features: Any = sum_features(model.covar_module, model.terms, num_features)
             shape = (num_functions, *model._aug_batch_shape)
             sizes = [each.num_features for each in features.values()]
             drawn = [torch.randn(*shape, size, dtype=torch.float64) for size in sizes]
@@ -98,7 +98,7 @@ class SampledFunctions(Module):
         conditioning = model.conditioning()
         with torch.no_grad():
             alpha = conditioning.mean_cache.unsqueeze(0)
-            features = sum_features(model.covar_module, 0)
+            features = sum_features(model.covar_module, model.terms, 0)
             return cls(model, features, alpha[..., :0], conditioning.train_inputs[0], alpha)
 
     def forward(self, X: Tensor) -> Tensor:

@@ -61,6 +61,7 @@ class ModelOptions(TypedDict, total=False):
     likelihood: LikelihoodLike
     outcome_transform: Outcomes
     input_transform: InputTransform | None
+    train_Xvar: ArrayLike | float | Sequence[float]
     categorical: Columns | Mapping[Any, Any] | None
     batch: Columns | None
 
@@ -81,10 +82,12 @@ class TermBuilder:
         given: What the user brought, whose parameters stay as they are.
         sources: What sets the noise of training rows apart between fits.
         link: That of the targets, of which data and physics are then, or None.
+        noisy_inputs: The inputs as they were measured, if with noise, or None.
         categories: The part of the input transform that is of categories, or None.
     """
 
     link: Any = None
+    noisy_inputs: Any = None
     categories: Any = None
 
     def __init__(
@@ -128,6 +131,7 @@ class TermBuilder:
         likelihood: LikelihoodLike = None,
         outcome_transform: Outcomes = DEFAULT,
         input_transform: InputTransform | None = None,
+        train_Xvar: ArrayLike | float | Sequence[float] = None,
         categorical: Columns | Mapping[Any, Any] | None = None,
         batch: Columns | None = None,
     ) -> TermBuilder:
@@ -157,6 +161,12 @@ class TermBuilder:
             link = Logit.of(outcome_transform)
         if link is not None:
             data, outcome_transform = link.of_data(data), DEFAULT
+        noisy: Any = None
+        if train_Xvar is not None:
+            from gpadjust.models.noisy_inputs import NoisyInputs
+
+            noisy = NoisyInputs.of(train_Xvar, data)
+            data = data._replace(X=noisy.points)
         transform = input_transform
         if physics is not None:
             physics = as_physics(physics)
@@ -189,6 +199,8 @@ class TermBuilder:
             units = estimated(outcome_transform, data.Y, X)
         make = cls(data, transform, units, d, likelihood)
         make.link, make.categories = link, input_transform if data.levels else None
+        if noisy is not None:
+            make.noisy_inputs, make.sources = noisy, [noisy]
         make.f, make._means, make._centers = f, means, [_center(center, v) for v in f]
         make._learns_mean = rho_mean == "learn" or (rho_mean is None and k > 1)
         make._learns_center = isinstance(center, str) and center == "learn"
@@ -336,6 +348,19 @@ class TermBuilder:
                 "vanishing_rbf, too (rho_covar_module)."
             )
         return term
+
+    @property
+    def means(self) -> Sequence[Tensor]:
+        """The prior mean of the rho of each physics, ``batch_shape x 1 x m`` or a number."""
+        return self._means
+
+    def prior_mean(self) -> Tensor:
+        """The sum of all physics with these at the training inputs, ``batch_shape x n x m``."""
+        return sum((w * v for w, v in zip(self._means, self.f, strict=True)), self._zero)
+
+    def columns(self) -> Tensor:
+        """The training inputs that kernels read, ``batch_shape x n x d``."""
+        return transformed(self.data.X, self.input_transform)[..., : self.num_inputs]
 
     def noise(self) -> Likelihood | None:
         """The likelihood, after all terms are made; None for the model's own.

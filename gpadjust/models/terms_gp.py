@@ -20,6 +20,7 @@ from gpytorch.models import ExactGP
 from gpytorch.settings import detach_test_caches, lazily_evaluate_kernels, prior_mode
 from linear_operator.operators import DiagLinearOperator
 from torch import Size, Tensor
+from torch.nn.functional import pad
 
 import gpadjust
 from gpadjust.checks import checked_whole
@@ -117,6 +118,7 @@ class TermsGP(TermsModel, SingleTaskGP):
             self.__dict__["link"] = link  # no submodule, of which the class's None would be first
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
+        self.noisy_inputs = made.noisy_inputs
         self.local_errors = LocalErrors(made.batch_shape, made.num_inputs)
         self.local_errors.to(data.X)
         self.input_names, self.output_names = data.input_names, data.output_names
@@ -198,13 +200,41 @@ class TermsGP(TermsModel, SingleTaskGP):
 
         With :math:`\alpha = K^{-1} (y - m)` they are :math:`y_i - \alpha_i / [K^{-1}]_{ii}` and
         :math:`1 / [K^{-1}]_{ii}` (Rasmussen and Williams 2006, eqs. 5.10-5.12), in model units;
-        NaN where there is no observation.
+        NaN where there is no observation. Variances are those of an observation that is no outlier.
         """
         if self.training:
             self.eval()
-        alpha, precision = self.conditioning().of_rows()
+        conditioning = self.conditioning()
+        factors = conditioning.factors()
+        alpha, precision = factors.alpha, factors.squared_columns()
+        if conditioning.repeats is not None:
+            alpha, precision = conditioning.of_each(alpha, precision)
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
-        return self.train_targets - alpha * variance, variance
+        mean = self.train_targets - alpha * variance
+        if self.noise.rows is not None and self.noise.rows.outlying.any():
+            noise = self.noise.at(self.train_inputs[0])
+            outlying = self.noise.trusted(self.train_targets).isnan() & ~self.train_targets.isnan()
+            least = (variance + noise - self.noise.of_rows(noise)).maximum(noise)
+            variance = variance.where(~outlying, least)
+        return mean, variance
+
+    def outliers(self) -> Tensor:
+        """Return the probability of each observation to be an outlier, ``batch_shape x n x m``.
+
+        By the others, and by hyper-parameters that were fitted without those that are likelier
+        outliers; of a ``likelihood="heavy-tailed"``.
+
+        Raises:
+            ValueError: If the noise has no heavy tails.
+        """
+        if not self.has_heavy_tails:
+            raise ValueError(
+                "The noise of the model has no outliers; build it with likelihood='heavy-tailed'."
+            )
+        from gpadjust.models.heavy_tails import probabilities
+
+        self.eval()
+        return self.outputs_last(probabilities(self))
 
     @torch.no_grad()
     def learn_local_errors(self) -> None:
@@ -224,7 +254,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        squares = (self.train_targets - mean).square().mean(0) / variance.maximum(least).mean(0)
+        targets = self.noise.trusted(self.train_targets)
+        squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)
         found[..., rows] = squares[..., rows].nan_to_num(nan=1.0, posinf=1.0)
@@ -246,14 +277,24 @@ class TermsGP(TermsModel, SingleTaskGP):
         noise = None if noise is None else self.outputs_last(noise * scale.square())
         if noise is not None and self.link is not None:
             noise = noise / (2 * self.link.log_slope(targets)).exp().nan_to_num(nan=1.0)
+        given: Tensor | None = None
+        if self.noisy_inputs is not None:
+            inputs, _ = self.measured_rows(inputs)
+            given = self.noisy_inputs.variances
+            given = pad(given, (0, 0, 0, inputs.shape[-2] - len(given)))
         if self.num_samples is not None:
             inputs, targets = inputs[0], targets[0]
             if noise is not None and noise.shape != targets.shape:  # of later observations, too
                 noise = noise[0]
-        return {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
+        found = {"train_X": inputs, "train_Y": targets, "train_Yvar": noise}
+        return found if given is None else {**found, "train_Xvar": given}
 
     def measured_rows(self, inputs: Tensor) -> tuple[Tensor, slice]:
         """Raw training inputs without what the model added to them, and the user's rows of them."""
+        own = None if self.noisy_inputs is None else self.noisy_inputs.measured
+        if own is not None and inputs.shape[-1] == own.shape[-1]:  # raw ones
+            later = inputs[..., len(own) :, :]
+            inputs = torch.cat([own.expand(*inputs.shape[:-2], *own.shape), later], dim=-2)
         return inputs, slice(None)
 
     def trend_inputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -350,7 +391,11 @@ class TermsGP(TermsModel, SingleTaskGP):
             self.hold_samples(samples)
         elif self.has_unknowns and self.num_samples is None:
             self.train()  # for inputs to be transformed again, with what is loaded
+        before = self.measured_targets()
         keys = super().load_state_dict(state_dict, strict, *args, **kwargs)
+        if self.noisy_inputs is not None:  # of which a fit moves the targets
+            self.train_targets = self.train_targets + before - self.measured_targets()
+            self.prediction_strategy = None
         self.was_fitted = True
         if self.num_samples is not None:
             transform_training_inputs(self)
@@ -379,6 +424,10 @@ class TermsGP(TermsModel, SingleTaskGP):
         subset.output_names = tuple(self.output_names[i] for i in idcs)
         if m > 1:
             subset.local_errors = self.local_errors.of_outputs(idcs)
+            if self.noisy_inputs is not None:
+                old, subset.noisy_inputs = subset.noisy_inputs, self.noisy_inputs.of_outputs(idcs)
+                rows: Any = subset.noise.rows
+                rows.sources = [subset.noisy_inputs if s is old else s for s in rows.sources]
         match_parameters(subset)
         return subset
 
@@ -484,6 +533,11 @@ class TermsGP(TermsModel, SingleTaskGP):
             raise NotImplementedError(
                 f"A {name} has rows of its own among the observations, of which a window would "
                 "forget some: take a CKA, or build the model again."
+            )
+        if self.noise.rows is not None and self.noise.rows.added.any():
+            raise NotImplementedError(
+                f"The inputs of this {name} are noisy (train_Xvar), and of new ones that is not "
+                "known: build the model again."
             )
         keep_last(self, new, forget)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from inspect import signature
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from botorch.models.transforms.outcome import OutcomeTransform
@@ -15,8 +15,9 @@ from botorch.utils.datasets import SupervisedDataset
 from gpytorch.settings import detach_test_caches
 from torch import Tensor
 from torch.nn import Module
+from torch.nn.functional import pad
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import check_level, checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
@@ -24,12 +25,34 @@ from gpadjust.models.levels import coded
 from gpadjust.models.links import plain
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
+from gpadjust.models.posteriors import mixture_moments, mixture_quantile
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.term_builder import ModelOptions
-from gpadjust.models.training_data import ArrayLike, TrainingData, check_order, to_tensor
+from gpadjust.models.training_data import (
+    ArrayLike,
+    TrainingData,
+    as_given,
+    check_order,
+    to_tensor,
+)
 from gpadjust.physics import Physics
+
+
+class Adjustment(NamedTuple):
+    """A rho or a delta at some points, as :meth:`TermsModel.adjustments` returns it.
+
+    Args:
+        mean: Posterior means, ``q x m``; of a rho without units, else in the targets'.
+        lower: Lower ends of the intervals.
+        upper: Upper ends.
+    """
+
+    mean: Any
+    lower: Any
+    upper: Any
+
 
 _SHARED = "Unpack[ModelOptions]"  # how a constructor says that it takes these and no others
 
@@ -56,7 +79,7 @@ class TermsModel(PredictiveModel):
     """
 
     not_sampled: ClassVar[str] = ""
-    data_arguments: ClassVar[tuple[str, ...]] = ("train_X", "train_Y", "train_Yvar")
+    data_arguments: ClassVar[tuple[str, ...]] = ("train_X", "train_Y", "train_Yvar", "train_Xvar")
     covar_module: SumOfTerms
     input_transform: Any
     likelihood: Any
@@ -129,6 +152,12 @@ class TermsModel(PredictiveModel):
     def noise(self) -> Noise:
         """The noise of observations."""
         return Noise(self.likelihood)
+
+    @property
+    def has_heavy_tails(self) -> bool:
+        """True if observations may be outliers."""
+        rows = self.noise.rows
+        return rows is not None and any(source.has_outliers for source in rows.sources)
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -220,6 +249,53 @@ class TermsModel(PredictiveModel):
             shift, scale = self.units(term.unit)
             covariance = covariance * scale.square().unsqueeze(-1)
             return self.as_posterior(mean * scale + shift, covariance, mixed)
+
+    def adjustments(self, X: ArrayLike, level: float = 0.95) -> Any:
+        r"""Every :math:`\rho` and :math:`\delta` with its interval, at each point by itself.
+
+        The moments of :meth:`term`, without the covariances between points, so that there may be
+        many of them.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            level: The probability that an interval holds.
+
+        Returns:
+            Of tensors and arrays, an :class:`Adjustment` for each of ``term_names``, by name: mean,
+            lower and upper, ``q x m``. Of a frame, one frame with columns such as ``rho mean``,
+            ``rho lower``, ``rho upper`` and ``delta mean``, of several outputs ``rho of head
+            mean``, and the index of X.
+
+        Raises:
+            ValueError: If ``level`` is not between 0 and 1.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import CKA
+            >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = CKA(X, X.sin(), physics=lambda X: X)
+            >>> rho, delta = model.adjustments(X).values()
+            >>> bool((rho.lower < rho.mean).all()), delta.upper.shape
+            (True, torch.Size([8, 1]))
+        """
+        check_level(level)
+        found: dict[str, Adjustment] = {}
+        with self._graph_for(X):
+            inputs = self.model_inputs(X, with_basis=False)
+            for term in (term for term in self.terms if term.name in self.term_names):
+                shift, scale = self.units(term.unit)
+                mean, variance = self.conditioning().marginals(self._at(term, inputs))
+                moments = torch.broadcast_tensors(mean * scale + shift, variance * scale.square())
+                parts = [self.outputs_last(each) for each in moments]
+                if self.num_samples is None:
+                    parts = [each.unsqueeze(MCMC_DIM) for each in parts]
+                ends = (mixture_quantile(*parts, (1 + side * level) / 2) for side in (-1, 1))
+                found[term.name] = Adjustment(mixture_moments(*parts)[0], *ends)
+        if not hasattr(X, "columns"):
+            return {n: Adjustment(*(as_given(v, X, ()) for v in a)) for n, a in found.items()}
+        of = [f" of {name}" if self.num_outputs > 1 else "" for name in self.output_names]
+        names = [f"{n}{each} {k}" for n in found for k in Adjustment._fields for each in of]
+        return as_given(torch.cat([v for a in found.values() for v in a], -1), X, names)
 
     def rho_name(self, physics: str | int | None = None) -> str:
         """The name of the term that scales a physics, which is given by name or number."""
@@ -411,10 +487,21 @@ class TermsModel(PredictiveModel):
         shift = shift if unit is Unit.TARGET else torch.zeros_like(shift)
         return shift, torch.ones_like(scale) if unit is Unit.NONE else scale
 
+    def measured_targets(self) -> Tensor:
+        """Targets as they were measured, in the model's units, ``... x (m) x n``.
+
+        Those of ``train_targets`` are without what the noise of inputs adds to their mean.
+        """
+        noisy = getattr(self, "noisy_inputs", None)
+        if noisy is None:
+            return self.train_targets
+        later = self.train_targets.shape[-1] - noisy.shift.shape[-1]
+        return self.train_targets + pad(noisy.shift, (0, later))
+
     def user_targets(self) -> Tensor:
         """Targets in the user's units, ``... x n x m``."""
         shift, scale = self.units()
-        targets = self.outputs_last(self.train_targets * scale + shift)
+        targets = self.outputs_last(self.measured_targets() * scale + shift)
         return targets if self.link is None else self.link.inverse(targets)
 
     def outputs_last(self, values: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from gpadjust.physics.black_box import BlackBoxPhysics
 from gpadjust.physics.error import PhysicsError
 from gpadjust.physics.function import FunctionPhysics, JoinedPhysics, as_physics
 from gpadjust.physics.ode import ODEPhysics
+from gpadjust.physics.subprocess_physics import SubprocessPhysics
 from gpadjust.physics.unknown import ParameterValues, Unknown
 from gpadjust.physics.warning import PhysicsWarning
 
@@ -17,6 +18,7 @@ __all__ = [
     "Physics",
     "PhysicsError",
     "PhysicsWarning",
+    "SubprocessPhysics",
     "Unknown",
     "as_physics",
 ]

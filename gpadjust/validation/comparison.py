@@ -131,6 +131,22 @@ class Comparison:
         beneath = beside(self.alone, self.left_out, [*self.table].index(output))
         return [*self.table[output], *beneath]
 
+    def to_dataframe(self) -> Any:
+        """All tables as a pandas DataFrame: a row for each output and candidate, best first.
+
+        Its columns are ``output`` and those of :class:`Candidate`; rows of a physics alone have no
+        weight. An ImportError without pandas.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError as error:
+            raise ImportError("to_dataframe() needs pandas; run `pip install pandas`.") from error
+        rows = [{"output": name, **r._asdict()} for name in self.table for r in self.rows(name)]
+        for row in rows:
+            if str(row["structure"]).startswith(ALONE):
+                row["weight"] = float("nan")
+        return DataFrame(rows)
+
     def __str__(self) -> str:
         shown = {output: self.rows(output) for output in self.table}
         width = max(len(row.structure) for rows in shown.values() for row in rows)

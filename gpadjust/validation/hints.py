@@ -44,7 +44,7 @@ def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
         Y, mean, variance = (each[seen, j] for each in (loo.Y, loo.mean, loo.variance))
         own: list[str] = []
         if len(Y) >= _ENOUGH:
-            z = (Y - mean) / variance.sqrt()
+            z = _residuals(Y, mean, variance, told.get("link"))
             grows = float(noise[seen, j].median()) > _NOISE and _grows(z.abs(), mean.abs())
             if grows and "relative" not in told:
                 own.append(_GROWS)
@@ -70,8 +70,8 @@ def told_of(model: TermsGP | StackedGP) -> dict[str, Any]:
     found |= {name: v for name, v in one.data().items() if name.endswith("var") and v is not None}
     if getattr(one, "link", None) is not None:
         found["link"] = one.link
-    if given.get("categorical") or getattr(one, "categories", None):
-        found["categorical"] = given.get("categorical") or one.categories
+    if one.levels:
+        found["categorical"] = [one.input_names[i] for i in one.levels]
     return found
 
 
@@ -79,6 +79,16 @@ _GROWS = (
     "Left-out residuals grow with the size of the prediction: is the noise relative? Then give "
     "likelihood='relative' (--noise relative)."
 )
+
+
+def _residuals(Y: Tensor, mean: Tensor, variance: Tensor, link: Any) -> Tensor:
+    """Residuals in standard deviations: of a link of the output, by its slope there."""
+    if link is None:
+        return (Y - mean) / variance.sqrt()
+    Y, mean = Y.unsqueeze(-1), mean.unsqueeze(-1)
+    sd = variance.sqrt() * link.log_slope(mean).exp().squeeze(-1)
+    residuals: Tensor = (link.value(Y) - link.value(mean)).squeeze(-1) / sd
+    return residuals
 
 
 def _grows(size: Tensor, mean: Tensor) -> bool:

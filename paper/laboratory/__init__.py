@@ -3,11 +3,269 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 from paper.common.experiment import Axes, Experiment
+
+
+@dataclass(frozen=True, kw_only=True)
+class BalldropSettings:
+    """What decides the numbers."""
+
+    num_runs: int = 80
+    """runs of the simulator, the first ones: those that the documentation of SEPIA takes"""
+    heights: tuple[int, ...] = (10, 20, 30, 40, 50, 60)
+    """heights in m at which the runs are taken"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Balldrop(Experiment):
+    """Drop times of three balls, and runs of a simulator: the fourth ball is predicted."""
+
+    runs: int = 1
+    """fits of each case"""
+    out: Path = Path("results/balldrop")
+    settings: BalldropSettings = field(default_factory=BalldropSettings)
+
+    axes: ClassVar[Axes] = {
+        "physics": {"runs": "80 runs", "formula": "its formula"},
+        "left": {
+            "softball": "softball",
+            "basketball": "basketball",
+            "baseball": "baseball",
+            "bowling ball": "bowling ball",
+            "none": "none",
+        },
+        "model": {
+            "physics": "calibrated physics",
+            "mean": "physics mean",
+            "cka": "CKA",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        *("gpadjust.fit", "gpadjust.CKA", "gpadjust.PhysicsMeanGP"),
+        *("gpadjust.CalibratedPhysics", "gpadjust.EmulatedPhysics"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Categories(Experiment):
+    """Pumps of three materials on five rigs, of which each has an offset."""
+
+    runs: int = 24
+    """sets of pumps"""
+    out: Path = Path("results/categories")
+
+    axes: ClassVar[Axes] = {
+        "model": {
+            "ignored": "material and rig ignored",
+            "each": "a model of each material",
+            "numbers": "codes as numbers",
+            "onehot": "one-hot columns as numbers",
+            "ours": "categorical, batch",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriftSettings:
+    """Settings that decide the numbers, fixed before the first run."""
+
+    hours: int = 4380
+    """observations, one an hour: half a year"""
+    first: int = 168
+    """of these before the first fit"""
+    refit_every: int = 24
+    """hours between refits of what is fitted again"""
+    window: int = 168
+    """observations that are fitted again, and that an exact model keeps"""
+    forget: int = 84
+    """observations in which an RRA forgets"""
+    check_every: int = 6
+    """hours between checks of the monitor"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(Experiment):
+    """Half a year of a pump that wears, predicted an hour ahead by models that are updated."""
+
+    runs: int = 3
+    """pumps"""
+    out: Path = Path("results/drift")
+    settings: DriftSettings = field(default_factory=DriftSettings)
+
+    axes: ClassVar[Axes] = {
+        "model": {
+            "never": "CKA, fitted once",
+            "rra": "RRA, updated",
+            "cka": "CKA, updated",
+            "refit": "CKA, updated each hour and fitted again each day",
+            "steady": "RRA, updated, of a pump that does not wear",
+        }
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.RRA")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulatedSettings:
+    """What decides the numbers."""
+
+    per_input: int = 5
+    """observations for each input"""
+    runs_per_input: int = 20
+    """runs of the low level for each input: at the observed inputs, and on a Sobol sequence"""
+    num_test: int = 1000
+    """points that all models are scored at"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Emulated(Experiment):
+    """A physics known by its runs, on six pairs of functions of low and high fidelity."""
+
+    runs: int = 10
+    """data sets of each pair"""
+    out: Path = Path("results/emulated")
+    settings: EmulatedSettings = field(default_factory=EmulatedSettings)
+
+    axes: ClassVar[Axes] = {
+        "pair": {
+            name: name
+            for name in ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
+        },
+        "model": {
+            "exact": "CKA, exact f_p",
+            "emulated": "CKA, f_p emulated",
+            "certain": "CKA, emulator taken as exact",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        *("gpadjust.fit", "gpadjust.CKA", "gpadjust.EmulatedPhysics"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hints(Experiment):
+    """Hints of `compare`: given where the data are of a kind, and not where they are clean?"""
+
+    runs: int = 5
+    """data sets of each problem and kind"""
+    out: Path = Path("results/hints")
+
+    axes: ClassVar[Axes] = {
+        "data": {
+            "exact": "exact",
+            "noisy": "noise of 5 % of the sd",
+            "outliers": "noise, one in twenty off by 10 to 100 sd of it",
+            "decades": "output over decades, noise of one size",
+            "relative": "output over decades, noise of 15 % of it",
+            "copies": "noise, three rows copied",
+            "rigs": "noise, and the number of a rig",
+        },
+        "problem": {
+            name: name
+            for name in ("currin", "branin", "bohachevsky", "booth", "park91a", "hartmann6")
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.compare",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Links(Experiment):
+    """Positive and bounded outputs: a link, with the physics through it, beside none."""
+
+    runs: int = 24
+    """cases of each problem"""
+    out: Path = Path("results/links")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "rate": "reaction rate, 4 decades",
+            "diode": "current of a diode, 6 decades",
+            "pump": "efficiency of a pump, 0 to 1",
+            "reactor": "conversion in a reactor, 0 to 1",
+        },
+        "model": {"default": "CKA", "gp": "GP with the link", "linked": "CKA with the link"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outliers(Experiment):
+    """One in twenty observations is far off: errors beside those of clean data."""
+
+    runs: int = 8
+    """cases of each problem and size"""
+    out: Path = Path("results/outliers")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "wave": "wave: f_p lacks a slope",
+            "decay": "decay: a wrong rate",
+            "plane": "plane: two inputs",
+            "good": "good: f_p is 2 % off",
+            "misleading": "misleading: f_p is of no use",
+            "space": "space: three inputs",
+        },
+        "observations": {20: "20", 60: "60"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relative(Experiment):
+    """Noise that grows with an output over three decades: do intervals hold in each?"""
+
+    runs: int = 12
+    """cases of each problem"""
+    observations: int = 40
+    """training points"""
+    out: Path = Path("results/relative")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "rate": "rate: exponential",
+            "power": "power: a wrong exponent",
+            "plane": "plane: f_p lacks an input",
+        },
+        "structure": {"CKA": "CKA", "GP": "GP without physics"},
+        "noise": {"default": "one size", "relative": "relative"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SistersSettings:
+    """Settings that decide the numbers, fixed before the first run."""
+
+    points: int = 5
+    """measured points of pump B"""
+    known: int = 40
+    """measured points of each other machine"""
+    tests: int = 300
+    """points at which pump B is predicted"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sisters(Experiment):
+    """A pump of which five points are measured, with what other machines taught."""
+
+    runs: int = 30
+    """three times ten pumps, each once pump B"""
+    out: Path = Path("results/sisters")
+    settings: SistersSettings = field(default_factory=SistersSettings)
+
+    axes: ClassVar[Axes] = {
+        "prior": {
+            "one": "one other pump",
+            "three": "three other pumps",
+            "rough": "a machine that has nothing to do with it, rough",
+            "smooth": "a machine that has nothing to do with it, smooth",
+        }
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,43 +296,3 @@ class Vanishing(Experiment):
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """A wrong place is of the vanishing delta alone."""
         return () if kind[0] == "misplaced" and kind[1] != "vanishing" else self.seeds
-
-
-@dataclass(frozen=True, kw_only=True)
-class Links(Experiment):
-    """Positive and bounded outputs: a link, with the physics through it, beside none."""
-
-    runs: int = 24
-    """cases of each problem"""
-    out: Path = Path("results/links")
-
-    axes: ClassVar[Axes] = {
-        "problem": {
-            "rate": "reaction rate, 4 decades",
-            "diode": "current of a diode, 6 decades",
-            "pump": "efficiency of a pump, 0 to 1",
-            "reactor": "conversion in a reactor, 0 to 1",
-        },
-        "model": {"default": "CKA", "gp": "GP with the link", "linked": "CKA with the link"},
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Categories(Experiment):
-    """Pumps of three materials on five rigs, of which each has an offset."""
-
-    runs: int = 24
-    """sets of pumps"""
-    out: Path = Path("results/categories")
-
-    axes: ClassVar[Axes] = {
-        "model": {
-            "ignored": "material and rig ignored",
-            "each": "a model of each material",
-            "numbers": "codes as numbers",
-            "onehot": "one-hot columns as numbers",
-            "ours": "categorical, batch",
-        },
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")

@@ -401,7 +401,7 @@ def test_bad_data(data, change, error, message):
         ({"physics": lambda X: X[:, 0] * np.nan}, PhysicsError, "finite"),
         ({"fit_method": "hmc"}, ValueError, "Unknown method 'hmc'; expected 'bayes' or 'map'"),
         ({"fit_options": {"num_samples": 4}}, ValueError, "it is one of method 'bayes'"),
-        ({"model": partial(CKA, centre=0)}, TypeError, "argument 'centre'; it takes center"),
+        ({"model": partial(CKA, centre=0)}, TypeError, r"argument 'centre'; it takes .*center"),
         ({"physics": None, "model": CKA}, TypeError, "argument: 'physics'"),
         ({"random_state": "seed"}, ValueError, "cannot be used to seed"),
     ],

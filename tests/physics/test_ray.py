@@ -1,0 +1,41 @@
+"""Rows of a simulator on the nodes of a cluster."""
+
+import joblib
+import numpy as np
+import pytest
+import torch
+
+from gpadjust import BlackBoxPhysics, PhysicsError
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of Ray
+def test_rows_run_on_both_nodes_of_a_cluster():
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+    from ray.util.joblib import register_ray
+
+    def simulator(x):
+        if x[0] > 90:
+            raise ValueError("no solution here")
+        ray_node = ray.get_runtime_context().get_node_id()
+        return [x[0] ** 2, float(int(ray_node[:8], 16))]
+
+    physics = BlackBoxPhysics(simulator, batched=False, memo=0)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        cluster.add_node(num_cpus=1)
+        ray.init(address=cluster.address, log_to_driver=False)
+        cluster.wait_for_nodes()
+        register_ray()
+        X = torch.arange(40.0).double().unsqueeze(-1)
+        with joblib.parallel_config(backend="ray", n_jobs=2):
+            values = physics(X)
+            with pytest.raises(PhysicsError, match="no solution here") as caught:
+                physics(X + 60)
+        assert len(caught.value.rows) == 9
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    np.testing.assert_allclose(values[:, 0], X[:, 0] ** 2)
+    assert len(values[:, 1].unique()) == 2

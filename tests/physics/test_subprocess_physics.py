@@ -1,0 +1,136 @@
+"""An external program as physics."""
+
+import sys
+import time
+
+import joblib
+import pytest
+import torch
+
+from gpadjust import FunctionPhysics, PhysicsError, SubprocessPhysics, Unknown
+from tests.systems import line
+
+LAW = """
+import sys, pathlib
+t, k = map(float, sys.argv[1:3])
+if t > 2:
+    print("no solution at this t", file=sys.stderr)
+    sys.exit(3)
+if len(sys.argv) > 3:
+    with open(sys.argv[3], "a") as log:
+        log.write("ran\\n")
+print(k * t**2, t)
+"""
+
+
+@pytest.fixture
+def law(tmp_path):
+    (tmp_path / "law.py").write_text(LAW)
+    return [sys.executable, str(tmp_path / "law.py")]
+
+
+def test_placeholders_are_inputs_and_unknown_parameters(law):
+    unknowns = {"k": Unknown(4.0, sd=1.0)}
+    by_name = SubprocessPhysics([*law, "{t}", "{k}"], names=["t"], unknowns=unknowns)
+    by_number = SubprocessPhysics([*law, "{0}", "{1:.1f}"])
+    X = 0.1 + line(3)
+    expected = torch.cat([5 * X**2, X], dim=-1)
+    torch.testing.assert_close(by_name(X, torch.tensor([5.0]).double()), expected)
+    rows = torch.cat([X, 0 * X + 5.04], dim=-1)
+    torch.testing.assert_close(by_number(rows), expected)
+    assert by_name.name == "python" or by_name.name.startswith("python")
+
+
+def test_all_digits_arrive(law):
+    X = torch.rand(4, 1, dtype=torch.float64)
+    assert torch.equal(SubprocessPhysics([*law, "{0}", "1"])(X)[:, 1:], X)
+
+
+def test_it_reads_standard_input_and_its_output_is_parsed():
+    program = "import sys; print('result:', 2 * float(sys.stdin.read().split('=')[1]))"
+    physics = SubprocessPhysics(
+        [sys.executable, "-c", program],
+        names=["T"],
+        stdin="T = {T}",
+        parse=lambda text: float(text.removeprefix("result:")),
+    )
+    assert physics(torch.tensor([[1.5]]).double()).item() == 3.0
+
+
+def test_its_parameters_are_learnt(law):
+    one = {"names": ["t"], "parse": lambda text: float(text.split()[0])}
+    physics = SubprocessPhysics([*law, "{t}", "{k}"], unknowns={"k": Unknown(4.0, sd=1.0)}, **one)
+    t = 0.5 + line(3)
+    exact = FunctionPhysics(lambda X, p: p.k * X[:, 0] ** 2, unknowns={"k": Unknown(4.0, sd=1.0)})
+    parameters = torch.tensor([[4.905], [4.0]]).double()
+    torch.testing.assert_close(physics.or_nan(t, parameters), exact(t, parameters))
+
+
+def test_failures_say_what_the_program_wrote(law):
+    physics = SubprocessPhysics([*law, "{0}", "1"])
+    with pytest.raises(PhysicsError, match="no solution at this t") as caught:
+        physics(torch.tensor([[1.0], [3.0]]).double())
+    assert caught.value.rows == (1,)
+    assert physics.or_nan(torch.tensor([[3.0], [1.0]]).double())[1].isfinite().all()
+    with pytest.raises(PhysicsError, match="not found where it is to run; give its full path"):
+        SubprocessPhysics(["no_such_program", "{0}"])(line(1))
+    with pytest.raises(PhysicsError, match="printed 'done', expected numbers alone; give parse"):
+        SubprocessPhysics([sys.executable, "-c", "print('done')"])(line(1))
+
+
+def test_a_run_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path):
+    late = tmp_path / "late"
+    child = f"import time; time.sleep(3); open({str(late)!r}, 'w')"
+    program = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    physics = SubprocessPhysics([sys.executable, "-c", program], timeout=1.0)
+    begin = time.perf_counter()
+    with pytest.raises(PhysicsError, match=r"timed out after 1\.0 seconds"):
+        physics(line(1))
+    assert time.perf_counter() - begin < 2.5
+    time.sleep(2.5)
+    assert not late.exists()
+
+
+def test_outputs_are_kept_on_disk(law, tmp_path):
+    log, cache = tmp_path / "log", tmp_path / "cache"
+
+    def made():
+        return SubprocessPhysics([*law, "{0}", "1", str(log)], cache=cache)
+
+    X = line(2)
+    expected = made()(X)
+    assert torch.equal(made()(X), expected)
+    assert log.read_text().count("ran") == 2
+    files = sorted(cache.iterdir())
+    assert len(files) == 2
+    assert {file.suffix for file in files} == {".json"}
+    files[0].write_text("{")  # as a machine that went down leaves it
+    assert torch.equal(made()(X), expected)
+    with pytest.raises(PhysicsError):
+        made()(torch.tensor([[3.0]]).double())
+    assert len([*cache.iterdir()]) == 2  # a failure is not kept
+
+
+@pytest.mark.slow
+def test_processes_share_a_cache(law, tmp_path):
+    physics = SubprocessPhysics([*law, "{0}", "1"], cache=tmp_path / "cache", memo=0)
+    X = line(4)
+    with joblib.parallel_config(backend="loky", n_jobs=2):
+        values = physics(X.repeat(5, 1))
+    torch.testing.assert_close(values[:, 1:], X.repeat(5, 1))
+    assert len([*(tmp_path / "cache").iterdir()]) == 4
+
+
+def test_bad_input():
+    with pytest.raises(TypeError, match=r"shlex\.split"):
+        SubprocessPhysics("prog {T}")
+    with pytest.raises(ValueError, match="no name of an input"):
+        SubprocessPhysics(["prog", "{T}"])
+    with pytest.raises(ValueError, match="is no template"):
+        SubprocessPhysics(["prog", "{"])
+    with pytest.raises(ValueError, match="no placeholder of the unknown parameter k"):
+        SubprocessPhysics(["prog"], unknowns={"k": Unknown(4.0, sd=1.0)})
+    with pytest.raises(ValueError, match="positive number of seconds"):
+        SubprocessPhysics(["prog"], timeout=0)
+    with pytest.raises(PhysicsError, match="names has 1 entries"):
+        SubprocessPhysics(["prog", "{T}"], names=["T"])(torch.zeros(1, 2).double())
