@@ -264,8 +264,13 @@ def compare(
     asked = known_structures(STRUCTURES if structures is None else structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
-    categories = {name: options.get(name) for name in ("categorical", "batch")}
-    data = training_data(train_X, train_Y, train_Yvar, **categories)
+    data = training_data(
+        train_X,
+        train_Y,
+        train_Yvar,
+        categorical=options.get("categorical"),
+        batch=options.get("batch"),
+    )
     if data.X.dim() > 2:
         raise ValueError(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
