@@ -199,9 +199,7 @@ def test_physics_none_is_a_gaussian_process_without_physics(data):
         assert type(regressor.fit(X, y).model_) is ZeroMeanGP
     model = ZeroMeanGP(X, y.reshape(-1, 1))
     fit(model, "map", **FAST, seed=0)
-    np.testing.assert_array_equal(
-        regressor.predict(Z), model.predict(Z).mean[:, 0]
-    )
+    np.testing.assert_array_equal(regressor.predict(Z), model.predict(Z).mean[:, 0])
 
 
 def test_a_class_of_models_with_options(data):
@@ -210,9 +208,7 @@ def test_a_class_of_models_with_options(data):
     regressor = fast(model=partial(PhysicsMeanGP, **options)).fit(X, y)
     model = PhysicsMeanGP(X, y.reshape(-1, 1), physics=BlackBoxPhysics(wave), **options)
     fit(model, "map", **FAST, seed=0)
-    np.testing.assert_array_equal(
-        regressor.predict(Z), model.predict(Z).mean[:, 0]
-    )
+    np.testing.assert_array_equal(regressor.predict(Z), model.predict(Z).mean[:, 0])
     assert options == {"rho_mean": "learn", "train_Yvar": 0.05**2}
 
 
