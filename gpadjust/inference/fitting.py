@@ -267,6 +267,8 @@ def _refine_noise(model: TermsGP, search: Search) -> None:
     ):
         for name, buffer in found.named_buffers(recurse=False):
             setattr(own, name, buffer)
+    if model.noisy_inputs is not None:
+        model.noisy_inputs.move(model, copy.noisy_inputs.shift)
 
 
 def _is_unconfirmed(model: TermsGP) -> bool:

@@ -116,7 +116,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         if made.units is not None:  # not earlier: BoTorch would estimate it again
             units, link = made.units, made.link
             self.outcome_transform = units if link is None else link.units(units)
-            vars(self)["link"] = link  # no submodule, of which the class's None would be first
+            self.__dict__["link"] = link  # no submodule, of which the class's None would be first
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.noisy_inputs = made.noisy_inputs
