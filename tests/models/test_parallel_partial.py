@@ -114,7 +114,7 @@ def test_a_row_left_out_is_predicted_by_a_model_without_it(options):
     mean, variance = model.left_out()
     rest = make(X[1:], Y[1:], **options)
     settled(rest)
-    for name in ("scales", "along", "profile"):
+    for name in ("scales", "noises", "along", "profile"):
         setattr(rest, name, getattr(model, name))
     rest.unit, rest._remembered = model.unit, None
     rest._prepare(decay(X[1:]))
