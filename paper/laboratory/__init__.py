@@ -279,7 +279,7 @@ class Noisyinputs(Experiment):
 class Outliers(Experiment):
     """One in twenty observations is far off: errors beside those of clean data."""
 
-    runs: int = 8
+    runs: int = 5
     """cases of each problem and size"""
     out: Path = Path("results/outliers")
 
