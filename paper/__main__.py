@@ -21,10 +21,8 @@ CHAPTERS = {
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
     "laboratory": (
-    "laboratory": (
         *("Balldrop", "Categories", "Drift", "Emulated", "Hints", "Links"),
         *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
-    ),
     ),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
