@@ -20,17 +20,7 @@ CHAPTERS = {
     "measuring": ("Active", "Optimisation", "Misled"),
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
-    "laboratory": (
-        "Balldrop",
-        "Categories",
-        "Drift",
-        "Emulated",
-        "Hints",
-        "Links",
-        "Outliers",
-        "Relative",
-        "Sisters",
-        "Vanishing",
+    "laboratory": ("Balldrop", "Categories", "Curves", "Drift", "Emulated", "Hints", "Links", "Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
     ),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }

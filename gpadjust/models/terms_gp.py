@@ -29,6 +29,7 @@ from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.repeats import Repeats
+from gpadjust.gp.sister import Sister
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -357,6 +358,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
     ) -> Any:
         """Load parameters; with those of a model that holds samples, this one holds them too."""
+        if self.covar_module.sister is None:
+            self.covar_module.sister = Sister.of_state(state_dict, len(self._aug_batch_shape))
         samples = {
             name: state_dict[name]
             for name, parameter in self.named_parameters()

@@ -278,9 +278,9 @@ def compare(
         )
     if (m := data.Y.shape[-1]) > _MOST_OUTPUTS:
         raise ValueError(
-            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got {m}: "
-            "compare some of them, or fit a ParallelPartialGP of all with the physics and one with "
-            "physics=None, and see the scores of `leave_one_out` of both."
+            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got "
+            f"{m}: compare some of them, or fit a ParallelPartialGP of all with the physics and "
+            "one with physics=None, and see the scores of `leave_one_out` of both."
         )
     given_physics = as_physics(physics)
     fitted_to = candidates(asked, given_physics, len(data.X))
