@@ -194,7 +194,8 @@ class Vanishing(Experiment):
 
     axes: ClassVar[Axes] = {
         "problem": {
-            "ball": "ball: drag is missing, small at first",
+            "ball": "ball: drag is missing, taken as none until 0.5 s",
+            "early": "ball, until 0.3 s, of new seeds",
             "valve": "valve: its loss is missing, none when open",
             "misplaced": "valve, taken as open at 0.8",
         },
@@ -210,5 +211,7 @@ class Vanishing(Experiment):
     )
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """A wrong place is of the vanishing delta alone."""
-        return () if kind[0] == "misplaced" and kind[1] != "vanishing" else self.seeds
+        """Other places are of the vanishing delta alone, and one was chosen after the first run."""
+        if kind[0] in ("early", "misplaced") and kind[1] != "vanishing":
+            return ()
+        return range(3000, 3000 + self.runs) if kind[0] == "early" else self.seeds
