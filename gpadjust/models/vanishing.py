@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Size, Tensor
@@ -52,7 +52,7 @@ class VanishingRBF:
 
     def made_for(self, make: TermBuilder) -> VanishingKernel:
         """Return the kernel on the columns that the terms of a model read."""
-        raw, transform = self._raw(make.data.input_names), make.input_transform
+        raw, transform = self._raw(make.data.input_names), cast("Any", make.input_transform)
         if getattr(transform, "base", transform) is None:
             return self._kernel(raw, make.batch_shape)
         X = make.data.X.reshape(-1, raw.shape[-1])[:2]
