@@ -37,7 +37,7 @@ FLOORS = [
 CSV_TO_FREE_RUN = 46  # files that a log passes on the way to a judged free run
 TRIAL, ITERATION = 53, 51  # that a planned trial and an iteration of Dyna pass, fits included
 OF_CONTROL, OF_CONTROL_AND_RL = 9, 7  # of these
-FILES, CLASSES, FUNCTIONS = 32, 36, 256  # that the ten lines of the README pass; fewer are better
+FILES, CLASSES, FUNCTIONS = 32, 36, 264  # that the ten lines of the README pass; fewer are better
 REPORT, WITH_A_REPORT = 14, 34  # of report and validation, and of what is below, by a point fit
 
 

@@ -7,6 +7,7 @@ import sys
 from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from botorch.acquisition import qNegIntegratedPosteriorVariance
@@ -21,6 +22,7 @@ from gpadjust.active import collect
 from gpadjust.dynamics import LearnedDynamics, StateSpec
 from gpadjust.models.factory import with_options
 from gpadjust.report import report
+from gpadjust.report.markup import Markup
 from gpadjust.sklearn import CKARegressor
 
 KINDS = {
@@ -32,11 +34,17 @@ KINDS = {
         {"outcome_transform": Standardize(m=1)},
         lambda model: model.outcome_transform.means.abs().max() > 0.1,
     ),
+    "noisy inputs": (
+        {"train_Xvar": 1e-4},
+        lambda model: model.noisy_inputs is not None,
+    ),
     "units as they are": (
         {"outcome_transform": None},
         lambda model: getattr(model, "outcome_transform", None) is None,
     ),
     "positive outputs": ({"outcome_transform": "log"}, lambda model: "log" in model.link.formula),
+    "categories": ({"categorical": [1]}, lambda model: model.input_transform is not None),
+    "batches": ({"batch": [1]}, lambda model: model.input_transform is not None),
     "bounded outputs": ({"outcome_transform": (0.0, 9.0)}, lambda model: "9" in model.link.formula),
 }
 QUICK = {"num_starts": 1, "num_screened": 8}
@@ -54,12 +62,15 @@ def kind(request):
 
 @pytest.fixture
 def data():
-    X = torch.linspace(0, 3, 12, dtype=torch.float64).unsqueeze(-1)
-    return X, 1.2 * f_p(X) + 0.1 * X + 0.02 * torch.randn_like(X)
+    x = torch.linspace(0, 3, 12, dtype=torch.float64).unsqueeze(-1)
+    rig = torch.arange(12).remainder(3).unsqueeze(-1).double()
+    Y = 1.2 * f_p(x) + 0.1 * x + 0.02 * torch.randn_like(x)
+    return torch.cat([x, rig], dim=-1), Y
 
 
 def test_compare_and_its_page(kind, data, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules["gpadjust.validation.comparison"], "_DRAWS", (32, 32))
+    monkeypatch.setattr("gpadjust.report.sections.drawn", lambda draw: Markup())
     options, has = kind
     found = compare(*data, f_p, structures=["zero mean", "CKA"], **QUICK, **options)
     assert len(found.models) == 2
@@ -89,8 +100,29 @@ def test_regressor(kind, data):
     assert np.abs(fitted.predict(X) - y).max() < 0.2
 
 
+def test_a_frame_with_texts_in_a_search(data):
+    frame = pd.DataFrame(data[0].numpy(), columns=["time", "rig"])
+    frame["rig"] = frame["rig"].map({0.0: "old", 1.0: "new", 2.0: "lent"})
+    y = data[1][:, 0].numpy()
+    regressor = CKARegressor(
+        lambda X: 3 + np.sin(X[:, 0]), fit_method="map", fit_options=QUICK, random_state=0
+    )
+    options = {"model_options": [{}, {"batch": ["rig"]}]}
+    search = GridSearchCV(regressor, options, cv=2, error_score="raise").fit(frame, y)
+    assert np.abs(search.predict(frame) - y).max() < 0.2
+    assert [*search.feature_names_in_] == ["time", "rig"]
+    other = frame.assign(rig="another")
+    batches = regressor.set_params(model_options={"batch": "rig"}).fit(frame, y)
+    assert np.isfinite(batches.predict(other)).all()
+    plain = regressor.set_params(model_options=None).fit(frame, y)
+    with pytest.raises(ValueError, match="Expected rig to be one of lent, new, old, got 'another'"):
+        plain.predict(other)
+
+
 def test_collection(kind, tmp_path):
     options, has = kind
+    if {"categorical", "batch"} & {*options}:
+        pytest.skip("points are chosen among numbers")
     call = partial(
         collect,
         with_options(partial(CKA, physics=f_p), options),
@@ -114,7 +146,7 @@ def test_dynamics(kind):
         return LearnedDynamics(spec, f_p, model=model, target="absolute", fit_options=MAP)
 
     dynamics = build()
-    x, v = torch.rand(10, 1).double(), torch.rand(10, 1).double()
+    x, v = torch.rand(10, 1).double(), torch.arange(10).remainder(2).unsqueeze(-1).double()
     for _ in range(2):
         dynamics.update(x, v, f_p(x) + 0.1 * v)
     assert has(dynamics.model)

@@ -19,8 +19,10 @@ from gpadjust.gp import AppendedPhysics
 from gpadjust.gp.gaussian import threads_for
 from gpadjust.inference.bayes import SampleResult, default_num_samples, sample
 from gpadjust.inference.calibrate import calibrate
-from gpadjust.inference.optimise import FitResult, Search, maximise
+from gpadjust.inference.optimise import FitResult, Search, maximise, optima
+from gpadjust.inference.priors import register_priors
 from gpadjust.inference.shared_kernel import fit_shared
+from gpadjust.inference.targets import LogPosterior
 from gpadjust.inference.variational_fit import fit_variational
 from gpadjust.models import ParallelPartialGP, TermsGP, VariationalCKA
 from gpadjust.models.parameters import shared_parameters
@@ -70,7 +72,7 @@ METHODS = {
     "bayes": Method(sample, {"num_samples": 1, "num_draws": 16}),
 }
 """All methods by name: one more is an entry, which a module of its own can make."""
-_ROUNDS = 10  # of refinements of the noise, at most
+_ROUNDS = 30  # of refinements of the noise, at most
 _SEARCH = {"num_starts": 1, "num_screened": 0, "max_iterations": 1, "seed": 0}  # least values
 
 
@@ -152,9 +154,9 @@ def fit(
     *What others taught* (``prior=``): fitted models of other machines of the same kind, of the same
     class, inputs and outputs. Each term is then the sum of theirs and of a difference; of several
     the spread between them says how much machines differ, and in which directions. Lengthscales and
-    noise have priors around theirs. Whether they help has the prior probability 0.1, and by the
-    evidence of the model's own data ``result.sisters`` is what is left; so large is the share of the
-    model's samples that have them, the others are those of a fit without. (``"map"`` takes the
+    noise have priors around theirs. Whether they help has the prior probability 0.1;
+    ``result.sisters`` is the posterior one, by the evidence of the model's own data, and the share
+    of its samples that have them. The others are those of a fit without. (``"map"`` takes the
     likelier one.) The model keeps what it needs of the others.
 
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
@@ -220,13 +222,16 @@ def fit(
             begin = time.perf_counter()
             if isinstance(model, TermsGP) and model.noise.rows is not None:
                 _refine_noise(model, search)
-            if prior is None:
-                result = METHODS[method].run(model, search, **own)
-            else:
-                from gpadjust.inference.sisters import fit_with_prior
+            for _ in range(2):
+                if prior is None:
+                    result = METHODS[method].run(model, search, **own)
+                else:
+                    from gpadjust.inference.sisters import fit_with_prior
 
-                run = METHODS[method].run
-                result = fit_with_prior(model, prior, run, search, **own)
+                    run = METHODS[method].run
+                    result = fit_with_prior(model, prior, run, search, **own)
+                if not (isinstance(model, TermsGP) and _is_unconfirmed(model)):
+                    break
             if isinstance(model, TermsGP):
                 model.was_fitted = True
                 model.eval()
@@ -240,13 +245,40 @@ def fit(
 
 
 def _refine_noise(model: TermsGP, search: Search) -> None:
-    """Bring what is said of the noise of training rows to rest, by cheap fits on the way."""
-    model.noise.rows.forget()
+    """Bring what is said of the noise of training rows to rest, by rough fits of a copy."""
+    copy = deepcopy(model)
+    copy.noise.rows.forget()
+    search = search._replace(num_starts=4, num_screened=64)
+    if not model.has_unknowns:
+        register_priors(copy)
     for _ in range(_ROUNDS):
-        most_likely(model, search)
-        if not model.noise.rows.refine(model):
-            return
-        search = search._replace(num_screened=0)  # goes on from there
+        if model.has_unknowns:
+            most_likely(copy, search)
+        else:
+            target = LogPosterior(copy)
+            vectors, values = optima(target, search)
+            target.assign(vectors[values.argmin(0), torch.arange(values.shape[1])])
+            copy.eval()
+        if not copy.noise.rows.refine(copy):
+            break
+    for own, found in (
+        (model.likelihood, copy.likelihood),
+        (model.noise.rows, copy.noise.rows),
+    ):
+        for name, buffer in found.named_buffers(recurse=False):
+            setattr(own, name, buffer)
+    if model.noisy_inputs is not None:
+        model.noisy_inputs.move(model, copy.noisy_inputs.shift)
+
+
+def _is_unconfirmed(model: TermsGP) -> bool:
+    """Return whether a fit contradicts the noise of its rows; then they are others, for another."""
+    rows = model.noise.rows
+    if rows is None or not rows.confirm(model.eval()):
+        return False
+    if model.num_samples is not None:
+        model.release_samples()
+    return True
 
 
 def check_options(method: str, options: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ from gpadjust.gp import AppendedPhysics, Term
 from gpadjust.gp.kernels import CompositeKernel
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.sister import Sister
+from gpadjust.models.relative_noise import RelativeNoise
 from gpadjust.models.updates import UpdatedWeights
 
 HOLDS_SAMPLES = (
@@ -23,7 +24,16 @@ HOLDS_SAMPLES = (
     "`model.release_samples()` keeps the first."
 )
 # Modules whose buffers have the batch.
-_BATCHED = (AppendedPhysics, CompositeKernel, RFFKernel, RowNoise, Sister, Term, UpdatedWeights)
+_BATCHED = (
+    AppendedPhysics,
+    CompositeKernel,
+    RFFKernel,
+    RelativeNoise,
+    RowNoise,
+    Sister,
+    Term,
+    UpdatedWeights,
+)
 
 
 def hold_samples(model: Any, samples: dict[str, Tensor]) -> None:

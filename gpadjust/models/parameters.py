@@ -202,6 +202,7 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
         mean = kernel.at(inputs).combine({term.name: term.given_mean for term in kernel.terms})
     else:
         mean = model.mean_module(inputs)
+    targets = Noise(model.likelihood).trusted(targets)
     unit = (targets - mean).square().nanmean(-1)
     # A physics that misleads says nothing of how large functions and noise are.
     spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1)

@@ -78,7 +78,17 @@ def _lines(model: Any) -> list[str]:
         lines += _of_kernel(model, [row for row in rows if id(row.raw) in own], unit)
     noise = model.noise.at(model.train_inputs[0]).mean(-1)
     at = [_at_bound(noise, row.limits()) for row in rows if row.kind == "noise"]
-    return [*lines, f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}"]
+    if hasattr(model.likelihood, "said"):
+        constant, relative = model.likelihood.said(scale)
+        of = "f_p" if model.likelihood.weights.shape[-1] else "the mean"
+        lines.append(f"  noise: sd {_text(constant)}, and {_text(100 * relative)} % of {of}")
+    else:
+        lines.append(f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}")
+    if model.has_heavy_tails:
+        rows = (model.outliers().squeeze(-1) > 0.5).reshape(-1, model.train_targets.shape[-1])[0]
+        numbers = ", ".join(map(str, rows.nonzero().flatten().tolist()))
+        lines.append(f"  outliers: {f'rows {numbers}' if numbers else 'none'}")
+    return lines
 
 
 def _alone(model: Any) -> list[str]:

@@ -29,6 +29,7 @@ from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.repeats import Repeats
+from gpadjust.gp.sister import Sister
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -115,7 +116,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         if made.units is not None:  # not earlier: BoTorch would estimate it again
             units, link = made.units, made.link
             self.outcome_transform = units if link is None else link.units(units)
-            vars(self)["link"] = link  # no submodule, of which the class's None would be first
+            self.__dict__["link"] = link  # no submodule, of which the class's None would be first
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.noisy_inputs = made.noisy_inputs
@@ -200,13 +201,41 @@ class TermsGP(TermsModel, SingleTaskGP):
 
         With :math:`\alpha = K^{-1} (y - m)` they are :math:`y_i - \alpha_i / [K^{-1}]_{ii}` and
         :math:`1 / [K^{-1}]_{ii}` (Rasmussen and Williams 2006, eqs. 5.10-5.12), in model units;
-        NaN where there is no observation.
+        NaN where there is no observation. Variances are those of an observation that is no outlier.
         """
         if self.training:
             self.eval()
-        alpha, precision = self.conditioning().of_rows()
+        conditioning = self.conditioning()
+        factors = conditioning.factors()
+        alpha, precision = factors.alpha, factors.squared_columns()
+        if conditioning.repeats is not None:
+            alpha, precision = conditioning.of_each(alpha, precision)
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
-        return self.train_targets - alpha * variance, variance
+        mean = self.train_targets - alpha * variance
+        if self.noise.rows is not None and self.noise.rows.outlying.any():
+            noise = self.noise.at(self.train_inputs[0])
+            outlying = self.noise.trusted(self.train_targets).isnan() & ~self.train_targets.isnan()
+            least = (variance + noise - self.noise.of_rows(noise)).maximum(noise)
+            variance = variance.where(~outlying, least)
+        return mean, variance
+
+    def outliers(self) -> Tensor:
+        """Return the probability of each observation to be an outlier, ``batch_shape x n x m``.
+
+        By the others, and by hyper-parameters that were fitted without those that are likelier
+        outliers; of a ``likelihood="heavy-tailed"``.
+
+        Raises:
+            ValueError: If the noise has no heavy tails.
+        """
+        if not self.has_heavy_tails:
+            raise ValueError(
+                "The noise of the model has no outliers; build it with likelihood='heavy-tailed'."
+            )
+        from gpadjust.models.heavy_tails import probabilities
+
+        self.eval()
+        return self.outputs_last(probabilities(self))
 
     @torch.no_grad()
     def learn_local_errors(self) -> None:
@@ -226,7 +255,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        squares = (self.train_targets - mean).square().mean(0) / variance.maximum(least).mean(0)
+        targets = self.noise.trusted(self.train_targets)
+        squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)
         found[..., rows] = squares[..., rows].nan_to_num(nan=1.0, posinf=1.0)
@@ -328,6 +358,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
     ) -> Any:
         """Load parameters; with those of a model that holds samples, this one holds them too."""
+        if self.covar_module.sister is None:
+            self.covar_module.sister = Sister.of_state(state_dict, len(self._aug_batch_shape))
         samples = {
             name: state_dict[name]
             for name, parameter in self.named_parameters()

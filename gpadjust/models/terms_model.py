@@ -154,6 +154,12 @@ class TermsModel(PredictiveModel):
         return Noise(self.likelihood)
 
     @property
+    def has_heavy_tails(self) -> bool:
+        """True if observations may be outliers."""
+        rows = self.noise.rows
+        return rows is not None and any(source.has_outliers for source in rows.sources)
+
+    @property
     def terms(self) -> Sequence[Term]:
         """The terms of the sum."""
         terms: Sequence[Term] = self.covar_module.terms

@@ -16,7 +16,6 @@ from gpadjust.models.levels import (
     Levels,
     coded,
     declared,
-    is_frame,
     levels_of,
     several,
     texts_of,
@@ -90,7 +89,7 @@ def training_data(
     """
     name_X, name_Y = f"{prefix}_X", f"{prefix}_Y"
     levels: Levels = {}
-    if is_frame(train_X) or isinstance(categorical, Mapping):
+    if hasattr(train_X, "iloc") or isinstance(categorical, Mapping):
         own = column_names(train_X) or default_names("x", train_X.shape[-1])
         named = [*several(categorical), *several(batch)]
         levels = {**texts_of(train_X, named), **declared(categorical, own)}

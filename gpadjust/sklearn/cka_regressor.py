@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from copy import deepcopy
 from numbers import Integral
 from typing import Any, Literal, Self
@@ -32,6 +33,7 @@ from gpadjust.models import (
     ZeroMeanGP,
 )
 from gpadjust.models.factory import ModelFactory, make_model, with_options
+from gpadjust.models.levels import Levels, coded, several, texts_of
 from gpadjust.models.plausibility import is_standardised
 from gpadjust.models.training_data import check_array, column_names
 from gpadjust.physics import PhysicsWarning
@@ -140,7 +142,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Build the model on the data, and fit it.
 
         Args:
-            X: Inputs, ``n x d``, ``n >= 2``, in the units that the physics reads.
+            X: Inputs, ``n x d``, ``n >= 2``, in the units that the physics reads. The columns of a
+                frame that are texts are categories; the physics reads the numbers of their levels.
             y: Targets, ``n`` or ``n x m``, in the units that it returns. Several columns make
                 independent outputs.
             train_Yvar: Known variances of the observations, of the shape of y, as in
@@ -162,8 +165,11 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 data are dates or times.
             PhysicsError: If the physics fails, or returns NaN or a wrong shape.
         """
-        names_of_y = column_names(y)
         _check_measured(X=X, y=y)
+        names_of_y, options = column_names(y), _checked(self.model_options)
+        names = [*several(options.get("categorical")), *several(options.get("batch"))]
+        levels, frame = texts_of(X, names), X
+        X = _in_numbers(X, levels)
         X, y = validate_data(
             self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
         )
@@ -172,11 +178,12 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         rows = {name: np.asanyarray(each) for name, each in rows.items() if each is not None}
         if "train_Yvar" in rows and rows["train_Yvar"].shape == (len(y),):
             rows["train_Yvar"] = rows["train_Yvar"].reshape(-1, 1)
-        model = self._build(X, targets, {**_checked(self.model_options), **rows})
+        given = frame if levels or names else X  # of a frame the model knows columns and texts
+        model = self._build(given, X, targets, {**options, **rows})
         model.input_names = tuple(getattr(self, "feature_names_in_", model.input_names))
         model.output_names = names_of_y or model.output_names
-        options = {"seed": _seed(self.random_state), **(self.fit_options or {})}
-        result: Any = fit(model, self.fit_method, **options)
+        search = {"seed": _seed(self.random_state), **(self.fit_options or {})}
+        result: Any = fit(model, self.fit_method, **search)
         self.model_, self.fit_result_ = model, result
         self.__dict__.pop("physics_parameters_", None)
         if model.has_unknowns:
@@ -256,8 +263,8 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             draws = draws[torch.randperm(len(draws))[:n_samples]]
         return _array(draws.permute(1, 2, 0), dim=1)
 
-    def _build(self, X: Array, Y: Array, options: dict[str, Any]) -> TermsModel:
-        """The model that the parameters say, with further options."""
+    def _build(self, given: Any, X: Array, Y: Array, options: dict[str, Any]) -> TermsModel:
+        """The model that the parameters say, with further options, of inputs as they are given."""
         factory: Any = self.model
         if isinstance(factory, str):
             if factory not in MODELS:
@@ -279,7 +286,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             factory = with_options(deepcopy(factory), options)
-            model: TermsModel = make_model(factory, X, Y, kind=TermsModel, physics=physics)
+            model: TermsModel = make_model(factory, given, Y, kind=TermsModel, physics=physics)
         for each in caught:
             hints = _hints(X, Y) if issubclass(each.category, PhysicsWarning) else ""
             warnings.warn(f"{each.message}{hints}", each.category, stacklevel=3)
@@ -288,6 +295,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _inputs(self, X: Any) -> Tensor:
         check_is_fitted(self)
         _check_measured(X=X)
+        X = _in_numbers(X, self.model_.levels, self.model_.batches)
         return torch.tensor(validate_data(self, X, dtype=np.float64, reset=False))
 
     def _covariance(self, X: Tensor, observation_noise: bool) -> Tensor:
@@ -324,6 +332,12 @@ def _hints(X: Array, Y: Array) -> str:
             "physics: leave it out, too."
         )
     return hints
+
+
+def _in_numbers(X: Any, levels: Levels, batches: Sequence[int] = ()) -> Any:
+    """A frame with the numbers of levels in place of texts; anything else as it is."""
+    found = coded(X, levels, batches)
+    return X if found is X else type(X)(found.astype(float), index=X.index, columns=X.columns)
 
 
 def _checked(options: Any) -> dict[str, Any]:

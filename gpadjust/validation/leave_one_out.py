@@ -19,6 +19,7 @@ from torch import Tensor
 from gpadjust.gp.noise import Noise
 from gpadjust.models import ParallelPartialGP, StackedGP, TermsGP, VariationalCKA
 from gpadjust.models.exact_conditioning import Factors
+from gpadjust.models.heavy_tails import with_tails
 from gpadjust.models.stacked import Part
 from gpadjust.validation.scores import Scores, central_share
 
@@ -41,6 +42,9 @@ class LeaveOneOut:
         output_names: The names of the outputs; empty if the model has none.
         pit: The predicted probabilities of less than was observed, of outputs with a link, whose
             predictions are not Gaussian; else None.
+        is_outlier: Mask of the observations that count as outliers of a noise with heavy tails, of
+            the shape of ``Y``; None of other noise. Mean and variance are of an observation that is
+            none; the density allows that it may be one. Scores leave them out, but for the density.
     """
 
     X: Tensor
@@ -50,6 +54,7 @@ class LeaveOneOut:
     log_density: Tensor
     output_names: tuple[str, ...] = ()
     pit: Tensor | None = None
+    is_outlier: Tensor | None = None
 
     @property
     def residuals(self) -> Tensor:
@@ -72,7 +77,8 @@ class LeaveOneOut:
             level: Nominal coverage, between 0 and 1.
         """
         names = self.output_names
-        scores = Scores.of(self.mean, self.variance, self.Y, level=level, output_names=names)
+        Y = self.Y if self.is_outlier is None else self.Y.masked_fill(self.is_outlier, torch.nan)
+        scores = Scores.of(self.mean, self.variance, Y, level=level, output_names=names)
         if self.pit is not None:
             scores = replace(scores, pit=self.pit, coverage=central_share(self.pit, level))
         return replace(scores, nlpd=-self.log_density.nanmean(-2))
@@ -153,7 +159,9 @@ def leave_one_out(
         targets = model.train_targets
         if isinstance(model, TermsGP):
             targets, mean = model.measured_targets(), mean + model.measured_targets() - targets
-        Y, mean, variance = (_outputs_last(model, t)[..., rows, :] for t in (targets, mean, variance))
+        Y, mean, variance = (
+            _outputs_last(model, t)[..., rows, :] for t in (targets, mean, variance)
+        )
         # A missing observation is predicted from all that there are, but not compared.
         missing, link, own_pit = Y.isnan(), getattr(model, "link", None), None
         mean, variance = mean.masked_fill(missing, 0.0), variance.masked_fill(missing, 1.0)
@@ -165,7 +173,12 @@ def leave_one_out(
             X, Y = X.select(MCMC_DIM, 0), Y.select(MCMC_DIM, 0)
         else:
             mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
-        density = log_densities(mean, variance, Y)
+        density, is_outlier = log_densities(mean, variance, Y), None
+        if isinstance(model, TermsGP) and model.has_heavy_tails:
+            density = with_tails(density, Y.unsqueeze(MCMC_DIM) - mean, variance)
+            kept = _outputs_last(model, model.noise.trusted(model.train_targets))[..., rows, :]
+            kept = kept.select(MCMC_DIM, 0) if is_fully_bayesian(model) else kept
+            is_outlier = kept.isnan() & ~Y.isnan()
         weight = _without_each(density)
         if link is not None:
             below = torch.special.ndtr((Y.unsqueeze(MCMC_DIM) - mean) / variance.sqrt())
@@ -175,7 +188,7 @@ def leave_one_out(
         mean, variance, density = _mixture_of(mean, variance, density, weight)
     X, Y = X[..., rows, :].expand(*mean.shape[:-1], X.shape[-1]), Y.expand(mean.shape)
     names = getattr(model, "output_names", ())
-    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, density, names, own_pit)
+    return LeaveOneOut(X.clone(), Y.clone(), mean, variance, density, names, own_pit, is_outlier)
 
 
 def log_densities(mean: Tensor, variance: Tensor, Y: Tensor) -> Tensor:

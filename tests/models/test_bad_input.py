@@ -187,9 +187,9 @@ BAD_OPTIONS = [
         for kind in ("CKA", "ZeroMeanGP", "RRA", "AR1")
     ),
     *(
-        (kind, {"likelihood": likelihood}, TypeError, "likelihood")
+        (kind, {"likelihood": likelihood}, error, "likelihood")
         for kind in ("CKA", "ZeroMeanGP", "RRA")
-        for likelihood in ("x", BernoulliLikelihood())
+        for likelihood, error in (("x", TypeError), (BernoulliLikelihood(), TypeError))
     ),
 ]
 
