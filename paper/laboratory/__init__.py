@@ -141,7 +141,6 @@ class Hints(Experiment):
             "outliers": "noise, one in twenty off by 10 to 100 sd of it",
             "decades": "output over decades, noise of one size",
             "relative": "output over decades, noise of 15 % of it",
-            "copies": "noise, three rows copied",
             "rigs": "noise, and the number of a rig",
         },
         "problem": {
