@@ -135,6 +135,8 @@ def real_array(values: ArrayLike) -> NDArray[np.float64]:
     NumPy would drop the imaginary part of complex numbers, and take None for NaN and text for
     numbers.
     """
+    if np.ma.is_masked(values):
+        raise TypeError("expected real numbers, found masked values")
     array = np.array(values)
     # Objects may be numbers, such as fractions.
     if array.dtype.kind not in "biufO" or (

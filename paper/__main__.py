@@ -20,7 +20,8 @@ CHAPTERS = {
     "measuring": ("Active", "Optimisation", "Misled"),
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
-    "laboratory": ("Balldrop", "Drift", "Emulated", "Hints", "Sisters", "Vanishing"),
+    "laboratory": ("Balldrop", "Categories", "Curves", "Drift", "Emulated", "Hints", "Links", "Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
+    ),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }
 """Folders, and the classes of the experiments that they declare."""

@@ -34,6 +34,10 @@ KINDS = {
         {"outcome_transform": Standardize(m=1)},
         lambda model: model.outcome_transform.means.abs().max() > 0.1,
     ),
+    "noisy inputs": (
+        {"train_Xvar": 1e-4},
+        lambda model: model.noisy_inputs is not None,
+    ),
     "units as they are": (
         {"outcome_transform": None},
         lambda model: getattr(model, "outcome_transform", None) is None,

@@ -160,7 +160,8 @@ class Dynamics(ABC):
                 has ends, 39 or more for 95 %.
             level: The probability of the intervals.
             noise: Whether intervals and particles are of measured states, with the noise that the
-                dynamics learnt, or of the states themselves. Or the standard deviations
+                dynamics learnt (errors of entries that are clearly correlated, jointly), or of the
+                states themselves. Or the standard deviations
                 ``state_dim`` of the measurements' errors.
             start_noise: Standard deviations ``state_dim`` by which the initial states, as measured,
                 err; each particle then starts elsewhere. ``"learnt"``: half of the variance of the
@@ -214,6 +215,9 @@ class Dynamics(ABC):
                 "noise=smoothed.noise of smooth(records, physics), or noise=False."
             )
         generator = torch.Generator().manual_seed(seed)
+        learnt = "learnt" in (start_noise, process_noise) or noise is True
+        root = self.noise_root() if learnt else None
+        roots = [root if isinstance(each, str) else None for each in (start_noise, process_noise)]
         # Dynamics of a user's may draw from PyTorch's generator all the same.
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -224,7 +228,8 @@ class Dynamics(ABC):
                 start_noise = with_lags(spec, (variance.nan_to_num(nan=0.0) / 2).sqrt())
             if start_noise is not None:
                 error = start_noise.expand_as(initial_states)
-                particles = particles + measurement_noise(spec, error, num_functions, generator)
+                drawn = measurement_noise(spec, error, num_functions, generator, roots[0])
+                particles = particles + drawn
             lost = torch.zeros(particles.shape[:2], dtype=torch.bool)
             path, lost_by_then = [], []
             for each in actions.unbind(1):
@@ -239,7 +244,7 @@ class Dynamics(ABC):
                 if added is not None:
                     error = torch.zeros_like(initial_states)
                     error[:, spec.moving] = added.expand_as(initial_states)[:, spec.moving]
-                    moved = measurement_noise(spec, error, num_functions, generator)
+                    moved = measurement_noise(spec, error, num_functions, generator, roots[1])
                     particles = particles + moved.masked_fill(lost.unsqueeze(-1), 0.0)
                     if state_bounds is not None:
                         low, high = state_bounds
@@ -259,7 +264,7 @@ class Dynamics(ABC):
                 parts = zip(*rows, strict=True)
                 variances = [step_or_nan(self.noise_variance, *part) for part in parts]
                 scatter = with_lags(spec, torch.cat(variances).sqrt().view_as(center))
-                cloud = cloud + measurement_noise(spec, scatter, num_functions, generator)
+                cloud = cloud + measurement_noise(spec, scatter, num_functions, generator, root)
         low, high = central_interval(cloud, level)
         return FreeRun(
             mean=mean,
@@ -283,6 +288,10 @@ class Dynamics(ABC):
             actions: ``N x action_dim``.
         """
         return torch.zeros_like(states)
+
+    def noise_root(self) -> Tensor | None:
+        """Lower triangular root of the correlation of predicted states' noise; None for none."""
+        return None
 
     def _varied(
         self, variation: Tensor | float

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gpadjust.checks import check_switch
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
+from gpadjust.dynamics.joint_errors import error_correlation
 from gpadjust.dynamics.learning import (
     DynamicsFitOptions,
     Learnt,
@@ -109,6 +110,7 @@ class LearnedDynamics(Dynamics):
         self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions
         self._means: tuple[TermsModel, Any] | None = None  # of a model, made once
+        self._root: tuple[TermsModel, Tensor | None] | None = None  # likewise
 
     @property
     def is_fitted(self) -> bool:
@@ -214,7 +216,9 @@ class LearnedDynamics(Dynamics):
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """Draw next states, noise included, row by row, from PyTorch's generator."""
         mean, variance = self._predict(states, actions, True)
-        return self.spec.complete(states, actions, mean + variance.sqrt() * torch.randn_like(mean))
+        drawn, root = torch.randn_like(mean), self.noise_root()
+        drawn = drawn if root is None else drawn @ root.mT
+        return self.spec.complete(states, actions, mean + variance.sqrt() * drawn)
 
     def sample_functions(self, num_functions: int, seed: int | None = None) -> TransitionFunctions:
         """Draw transition functions from the posterior, without noise; see :class:`Dynamics`.
@@ -260,6 +264,17 @@ class LearnedDynamics(Dynamics):
         """The variance of the noise that was learnt, ``N x state_dim``; errors as `predict`."""
         noisy, without = (self._predict(states, actions, noise)[1] for noise in (True, False))
         return self.spec.complete_variance((noisy - without).clamp_min(0.0))
+
+    def noise_root(self) -> Tensor | None:
+        """Lower triangular root of the correlation of predicted states' noise; None for none.
+
+        That of their left-out errors, shrunk, of states whose correlation these clearly show.
+        """
+        model = self.model
+        if self._root is None or self._root[0] is not model:
+            found = error_correlation(model)
+            self._root = model, None if found is None else torch.linalg.cholesky(found)
+        return self._root[1]
 
     def describe(self) -> dict[str, str]:
         """Each setting of these dynamics as a text; of objects, the class."""

@@ -92,13 +92,20 @@ def about_center(spec: StateSpec, particles: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def measurement_noise(
-    spec: StateSpec, noise: Tensor, num_particles: int, generator: torch.Generator
+    spec: StateSpec,
+    noise: Tensor,
+    num_particles: int,
+    generator: torch.Generator,
+    root: Tensor | None = None,
 ) -> Tensor:
     """Draws of a noise with standard deviations ``... x state_dim``, one for each particle.
 
-    An integrated state has the draws of its velocity.
+    An integrated state has the draws of its velocity. Predicted states have a correlation, if a
+    lower triangular root of it is given.
     """
     z = torch.randn(num_particles, *noise.shape, generator=generator, dtype=torch.float64)
+    if root is not None:
+        z[..., spec.predicted] = z[..., spec.predicted] @ root.mT
     for name, velocity in spec.integrated.items():
         z[..., spec.states.index(name)] = z[..., spec.states.index(velocity)]
     return noise * z

@@ -7,7 +7,7 @@ import warnings
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -91,6 +91,21 @@ class SampleResult:
     num_samples: int | None = None
     seconds: float | None = None
     sisters: Tensor | None = None
+
+    def to_arviz(self) -> Any:
+        """The draws as ArviZ has them: a DataTree with the group ``posterior``, of one chain.
+
+        The draws are equally likely, and not in the order of a chain. An ImportError without
+        ArviZ, ``pip install "gpadjust[arviz]"``.
+        """
+        try:
+            from arviz_base import from_dict
+        except ImportError as error:
+            raise ImportError(
+                'to_arviz() needs arviz-base; run `pip install "gpadjust[arviz]"`.'
+            ) from error
+        draws = {name: each.detach().cpu().numpy()[None] for name, each in self.draws.items()}
+        return from_dict({"posterior": draws})
 
     def __repr__(self) -> str:
         """A sentence; of several outputs with their least effective size."""

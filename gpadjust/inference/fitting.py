@@ -154,9 +154,9 @@ def fit(
     *What others taught* (``prior=``): fitted models of other machines of the same kind, of the same
     class, inputs and outputs. Each term is then the sum of theirs and of a difference; of several
     the spread between them says how much machines differ, and in which directions. Lengthscales and
-    noise have priors around theirs. Whether they help has the prior probability 0.1, and by the
-    evidence of the model's own data ``result.sisters`` is what is left; so large is the share of the
-    model's samples that have them, the others are those of a fit without. (``"map"`` takes the
+    noise have priors around theirs. Whether they help has the prior probability 0.1;
+    ``result.sisters`` is the posterior one, by the evidence of the model's own data, and the share
+    of its samples that have them. The others are those of a fit without. (``"map"`` takes the
     likelier one.) The model keeps what it needs of the others.
 
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
@@ -267,6 +267,8 @@ def _refine_noise(model: TermsGP, search: Search) -> None:
     ):
         for name, buffer in found.named_buffers(recurse=False):
             setattr(own, name, buffer)
+    if model.noisy_inputs is not None:
+        model.noisy_inputs.move(model, copy.noisy_inputs.shift)
 
 
 def _is_unconfirmed(model: TermsGP) -> bool:

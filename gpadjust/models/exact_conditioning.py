@@ -244,7 +244,10 @@ class ExactConditioning(DefaultPredictionStrategy):
         with torch.set_grad_enabled(torch.is_grad_enabled() and detach_test_caches.off()):
             train = self.kernel.at(self.train_inputs[0])
             covariance = train.covariance(self.kernel.known_means)
-            targets, noise, _ = self.observations()
+            if self.repeats is None:
+                targets, noise = self.targets, self.noise.of_rows(self.noise.at(train.x))
+            else:
+                targets, noise, _ = self.observations()
             # Not in place: kernels may share memory with what they return.
             covariance = covariance + torch.diag_embed(noise)
             factors = Factors.of(covariance, targets - train.mean())
@@ -256,14 +259,12 @@ class ExactConditioning(DefaultPredictionStrategy):
         self._inverse = None
         return factors
 
-    def of_rows(self) -> tuple[Tensor, Tensor]:
-        r"""The weights of all observations, and the diagonal of their inverse covariance."""
-        factors = self.factors()
-        precision = factors.squared_columns()
-        if self.repeats is None:
-            return factors.alpha, precision
+    def of_each(self, alpha: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights and precisions of all observations, by those of the means of repeated ones."""
         _, noise, means = self.observations()
-        return self.repeats.of_each(means, self.targets, noise, factors.alpha, precision)
+        if self.repeats is None or means is None:
+            return alpha, precision
+        return self.repeats.of_each(means, self.targets, noise, alpha, precision)
 
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Posterior means and variances at each point by itself, ``... x q``."""

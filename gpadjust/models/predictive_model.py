@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from importlib import import_module
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 from botorch.acquisition.objective import PosteriorTransform
 from botorch.models.model import Model
@@ -20,10 +21,12 @@ from gpadjust.models.posteriors import (
     mixture_quantile,
 )
 from gpadjust.models.sampled_functions import DRAWING, check_num_features, seeded
-from gpadjust.models.training_data import ArrayLike
+from gpadjust.models.training_data import ArrayLike, as_given
+
+Values = TypeVar("Values")
 
 
-class Prediction(NamedTuple):
+class Prediction(NamedTuple, Generic[Values]):
     """Marginal predictions, as :meth:`~gpadjust.CKA.predict` returns them.
 
     Args:
@@ -31,12 +34,16 @@ class Prediction(NamedTuple):
         variance: Posterior variances, ``batch_shape x q x m``, in their square.
     """
 
-    mean: Tensor
-    variance: Tensor
+    mean: Values
+    variance: Values
 
 
 class PredictiveModel(Model):
     """A BoTorch model whose predictions are mixtures of ``S`` Gaussians, or of one.
+
+    Its numbers come as the inputs came: of tensors as tensors; of NumPy arrays as arrays; of pandas
+    and polars frames as frames, with the names of the outputs and the index of the inputs. All are
+    in the user's units. Posteriors are BoTorch's, and so of tensors.
 
     Attributes:
         num_samples: Number ``S`` of Gaussians; None for a single one.
@@ -105,7 +112,17 @@ class PredictiveModel(Model):
             return posterior
         return ScaleFreePosterior.transformed(posterior_transform(posterior=posterior, X=X))
 
-    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction:
+    @overload
+    def predict(
+        self, X: Tensor, observation_noise: bool | Tensor = False
+    ) -> Prediction[Tensor]: ...
+
+    @overload
+    def predict(
+        self, X: ArrayLike, observation_noise: bool | Tensor = False
+    ) -> Prediction[Any]: ...
+
+    def predict(self, X: ArrayLike, observation_noise: bool | Tensor = False) -> Prediction[Any]:
         """Predict each point by itself, without the covariances between them.
 
         The mean and variance of ``posterior(X)`` (of a model that holds samples of its
@@ -118,8 +135,11 @@ class PredictiveModel(Model):
             observation_noise: Whether to predict observations instead of the function; or their
                 noise variances, ``batch_shape x q x m``, in the square of the user's units.
 
+        Returns:
+            Mean and variance, as ``X`` came: tensors, arrays or frames.
+
         Raises:
-            TypeError: If ``X`` is not float64.
+            TypeError: If ``X`` is a tensor that is not float64, or holds no numbers.
             ValueError: If ``X`` has not the columns that the model was built on, or a variance is
                 negative.
             PhysicsError: If the physics fails at ``X``.
@@ -136,12 +156,13 @@ class PredictiveModel(Model):
         mean, variance = self.components(X, observation_noise)
         if self.link is not None:
             mean, variance = self.link.moments(mean, variance)
-        return Prediction(*mixture_moments(mean, variance))
+        moments = mixture_moments(mean, variance)
+        return Prediction(*(as_given(each, X, self.output_names) for each in moments))
 
     def interval(
         self, X: ArrayLike, level: float = 0.95, observation_noise: bool | Tensor = False
-    ) -> tuple[Tensor, Tensor]:
-        """The central interval at each point by itself: lower and upper ends.
+    ) -> tuple[Any, Any]:
+        """The central interval at each point by itself: lower and upper ends, as ``X`` came.
 
         Args:
             X: Raw inputs, ``batch_shape x q x d``.
@@ -151,7 +172,27 @@ class PredictiveModel(Model):
         check_level(level)
         parts, link = self.components(X, observation_noise), self.link
         lower, upper = (mixture_quantile(*parts, (1 + s * level) / 2, link) for s in (-1, 1))
-        return lower, upper
+        return as_given(lower, X, self.output_names), as_given(upper, X, self.output_names)
+
+    def plot(self, **options: Any) -> Any:
+        """Draw predictions and adjustments along each input: what one wants to see first.
+
+        See :func:`~gpadjust.validation.plots.plot_model`, whose options these are, as ``output``,
+        ``level``, ``base`` (where the other inputs stay) and ``bounds``.
+
+        Returns:
+            An array of axes, ``rows x d``; ``axes[0, 0].figure`` is the figure.
+
+        Raises:
+            ImportError: Without matplotlib, ``pip install "gpadjust[plot]"``.
+        """
+        try:  # a room below, which is asked for at the call
+            plots = import_module("gpadjust.validation.plots")
+        except ImportError as error:
+            raise ImportError(
+                'model.plot() needs matplotlib; run `pip install "gpadjust[plot]"`.'
+            ) from error
+        return plots.plot_model(self, **options)
 
     def sample_functions(
         self, num_functions: int, seed: int | None = None, num_features: int = 1024

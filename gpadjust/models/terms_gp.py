@@ -29,6 +29,7 @@ from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.repeats import Repeats
+from gpadjust.gp.sister import Sister
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -115,7 +116,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         if made.units is not None:  # not earlier: BoTorch would estimate it again
             units, link = made.units, made.link
             self.outcome_transform = units if link is None else link.units(units)
-            vars(self)["link"] = link  # no submodule, of which the class's None would be first
+            self.__dict__["link"] = link  # no submodule, of which the class's None would be first
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.noisy_inputs = made.noisy_inputs
@@ -204,7 +205,11 @@ class TermsGP(TermsModel, SingleTaskGP):
         """
         if self.training:
             self.eval()
-        alpha, precision = self.conditioning().of_rows()
+        conditioning = self.conditioning()
+        factors = conditioning.factors()
+        alpha, precision = factors.alpha, factors.squared_columns()
+        if conditioning.repeats is not None:
+            alpha, precision = conditioning.of_each(alpha, precision)
         variance = precision.masked_fill(precision <= 0, torch.nan).reciprocal()
         mean = self.train_targets - alpha * variance
         if self.noise.rows is not None and self.noise.rows.outlying.any():
@@ -353,6 +358,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
     ) -> Any:
         """Load parameters; with those of a model that holds samples, this one holds them too."""
+        if self.covar_module.sister is None:
+            self.covar_module.sister = Sister.of_state(state_dict, len(self._aug_batch_shape))
         samples = {
             name: state_dict[name]
             for name, parameter in self.named_parameters()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from inspect import signature
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from botorch.models.transforms.outcome import OutcomeTransform
@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import Module
 from torch.nn.functional import pad
 
-from gpadjust.checks import checked_whole
+from gpadjust.checks import check_level, checked_whole
 from gpadjust.gp import AppendedPhysics, PhysicsInput, SumOfTerms, Term, Unit, WeightedSum
 from gpadjust.gp.noise import Noise
 from gpadjust.models.hyperparameter_samples import take_samples
@@ -25,12 +25,34 @@ from gpadjust.models.levels import coded
 from gpadjust.models.links import plain
 from gpadjust.models.local_errors import LocalErrors
 from gpadjust.models.physics_parameters import PhysicsParameters
+from gpadjust.models.posteriors import mixture_moments, mixture_quantile
 from gpadjust.models.predictive_model import PredictiveModel, given_noise
 from gpadjust.models.sampled_functions import FunctionPerBatch, SampledFunctions
 from gpadjust.models.summary import summary, title
 from gpadjust.models.term_builder import ModelOptions
-from gpadjust.models.training_data import ArrayLike, TrainingData, check_order, to_tensor
+from gpadjust.models.training_data import (
+    ArrayLike,
+    TrainingData,
+    as_given,
+    check_order,
+    to_tensor,
+)
 from gpadjust.physics import Physics
+
+
+class Adjustment(NamedTuple):
+    """A rho or a delta at some points, as :meth:`TermsModel.adjustments` returns it.
+
+    Args:
+        mean: Posterior means, ``q x m``; of a rho without units, else in the targets'.
+        lower: Lower ends of the intervals.
+        upper: Upper ends.
+    """
+
+    mean: Any
+    lower: Any
+    upper: Any
+
 
 _SHARED = "Unpack[ModelOptions]"  # how a constructor says that it takes these and no others
 
@@ -227,6 +249,53 @@ class TermsModel(PredictiveModel):
             shift, scale = self.units(term.unit)
             covariance = covariance * scale.square().unsqueeze(-1)
             return self.as_posterior(mean * scale + shift, covariance, mixed)
+
+    def adjustments(self, X: ArrayLike, level: float = 0.95) -> Any:
+        r"""Every :math:`\rho` and :math:`\delta` with its interval, at each point by itself.
+
+        The moments of :meth:`term`, without the covariances between points, so that there may be
+        many of them.
+
+        Args:
+            X: Raw inputs, ``batch_shape x q x d``.
+            level: The probability that an interval holds.
+
+        Returns:
+            Of tensors and arrays, an :class:`Adjustment` for each of ``term_names``, by name: mean,
+            lower and upper, ``q x m``. Of a frame, one frame with columns such as ``rho mean``,
+            ``rho lower``, ``rho upper`` and ``delta mean``, of several outputs ``rho of head
+            mean``, and the index of X.
+
+        Raises:
+            ValueError: If ``level`` is not between 0 and 1.
+
+        Example:
+            >>> import torch
+            >>> from gpadjust import CKA
+            >>> X = torch.linspace(0, 1, 8, dtype=torch.float64).unsqueeze(-1)
+            >>> model = CKA(X, X.sin(), physics=lambda X: X)
+            >>> rho, delta = model.adjustments(X).values()
+            >>> bool((rho.lower < rho.mean).all()), delta.upper.shape
+            (True, torch.Size([8, 1]))
+        """
+        check_level(level)
+        found: dict[str, Adjustment] = {}
+        with self._graph_for(X):
+            inputs = self.model_inputs(X, with_basis=False)
+            for term in (term for term in self.terms if term.name in self.term_names):
+                shift, scale = self.units(term.unit)
+                mean, variance = self.conditioning().marginals(self._at(term, inputs))
+                moments = torch.broadcast_tensors(mean * scale + shift, variance * scale.square())
+                parts = [self.outputs_last(each) for each in moments]
+                if self.num_samples is None:
+                    parts = [each.unsqueeze(MCMC_DIM) for each in parts]
+                ends = (mixture_quantile(*parts, (1 + side * level) / 2) for side in (-1, 1))
+                found[term.name] = Adjustment(mixture_moments(*parts)[0], *ends)
+        if not hasattr(X, "columns"):
+            return {n: Adjustment(*(as_given(v, X, ()) for v in a)) for n, a in found.items()}
+        of = [f" of {name}" if self.num_outputs > 1 else "" for name in self.output_names]
+        names = [f"{n}{each} {k}" for n in found for k in Adjustment._fields for each in of]
+        return as_given(torch.cat([v for a in found.values() for v in a], -1), X, names)
 
     def rho_name(self, physics: str | int | None = None) -> str:
         """The name of the term that scales a physics, which is given by name or number."""

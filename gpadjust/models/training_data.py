@@ -172,15 +172,7 @@ def to_tensor(values: ArrayLike, name: str) -> Tensor:
             f"Expected {name} to be a torch tensor, a NumPy array or a DataFrame, got "
             f"{type(values).__name__}; convert it with `torch.tensor({name}, dtype=torch.float64)`."
         )
-    if np.ma.is_masked(array):
-        raise ValueError(
-            f"Expected {name} without masked values, found {np.ma.count_masked(array)}. Leave "
-            f"their rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
-        )
-    found = {type(each) for each in array.flat} if array.dtype.kind == "O" else set()
-    for what, (kinds, types, _) in _NO_NUMBERS.items():
-        if array.dtype.kind in kinds or any(issubclass(each, types) for each in found):
-            raise TypeError(_not_numbers(name, what))
+    check_array(array, name)
     try:
         return torch.as_tensor(np.array(array, dtype=np.float64))
     except (TypeError, ValueError) as error:
@@ -188,6 +180,20 @@ def to_tensor(values: ArrayLike, name: str) -> Tensor:
             f"Expected {name} to hold numbers only, but {error}. Select the numeric columns, and "
             "encode or drop the others."
         ) from error
+
+
+def check_array(array: Any, name: str, what: Sequence[str] = tuple(_NO_NUMBERS)) -> None:
+    """Raise an error if an array has masked values, or what NumPy would turn into numbers."""
+    if np.ma.is_masked(array):
+        raise ValueError(
+            f"Expected {name} without masked values, found {np.ma.count_masked(array)}. Leave "
+            f"their rows out, or make them NaN by `{name}.filled(np.nan)`, if they are targets."
+        )
+    found = {type(value) for value in array.flat} if array.dtype.kind == "O" else set()
+    for each in what:
+        kinds, types, _ = _NO_NUMBERS[each]
+        if array.dtype.kind in kinds or any(issubclass(kind, types) for kind in found):
+            raise TypeError(_not_numbers(name, each))
 
 
 def _not_numbers(name: str, found: str) -> str:
@@ -208,6 +214,19 @@ def with_names(X: Tensor, names: Sequence[str]) -> Tensor:
     named = X.view_as(X)
     named.columns = names  # type: ignore[attr-defined]
     return named
+
+
+def as_given(values: Tensor, X: ArrayLike, names: Sequence[str]) -> Any:
+    """Values ``... x q x m`` as X came: a tensor, an array, or a frame of pandas or polars.
+
+    A frame has these names of columns, and pandas' the index of X.
+    """
+    if isinstance(X, Tensor):
+        return values
+    array, library = values.detach().cpu().numpy(), type(X).__module__.partition(".")[0]
+    if library == "pandas":
+        return type(X)(array, index=X.index, columns=list(names))
+    return type(X)(array, schema=list(names)) if library == "polars" else array
 
 
 def check_order(values: ArrayLike, names: tuple[str, ...]) -> None:

@@ -60,14 +60,11 @@ def keep_last(model: Any, new: NewRows, number: int) -> None:
     model.train_targets = last(model.train_targets, new.targets, -1)
     rows = model.noise.rows
     if rows is not None:
-        rows.factors = last(rows.factors, torch.ones_like(new.targets), -1)
+        rows.errors = last(rows.errors, torch.zeros_like(new.targets), -1)
         rows.added = last(rows.added, torch.zeros_like(new.targets), -1)
     if new.noise is not None:
         holder = model.likelihood.noise_covar
         holder.noise = last(holder.noise.expand(*new.noise.shape[:-1], -1), new.noise, -1)
-    if (rows := model.noise.rows) is not None:
-        rows.factors = last(rows.factors, torch.ones_like(new.targets), -1)
-        rows.added = last(rows.added, torch.zeros_like(new.targets), -1)
     model.prediction_strategy = None
 
 

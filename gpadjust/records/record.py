@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,6 +35,7 @@ class Record:
 
     Args:
         times: ``N`` times, in s or the unit of time of the velocities, that rise within a segment.
+            Dates and durations, as the index of a pandas frame, become seconds since the first.
         states: ``N x state_dim``; NaN where an entry was not measured.
         actions: ``N x action_dim``.
         segments: ``N`` labels; a segment ends wherever the label changes. Default: one for all.
@@ -62,7 +65,7 @@ class Record:
         name: str = "unnamed",
     ) -> None:
         self.name = name
-        self.times = self._numbers(times, "times", 1)
+        self.times = self._numbers(_in_seconds(times), "times", 1)
         self.states = self._numbers(states, "states", 2)
         self.actions = self._numbers(actions, "actions", 2)
         labels: Any = segments.tolist() if hasattr(segments, "tolist") else segments
@@ -196,6 +199,20 @@ class Record:
                 f"{before:.10g}. Leave out rows that were written twice; where the clock was set "
                 "again, begin a new segment by `segments`."
             )
+
+
+def _in_seconds(times: ArrayLike) -> ArrayLike:
+    """Dates and durations as seconds since the first; anything else as it is."""
+    found = np.asarray(times) if hasattr(times, "dtype") and not isinstance(times, Tensor) else None
+    if found is None or not len(found):
+        return times
+    if found.dtype.kind == "O" and isinstance(found.flat[0], datetime | timedelta):
+        # Of a time zone; those that are measured without one NumPy knows.
+        kind = "datetime64[ns]" if isinstance(found.flat[0], datetime) else "timedelta64[ns]"
+        with_zone = getattr(found.flat[0], "tzinfo", None) is not None
+        found = [t.astimezone(UTC).replace(tzinfo=None) if with_zone else t for t in found]
+        found = np.array(found, dtype=kind)
+    return (found - found[0]) / np.timedelta64(1, "s") if found.dtype.kind in "mM" else times
 
 
 class Stretch(NamedTuple):

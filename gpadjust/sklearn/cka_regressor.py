@@ -35,7 +35,7 @@ from gpadjust.models import (
 from gpadjust.models.factory import ModelFactory, make_model, with_options
 from gpadjust.models.levels import Levels, coded, several, texts_of
 from gpadjust.models.plausibility import is_standardised
-from gpadjust.models.training_data import column_names
+from gpadjust.models.training_data import check_array, column_names
 from gpadjust.physics import PhysicsWarning
 from gpadjust.physics.array_physics import array_physics
 
@@ -158,12 +158,14 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             PhysicsWarning: If the physics is obviously off at X, as after a scaler.
 
         Raises:
-            ValueError: If data are not finite real numbers, or shapes disagree (scikit-learn says
-                it); or if the model's name is unknown. Of outputs that are missing in some rows,
-                take the models of this library.
-            TypeError: If the physics is none, an option has a wrong type, or the model none.
+            ValueError: If data are masked, not finite real numbers, or shapes disagree
+                (scikit-learn says it); or if the model's name is unknown. Of outputs that are
+                missing in some rows, take the models of this library.
+            TypeError: If the physics is none, an option has a wrong type, or the model none; if
+                data are dates or times.
             PhysicsError: If the physics fails, or returns NaN or a wrong shape.
         """
+        _check_measured(X=X, y=y)
         names_of_y, options = column_names(y), _checked(self.model_options)
         names = [*several(options.get("categorical")), *several(options.get("batch"))]
         levels, frame = texts_of(X, names), X
@@ -173,7 +175,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
         rows = {"train_Yvar": train_Yvar, "train_Xvar": train_Xvar}
-        rows = {name: np.asarray(each) for name, each in rows.items() if each is not None}
+        rows = {name: np.asanyarray(each) for name, each in rows.items() if each is not None}
         if "train_Yvar" in rows and rows["train_Yvar"].shape == (len(y),):
             rows["train_Yvar"] = rows["train_Yvar"].reshape(-1, 1)
         given = frame if levels or names else X  # of a frame the model knows columns and texts
@@ -292,6 +294,7 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _inputs(self, X: Any) -> Tensor:
         check_is_fitted(self)
+        _check_measured(X=X)
         X = _in_numbers(X, self.model_.levels, self.model_.batches)
         return torch.tensor(validate_data(self, X, dtype=np.float64, reset=False))
 
@@ -306,6 +309,13 @@ class CKARegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 covariance = (covariance + spread @ spread.mT).mean(0)
             covariances.append(covariance)
         return torch.stack(covariances, dim=-1)
+
+
+def _check_measured(**data: Any) -> None:
+    """Refuse masked values and times, which scikit-learn would turn into numbers."""
+    for name, values in data.items():
+        if hasattr(values, "dtype") or hasattr(values, "dtypes"):
+            check_array(np.asanyarray(values), name, ["dates or times"])
 
 
 def _hints(X: Array, Y: Array) -> str:

@@ -131,6 +131,22 @@ class Comparison:
         beneath = beside(self.alone, self.left_out, [*self.table].index(output))
         return [*self.table[output], *beneath]
 
+    def to_dataframe(self) -> Any:
+        """All tables as a pandas DataFrame: a row for each output and candidate, best first.
+
+        Its columns are ``output`` and those of :class:`Candidate`; rows of a physics alone have no
+        weight. An ImportError without pandas.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError as error:
+            raise ImportError("to_dataframe() needs pandas; run `pip install pandas`.") from error
+        rows = [{"output": name, **r._asdict()} for name in self.table for r in self.rows(name)]
+        for row in rows:
+            if str(row["structure"]).startswith(ALONE):
+                row["weight"] = float("nan")
+        return DataFrame(rows)
+
     def __str__(self) -> str:
         shown = {output: self.rows(output) for output in self.table}
         width = max(len(row.structure) for rows in shown.values() for row in rows)
@@ -248,8 +264,13 @@ def compare(
     asked = known_structures(STRUCTURES if structures is None else structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
-    categories = {name: options.get(name) for name in ("categorical", "batch")}
-    data = training_data(train_X, train_Y, train_Yvar, **categories)
+    data = training_data(
+        train_X,
+        train_Y,
+        train_Yvar,
+        categorical=options.get("categorical"),
+        batch=options.get("batch"),
+    )
     if data.X.dim() > 2:
         raise ValueError(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
@@ -257,9 +278,9 @@ def compare(
         )
     if (m := data.Y.shape[-1]) > _MOST_OUTPUTS:
         raise ValueError(
-            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got {m}: "
-            "compare some of them, or fit a ParallelPartialGP of all with the physics and one with "
-            "physics=None, and see the scores of `leave_one_out` of both."
+            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got "
+            f"{m}: compare some of them, or fit a ParallelPartialGP of all with the physics and "
+            "one with physics=None, and see the scores of `leave_one_out` of both."
         )
     given_physics = as_physics(physics)
     fitted_to = candidates(asked, given_physics, len(data.X))

@@ -1,5 +1,6 @@
 """Full Bayes, the default of `fit`."""
 
+import sys
 from copy import deepcopy
 
 import pyro
@@ -13,7 +14,7 @@ from gpytorch.priors import LogNormalPrior
 from pyro.infer import MCMC, NUTS
 from pyro.ops.stats import effective_sample_size
 
-from gpadjust import CKA, BiasGP, ZeroMeanGP, fit
+from gpadjust import CKA, BiasGP, PhysicsMeanGP, ZeroMeanGP, fit
 from gpadjust.inference import (
     FitResult,
     SampleResult,
@@ -24,6 +25,7 @@ from gpadjust.inference import (
 from gpadjust.inference.optimise import Search, optima
 from gpadjust.inference.proposals import Both, Mixture, laplace_root
 from gpadjust.inference.targets import LogPosterior
+from gpadjust.physics import FunctionPhysics, Unknown
 from gpadjust.validation import leave_one_out
 from gpadjust.validation.plots import plot_adjustment, plot_adjustment_pair
 from tests.systems import Sine, line, ripple
@@ -389,3 +391,18 @@ def test_narrow_constraints_are_kept(d, uniform):
     fit(model)
     assert ((base.lengthscale >= 0.9) & (base.lengthscale <= 1.1)).all()
     assert model.predict(X).mean.isfinite().all()
+
+
+def test_draws_for_arviz(monkeypatch):
+    X = torch.linspace(0, 1, 6, dtype=torch.float64).unsqueeze(-1)
+    law = FunctionPhysics(lambda X, p: p.slope * X[:, 0], unknowns={"slope": Unknown(1.0, sd=1.0)})
+    model = PhysicsMeanGP(X, 2 * X, physics=law)
+    result = fit(model, num_samples=4)
+    tree = pytest.importorskip("arviz_base") and result.to_arviz()
+    for name, draws in result.draws.items():
+        assert tree["posterior"][name].shape == (1, *draws.shape)
+    slopes = tree["posterior"]["physics.slope"].to_numpy()[0]
+    assert abs(slopes.mean() - model.physics_parameters["slope"].mean()) < 1e-9
+    monkeypatch.setitem(sys.modules, "arviz_base", None)
+    with pytest.raises(ImportError, match=r"gpadjust\[arviz\]"):
+        result.to_arviz()

@@ -11,7 +11,9 @@ import torch
 
 from gpadjust import CKA, VariationalCKA
 from gpadjust.models.training_data import to_tensor
+from gpadjust.physics import BlackBoxPhysics, PhysicsError
 from gpadjust.records import Record
+from gpadjust.sklearn import CKARegressor
 
 N = 6
 ONE_TO_SIX = np.arange(1.0, N + 1)
@@ -82,17 +84,51 @@ class TestRefused:
 
     def test_records(self, values, message):
         numbers = column(ONE_TO_SIX)
-        with pytest.raises(TypeError, match=rf"times to hold numbers.*{message}"):
-            Record(values, numbers, numbers)
+        if "times" not in message or type(np.asarray(values).flat[0]) in (date, time):
+            with pytest.raises(TypeError, match=rf"times to hold numbers.*{message}"):
+                Record(values, numbers, numbers)
         with pytest.raises(TypeError, match=rf"states to hold numbers.*{message}"):
             Record(ONE_TO_SIX, column(values), numbers)
 
 
-@pytest.mark.parametrize("values", [TIMES[n] for n in ("dates", "index", "column", "time zone")])
-def test_the_way_out_of_times(values):
-    seconds = (values - values.min()) / SECOND
-    record = Record(seconds, column(ONE_TO_SIX), column(ONE_TO_SIX))
+@pytest.mark.parametrize("name", [n for n in TIMES if n not in ("date", "time")])
+def test_times_of_a_record_are_seconds_since_the_first(name):
+    record = Record(TIMES[name], column(ONE_TO_SIX), column(ONE_TO_SIX))
     assert record.times.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+def test_velocities_are_in_seconds():
+    """A point that moves by 3 m/s, every 250 ms, by the clock of a pandas frame."""
+    index = pd.date_range("2020-03-29 00:59:59", periods=9, freq="250ms", tz="Europe/London")
+    frame = pd.DataFrame({"x": 0.75 * np.arange(9.0), "u": 0.0}, index=index)
+    record = Record(frame.index, frame[["x"]], frame[["u"]])  # the clocks change in it
+    assert record.sampling_step == 0.25
+    speed = record.states.diff(dim=0) / record.times.diff().unsqueeze(-1)
+    assert speed.flatten().tolist() == [3.0] * 8
+
+
+def test_scikit_learn_is_asked_before_it_makes_numbers_of_them():
+    regressor = CKARegressor(lambda X: X[:, 0], fit_method="map")
+    numbers, dates = column(ONE_TO_SIX), DATES.reshape(-1, 1)
+    masked = np.ma.masked_array(numbers, mask=numbers == 3)
+    for X, y, message in [
+        (dates, ONE_TO_SIX, "X to hold numbers.*dates or times"),
+        (numbers, DATES - DATES[0], "y to hold numbers.*dates or times"),
+        (masked, ONE_TO_SIX, "X without masked"),
+        (numbers, masked[:, 0], "y without masked"),
+    ]:
+        with pytest.raises((TypeError, ValueError), match=message):
+            regressor.fit(X, y)
+    with pytest.raises(ValueError, match="train_Yvar without masked"):
+        regressor.fit(numbers, ONE_TO_SIX, train_Yvar=masked[:, 0])
+    with pytest.raises(TypeError, match=r"X to hold numbers.*dates or times"):
+        regressor.fit(numbers, ONE_TO_SIX).predict(dates)
+
+
+def test_a_physics_that_returns_masked_values():
+    masked = np.ma.masked_array(ONE_TO_SIX, mask=ONE_TO_SIX == 3)
+    with pytest.raises(PhysicsError, match="masked values"):
+        CKA(column(ONE_TO_SIX), column(ONE_TO_SIX), physics=BlackBoxPhysics(lambda X: masked))
 
 
 def test_a_frame_with_a_column_of_times():

@@ -22,7 +22,9 @@ def test_arrays_and_frames(data, build, kind, uniform, same):
         same(other, model, Z)
         for asked in (Z.numpy(), pd.DataFrame(Z.numpy())):
             torch.testing.assert_close(other.posterior(asked).mean, model.posterior(Z).mean)
-            torch.testing.assert_close(other.predict(asked).mean, model.predict(Z).mean)
+            found = other.predict(asked).mean
+            assert type(found) is type(asked)
+            np.testing.assert_allclose(found, model.predict(Z).mean, atol=1e-12)
         new = other.condition_on_observations(Z.numpy(), Z.numpy(), noise=torch.ones_like(Z))
         expected = model.condition_on_observations(Z, Z, noise=torch.ones_like(Z))
         same(new, expected, Z)
@@ -63,3 +65,25 @@ def test_missing_values_of_a_frame(data, build, uniform, same):
     Y[3, 1] = torch.nan
     frame = pd.DataFrame(Y.numpy().astype(object)).where(~Y.isnan().numpy(), None)
     same(build("CKA", X, frame), build("CKA", X, Y), uniform(5, 2), 1e-12)
+
+
+def test_results_come_as_the_inputs_came(data, build, kind, uniform):
+    X, Y = data(num_outputs=2)
+    index = [f"run {i}" for i in range(5)]
+    frame = pd.DataFrame(uniform(5, 2).numpy(), columns=["speed", "load"], index=index)
+    named = pd.DataFrame(X.numpy(), columns=frame.columns)
+    model = build(kind, named, pd.DataFrame(Y.numpy(), columns=["head [m]", "flow"]))
+    array = frame.to_numpy()
+    tensor = torch.tensor(array)
+
+    def answers(asked):
+        return [*model.predict(asked), *model.interval(asked, level=0.8)]
+
+    for of_frame, of_array, of_tensor in zip(*map(answers, (frame, array, tensor)), strict=True):
+        assert isinstance(of_tensor, torch.Tensor)
+        assert isinstance(of_array, np.ndarray)
+        assert np.array_equal(of_array, of_tensor.numpy())
+        assert [*of_frame.columns] == ["head [m]", "flow"]
+        assert [*of_frame.index] == index
+        assert np.array_equal(of_frame.to_numpy(), of_array)
+    assert isinstance(model.posterior(frame).mean, torch.Tensor)

@@ -114,7 +114,7 @@ def test_a_row_left_out_is_predicted_by_a_model_without_it(options):
     mean, variance = model.left_out()
     rest = make(X[1:], Y[1:], **options)
     settled(rest)
-    for name in ("scales", "along", "profile"):
+    for name in ("scales", "noises", "along", "profile"):
         setattr(rest, name, getattr(model, name))
     rest.unit, rest._remembered = model.unit, None
     rest._prepare(decay(X[1:]))
@@ -135,22 +135,26 @@ def test_the_whole_house(options, tmp_path):
     assert posterior.rsample(Size([2])).shape[-2:] == (2, 30)
     same(model.posterior(TEST, [3, 1]).mixture_mean, mean[:, [3, 1]])
     single, whole = model.interval(TEST), model.interval(TEST, simultaneous=True)
-    assert (whole[0] <= single[0]).all() and (whole[1] >= single[1]).all()
+    assert (whole[0] <= single[0]).all()
+    assert (whole[1] >= single[1]).all()
     noisy = model.interval(TEST, observation_noise=True, simultaneous=True)
     assert (noisy[1] - noisy[0] > whole[1] - whole[0]).all()
     loo = leave_one_out(model)
-    assert (loo.score().coverage.mean() > 0.85) and (loo.score().rmse.mean() < 0.1)
+    assert loo.score().coverage.mean() > 0.85
+    assert loo.score().rmse.mean() < 0.1
     more = model.condition_on_observations(TEST, truth(TEST))
     assert more.components(TEST, False)[1].mean() < model.components(TEST, False)[1].mean()
     save(model, tmp_path / "model.pt")
     again = load(tmp_path / "model.pt", **({"physics": decay} if "physics" not in options else {}))
     same(again.predict(TEST).variance, variance)
     assert again.is_fitted
-    assert "30 outputs" in repr(model) and "lengthscale of x" in model.summary()
+    assert "30 outputs" in repr(model)
+    assert "lengthscale of x" in model.summary()
     with pytest.raises(TypeError, match="section for each output"):
         report(model, tmp_path / "page.html")
     result = fit(model, "map")
-    assert bool(result.converged) and model.num_samples == 1
+    assert bool(result.converged)
+    assert model.num_samples == 1
 
 
 def test_regressor():

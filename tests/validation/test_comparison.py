@@ -465,6 +465,19 @@ class TestWeights:
         assert [row.weight for row in rows] == pytest.approx([1, 0], abs=0.01)
 
 
+def test_as_a_frame(scaled, monkeypatch):
+    found = compare(*scaled, crude, structures=["physics mean", "CKA"])
+    table = found.to_dataframe()
+    rows = found.rows("y")
+    assert [*table["structure"]] == [each.structure for each in rows]
+    assert {*table["output"]} == {"y"}
+    assert table["elpd"].tolist() == [each.elpd for each in rows]
+    assert table["weight"].isna().tolist() == [n == "physics alone" for n in table["structure"]]
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas"):
+        found.to_dataframe()
+
+
 def test_bad_input(scaled):
     X, Y = scaled
     for data, options, says in (

@@ -1,5 +1,6 @@
 """Figures: what is drawn is what was predicted."""
 
+import sys
 from dataclasses import replace
 
 import matplotlib as mpl
@@ -349,3 +350,31 @@ def test_bad_input(line, plane, data, forrester):
     ):
         with pytest.raises(error, match=says):
             call()
+
+
+def test_the_figure_of_a_model(line, plane, forrester):
+    axes = line.plot(num_points=40)
+    assert axes.shape == (3, 1)
+    x = np.asarray(curve(axes[0, 0], "mean").get_xdata())
+    expected = line.predict(torch.tensor(x).unsqueeze(-1)).mean.squeeze(-1)
+    np.testing.assert_allclose(curve(axes[0, 0], "mean").get_ydata(), expected, atol=1e-9)
+    dots, (X, Y) = curve(axes[0, 0], "data"), forrester.data(0)
+    np.testing.assert_allclose(dots.get_ydata(), Y[:, 0])
+    f_p = forrester.crude(torch.tensor(x).unsqueeze(-1)).squeeze(-1)
+    np.testing.assert_allclose(curve(axes[0, 0], "physics").get_ydata(), f_p)
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["y", r"$\rho$", r"$\delta$"]
+    of_two = plane.plot(output=1, num_points=5, base=[0.2, 0.4])
+    assert of_two.shape == (3, 2)
+    assert len({ax.get_ylim() for ax in of_two[0]}) == 1
+    assert ZeroMeanGP(X, Y).plot().shape == (1, 1)
+    with pytest.raises(ValueError, match="no output 2"):
+        plane.plot(output=2)
+
+
+def test_a_figure_without_matplotlib(line, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("gpadjust.validation.plots")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ImportError, match=r"gpadjust\[plot\]"):
+        line.plot()

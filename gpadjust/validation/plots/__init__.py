@@ -10,6 +10,7 @@ from gpadjust.validation.plots.adjustments import (
     plot_trust,
     plot_trust_pair,
 )
+from gpadjust.validation.plots.overview import plot_model
 from gpadjust.validation.plots.predictions import (
     plot_coverage,
     plot_leave_one_out,
@@ -22,6 +23,7 @@ __all__ = [
     "plot_adjustment_pair",
     "plot_coverage",
     "plot_leave_one_out",
+    "plot_model",
     "plot_pit",
     "plot_prediction",
     "plot_trust",

@@ -78,7 +78,7 @@ def plot_adjustment(
     names = _adjustments(model)
     num_points = checked_whole("num_points", num_points, 2)
     quantile(level)  # refused before there is a figure
-    train_X, bounds, base, suffix = _domain(model, bounds, base, output)
+    train_X, bounds, base, suffix = domain(model, bounds, base, output)
     d = train_X.shape[-1]
     axes = axes_of(axes, len(names), d, 2.6)
     for i, label in enumerate(labels(model, "input", d)):
@@ -136,7 +136,7 @@ def plot_adjustment_pair(
     """
     names = _adjustments(model)
     num_points = checked_whole("num_points", num_points, 2)
-    train_X, bounds, base, suffix = _domain(model, bounds, base, output)
+    train_X, bounds, base, suffix = domain(model, bounds, base, output)
     i, j = two_inputs(inputs, train_X.shape[-1], "`plot_adjustment`")
     axes = axes_of(axes, len(names), 2)
     lines = [
@@ -168,9 +168,14 @@ def plot_adjustment_pair(
     return axes
 
 
+def adjustments_of(model: Any) -> list[str]:
+    """The names of the rhos and deltas of a model, if it has any."""
+    return [name for name in getattr(model, "term_names", ()) if name != "f"]
+
+
 def _adjustments(model: Any) -> list[str]:
-    """The names of the rhos and deltas of a model."""
-    names = [name for name in getattr(model, "term_names", ()) if name != "f"]
+    """The names of the rhos and deltas of a model, one at least."""
+    names = adjustments_of(model)
     if not names:
         raise TypeError(
             f"{type(model).__name__} has neither rho nor delta to draw; CKA, RRA, ScaleGP and "
@@ -194,7 +199,7 @@ def _symbol(name: str) -> str:
     return rf"$\{symbol}$" + (f" of {physics}" if physics else "")
 
 
-def _domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Tensor, Tensor, str]:
+def domain(model: Any, bounds: Any, base: Any, output: int) -> tuple[Tensor, Tensor, Tensor, str]:
     """Inputs at which the output was observed, the range, the base point, and whose they are."""
     X, Y = observations(model)
     d, num_outputs = X.shape[-1], Y.shape[-1]
