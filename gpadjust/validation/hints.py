@@ -33,8 +33,8 @@ def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
         model: A fitted model, or a mixture.
         loo: Its predictions of left-out observations.
     """
-    told = told_of(model)
-    found = []
+    told, found = told_of(model), []
+    growing = {"relative", "link"} & told.keys()  # errors may grow
     with torch.no_grad():
         noise = model.predict(loo.X, observation_noise=True).variance
         noise = (noise - model.predict(loo.X).variance).clamp_min(0) / loo.variance
@@ -46,11 +46,11 @@ def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
         if len(Y) >= _ENOUGH:
             z = loo.residuals[seen, j]
             grows = float(noise[seen, j].median()) > _NOISE and _grows(z.abs(), mean.abs())
-            if grows and "relative" not in told:
+            if grows and not growing:
                 own.append(_GROWS)
             elif "heavy-tailed" not in told:
                 own += _outliers(z)
-        if "link" not in told:
+        if not growing:
             own += _positive(Y, mean, variance)
         found += [where + sentence for sentence in own]
     return [*found, *_categories(model, loo.X, told)]
