@@ -25,9 +25,9 @@ _LEVELS = range(3, 13)  # numbers of different values that may be categories
 def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
     """What the data look like that the model was not told, in sentences with the option to give.
 
-    Outliers, noise that grows with the mean, outputs that cannot be negative, columns that
-    may be categories. Each is a question rather than a finding, as residuals of
-    few observations tell little; of fewer than 12 they are not asked.
+    Outliers, noise that grows with the mean, outputs that cannot be negative, columns that may be
+    categories. Each is a question rather than a finding, as residuals of few observations tell
+    little; of fewer than 12 they are not asked.
 
     Args:
         model: A fitted model, or a mixture.
