@@ -20,7 +20,9 @@ CHAPTERS = {
     "measuring": ("Active", "Optimisation", "Misled"),
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
-    "laboratory": ("Balldrop", "Categories", "Curves", "Drift", "Emulated", "Hints", "Links", "Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
+    "laboratory": (
+        *("Balldrop", "Categories", "Curves", "Drift", "Emulated", "Hints", "Links"),
+        *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
     ),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),
 }

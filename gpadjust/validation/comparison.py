@@ -59,7 +59,7 @@ class Comparison:
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
         hints: What the data look like that the models were not told, each with the option to give:
-            outliers, relative noise, outputs that cannot be negative, copies of rows, categories.
+            outliers, relative noise, outputs that cannot be negative, categories.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
             candidates (:meth:`rows`), and no part of what is recommended.
     """

@@ -25,8 +25,8 @@ _LEVELS = range(3, 13)  # numbers of different values that may be categories
 def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
     """What the data look like that the model was not told, in sentences with the option to give.
 
-    Outliers, noise that grows with the mean, outputs that cannot be negative, rows that are there
-    twice, columns that may be categories. Each is a question rather than a finding, as residuals of
+    Outliers, noise that grows with the mean, outputs that cannot be negative, columns that may be
+    categories. Each is a question rather than a finding, as residuals of
     few observations tell little; of fewer than 12 they are not asked.
 
     Args:
@@ -53,7 +53,7 @@ def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
         if "link" not in told:
             own += _positive(Y, mean, variance)
         found += [where + sentence for sentence in own]
-    return [*found, *_copies(loo.X, loo.Y), *_categories(model, loo.X, told)]
+    return [*found, *_categories(model, loo.X, told)]
 
 
 def told_of(model: TermsGP | StackedGP) -> dict[str, Any]:
@@ -132,19 +132,6 @@ def _positive(Y: Tensor, mean: Tensor, variance: Tensor) -> list[str]:
     return [
         f"All observations are positive, but {below} of {len(Y)} left-out intervals reach below "
         f"zero: if the output cannot be negative, {way}."
-    ]
-
-
-def _copies(X: Tensor, Y: Tensor) -> list[str]:
-    """A sentence on rows that are there again with the same outputs."""
-    rows = torch.cat([X, Y.nan_to_num(nan=torch.inf)], -1)
-    again = len(rows) - len(rows.unique(dim=0))
-    if not again:
-        return []
-    some = "1 row is" if again == 1 else f"{again} rows are"
-    return [
-        f"{some} there again with the same inputs and outputs: a copy is no second measurement, "
-        "and makes intervals too narrow. Take copies out."
     ]
 
 
