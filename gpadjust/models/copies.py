@@ -16,13 +16,13 @@ _CHANCE = 1e-3  # of so many equal repeats by rounding alone
 
 
 def warn_of_copies(data: TrainingData, stacklevel: int) -> None:
-    """Warn of rows that equal an earlier one in all inputs and outputs, to the last bit.
+    r"""Warn of rows that equal an earlier one in all inputs and outputs, to the last bit.
 
     True repeats differ by their noise, unless outputs are on a coarse grid, as rounded values and
     counts. With the step h of the grid and the standard deviation s of repeats that differ, two of
-    them are equal with the probability :math:`h / (2 \\sqrt{\\pi} s)` at most. There is a warning if
-    as many equal ones as there are have a chance below 0.001. Of a batch of data sets nothing is
-    said.
+    them are equal with the probability :math:`h / (2 \sqrt{\pi} s)` at most. There is a warning
+    if the chance of as many equal ones as there are is below 0.001. Of a batch of data sets
+    nothing is said.
 
     Args:
         data: The data.

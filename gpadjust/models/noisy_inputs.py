@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from gpadjust.checks import check_finite
-from gpadjust.gp.noise import RowNoise
+from gpadjust.gp.noise import RowNoise, RowSource
 from gpadjust.models.training_data import ArrayLike, TrainingData, to_tensor
 from gpadjust.physics import PhysicsError
 
@@ -18,13 +18,13 @@ _SPREAD = (3.0**0.5, 1.0, 0.5, 0.1)  # differences, in standard deviations of a 
 _SETTLED = (0.05, 0.1)  # change of variances, relative, and of means, in standard deviations
 
 
-class NoisyInputs(Module):
+class NoisyInputs(RowSource, Module):
     r"""Inputs that were measured with independent Gaussian errors of known variances S.
 
     The true inputs of a column have the mean and variance of the measured ones, less S. Given a
     measured input x, the true one then has the mean :math:`\hat x = \bar x + \lambda (x - \bar x)`
-    and the variance :math:`P = \lambda S`, with :math:`\lambda` the share of the variance that is not
-    error (regression calibration: Fuller 1987; Carroll et al. 2006). Models are of
+    and the variance :math:`P = \lambda S`, with :math:`\lambda` the share of the variance that is
+    not error (regression calibration: Fuller 1987; Carroll et al. 2006). Models are of
     :math:`\hat x`, and a target has, beside its noise,
 
     .. math::
@@ -32,8 +32,8 @@ class NoisyInputs(Module):
         \mathrm{E} = f(\hat x) + \tfrac12 \sum_j P_j \partial_j^2 f, \quad
         \mathrm{Var} = \sum_j P_j (\partial_j f)^2 + \tfrac12 (P_j \partial_j^2 f)^2,
 
-    of which the first part of the variance is that of McHutchon and Rasmussen (2011). The slopes are
-    of f_p at first, and then of the posterior mean, by differences over
+    of which the first part of the variance is that of McHutchon and Rasmussen (2011). The slopes
+    are of f_p at first, and then of the posterior mean, by differences over
     :math:`\pm \sqrt{3 P_j}`, which are exact up to the fifth order for both sums of each input.
 
     Args:
@@ -112,12 +112,12 @@ class NoisyInputs(Module):
 
     @torch.no_grad()
     def refine(self, model: Any, rows: RowNoise) -> bool:
-        """Set shifts and added variances by the slopes of a fitted model."""
+        """Set the shift and added variances by the slopes of a fitted model."""
         is_first = not rows.added.any()
         mean, variance = self._moments(model, is_first)
         if is_first and not variance.any():  # a prior mean without slope
             mean, variance = self._moments(model, False)
-        noise = rows.factors * model.noise.at(model.train_inputs[0])
+        noise = rows.errors + model.noise.at(model.train_inputs[0])
         off = (variance - rows.added).abs() / (rows.added + noise)
         away = (mean - self.shift).abs() / (variance + noise).sqrt()
         self.move(model, mean)
