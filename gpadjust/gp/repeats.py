@@ -12,8 +12,8 @@ from torch import Tensor
 class Within(NamedTuple):
     r"""What observations of equal inputs say of their noise, beside their means.
 
-    Of ``n`` observations with the mean :math:`\bar y` and variances :math:`v_i = V c / p_i`, where V
-    is that of the mean and :math:`c = \sum_i p_i`,
+    Of ``n`` observations with the mean :math:`\bar y` and variances :math:`v_i = V c / p_i`, where
+    V is that of the mean and :math:`c = \sum_i p_i`,
 
     .. math::
 
