@@ -74,7 +74,7 @@ class Categories(Experiment):
 class Curves(Experiment):
     """Outputs that are a curve: errors, intervals of single points and of whole curves, time."""
 
-    runs: int = 12
+    runs: int = 8
     """cases of each problem; of CKA and times a quarter"""
     out: Path = Path("results/curves")
 
