@@ -11,42 +11,6 @@ from paper.common.experiment import Axes, Experiment
 
 
 @dataclass(frozen=True, kw_only=True)
-class Curves(Experiment):
-    """Outputs that are a curve: errors, intervals of single points and of whole curves, time."""
-
-    runs: int = 8
-    """cases of each problem; of CKA and times a quarter"""
-    out: Path = Path("results/curves")
-
-    axes: ClassVar[Axes] = {
-        "problem": {
-            "oscillator": "oscillator: the cubic spring is missing, 30 rows of 200 outputs",
-            "diffusion": "diffusion: the decay is missing, 20 rows of 100 outputs",
-            "spectrum": "spectrum: saturation and background are missing, 40 rows of 300 outputs",
-            "large": "100 rows of 1,000 outputs",
-        },
-        "model": {
-            "physics": "physics alone",
-            "parallel": "ParallelPartialGP",
-            "coupled": "ParallelPartialGP, coupled",
-            "alone": "ParallelPartialGP, no physics",
-            "components": "GPs of principal components",
-            "cka": "CKA of each of 8 outputs",
-            "times": "seconds of a fit",
-        },
-    }
-    calls: ClassVar[tuple[str, ...]] = (
-        *("gpadjust.fit", "gpadjust.ParallelPartialGP", "gpadjust.CKA", "gpadjust.ZeroMeanGP"),
-    )
-
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """CKA is slow; times are of the largest problem alone."""
-        if (kind[0] == "large") != (kind[1] == "times"):
-            return ()
-        return self.seeds[: max(1, self.runs // 4)] if kind[1] in ("cka", "times") else self.seeds
-
-
-@dataclass(frozen=True, kw_only=True)
 class BalldropSettings:
     """What decides the numbers."""
 
@@ -110,7 +74,7 @@ class Categories(Experiment):
 class Curves(Experiment):
     """Outputs that are a curve: errors, intervals of single points and of whole curves, time."""
 
-    runs: int = 12
+    runs: int = 8
     """cases of each problem; of CKA and times a quarter"""
     out: Path = Path("results/curves")
 
