@@ -141,6 +141,11 @@ class ParallelPartialGP(TermsModel):
                     "not learn: learn them with a CKA of a few outputs, and give the physics with "
                     "their values."
                 )
+            if made.is_emulated:
+                raise ValueError(
+                    f"Physics {made.name!r} is emulated, with an error that a ParallelPartialGP has "
+                    "no term for: FunctionPhysics(physics) takes the emulator's mean as exact."
+                )
             self.input_transform = PhysicsInput(made, data.X.shape[-1], input_transform)
             with torch.no_grad():
                 f_p = self.input_transform.values(data.X)
