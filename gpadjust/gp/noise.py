@@ -143,7 +143,7 @@ class Noise(NamedTuple):
 
     def trusted(self, values: Tensor) -> Tensor:
         """Values at the training rows, ``... x (m) x n``, with NaN at outliers."""
-        if self.rows is None or not self.rows.outlying.any():
+        if self.rows is None:
             return values
         later = (0, values.shape[-1] - self.rows.errors.shape[-1])
         return values.masked_fill(pad(self.rows.outlying, later), torch.nan)

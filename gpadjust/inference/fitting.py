@@ -230,7 +230,7 @@ def fit(
 
                     run = METHODS[method].run
                     result = fit_with_prior(model, prior, run, search, **own)
-                if not (isinstance(model, TermsGP) and _is_unconfirmed(model)):
+                if not (isinstance(model, TermsGP) and model.noise.rows and _is_unconfirmed(model)):
                     break
             if isinstance(model, TermsGP):
                 model.was_fitted = True
@@ -273,8 +273,7 @@ def _refine_noise(model: TermsGP, search: Search) -> None:
 
 def _is_unconfirmed(model: TermsGP) -> bool:
     """Return whether a fit contradicts the noise of its rows; then they are others, for another."""
-    rows = model.noise.rows
-    if rows is None or not rows.confirm(model.eval()):
+    if not model.noise.rows.confirm(model.eval()):
         return False
     if model.num_samples is not None:
         model.release_samples()

@@ -255,7 +255,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        targets = self.noise.trusted(self.train_targets)
+        rows, targets = self.noise.rows, self.train_targets
+        targets = targets if rows is None else self.noise.trusted(targets)
         squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)

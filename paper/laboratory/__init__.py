@@ -74,7 +74,7 @@ class Categories(Experiment):
 class Curves(Experiment):
     """Outputs that are a curve: errors, intervals of single points and of whole curves, time."""
 
-    runs: int = 12
+    runs: int = 8
     """cases of each problem; of CKA and times a quarter"""
     out: Path = Path("results/curves")
 
@@ -281,7 +281,7 @@ class Noisyinputs(Experiment):
 class Outliers(Experiment):
     """One in twenty observations is far off: errors beside those of clean data."""
 
-    runs: int = 8
+    runs: int = 5
     """cases of each problem and size"""
     out: Path = Path("results/outliers")
 
