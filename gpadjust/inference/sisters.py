@@ -309,6 +309,8 @@ def _check_terms(model: TermsGP, which: str) -> None:
         )
     elif model.rho_names and any(p.requires_grad for p in model.physics.parameters()):
         why = "has a physics that is trained: train it first, and stop its gradients"
+    elif any(term.scaled_by for term in model.terms):
+        why = "has a physics that is emulated: take its emulator as exact, FunctionPhysics(physics)"
     elif any(term.learns_mean for term in model.terms):
         why = "has unknown prior means: give them as numbers (rho_mean=1.0)"
     elif getattr(getattr(model, "input_transform", None), "base", None) is not None:

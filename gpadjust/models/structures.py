@@ -71,6 +71,11 @@ class CKA(TermsGP):
             ``"logit"`` of shares, or bounds ``(lower, upper)``, see
             :class:`~gpadjust.models.Logit`; rho, delta and noise are then of its values.
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
+        categorical: Names or numbers of the columns that are categories, or a mapping from these to
+            their levels. Text in a DataFrame is one without being named; f_p gets the numbers of
+            its levels, sorted, from 0.
+        batch: Names or numbers of columns of which each level has an offset of its own, a term of
+            the column's name; other levels are new ones.
 
     Warns:
         PhysicsWarning: If f_p is obviously off at the training inputs, and shows why.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import torch
 from botorch.fit import _fit_fallback
@@ -43,7 +43,7 @@ from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
-from gpadjust.models.updates import NewRows, keep_last
+from gpadjust.models.updates import NewRows, judge, keep_last
 
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
 _DISTINCT = 0.75  # of the rows, at most, for equal ones to be taken together
@@ -485,7 +485,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         Any other model keeps its last ``forget`` observations, and forgets those before.
 
         Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
-        observations; so do places of larger errors. To fit them again, build a model of recent
+        observations; so do places of larger errors. Where new observations are missed by more than
+        predicted, as while a machine drifts, variances grow by the ratio (with ``forget``). To fit them again, build a model of recent
         observations.
 
         Args:
@@ -522,10 +523,18 @@ class TermsGP(TermsModel, SingleTaskGP):
         if self.has_repeats:  # rows come and go from now on
             self.has_repeats, self.prediction_strategy = False, None
         with torch.no_grad():
-            self._take(NewRows.of(self, X, Y, noise), forget)
+            self._check_window(forget)
+            new = NewRows.of(self, X, Y, noise)
+            if forget is not None:
+                judge(self, new, forget)
+            self._take(new, forget)
 
     def _take(self, new: NewRows, forget: int | None) -> None:
         """Take new observations, and forget others."""
+        keep_last(self, new, cast("int", forget))
+
+    def _check_window(self, forget: int | None) -> None:
+        """Raise an error if a model cannot keep its last observations."""
         name = type(self).__name__
         if forget is None:
             raise ValueError(
@@ -543,7 +552,6 @@ class TermsGP(TermsModel, SingleTaskGP):
                 f"The inputs of this {name} are noisy (train_Xvar), and of new ones that is not "
                 "known: build the model again."
             )
-        keep_last(self, new, forget)
 
     def _check_noise(self, noise: Tensor | None, Y: Tensor) -> None:
         """Raise an error unless variances of new observations are given where they are known."""

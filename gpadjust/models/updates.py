@@ -43,6 +43,19 @@ class NewRows(NamedTuple):
 
 
 @torch.no_grad()
+def judge(model: Any, new: NewRows, forget: float) -> None:
+    """Let variances follow the errors of what a model predicted of new rows."""
+    f, errors = model.at(new.inputs), model.local_errors
+    mean, variance = model.conditioning().marginals(f)
+    variance = variance + (model.noise.at(f.x) if new.noise is None else new.noise)
+    x, missed = f.x[..., : model.terms[0].num_inputs], new.targets - mean
+    if model.num_samples is not None:
+        variance = variance.mean(0) + mean.var(0, correction=0)
+        missed, x = missed.mean(0), x[0]
+    errors.observe(missed.square() / (variance * errors.near(x)), forget)
+
+
+@torch.no_grad()
 def keep_last(model: Any, new: NewRows, number: int) -> None:
     """Give an exact model new rows, and drop all but the last ones of it."""
 

@@ -288,7 +288,7 @@ def compare(
     left_out: dict[str, LeaveOneOut] = {}
     converged: dict[str, Tensor] = {}
     relevance: dict[str, Tensor] = {}
-    said: set[str] = set()
+    heard: dict[tuple[str, type[Warning]], list[str]] = {}
     number = max(_DRAWS[0], min(_DRAWS[1], _MEMORY // len(data.X)))
     for structure, part in tqdm(fitted_to, disable=not progress, unit="structure"):
         with warnings.catch_warnings(record=True) as caught:
@@ -311,17 +311,16 @@ def compare(
                 error.add_note(f"This is of the structure {structure.name!r}.")
                 raise
         for each in caught:
-            text = str(each.message)
-            if not issubclass(each.category, PhysicsWarning):
-                text = f"{structure.name}: {text}"
-            elif text in said:
-                continue
-            said.add(text)
-            warnings.warn(text, each.category, stacklevel=2)
+            heard.setdefault((str(each.message), each.category), []).append(structure.name)
         converged[structure.name] = result.converged.flatten()
         if result.relevance is not None:
             relevance[structure.name] = result.relevance.flatten()
         models[structure.name] = _thinned(model)
+    for (text, category), names in heard.items():
+        # One of the physics or of the data is of all models that have them.
+        of_all = issubclass(category, PhysicsWarning) or 1 < len(names) == len(models)
+        of = "" if of_all else f"{', '.join(names)}: "
+        warnings.warn(f"{of}{text}", category, stacklevel=2)
     prior = [structure.prior for structure, _ in fitted_to]
     by_output = [ranking(left_out, j, prior) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))

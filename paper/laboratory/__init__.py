@@ -117,7 +117,9 @@ class DriftSettings:
     refit_every: int = 12
     """observations between refits of what is fitted again: a day"""
     window: int = 84
-    """observations that are fitted again, and that an exact model keeps: a week"""
+    """observations that an exact model keeps: a week"""
+    refit_window: int = 168
+    """observations that are fitted again: two weeks"""
     forget: int = 42
     """observations in which an RRA forgets"""
     method: str = "map"
@@ -132,7 +134,7 @@ class DriftSettings:
 class Drift(Experiment):
     """Half a year of a pump that wears, predicted a step ahead by models that are updated."""
 
-    runs: int = 4
+    runs: int = 2
     """pumps"""
     out: Path = Path("results/drift")
     settings: DriftSettings = field(default_factory=DriftSettings)

@@ -1,7 +1,10 @@
 """Half a year of a pump that wears, predicted a step of two hours ahead.
 
-What is fitted again: a CKA of the last week, to its most likely hyper-parameters, each day; between
-it is updated at each step.
+What is fitted again: a CKA of the last two weeks, to its most likely hyper-parameters, each day;
+between it is updated at each step. Tried on other seeds (900 and 901): two weeks for this one, as of
+one it errs by 0.34 m, and the updated models by 0.29 m. An RRA whose weights return to their prior
+as a random walk does forgets too much (0.30 m beside 0.14 m, of a faster drift), as its prior is
+vague. Intervals of fixed hyper-parameters hold 0.89; so variances follow recent errors.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
     X, Y = pump.X, pump.Y
 
     def built(end: int) -> Any:
-        start = max(0, end - (settings.window if model != "never" else end))
+        start = max(0, end - (settings.refit_window if model == "refit" else end))
         rows = slice(start, end)
         if model in _RRA:
             return RRA(X[rows], Y[rows], physics=catalogue, num_features=settings.num_features)
@@ -44,7 +47,7 @@ def run(experiment: Drift, model: str, seed: int) -> Run:
     adjusted = built(first)
     fit(adjusted, settings.method)
     monitor = DriftMonitor(adjusted) if model in _RRA else None
-    forget = settings.forget if model in _RRA else settings.window
+    forget = {"cka": settings.window, "refit": settings.refit_window}.get(model, settings.forget)
     means, held, alarms = [], [], []
     if model == "never":
         mean, _ = adjusted.predict(X[first:])

@@ -14,9 +14,9 @@ the heat, point fits above and full Bayes below, and the coverage.
 | all three, as it is | 0.66 | 0.91 |
 | the same, and what is not known of slopes | 0.66 | 0.90 |
 
-What is as it was run takes slopes from rough fits with priors (0.66 to 0.71 on these problems and
-a fifth, with more seeds). Of a law alone (100 observations, point fits) orthogonal distances and
-what was taken find a slope of 2 as 2.035 and 2.036, a rate of 3.5 as 3.478 and 3.471.
+Slopes are now of rough fits with priors: ratio 0.71, coverage 0.90, with the pump, on six
+seeds. Of a law alone (100 observations, point fits) orthogonal distances and what was taken find a slope
+of 2 as 2.035 and 2.036, a rate of 3.5 as 3.478 and 3.471.
 """
 
 from __future__ import annotations

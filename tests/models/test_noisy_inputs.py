@@ -28,7 +28,15 @@ def truth(X):
     return 1.2 * f_p(X) + X.square()
 
 
-def case(seed):
+def forrester(X):
+    return (6 * X - 2).square() * torch.sin(12 * X - 4)
+
+
+def half_of_it(X):
+    return 0.5 * forrester(X) + 10 * (X - 0.5) - 5
+
+
+def case(seed, truth=truth):
     draw = torch.Generator().manual_seed(seed)
     true = torch.rand(30, 1, generator=draw, dtype=torch.float64)
     X, Y = (
@@ -72,14 +80,14 @@ def test_true_inputs_have_the_moments_of_the_measured_ones_less_noise(data):
 
 def test_it_is_nearer_than_what_ignores_it():
     ratios = []
-    for seed in range(4):
+    for seed in range(3):
         off = []
         for options in ({}, {"train_Xvar": SD**2}):
-            model = CKA(*case(seed), physics=f_p, **options)
+            model = CKA(*case(seed, forrester), physics=half_of_it, **options)
             QUICK(model)
-            off.append((model.predict(TEST).mean - truth(TEST)).square().mean().sqrt().log())
+            off.append((model.predict(TEST).mean - forrester(TEST)).square().mean().sqrt().log())
         ratios.append(off[1] - off[0])
-    assert sum(ratios) / 4 < -0.1
+    assert sum(ratios) / 3 < -0.2
 
 
 def test_it_works_through_the_house(data, tmp_path):
