@@ -69,6 +69,7 @@ def parser() -> ArgumentParser:
     ends.add_argument("--positive", action="store_true", help="the outputs cannot be negative")
     ends.add_argument("--bounds", metavar="0,1", help="the outputs are between these numbers")
     add("--categories", metavar="a,b", help="inputs that are names, not sizes: numbers or text")
+    add("--batches", metavar="rig", help="categories that each shift the outputs by an offset")
     add(
         "--fit",
         choices=("compare", "bayes", "map"),

@@ -21,7 +21,7 @@ CHAPTERS = {
     "cartpole": ("CartPole", "Planning", "Floor"),
     "arm": ("Arm", "Reaching"),
     "laboratory": (
-        *("Balldrop", "Categories", "Drift", "Emulated", "Hints", "Links"),
+        *("Balldrop", "Categories", "Curves", "Drift", "Emulated", "Hints", "Links"),
         *("Noisyinputs", "Outliers", "Relative", "Repeats", "Sisters", "Vanishing"),
     ),
     "machines": ("Real", "Elsewhere", "Tanks", "Foresight", "Kinks"),

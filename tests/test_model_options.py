@@ -43,6 +43,14 @@ KINDS = {
         lambda model: getattr(model, "outcome_transform", None) is None,
     ),
     "positive outputs": ({"outcome_transform": "log"}, lambda model: "log" in model.link.formula),
+    "outliers": (
+        {"likelihood": "heavy-tailed"},
+        lambda model: model.options["likelihood"] == "heavy-tailed",
+    ),
+    "relative noise and outliers": (
+        {"likelihood": ["relative", "heavy-tailed"]},
+        lambda model: "relative" in model.options["likelihood"],
+    ),
     "categories": ({"categorical": [1]}, lambda model: model.input_transform is not None),
     "batches": ({"batch": [1]}, lambda model: model.input_transform is not None),
     "bounded outputs": ({"outcome_transform": (0.0, 9.0)}, lambda model: "9" in model.link.formula),

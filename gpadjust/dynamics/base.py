@@ -70,7 +70,7 @@ class Dynamics(ABC):
         """Learn from further transitions, ``N`` rows each."""
 
     @abstractmethod
-    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
+    def predict(self, states: Tensor, actions: Tensor) -> Prediction[Tensor]:
         """Mean and variance of the next states, ``N x state_dim`` each, entry by entry."""
 
     @abstractmethod

@@ -13,10 +13,10 @@ _LEAST = 1e-6  # eigenvalue of a correlation matrix
 
 
 def error_correlation(model: TermsModel) -> Tensor | None:
-    """The correlation of a model's outputs by its left-out errors, ``m x m``; None if none is clear.
+    r"""The correlation of outputs by a model's left-out errors, ``m x m``; None if none is clear.
 
-    A correlation r of n pairs has the standard error :math:`(1 - r^2) / \\sqrt n`. It counts where
-    :math:`|r| \\sqrt n` is more than 3.5, and is shrunk by the share of its square that is chance
+    A correlation r of n pairs has the standard error :math:`(1 - r^2) / \sqrt n`. It counts where
+    :math:`|r| \sqrt n` is more than 3.5, and is shrunk by the share of its square that is chance
     (Schaefer and Strimmer 2005).
     """
     if model.num_outputs < 2 or not isinstance(model, TermsGP):

@@ -185,7 +185,7 @@ class LearnedDynamics(Dynamics):
 
     def predict(
         self, states: Tensor, actions: Tensor, *, observation_noise: bool = True
-    ) -> Prediction:
+    ) -> Prediction[Tensor]:
         """Mean and variance of the next states, entry by entry.
 
         Args:

@@ -139,7 +139,7 @@ class PhysicsDynamics(Dynamics):
             self.physics.forget()
         self._compared = True
 
-    def predict(self, states: Tensor, actions: Tensor) -> Prediction:
+    def predict(self, states: Tensor, actions: Tensor) -> Prediction[Tensor]:
         """The next states, and the variance of the noise, zero without unknown parameters."""
         with torch.no_grad():
             following = self._step(states, actions, self._values)

@@ -11,7 +11,7 @@ from botorch.models.transforms.outcome import Standardize
 from gpytorch.kernels import MaternKernel, ScaleKernel
 from torch import Size, Tensor
 
-from gpadjust.emulation.error_kernel import ErrorKernel
+from gpadjust.emulation.error_kernel import ErrorKernel, unresolved
 from gpadjust.inference import fit
 from gpadjust.inference.fitting import FitOptions
 from gpadjust.models import ZeroMeanGP
@@ -48,6 +48,9 @@ class EmulatedPhysics(Physics):
         inputs: The columns of the data that are the first ``d`` inputs of the runs, in their order.
             Default: all.
         unknowns: The unknown parameters by name.
+        is_random: Whether the simulator is random, and f_p its mean. Else what the emulator takes
+            for noise in the runs is their finest detail, which other rows have unseen: a part of
+            its error.
         model_factory: Makes the emulator of ``X`` and ``Y``. Default: :class:`~gpadjust.ZeroMeanGP`
             of standardised outputs, with an RBF kernel or one of Matern (5/2), whichever predicts
             runs that are left out with the higher density. ``functools.partial(CKA, physics=...)``
@@ -87,6 +90,7 @@ class EmulatedPhysics(Physics):
         *,
         inputs: Sequence[int] | None = None,
         unknowns: Mapping[str, Unknown] | None = None,
+        is_random: bool = False,
         model_factory: ModelFactory | None = None,
         fit_options: FitOptions | None = None,
         name: str | None = None,
@@ -127,6 +131,8 @@ class EmulatedPhysics(Physics):
         self.num_outputs = emulator.num_outputs
         # In a tuple, no submodule: it is no part of a model that a fit changes, or a copy copies.
         self._emulator = (emulator, emulator.mean_functions())
+        with torch.no_grad():
+            self._white = (None if is_random else unresolved(emulator),)
 
     @property
     def emulator(self) -> TermsGP:
@@ -152,7 +158,7 @@ class EmulatedPhysics(Physics):
 
     def error_kernel(self, unknowns: Unknowns, columns: Sequence[int], unit: Tensor) -> ErrorKernel:
         """The kernel of the emulator's error; see :class:`ErrorKernel` for the arguments."""
-        return ErrorKernel(self, self.emulator, unknowns, columns, unit)
+        return ErrorKernel(self, self.emulator, unknowns, columns, unit, *self._white)
 
 
 def _matern(num_inputs: int, batch_shape: Size) -> ScaleKernel:

@@ -16,7 +16,15 @@ from gpadjust.physics import Physics
 from gpadjust.physics.unknown import Unknowns
 
 
-def error_covariance(emulator: TermsGP, rows: Tensor, others: Tensor | None = None) -> Tensor:
+def unresolved(emulator: TermsGP) -> Tensor:
+    """The variance of the noise of runs, ``m``, in the square of the outputs' units."""
+    noise = emulator.noise.at(emulator.train_inputs[0]) * emulator.units()[1].square()
+    return noise.mean(-1).reshape(-1, emulator.num_outputs).mean(0)
+
+
+def error_covariance(
+    emulator: TermsGP, rows: Tensor, others: Tensor | None = None, white: Tensor | None = None
+) -> Tensor:
     r"""The posterior covariance of a simulator's outputs, by an emulator of its runs.
 
     Of an emulator that holds samples s of its hyper-parameters, with the means :math:`m_s` and
@@ -27,6 +35,7 @@ def error_covariance(emulator: TermsGP, rows: Tensor, others: Tensor | None = No
         emulator: A model of the runs, in eval mode.
         rows: Inputs of the simulator, ``... x n x D``.
         others: Others, ``... x n' x D``. Default: the same.
+        white: The variances of what is independent in each row, ``m``; None for nothing.
 
     Returns:
         ``... x m x n x n'``, in the square of the outputs' units.
@@ -39,12 +48,16 @@ def error_covariance(emulator: TermsGP, rows: Tensor, others: Tensor | None = No
     covariance = covariance * scale.square()
     if emulator.num_outputs == 1:
         covariance = covariance.unsqueeze(-3)
+    if white is not None:
+        same = (rows.unsqueeze(-2) == (rows if others is None else others).unsqueeze(-3)).all(-1)
+        white = white[:, None, None] * same.unsqueeze(-3)
     if emulator.num_samples is None:
-        return covariance
+        return covariance if white is None else covariance + white
     away = [(s.mean * scale.squeeze(-1)).unsqueeze(-1) for s in (left, right)]
     away = [each if emulator.num_outputs > 1 else each.unsqueeze(-3) for each in away]
     one, two = (each - each.mean(-4, keepdim=True) for each in away)
-    return (covariance + one @ two.mT).mean(-4)
+    covariance = (covariance + one @ two.mT).mean(-4)
+    return covariance if white is None else covariance + white
 
 
 class _Side:
@@ -73,6 +86,7 @@ class ErrorKernel(CompositeKernel):
         unknowns: The unknown parameters of the model's physics, of which it may be a part.
         columns: The numbers of these columns.
         unit: The scale of the model's targets, ``batch_shape x (m) x 1``.
+        white: As of :func:`error_covariance`.
     """
 
     unit: Tensor
@@ -85,11 +99,12 @@ class ErrorKernel(CompositeKernel):
         unknowns: Unknowns,
         columns: Sequence[int],
         unit: Tensor,
+        white: Tensor | None = None,
     ) -> None:
         super().__init__(batch_shape=unit.shape[:-1])
         # In a tuple, no submodule: it is the emulator's owner that is copied and moved, or not.
         self._runs = (physics, emulator, unknowns)
-        self.columns = columns
+        self.columns, self.white = columns, white
         self.register_buffer("unit", unit.clone())
         outputs = torch.zeros_like(unit, dtype=torch.long)
         if (m := emulator.num_outputs) > 1:
@@ -125,9 +140,10 @@ class ErrorKernel(CompositeKernel):
         if diag:
             mean, variance = emulator.components(rows, False)
             variance = variance.mean(-3) + mean.var(-3, correction=0)
+            variance = variance if self.white is None else variance + self.white
             return self._chosen(variance.mT, -2) / unit.square()
         others = None if x2 is x1 or torch.equal(x1, x2) else self.rows(x2)
-        found = self._chosen(error_covariance(emulator, rows, others), -3)
+        found = self._chosen(error_covariance(emulator, rows, others, self.white), -3)
         return found / unit.square().unsqueeze(-1)
 
     def features(self, num_features: int) -> Module:

@@ -135,12 +135,13 @@ class GroupedRBFKernel(RBFKernel):
     """
 
     names: Sequence[str] = ()
+    raw_lengthscale: Any
 
     def __init__(self, groups: Sequence[int], **options: Any) -> None:
         super().__init__(ard_num_dims=len(groups), **options)
         self.groups = [*groups]
-        raw = self.raw_lengthscale.detach()
-        self.raw_lengthscale = Parameter(raw[..., : max(groups) + 1].clone())
+        raw: Any = self.raw_lengthscale
+        self.raw_lengthscale = Parameter(raw.detach()[..., : max(groups) + 1].clone())
 
     @property
     def lengthscale(self) -> Tensor:
@@ -149,6 +150,9 @@ class GroupedRBFKernel(RBFKernel):
 
     @lengthscale.setter
     def lengthscale(self, value: Any) -> None:
+        number, value = self.raw_lengthscale.shape[-1], torch.as_tensor(value)
+        if value.dim() and value.shape[-1] == len(self.groups) > number:  # of inputs
+            value = value[..., [self.groups.index(k) for k in range(number)]]
         self._set_lengthscale(value)
 
     def _lengthscale_param(self, m: Any) -> Tensor:

@@ -14,8 +14,6 @@ from torch import Size, Tensor
 from torch.nn import Module, Parameter
 from torch.nn.functional import pad
 
-_OUTLYING = 1e3  # times the variance of a new observation: a row that hardly counts
-
 
 class RowSource:
     """A reason why the noise of training rows differs from that of new observations there."""
@@ -38,32 +36,32 @@ class RowNoise(Module):
     noise of new observations.
 
     Args:
-        sources: The reasons, which set ``factors`` or ``added`` between fits.
+        sources: The reasons, which set ``added`` or ``errors`` between fits.
         shape: ``batch_shape x (m) x n``.
 
     Attributes:
-        factors: Multiples of the variance of each training target, of this shape (of a model that
-            holds samples ``S x`` it).
-        added: What is added to the variances after that, in the square of the model's units.
+        added: What is added to the variance of each training target, in the square of the model's
+            units, of this shape (of a model that holds samples ``S x`` it).
+        errors: The same of outliers, which hardly count; zero for others.
     """
 
-    factors: Tensor
     added: Tensor
+    errors: Tensor
 
     def __init__(self, sources: Sequence[RowSource], shape: Size) -> None:
         super().__init__()
         self.sources = sources
-        self.register_buffer("factors", torch.ones(shape, dtype=torch.float64))
         self.register_buffer("added", torch.zeros(shape, dtype=torch.float64))
+        self.register_buffer("errors", torch.zeros(shape, dtype=torch.float64))
 
     @property
     def outlying(self) -> Tensor:
-        """Mask of the rows that hardly count, outliers, of the shape of ``factors``."""
-        return self.factors > _OUTLYING
+        """Mask of the outliers, of the shape of ``errors``."""
+        return self.errors > 0
 
     def forget(self) -> None:
         """Let training rows have the noise of new observations."""
-        self.factors, self.added = torch.ones_like(self.factors), torch.zeros_like(self.added)
+        self.added, self.errors = torch.zeros_like(self.added), torch.zeros_like(self.errors)
 
     def refine(self, model: Any) -> bool:
         """Let each source set the noise of rows after a rough fit; return whether to fit again."""
@@ -140,15 +138,14 @@ class Noise(NamedTuple):
         """
         if self.rows is None:
             return variances
-        factors, added = self.rows.factors[..., kept], self.rows.added[..., kept]
-        later = (0, variances.shape[-1] - factors.shape[-1])
-        return variances * pad(factors, later, value=1.0) + pad(added, later)
+        beside = (self.rows.added + self.rows.errors)[..., kept]
+        return variances + pad(beside, (0, variances.shape[-1] - beside.shape[-1]))
 
     def trusted(self, values: Tensor) -> Tensor:
         """Values at the training rows, ``... x (m) x n``, with NaN at outliers."""
-        if self.rows is None or not self.rows.outlying.any():
+        if self.rows is None:
             return values
-        later = (0, values.shape[-1] - self.rows.factors.shape[-1])
+        later = (0, values.shape[-1] - self.rows.errors.shape[-1])
         return values.masked_fill(pad(self.rows.outlying, later), torch.nan)
 
     def shares(
@@ -163,11 +160,8 @@ class Noise(NamedTuple):
         Returns:
             ``... x n x K``, None for one variance in full; and ``... x n``, None for nothing.
         """
-        selection = self.selection(inputs)
-        if self.rows is None:
-            return selection, None
-        factors = self.rows.factors[..., kept].unsqueeze(-1)
-        return factors if selection is None else selection * factors, self.rows.added[..., kept]
+        beside = None if self.rows is None else (self.rows.added + self.rows.errors)[..., kept]
+        return self.selection(inputs), beside
 
     def typical(self, observed: Tensor) -> Tensor:
         """The mean of the given variances of observations, ``... x n`` booleans: ``... x 1``."""

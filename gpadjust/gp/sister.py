@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from gpadjust.gp.gaussian import cholesky
 from gpadjust.gp.kernels import Batched, Profile, Stationary
 from gpadjust.gp.term import Unit, side_by_side
 
+_NAMES = ("points", "lengthscale", "variance", "mean", "root", "scale")
 _NUGGET = 1e-6  # of a variance: functions of other kernels are interpolated, too
 
 
@@ -49,9 +50,20 @@ class Sister(Batched, Module):
 
     def __init__(self, **tensors: Tensor) -> None:
         super().__init__()
-        for name in ("points", "lengthscale", "variance", "mean", "root", "scale"):
+        for name in _NAMES:
             self.register_buffer(name, tensors[name])
         self.on = Parameter(torch.ones_like(self.scale), requires_grad=False)
+
+    @classmethod
+    def of_state(cls, state: Mapping[str, Tensor], batch_dims: int) -> Sister | None:
+        """Return that of a model's ``state_dict``, of the first of its samples; None without."""
+        own = {name: state.get(f"covar_module.sister.{name}") for name in _NAMES}
+        found = {name: tensor for name, tensor in own.items() if tensor is not None}
+        if len(found) < len(own):
+            return None
+        if found["scale"].dim() > batch_dims + 1:
+            found = {name: tensor[0] for name, tensor in found.items()}
+        return cls(**{name: tensor.clone() for name, tensor in found.items()})
 
     def forms(self, profiles: Sequence[Profile]) -> list[Stationary]:
         """The kernels, of profiles that the model's own have, at variances in the user's units."""

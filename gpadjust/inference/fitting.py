@@ -154,9 +154,9 @@ def fit(
     *What others taught* (``prior=``): fitted models of other machines of the same kind, of the same
     class, inputs and outputs. Each term is then the sum of theirs and of a difference; of several
     the spread between them says how much machines differ, and in which directions. Lengthscales and
-    noise have priors around theirs. Whether they help has the prior probability 0.1, and by the
-    evidence of the model's own data ``result.sisters`` is what is left; so large is the share of the
-    model's samples that have them, the others are those of a fit without. (``"map"`` takes the
+    noise have priors around theirs. Whether they help has the prior probability 0.1;
+    ``result.sisters`` is the posterior one, by the evidence of the model's own data, and the share
+    of its samples that have them. The others are those of a fit without. (``"map"`` takes the
     likelier one.) The model keeps what it needs of the others.
 
     Parameters with ``requires_grad=False`` stay. A model that holds samples lets go of them first.
@@ -230,7 +230,7 @@ def fit(
 
                     run = METHODS[method].run
                     result = fit_with_prior(model, prior, run, search, **own)
-                if not (isinstance(model, TermsGP) and _is_unconfirmed(model)):
+                if not (isinstance(model, TermsGP) and model.noise.rows and _is_unconfirmed(model)):
                     break
             if isinstance(model, TermsGP):
                 model.was_fitted = True
@@ -273,8 +273,7 @@ def _refine_noise(model: TermsGP, search: Search) -> None:
 
 def _is_unconfirmed(model: TermsGP) -> bool:
     """Return whether a fit contradicts the noise of its rows; then they are others, for another."""
-    rows = model.noise.rows
-    if rows is None or not rows.confirm(model.eval()):
+    if not model.noise.rows.confirm(model.eval()):
         return False
     if model.num_samples is not None:
         model.release_samples()

@@ -64,8 +64,8 @@ class SharedPosterior(LogPosterior):
 
     .. math:: -\log p_j = (a + \tfrac n2) \log(a + \tfrac12 S_j) + \tfrac12 \log|K| + \dots
 
-    of the cost :math:`S_j = r_j^T P_j r_j` of its residuals, with a = 1. The sum over outputs has the
-    weight of their effective number, the participation ratio of their covariance.
+    of the cost :math:`S_j = r_j^T P_j r_j` of its residuals, with a = 1. The sum over outputs has
+    the weight of their effective number, the participation ratio of their covariance.
 
     Args:
         model: The model of the kernel, with ``outputs``.

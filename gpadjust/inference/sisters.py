@@ -124,10 +124,11 @@ def _register_priors(
     """Register priors by what others have, with a variance of functions in units of theirs."""
     rows = {row.name: row for row in hyperparameters(model) if row.is_log and row.raw.requires_grad}
     for name, row in rows.items():
-        logs = torch.stack([_logs(other, name, model) for other in others])
-        middle = logs.mean((0, 1))
-        spread = logs.mean(1).std(0) if len(others) > 1 else torch.zeros_like(middle)
-        inner = logs.var(1).mean(0) if logs.shape[1] > 1 else 0.0
+        logs = [_logs(other, name, model) for other in others]
+        means = torch.stack([each.mean(0) for each in logs])
+        middle = means.mean(0)
+        spread = means.std(0) if len(others) > 1 else torch.zeros_like(middle)
+        inner = torch.stack([each.var(0, correction=int(len(each) > 1)) for each in logs]).mean(0)
         if row.kind in _WIDER:
             sd = (inner + spread.square() + _WIDER[row.kind] ** 2).sqrt()
         else:
@@ -165,7 +166,7 @@ def _scale(model: TermsGP, unit: Unit = Unit.TARGET) -> Tensor:
 
 
 def _of_physics(model: TermsGP, values: Tensor) -> Tensor:
-    """Values of samples, ``S x ...``, where those without the physics are the mean of the others."""
+    """Values of samples, ``S x ...``; those without the physics have the mean of the others."""
     used = uses_physics(model)
     used = used.reshape(*used.shape, *[1] * (values.dim() - used.dim())).to(values)
     used = torch.where(used.sum(0) > 0, used, torch.ones_like(used))
@@ -308,6 +309,8 @@ def _check_terms(model: TermsGP, which: str) -> None:
         )
     elif model.rho_names and any(p.requires_grad for p in model.physics.parameters()):
         why = "has a physics that is trained: train it first, and stop its gradients"
+    elif any(term.scaled_by for term in model.terms):
+        why = "has a physics that is emulated: take its emulator as exact, FunctionPhysics(physics)"
     elif any(term.learns_mean for term in model.terms):
         why = "has unknown prior means: give them as numbers (rho_mean=1.0)"
     elif getattr(getattr(model, "input_transform", None), "base", None) is not None:

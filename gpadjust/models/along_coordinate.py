@@ -27,9 +27,9 @@ class AlongCoordinate(NamedTuple):
     r"""Residuals E with the covariance :math:`K_x \otimes A K_t A + s I`, for ``S`` samples.
 
     With :math:`K_x = U \Lambda U^T` and :math:`A K_t A = V M V^T`, whose rank is at most 128 (a
-    Nystrom approximation at evenly spaced outputs), the coefficients :math:`U^T E V` are independent
-    with variances :math:`\lambda_i \mu_k + s` (Stegle et al. 2011), and what is not in the span of V
-    is noise.
+    Nystrom approximation at evenly spaced outputs), the coefficients :math:`U^T E V` are
+    independent, with variances :math:`\lambda_i \mu_k + s` (Stegle et al. 2011), and what
+    is not in the span of V is noise.
 
     Attributes:
         train: The kernel's sum at the training inputs.
@@ -109,12 +109,6 @@ class AlongCoordinate(NamedTuple):
             rows.append(torch.stack([lengths[i], scale[s, k], scale[s, k] * near[k]]))
         return torch.stack(rows)
 
-    def calibration(self, residuals: Tensor) -> Tensor:
-        """Mean squares of standardised left-out errors along the coordinate, at least 1, ``m``."""
-        mean, variance = self.left_out(residuals)
-        square = ((residuals - mean).square() / variance).mean((0, 1))
-        return smoothed(self.coordinate, square).clamp_min(1.0)
-
     def marginals(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         """Means and variances of delta, ``... x S x q x m``."""
         projected, size = self._projected(sought)
@@ -139,14 +133,13 @@ class AlongCoordinate(NamedTuple):
         return found.flatten(-4, -3).flatten(-2, -1)
 
     def left_out(self, residuals: Tensor) -> tuple[Tensor, Tensor]:
-        """Each row from all others, means and variances with noise, ``S x n x m``."""
+        """Each row from all others, means and variances without noise, ``S x n x m``."""
         inverse = self.variances.reciprocal()
         precision = self.vectors.square() @ inverse
         error = self.vectors @ (self.coefficients * inverse) / precision
         shown = residuals @ self.basis - error
-        rest = (1 - self.basis.square().sum(-1)).clamp_min(0.0) * self.noise  # S x m
-        variance = precision.reciprocal() @ self.basis.square().mT + rest.unsqueeze(-2)
-        return shown @ self.basis.mT, variance
+        variance = (precision.reciprocal() - self.noise.unsqueeze(-1)).clamp_min(0.0)
+        return shown @ self.basis.mT, variance @ self.basis.square().mT
 
     def _projected(self, sought: WeightedSum) -> tuple[Tensor, Tensor]:
         cross = (sought.cross(self.train, is_data=True) + self.constant) @ self.vectors

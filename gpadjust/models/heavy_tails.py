@@ -17,7 +17,7 @@ _NEAR = 3.0  # standard deviations, nearer than which outliers are no more likel
 _SUSPECT = 0.9  # of the largest of n standard normal numbers, for a row to be tried
 _PATIENCE = 3  # sets of outliers that are tried after the best one
 _MOST = 1 / 3  # of the observations are outliers
-_FAR = 1e4  # times its squared residual is the variance of an outlier
+_FAR = 1e4  # times its squared residual is the variance of an outlier in a fit
 
 
 class HeavyTails(RowSource):
@@ -59,15 +59,15 @@ class HeavyTails(RowSource):
             chosen = sets.gather(0, best[None, ..., None].expand(1, *sets.shape[1:]))[0]
         else:
             chosen = torch.where(done.unsqueeze(-1), outlying, following)
-        size = (found.residual.square() / found.noise).clamp_min(1.0)
-        rows.factors = torch.where(chosen, _FAR * size, 1.0)
+        # Not a multiple of the noise, which the likelihood would make small for their sake.
+        rows.errors = chosen * _FAR * (found.residual.square() + found.noise)
         return not bool(done.all())
 
     @torch.no_grad()
     def confirm(self, model: Any, rows: RowNoise) -> bool:
         """Take rows in again that are likelier no outliers, by all samples."""
         wrong = rows.outlying & (probabilities(model) < 0.5)
-        rows.factors = rows.factors.masked_fill(wrong, 1.0)
+        rows.errors = rows.errors.masked_fill(wrong, 0.0)
         return bool(wrong.any())
 
 

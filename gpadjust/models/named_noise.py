@@ -17,12 +17,11 @@ def named_noise(names: str | Sequence[str], make: Any) -> Likelihood | None:
     """The likelihood of names, for a builder of terms; None for the model's own.
 
     Raises:
-        TypeError: If there is no noise of a name.
-        ValueError: If noise is to be relative in the units of a link.
+        ValueError: If there is no noise of a name, or noise is to be relative in the units of a link.
     """
     names = [names] if isinstance(names, str) else [*names]
     if unknown := [name for name in names if name not in _NAMES]:
-        raise TypeError(
+        raise ValueError(
             "Expected likelihood as 'relative', 'heavy-tailed', a sequence of both, or a Gaussian "
             f"likelihood of GPyTorch, got {unknown[0]!r}."
         )

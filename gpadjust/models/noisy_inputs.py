@@ -117,7 +117,7 @@ class NoisyInputs(RowSource, Module):
         mean, variance = self._moments(model, is_first)
         if is_first and not variance.any():  # a prior mean without slope
             mean, variance = self._moments(model, False)
-        noise = rows.factors * model.noise.at(model.train_inputs[0])
+        noise = rows.errors + model.noise.at(model.train_inputs[0])
         off = (variance - rows.added).abs() / (rows.added + noise)
         away = (mean - self.shift).abs() / (variance + noise).sqrt()
         self.move(model, mean)

@@ -38,8 +38,8 @@ from gpadjust.physics import as_physics
 
 DEGREES = 2.0  # of freedom of the prior of an output's variance, around that of its residuals
 _VAGUE = 100.0  # prior standard deviation of an unknown constant, in residuals' standard deviations
+_CAUTION = 0.5  # standard errors that left-out errors are taken as larger by
 _DRAWS = 2_000  # of curves, for intervals that hold all of one
-_AT_ONCE = 2**22  # numbers in these draws
 _MOST = 4_000  # points times outputs, of a joint covariance of coupled outputs
 
 
@@ -69,14 +69,15 @@ class ParallelPartialGP(TermsModel):
 
     One kernel k and one ratio of noise serve all outputs, so that one Cholesky factor does; the
     variance :math:`\tau_j` and the constants of each output are integrated out in closed form
-    (parallel partial emulation, Gu and Berger 2016). Its prior is an inverse gamma distribution of 2
-    degrees of freedom around the mean square of the output's residuals. The outputs are
-    independent, given the kernel, unless they have a ``coordinate``.
+    (parallel partial emulation, Gu and Berger 2016). Given the kernel the outputs are independent,
+    unless they have a ``coordinate``. Where left-out errors are larger than predicted, variances
+    grow.
 
-    With a ``coordinate`` delta is one function of x and t, with the covariance :math:`\tau\, k(x,
-    x')\, a(t)\, k_t(t, t')\, a(t')` and noise of one variance for all outputs, by the eigenvalues of
-    both (Stegle et al. 2011): neighbours average the noise, and whole curves have a joint posterior.
-    The lengthscale of the Matern kernel :math:`k_t` is learnt; a(t) follows the residuals.
+    With a ``coordinate`` t delta is one function of x and t, with the covariance :math:`\tau\,
+    k(x, x')\, a(t)\, k_t(t, t')\, a(t')` and noise of one variance for all outputs, by the
+    eigenvalues of both (Stegle et al. 2011): neighbours average the noise, and whole curves have a
+    joint posterior. The lengthscale of the Matern kernel :math:`k_t` is learnt; a(t) follows the
+    size of the residuals.
 
     Args:
         train_X: Inputs, ``n x d``, as in :class:`~gpadjust.CKA`.
@@ -140,6 +141,11 @@ class ParallelPartialGP(TermsModel):
                     "not learn: learn them with a CKA of a few outputs, and give the physics with "
                     "their values."
                 )
+            if made.is_emulated:
+                raise ValueError(
+                    f"Physics {made.name!r} is emulated, with an error that a ParallelPartialGP has "
+                    "no term for: FunctionPhysics(physics) takes the emulator's mean as exact."
+                )
             self.input_transform = PhysicsInput(made, data.X.shape[-1], input_transform)
             with torch.no_grad():
                 f_p = self.input_transform.values(data.X)
@@ -179,6 +185,7 @@ class ParallelPartialGP(TermsModel):
             outcome_transform=None,
         )
         self.register_buffer("scales", torch.ones(1, m).to(data.Y))
+        self.register_buffer("noises", torch.ones(1, m).to(data.Y))
         self.register_buffer("along", torch.ones(1, 3).to(data.Y))
         self.register_buffer("profile", torch.ones(m).to(data.Y))
         self._remembered: Any = None
@@ -204,7 +211,7 @@ class ParallelPartialGP(TermsModel):
     # What a TermsModel has, of the shared kernel.
 
     @property
-    def covar_module(self) -> SumOfTerms:  # type: ignore[override]
+    def covar_module(self) -> SumOfTerms:
         """The shared kernel."""
         return self.shared.covar_module
 
@@ -214,12 +221,12 @@ class ParallelPartialGP(TermsModel):
         return self.shared.likelihood
 
     @property
-    def train_inputs(self) -> Any:  # type: ignore[override]
+    def train_inputs(self) -> Any:
         """Transformed training inputs, ``S x n x d``."""
         return self.shared.train_inputs
 
     @property
-    def train_targets(self) -> Tensor:  # type: ignore[override]
+    def train_targets(self) -> Tensor:
         """Targets in the user's units, ``m x n``."""
         return self._Y.mT
 
@@ -234,7 +241,7 @@ class ParallelPartialGP(TermsModel):
         return self.scales.shape[:1]
 
     @property
-    def num_samples(self) -> int:  # type: ignore[override]
+    def num_samples(self) -> int:
         """The number ``S`` of samples; 1 before a fit."""
         return len(self.scales)
 
@@ -317,20 +324,24 @@ class ParallelPartialGP(TermsModel):
         self._remembered = None
         number = self.shared.num_samples or 1
         if self.coordinate is not None:
-            self.scales = self.unit.new_ones(number, self.num_outputs)
             self.profile = smoothed(self.coordinate, self.residuals.square().mean(0)).sqrt()
             self.along = AlongCoordinate.learn(self)
             shape = 0.5 * len(self._Y) * effective_number(self.residuals)
-            rate = shape * self._coupled().calibration(self.residuals).expand(number, -1)
+            rate = torch.full((number, 1), shape).to(self.unit)
         else:
             rate = 0.5 * (DEGREES + self._weights().square)  # S x m
             shape = 0.5 * (DEGREES + len(self._Y))
         # Quantiles of each output's variance (coupled, of one factor for all), one for each sample.
-        several = rate[:, :1] if self.coordinate is not None else rate
-        order = torch.rand(several.shape, generator=generator, dtype=rate.dtype).argsort(0)
+        order = torch.rand(rate.shape, generator=generator, dtype=rate.dtype).argsort(0)
         level = (order.double() + 0.5) / number
         unit = torch.as_tensor(invgamma.ppf(level.numpy(), shape)).to(rate)
-        self.scales = rate * (unit if number > 1 else 1 / max(shape - 1, 0.5))
+        scales = rate * (unit if number > 1 else 1 / max(shape - 1, 0.5))
+        self.scales = scales.expand(number, self.num_outputs).clone()
+        if self.coordinate is not None:
+            self.noises = self.along[:, 2:].expand_as(self.scales).clone()
+        else:
+            self.noises = self.scales * self.shared.noise.at(self.train_inputs[0])[..., :1]
+        self.scales *= self._calibration()
         self.was_fitted = True
 
     def _weights(self) -> _Weights:
@@ -375,11 +386,22 @@ class ParallelPartialGP(TermsModel):
             return given.unsqueeze(MCMC_DIM)
         if not observation_noise:
             return 0.0
+        return (self.noises * self.unit.square()).unsqueeze(-2)
+
+    def _calibration(self) -> Tensor:
+        """Factors of delta's variances by which left-out errors are as large as predicted, ``m``.
+
+        At least 1, with half a standard error of caution, for errors that noise may hide.
+        """
+        mean, variance = self.left_out()
+        own = variance - (self.noises * self.unit.square()).unsqueeze(1)  # S x n x m
+        excess = ((self._Y - mean).square() - variance).mean(0)  # n x m
+        own = own.mean((0, 1))
         if self.coordinate is not None:
-            noise = self.along[:, 2:].unsqueeze(-1)
-        else:
-            noise = self.shared.noise.at(self.train_inputs[0])[..., :1].unsqueeze(-1)
-        return noise * (self.scales * self.unit.square()).unsqueeze(-2)
+            excess = torch.stack([smoothed(self.coordinate, row) for row in excess])
+            own = smoothed(self.coordinate, own)
+        excess = excess.mean(0) + _CAUTION * excess.std(0) / len(excess) ** 0.5
+        return 1 + excess.clamp_min(0.0) / own.clamp_min(torch.finfo(own.dtype).tiny)
 
     def components(self, X: ArrayLike, observation_noise: bool | Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances for each sample, ``... x S x q x m``."""
@@ -542,21 +564,19 @@ class ParallelPartialGP(TermsModel):
         variance = variance.movedim(MCMC_DIM, 0).flatten(1, -2).transpose(0, 1)
         generator = torch.Generator().manual_seed(0)
         options: Any = {"generator": generator, "dtype": mean.dtype}
-        at_once = max(1, _AT_ONCE // (number * self.num_outputs))
-        for i in range(len(points)):
-            for s, part in enumerate(points[i].unbind(0)):
-                maxima = []
-                for size_of in torch.arange(number).split(at_once):
-                    white = torch.randn(len(size_of), self.num_outputs, **options)
-                    if self.coordinate is None:
-                        drawn = white * variance[i, s].sqrt()
-                    else:
-                        own = torch.randn(len(size_of), basis.shape[-1], **options) * roots[i, s]
-                        drawn = own @ basis[s].mT * size[s] + white * noise[i, s].sqrt()
-                    deviation = (drawn + part - middle[i]).abs() / whole[i].sqrt()
-                    maxima.append(deviation.amax(-1))
-                found.append(torch.cat(maxima))
-        every = torch.stack(found).reshape(len(points), -1).mT
+        for s in range(self.num_samples):  # with the same draws at all points
+            white = torch.randn(number, self.num_outputs, **options)
+            if self.coordinate is not None:
+                own = torch.randn(number, basis.shape[-1], **options)
+            maxima = []
+            for i, part in enumerate(points[:, s]):
+                if self.coordinate is None:
+                    drawn = white * variance[i, s].sqrt()
+                else:
+                    drawn = (own * roots[i, s]) @ basis[s].mT * size[s] + white * noise[i, s].sqrt()
+                maxima.append(((drawn + part - middle[i]).abs() / whole[i].sqrt()).amax(-1))
+            found.append(torch.stack(maxima))
+        every = torch.cat(found, -1).mT
         return every.reshape(-1, *mean.shape[:MCMC_DIM], mean.shape[-2])
 
     @torch.no_grad()
@@ -572,9 +592,11 @@ class ParallelPartialGP(TermsModel):
             known = torch.einsum("snmk,smkl,snml->snm", own, weights.spread, own)
             precision = (precision - known).clamp_min(torch.finfo(known.dtype).tiny)
             mean = self.residuals - weights.mean / precision
-            variance = precision.reciprocal()
+            noise = self.shared.noise.at(self.train_inputs[0]).unsqueeze(-1)
+            variance = (precision.reciprocal() - noise).clamp_min(0.0)
         prior = self._Y - self.residuals * self.unit
-        return mean * self.unit + prior, variance * (self.scales * self.unit.square()).unsqueeze(1)
+        variance = variance * self.scales.unsqueeze(1) + self.noises.unsqueeze(1)
+        return mean * self.unit + prior, variance * self.unit.square()
 
     def condition_on_observations(self, X: ArrayLike, Y: ArrayLike, **kwargs: Any) -> Self:
         """Condition on new rows of all outputs; the hyper-parameters stay.
@@ -620,7 +642,7 @@ class ParallelPartialGP(TermsModel):
         own = {n.removeprefix("shared."): v for n, v in state_dict.items() if "shared." in n}
         self.shared.release_samples()
         keys = self.shared.load_state_dict(own, strict)
-        for name in ("scales", "along", "profile", "unit"):
+        for name in ("scales", "noises", "along", "profile", "unit"):
             setattr(self, name, state_dict[name].clone())
         self.was_fitted = True
         with torch.no_grad():

@@ -202,7 +202,8 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
         mean = kernel.at(inputs).combine({term.name: term.given_mean for term in kernel.terms})
     else:
         mean = model.mean_module(inputs)
-    targets = Noise(model.likelihood).trusted(targets)
+    noise = Noise(model.likelihood)
+    targets = targets if noise.rows is None else noise.trusted(targets)
     unit = (targets - mean).square().nanmean(-1)
     # A physics that misleads says nothing of how large functions and noise are.
     spread = (targets - targets.nanmean(-1, keepdim=True)).square().nanmean(-1)
@@ -225,7 +226,7 @@ def hyperparameters(model: BatchedMultiOutputGPyTorchModel) -> list[Hyperparamet
         if term.kernel is not None:
             variance = "scaling" if term.unit is Unit.NONE else "outputscale"
             _enter(found, term.kernel, inputs, ranges[..., : term.num_inputs], scale, variance)
-    for variances in Noise(model.likelihood).raw_variances:
+    for variances in noise.raw_variances:
         each = _units_of_groups(model, unit)
         each = each if each.shape == variances.shape else unit.unsqueeze(-1)
         found[id(variances)] = ("noise", each.expand(variances.shape))

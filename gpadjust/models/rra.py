@@ -166,13 +166,16 @@ class RRA(TermsGP):
         super().__init__(make, [*rhos, make.delta(kernel, delta_mean)])
         self.num_features = num_features
 
-    def _take(self, new: NewRows, forget: int | None) -> None:
-        """Take new observations by a step of a Kalman filter for each, which keeps no row."""
+    def _check_window(self, forget: int | None) -> None:
+        """Raise an error if there are no weights to update."""
         if self.conditioning_class is not WeightConditioning:
             raise NotImplementedError(
                 f"The covariance of {type(self).__name__} is not that of a posterior, so that "
                 "there is nothing to update; take RRA."
             )
+
+    def _take(self, new: NewRows, forget: int | None) -> None:
+        """Take new observations by a step of a Kalman filter for each, which keeps no row."""
         conditioning, kernel = self._regression(), self.covar_module
         before = getattr(kernel, "updated", None)
         if before is None:

@@ -59,8 +59,12 @@ class CKA(TermsGP):
             hyper-parameter, so that a constant in both f_p and targets makes no difference; a point
             fit (``"map"``) leaves it at the mean of f_p at ``train_X``, where ``"mean"`` keeps it.
             A number is c in the user's units; the literal model has 0.
-        likelihood: A Gaussian likelihood. Default: learnt noise, with a standard deviation of at
-            least three millionths of the root mean square of ``train_Y - f_p``.
+        likelihood: A Gaussian likelihood, a function of the :class:`~gpadjust.models.TermBuilder`
+            that makes one, or names: ``"relative"``, noise of a constant standard deviation and one
+            that is a share of f_p (without physics, of the posterior mean), both learnt;
+            ``"heavy-tailed"``, of which some observations may be outliers (:meth:`outliers`); a
+            sequence of both. Default: learnt noise, with a standard deviation of at least three
+            millionths of the root mean square of ``train_Y - f_p``.
         outcome_transform: ``Standardize`` or None. Default: division by the root mean square of
             ``train_Y - f_p``. Hyper-parameters are in the units after it. Or a link of bounded
             outputs, through which f_p goes, too: ``"log"`` (BoTorch's ``Log()``) of positive ones,
@@ -69,6 +73,11 @@ class CKA(TermsGP):
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
         train_Xvar: Known variances of errors of measured inputs: of the shape of ``train_X``, one for
             each input, or one number; zero where they are exact. Predictions are at exact inputs.
+        categorical: Names or numbers of the columns that are categories, or a mapping from these to
+            their levels. Text in a DataFrame is one without being named; f_p gets the numbers of
+            its levels, sorted, from 0.
+        batch: Names or numbers of columns of which each level has an offset of its own, a term of
+            the column's name; other levels are new ones.
 
     Warns:
         PhysicsWarning: If f_p is obviously off at the training inputs, and shows why.

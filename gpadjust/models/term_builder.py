@@ -48,11 +48,11 @@ KernelLike: TypeAlias = Kernel | Callable[[int, Size], Kernel]
 Kernels: TypeAlias = KernelLike | Sequence[KernelLike] | None
 Means = float | Sequence[float] | Literal["learn"]
 Center = float | Tensor | Literal["mean", "learn"]
-Columns = str | int | Sequence[str | int]
+Columns: TypeAlias = str | int | Sequence[str | int]
 LikelihoodLike: TypeAlias = (
     Likelihood | str | Sequence[str] | Callable[["TermBuilder"], Likelihood] | None
 )
-Outcomes = OutcomeTransform | tuple[float, float] | str | _DefaultType | None
+Outcomes: TypeAlias = OutcomeTransform | tuple[float, float] | str | _DefaultType | None
 
 
 class ModelOptions(TypedDict, total=False):
@@ -62,7 +62,7 @@ class ModelOptions(TypedDict, total=False):
     outcome_transform: Outcomes
     input_transform: InputTransform | None
     train_Xvar: ArrayLike | float | Sequence[float]
-    categorical: Columns | Mapping[str | int, Sequence[str | float]] | None
+    categorical: Columns | Mapping[Any, Any] | None
     batch: Columns | None
 
 
@@ -132,7 +132,7 @@ class TermBuilder:
         outcome_transform: Outcomes = DEFAULT,
         input_transform: InputTransform | None = None,
         train_Xvar: ArrayLike | float | Sequence[float] = None,
-        categorical: Columns | Mapping[str | int, Sequence[str | float]] | None = None,
+        categorical: Columns | Mapping[Any, Any] | None = None,
         batch: Columns | None = None,
     ) -> TermBuilder:
         r"""The builder of the terms of :math:`f_a(x) = \sum_i \rho_i(x) f_i(x) + \delta(x)`.

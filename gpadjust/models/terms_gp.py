@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import torch
 from botorch.fit import _fit_fallback
@@ -29,6 +29,7 @@ from gpadjust.gp.gaussian import negative_log_likelihood
 from gpadjust.gp.kernels import Stationary
 from gpadjust.gp.noise import RowNoise
 from gpadjust.gp.repeats import Repeats
+from gpadjust.gp.sister import Sister
 from gpadjust.models.exact_conditioning import ExactConditioning
 from gpadjust.models.hyperparameter_samples import (
     HOLDS_SAMPLES,
@@ -42,7 +43,7 @@ from gpadjust.models.parameters import learnt_noise, set_initial_values
 from gpadjust.models.term_builder import TermBuilder
 from gpadjust.models.terms_model import TermsModel
 from gpadjust.models.training_data import ArrayLike, check_noise, new_observations
-from gpadjust.models.updates import NewRows, keep_last
+from gpadjust.models.updates import NewRows, judge, keep_last
 
 _ROUNDING = 1e-8  # of the targets' standard deviation: smaller errors are of rounding
 _DISTINCT = 0.75  # of the rows, at most, for equal ones to be taken together
@@ -115,7 +116,7 @@ class TermsGP(TermsModel, SingleTaskGP):
         if made.units is not None:  # not earlier: BoTorch would estimate it again
             units, link = made.units, made.link
             self.outcome_transform = units if link is None else link.units(units)
-            vars(self)["link"] = link  # no submodule, of which the class's None would be first
+            self.__dict__["link"] = link  # no submodule, of which the class's None would be first
         if made.sources:
             self.likelihood.rows = RowNoise(made.sources, self.train_targets.shape)
         self.noisy_inputs = made.noisy_inputs
@@ -254,7 +255,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        targets = self.noise.trusted(self.train_targets)
+        rows, targets = self.noise.rows, self.train_targets
+        targets = targets if rows is None else self.noise.trusted(targets)
         squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)
@@ -357,6 +359,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         self, state_dict: Mapping[str, Any], strict: bool = True, *args: Any, **kwargs: Any
     ) -> Any:
         """Load parameters; with those of a model that holds samples, this one holds them too."""
+        if self.covar_module.sister is None:
+            self.covar_module.sister = Sister.of_state(state_dict, len(self._aug_batch_shape))
         samples = {
             name: state_dict[name]
             for name, parameter in self.named_parameters()
@@ -481,7 +485,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         Any other model keeps its last ``forget`` observations, and forgets those before.
 
         Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
-        observations; so do places of larger errors. To fit them again, build a model of recent
+        observations; so do places of larger errors. Where new observations are missed by more than
+        predicted, as while a machine drifts, variances grow by the ratio (with ``forget``). To fit them again, build a model of recent
         observations.
 
         Args:
@@ -518,10 +523,18 @@ class TermsGP(TermsModel, SingleTaskGP):
         if self.has_repeats:  # rows come and go from now on
             self.has_repeats, self.prediction_strategy = False, None
         with torch.no_grad():
-            self._take(NewRows.of(self, X, Y, noise), forget)
+            self._check_window(forget)
+            new = NewRows.of(self, X, Y, noise)
+            if forget is not None:
+                judge(self, new, forget)
+            self._take(new, forget)
 
     def _take(self, new: NewRows, forget: int | None) -> None:
         """Take new observations, and forget others."""
+        keep_last(self, new, cast("int", forget))
+
+    def _check_window(self, forget: int | None) -> None:
+        """Raise an error if a model cannot keep its last observations."""
         name = type(self).__name__
         if forget is None:
             raise ValueError(
@@ -539,7 +552,6 @@ class TermsGP(TermsModel, SingleTaskGP):
                 f"The inputs of this {name} are noisy (train_Xvar), and of new ones that is not "
                 "known: build the model again."
             )
-        keep_last(self, new, forget)
 
     def _check_noise(self, noise: Tensor | None, Y: Tensor) -> None:
         """Raise an error unless variances of new observations are given where they are known."""

@@ -286,11 +286,11 @@ class TermsModel(PredictiveModel):
                 shift, scale = self.units(term.unit)
                 mean, variance = self.conditioning().marginals(self._at(term, inputs))
                 moments = torch.broadcast_tensors(mean * scale + shift, variance * scale.square())
-                parts = [self.outputs_last(each) for each in moments]
+                mean, variance = (self.outputs_last(each) for each in moments)
                 if self.num_samples is None:
-                    parts = [each.unsqueeze(MCMC_DIM) for each in parts]
-                ends = (mixture_quantile(*parts, (1 + side * level) / 2) for side in (-1, 1))
-                found[term.name] = Adjustment(mixture_moments(*parts)[0], *ends)
+                    mean, variance = mean.unsqueeze(MCMC_DIM), variance.unsqueeze(MCMC_DIM)
+                ends = [mixture_quantile(mean, variance, (1 + s * level) / 2) for s in (-1, 1)]
+                found[term.name] = Adjustment(mixture_moments(mean, variance)[0], *ends)
         if not hasattr(X, "columns"):
             return {n: Adjustment(*(as_given(v, X, ()) for v in a)) for n, a in found.items()}
         of = [f" of {name}" if self.num_outputs > 1 else "" for name in self.output_names]

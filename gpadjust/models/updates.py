@@ -43,6 +43,19 @@ class NewRows(NamedTuple):
 
 
 @torch.no_grad()
+def judge(model: Any, new: NewRows, forget: float) -> None:
+    """Let variances follow the errors of what a model predicted of new rows."""
+    f, errors = model.at(new.inputs), model.local_errors
+    mean, variance = model.conditioning().marginals(f)
+    variance = variance + (model.noise.at(f.x) if new.noise is None else new.noise)
+    x, missed = f.x[..., : model.terms[0].num_inputs], new.targets - mean
+    if model.num_samples is not None:
+        variance = variance.mean(0) + mean.var(0, correction=0)
+        missed, x = missed.mean(0), x[0]
+    errors.observe(missed.square() / (variance * errors.near(x)), forget)
+
+
+@torch.no_grad()
 def keep_last(model: Any, new: NewRows, number: int) -> None:
     """Give an exact model new rows, and drop all but the last ones of it."""
 
@@ -60,14 +73,11 @@ def keep_last(model: Any, new: NewRows, number: int) -> None:
     model.train_targets = last(model.train_targets, new.targets, -1)
     rows = model.noise.rows
     if rows is not None:
-        rows.factors = last(rows.factors, torch.ones_like(new.targets), -1)
+        rows.errors = last(rows.errors, torch.zeros_like(new.targets), -1)
         rows.added = last(rows.added, torch.zeros_like(new.targets), -1)
     if new.noise is not None:
         holder = model.likelihood.noise_covar
         holder.noise = last(holder.noise.expand(*new.noise.shape[:-1], -1), new.noise, -1)
-    if (rows := model.noise.rows) is not None:
-        rows.factors = last(rows.factors, torch.ones_like(new.targets), -1)
-        rows.added = last(rows.added, torch.zeros_like(new.targets), -1)
     model.prediction_strategy = None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Size, Tensor
@@ -26,7 +26,7 @@ class VanishingRBF:
         names = column_names(where)
         if isinstance(where, Mapping):
             self.columns: list[str | int] | None = [*where]
-            each = [torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in where.values()]
+            each = [_numbers(values) for values in where.values()]
             sizes = {len(values) for values in each} - {1}
             if not each or len(sizes) > 1 or 0 in sizes:
                 raise ValueError(
@@ -52,7 +52,7 @@ class VanishingRBF:
 
     def made_for(self, make: TermBuilder) -> VanishingKernel:
         """Return the kernel on the columns that the terms of a model read."""
-        raw, transform = self._raw(make.data.input_names), make.input_transform
+        raw, transform = self._raw(make.data.input_names), cast("Any", make.input_transform)
         if getattr(transform, "base", transform) is None:
             return self._kernel(raw, make.batch_shape)
         X = make.data.X.reshape(-1, raw.shape[-1])[:2]
@@ -63,8 +63,10 @@ class VanishingRBF:
             transform.eval()
             rows = read(moved)[..., : make.num_inputs]
             transform.train(learns)
-        fits, given = rows.shape == moved.shape, raw.isfinite()
-        if not fits or not torch.equal(rows[:, 0][given], rows[:, 1][given]):
+        # The raw column that each of those is made of.
+        of = [*getattr(make.categories, "groups", range(raw.shape[-1]))]
+        given = raw[..., of].isfinite() if len(of) == rows.shape[-1] else rows[:, 0] == torch.inf
+        if not given.any() or not torch.equal(rows[:, 0][given], rows[:, 1][given]):
             raise ValueError(
                 "Expected an input transform that treats each column by itself, as Normalize, "
                 "beside vanishing_rbf: this one mixes columns, or has others."
@@ -101,6 +103,16 @@ class VanishingRBF:
         return VanishingKernel(kernel, places)
 
 
+def _numbers(values: float | Sequence[float]) -> Tensor:
+    try:
+        return torch.as_tensor(values, dtype=torch.float64).reshape(-1)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"Expected `where` to give each column a number, or several, got {values!r}; of a "
+            "category give the number of the level, from 0 in the order of the alphabet."
+        ) from error
+
+
 def vanishing_rbf(where: Where) -> VanishingRBF:
     """The default kernel, of a function that is zero where the user knows the formula to be right.
 
@@ -111,7 +123,8 @@ def vanishing_rbf(where: Where) -> VanishingRBF:
     Args:
         where: Values of columns, by name or number: ``{"valve": 1.0}``, ``{"valve": [0.0, 1.0]}``
             for either, ``{"valve": 1.0, "flow": 0.0}`` for both at once. Or points, ``p x d``, or
-            a frame with some of the columns. In the user's units.
+            a frame with some of the columns. In the user's units; of categories the numbers of
+            levels.
 
     Raises:
         ValueError: If it is empty, not finite, or of another shape; when a model is built, if it

@@ -148,7 +148,7 @@ class VariationalCKA(TermsModel, GPyTorchModel):
         self.input_transform = some.input_transform
         if hasattr(some, "outcome_transform"):
             self.outcome_transform = some.outcome_transform
-        vars(self)["link"] = some.link
+        self.__dict__["link"] = some.link
         self.input_names, self.output_names = data.input_names, data.output_names
         if data.levels:
             self.remember_levels(data)

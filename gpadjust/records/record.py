@@ -210,8 +210,8 @@ def _in_seconds(times: ArrayLike) -> ArrayLike:
         # Of a time zone; those that are measured without one NumPy knows.
         kind = "datetime64[ns]" if isinstance(found.flat[0], datetime) else "timedelta64[ns]"
         with_zone = getattr(found.flat[0], "tzinfo", None) is not None
-        found = [t.astimezone(UTC).replace(tzinfo=None) if with_zone else t for t in found]
-        found = np.array(found, dtype=kind)
+        each = [t.astimezone(UTC).replace(tzinfo=None) if with_zone else t for t in found]
+        found = np.array(each, dtype=kind)
     return (found - found[0]) / np.timedelta64(1, "s") if found.dtype.kind in "mM" else times
 
 

@@ -23,7 +23,7 @@ from gpadjust.report.inputs import (
     pairs,
     read_csv,
 )
-from gpadjust.report.markup import listed, plural
+from gpadjust.report.markup import listed, name_and_unit, plural
 from gpadjust.report.page import checked_path, write
 from gpadjust.report.sections import Origin, headline
 from gpadjust.report.subject import subject_of
@@ -48,8 +48,9 @@ def run(arguments: Namespace, command: Sequence[str]) -> None:
     units = {} if arguments.units is None else pairs(arguments.units, "--units")
     variances = noise_variances(arguments.noise, outputs)
     marks = (_mark(arguments.delimiter), arguments.decimal)
-    categories = names_of(arguments.categories, "--categories") if arguments.categories else []
-    data = read_csv(arguments.data, inputs, outputs, units, *marks, categories)
+    asked = ((arguments.categories, "--categories"), (arguments.batches, "--batches"))
+    categories, batches = (names_of(names, o) if names else [] for names, o in asked)
+    data = read_csv(arguments.data, inputs, outputs, units, *marks, [*categories, *batches])
     options = _options(arguments, inputs, data.levels)
     physics = named_physics(arguments.physics, data)
     names = (listed(data.Y.columns), listed(data.X.columns))
@@ -148,6 +149,10 @@ def _options(
         found["train_Xvar"] = _variances(arguments.input_noise, inputs)
     if levels:
         found["categorical"] = dict(levels)
+    if arguments.batches:
+        bare = {name_and_unit(name)[0]: name for name in levels}
+        batches = names_of(arguments.batches, "--batches")
+        found["batch"] = [name if name in levels else bare[name] for name in batches]
     return found
 
 

@@ -163,7 +163,7 @@ def _slice(subject: Subject, i: int, number_of_points: int) -> Tensor:
     pad = 0.5 * low.abs().clamp_min(1.0) if low == high else torch.zeros_like(low)
     X = subject.base.repeat(number_of_points, 1)
     X[:, i] = torch.linspace(float(low - pad), float(high + pad), number_of_points, dtype=X.dtype)
-    return on_levels(X, subject.model.levels)
+    return on_levels(X, subject.model.levels) if subject.model.levels else X
 
 
 def _prediction(subject: Subject, output: int, i: int, ax: Any) -> None:

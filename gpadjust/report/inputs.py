@@ -131,14 +131,14 @@ def read_csv(
         )
     d = len(inputs)
     if unknown := [name for name in categories if name not in inputs]:
-        raise ValueError(f"--categories names {unknown[0]!r}, which is none of --inputs.")
+        raise ValueError(f"The category {unknown[0]!r} is none of --inputs.")
     names = _with_units(headers, asked, units)
     values, levels = [], {}
     for i, name in enumerate(headers):
         if asked[i] in categories:
             column, levels[names[i]] = table.categories(name)
         else:
-            column = table.numbers(name, may_miss=i >= d)
+            column = _numbers(table, name, may_miss=i >= d)
         values.append(column)
     X, Y = torch.stack(values[:d], -1), torch.stack(values[d:], -1)
     seen = ~Y.isnan().all(-1)
@@ -166,6 +166,17 @@ def read_csv(
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     columns = Columns(tuple(names[:d]), X), Columns(tuple(names[d:]), Y)
     return CsvData(*columns, tuple(lines.tolist()), tuple(remarks), digest, levels)
+
+
+def _numbers(table: CsvColumns, name: str, may_miss: bool) -> Tensor:
+    """The numbers of a column; the error says what to do if they are names of an input."""
+    try:
+        return table.numbers(name, may_miss=may_miss)
+    except ValueError as error:
+        if may_miss or any(c.isdigit() for text in table.texts(name) for c in text):
+            raise
+        bare = name_and_unit(name)[0]
+        raise ValueError(f"{error} If these are names, say so by --categories {bare}.") from error
 
 
 def names_of(text: str, option: str) -> list[str]:

@@ -59,7 +59,7 @@ class Comparison:
         left_out: The predictions of left-out observations by each structure, which the tables tell
             of.
         hints: What the data look like that the models were not told, each with the option to give:
-            outliers, relative noise, outputs that cannot be negative, copies of rows, categories.
+            outliers, relative noise, outputs that cannot be negative, categories.
         alone: Those by the physics as it is, ``"physics alone"``, of several each: beside the
             candidates (:meth:`rows`), and no part of what is recommended.
     """
@@ -264,8 +264,13 @@ def compare(
     asked = known_structures(STRUCTURES if structures is None else structures)
     search: dict[str, Any] = {"num_starts": num_starts, "num_screened": num_screened, "seed": seed}
     check_options("map", search)
-    categories = {name: options.get(name) for name in ("categorical", "batch")}
-    data = training_data(train_X, train_Y, train_Yvar, **categories)
+    data = training_data(
+        train_X,
+        train_Y,
+        train_Yvar,
+        categorical=options.get("categorical"),
+        batch=options.get("batch"),
+    )
     if data.X.dim() > 2:
         raise ValueError(
             f"Expected one data set, train_X of n x d, got shape {tuple(data.X.shape)}; compare "
@@ -273,9 +278,9 @@ def compare(
         )
     if (m := data.Y.shape[-1]) > _MOST_OUTPUTS:
         raise ValueError(
-            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got {m}: "
-            "compare some of them, or fit a ParallelPartialGP of all with the physics and one with "
-            "physics=None, and see the scores of `leave_one_out` of both."
+            f"Expected at most {_MOST_OUTPUTS} outputs, each of which is judged by itself, got "
+            f"{m}: compare some of them, or fit a ParallelPartialGP of all with the physics and "
+            "one with physics=None, and see the scores of `leave_one_out` of both."
         )
     given_physics = as_physics(physics)
     fitted_to = candidates(asked, given_physics, len(data.X))
@@ -283,7 +288,7 @@ def compare(
     left_out: dict[str, LeaveOneOut] = {}
     converged: dict[str, Tensor] = {}
     relevance: dict[str, Tensor] = {}
-    said: set[str] = set()
+    heard: dict[tuple[str, type[Warning]], list[str]] = {}
     number = max(_DRAWS[0], min(_DRAWS[1], _MEMORY // len(data.X)))
     for structure, part in tqdm(fitted_to, disable=not progress, unit="structure"):
         with warnings.catch_warnings(record=True) as caught:
@@ -306,17 +311,16 @@ def compare(
                 error.add_note(f"This is of the structure {structure.name!r}.")
                 raise
         for each in caught:
-            text = str(each.message)
-            if not issubclass(each.category, PhysicsWarning):
-                text = f"{structure.name}: {text}"
-            elif text in said:
-                continue
-            said.add(text)
-            warnings.warn(text, each.category, stacklevel=2)
+            heard.setdefault((str(each.message), each.category), []).append(structure.name)
         converged[structure.name] = result.converged.flatten()
         if result.relevance is not None:
             relevance[structure.name] = result.relevance.flatten()
         models[structure.name] = _thinned(model)
+    for (text, category), names in heard.items():
+        # One of the physics or of the data is of all models that have them.
+        of_all = issubclass(category, PhysicsWarning) or 1 < len(names) == len(models)
+        of = "" if of_all else f"{', '.join(names)}: "
+        warnings.warn(f"{of}{text}", category, stacklevel=2)
     prior = [structure.prior for structure, _ in fitted_to]
     by_output = [ranking(left_out, j, prior) for j in range(data.Y.shape[-1])]
     table = dict(zip(data.output_names, by_output, strict=True))

@@ -25,16 +25,16 @@ _LEVELS = range(3, 13)  # numbers of different values that may be categories
 def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
     """What the data look like that the model was not told, in sentences with the option to give.
 
-    Outliers, noise that grows with the mean, outputs that cannot be negative, rows that are there
-    twice, columns that may be categories. Each is a question rather than a finding, as residuals of
-    few observations tell little; of fewer than 12 they are not asked.
+    Outliers, noise that grows with the mean, outputs that cannot be negative, columns that may be
+    categories. Each is a question rather than a finding, as residuals of few observations tell
+    little; of fewer than 12 they are not asked.
 
     Args:
         model: A fitted model, or a mixture.
         loo: Its predictions of left-out observations.
     """
-    told = told_of(model)
-    found = []
+    told, found = told_of(model), []
+    growing = {"relative", "link"} & told.keys()  # errors may grow
     with torch.no_grad():
         noise = model.predict(loo.X, observation_noise=True).variance
         noise = (noise - model.predict(loo.X).variance).clamp_min(0) / loo.variance
@@ -44,16 +44,16 @@ def hints(model: TermsGP | StackedGP, loo: LeaveOneOut) -> list[str]:
         Y, mean, variance = (each[seen, j] for each in (loo.Y, loo.mean, loo.variance))
         own: list[str] = []
         if len(Y) >= _ENOUGH:
-            z = _residuals(Y, mean, variance, told.get("link"))
+            z = loo.residuals[seen, j]
             grows = float(noise[seen, j].median()) > _NOISE and _grows(z.abs(), mean.abs())
-            if grows and "relative" not in told:
+            if grows and not growing:
                 own.append(_GROWS)
             elif "heavy-tailed" not in told:
                 own += _outliers(z)
-        if "link" not in told:
+        if not growing:
             own += _positive(Y, mean, variance)
         found += [where + sentence for sentence in own]
-    return [*found, *_copies(loo.X, loo.Y), *_categories(model, loo.X, told)]
+    return [*found, *_categories(model, loo.X, told)]
 
 
 def told_of(model: TermsGP | StackedGP) -> dict[str, Any]:
@@ -79,16 +79,6 @@ _GROWS = (
     "Left-out residuals grow with the size of the prediction: is the noise relative? Then give "
     "likelihood='relative' (--noise relative)."
 )
-
-
-def _residuals(Y: Tensor, mean: Tensor, variance: Tensor, link: Any) -> Tensor:
-    """Residuals in standard deviations: of a link of the output, by its slope there."""
-    if link is None:
-        return (Y - mean) / variance.sqrt()
-    Y, mean = Y.unsqueeze(-1), mean.unsqueeze(-1)
-    sd = variance.sqrt() * link.log_slope(mean).exp().squeeze(-1)
-    residuals: Tensor = (link.value(Y) - link.value(mean)).squeeze(-1) / sd
-    return residuals
 
 
 def _grows(size: Tensor, mean: Tensor) -> bool:
@@ -132,19 +122,6 @@ def _positive(Y: Tensor, mean: Tensor, variance: Tensor) -> list[str]:
     return [
         f"All observations are positive, but {below} of {len(Y)} left-out intervals reach below "
         f"zero: if the output cannot be negative, {way}."
-    ]
-
-
-def _copies(X: Tensor, Y: Tensor) -> list[str]:
-    """A sentence on rows that are there again with the same outputs."""
-    rows = torch.cat([X, Y.nan_to_num(nan=torch.inf)], -1)
-    again = len(rows) - len(rows.unique(dim=0))
-    if not again:
-        return []
-    some = "1 row is" if again == 1 else f"{again} rows are"
-    return [
-        f"{some} there again with the same inputs and outputs: a copy is no second measurement, "
-        "and makes intervals too narrow. Take copies out."
     ]
 
 

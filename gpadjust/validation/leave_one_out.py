@@ -182,7 +182,8 @@ def leave_one_out(
         weight = _without_each(density)
         if link is not None:
             below = torch.special.ndtr((Y.unsqueeze(MCMC_DIM) - mean) / variance.sqrt())
-            own_pit = (weight * below).sum(MCMC_DIM).masked_fill(Y.isnan(), torch.nan)
+            own_pit = (weight * below).sum(MCMC_DIM).clamp(0, 1)  # but for rounding
+            own_pit = own_pit.masked_fill(Y.isnan(), torch.nan)
             (mean, variance), Y = link.moments(mean, variance), link.inverse(Y)
             density = density + link.log_slope(Y).unsqueeze(MCMC_DIM)
         mean, variance, density = _mixture_of(mean, variance, density, weight)
@@ -231,6 +232,7 @@ def mixed(each: Sequence[LeaveOneOut], weight: Tensor) -> LeaveOneOut:
     pit = None
     if any(loo.pit is not None for loo in each):
         pit = (weight * torch.stack([loo.below() for loo in each], MCMC_DIM)).sum(MCMC_DIM)
+        pit = pit.clamp(0, 1)
     return replace(each[0], mean=mean, variance=variance, log_density=density, pit=pit)
 
 

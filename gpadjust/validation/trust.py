@@ -134,8 +134,10 @@ def trust(
     with torch.no_grad():
         train_X, train_Y = observations(model)
         if X is None:
-            X = on_levels(_points(train_X, num_points), model.levels)
-        X = to_tensor(coded(X, model.levels, model.batches), "X")
+            X = _points(train_X, num_points)
+            X = on_levels(X, model.levels) if model.levels else X
+        X = coded(X, model.levels, model.batches) if model.levels else X
+        X = to_tensor(X, "X")
         if X.dim() != 2 or not len(X):
             raise ValueError(f"Expected X of shape n x d, one point or more, got {tuple(X.shape)}.")
         mean, variance = model.predict(X)

@@ -24,8 +24,8 @@ class BalldropSettings:
 class Balldrop(Experiment):
     """Drop times of three balls, and runs of a simulator: the fourth ball is predicted."""
 
-    runs: int = 1
-    """fits of each case"""
+    runs: int = 2
+    """fits of each case, by other seeds"""
     out: Path = Path("results/balldrop")
     settings: BalldropSettings = field(default_factory=BalldropSettings)
 
@@ -71,28 +71,70 @@ class Categories(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Curves(Experiment):
+    """Outputs that are a curve: errors, intervals of single points and of whole curves, time."""
+
+    runs: int = 8
+    """cases of each problem; of CKA and times a quarter"""
+    out: Path = Path("results/curves")
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "oscillator": "oscillator: the cubic spring is missing, 30 rows of 200 outputs",
+            "diffusion": "diffusion: the decay is missing, 20 rows of 100 outputs",
+            "spectrum": "spectrum: saturation and background are missing, 40 rows of 300 outputs",
+            "large": "100 rows of 1,000 outputs",
+        },
+        "model": {
+            "physics": "physics alone",
+            "parallel": "ParallelPartialGP",
+            "coupled": "ParallelPartialGP, coupled",
+            "alone": "ParallelPartialGP, no physics",
+            "components": "GPs of principal components",
+            "cka": "CKA of each of 8 outputs",
+            "times": "seconds of a fit",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        *("gpadjust.fit", "gpadjust.ParallelPartialGP", "gpadjust.CKA", "gpadjust.ZeroMeanGP"),
+    )
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """CKA is slow; times are of the largest problem alone."""
+        if (kind[0] == "large") != (kind[1] == "times"):
+            return ()
+        return self.seeds[: max(1, self.runs // 4)] if kind[1] in ("cka", "times") else self.seeds
+
+
+@dataclass(frozen=True, kw_only=True)
 class DriftSettings:
     """Settings that decide the numbers, fixed before the first run."""
 
-    hours: int = 4380
-    """observations, one an hour: half a year"""
-    first: int = 168
-    """of these before the first fit"""
-    refit_every: int = 24
-    """hours between refits of what is fitted again"""
-    window: int = 168
-    """observations that are fitted again, and that an exact model keeps"""
-    forget: int = 84
+    steps: int = 2190
+    """observations, one each two hours: half a year"""
+    first: int = 84
+    """of these before the first fit: a week"""
+    refit_every: int = 12
+    """observations between refits of what is fitted again: a day"""
+    window: int = 84
+    """observations that an exact model keeps: a week"""
+    refit_window: int = 168
+    """observations that are fitted again: two weeks"""
+    forget: int = 42
     """observations in which an RRA forgets"""
+    method: str = "map"
+    """of all fits"""
+    num_features: int = 64
+    """features of each term of an RRA"""
     check_every: int = 6
-    """hours between checks of the monitor"""
+    """observations between checks of the monitor"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drift(Experiment):
-    """Half a year of a pump that wears, predicted an hour ahead by models that are updated."""
+    """Half a year of a pump that wears, predicted a step ahead by models that are updated."""
 
-    runs: int = 3
+    runs: int = 2
     """pumps"""
     out: Path = Path("results/drift")
     settings: DriftSettings = field(default_factory=DriftSettings)
@@ -102,7 +144,7 @@ class Drift(Experiment):
             "never": "CKA, fitted once",
             "rra": "RRA, updated",
             "cka": "CKA, updated",
-            "refit": "CKA, updated each hour and fitted again each day",
+            "refit": "CKA, updated, and fitted again each day",
             "steady": "RRA, updated, of a pump that does not wear",
         }
     }
@@ -193,10 +235,53 @@ class Links(Experiment):
 
 
 @dataclass(frozen=True, kw_only=True)
+class NoisyinputsSettings:
+    """Settings that decide the numbers, fixed before the first run."""
+
+    observations: int = 40
+    """of a function"""
+    observations_of_law: int = 100
+    """of a law whose parameters are asked for"""
+    input_noise: float = 0.05
+    """standard deviation of an input's error, in its range"""
+    noise: float = 0.02
+    """standard deviation of an output's error, in its range"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noisyinputs(Experiment):
+    """Inputs that were measured with noise: errors, coverage, and parameters without bias."""
+
+    runs: int = 12
+    """cases of each problem"""
+    seed: int = 5000
+    """the first seed; 1000 to 1099 were for trying"""
+    out: Path = Path("results/noisyinputs")
+    settings: NoisyinputsSettings = field(default_factory=NoisyinputsSettings)
+
+    axes: ClassVar[Axes] = {
+        "problem": {
+            "wave": "wave",
+            "step": "step",
+            "forrester": "Forrester",
+            "heat": "heat (2 inputs)",
+            "pump": "pump (2 inputs)",
+            "line": "line: slope",
+            "decay": "decay: rate",
+            "saturation": "saturation: limit",
+        },
+        "model": {"ignoring": "ignoring it", "noisy": "train_Xvar"},
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        *("gpadjust.fit", "gpadjust.CKA", "gpadjust.CalibratedPhysics"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Outliers(Experiment):
     """One in twenty observations is far off: errors beside those of clean data."""
 
-    runs: int = 8
+    runs: int = 5
     """cases of each problem and size"""
     out: Path = Path("results/outliers")
 
@@ -234,6 +319,36 @@ class Relative(Experiment):
         "noise": {"default": "one size", "relative": "relative"},
     }
     calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA", "gpadjust.ZeroMeanGP")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepeatsSettings:
+    """Settings that decide the numbers, fixed before the first run."""
+
+    distinct: int = 40
+    """inputs that differ"""
+    noise: float = 0.1
+    """standard deviation of the noise"""
+    copied: float = 0.3
+    """share of the rows that a careless join has twice"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeats(Experiment):
+    """Repeated rows: the same answers at the cost of distinct ones; and rows that stand twice."""
+
+    runs: int = 6
+    """cases of each size"""
+    seed: int = 5000
+    """the first seed; 1000 to 1099 were for trying"""
+    out: Path = Path("results/repeats")
+    settings: RepeatsSettings = field(default_factory=RepeatsSettings)
+
+    axes: ClassVar[Axes] = {
+        "rows": {"400": "400", "1000": "1000", "copies": "80, of which 0.3 stand twice"},
+        "method": {"map": "map", "bayes": "bayes"},
+    }
+    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +393,8 @@ class Vanishing(Experiment):
 
     axes: ClassVar[Axes] = {
         "problem": {
-            "ball": "ball: drag is missing, small at first",
+            "ball": "ball: drag is missing, taken as none until 0.5 s",
+            "early": "ball, until 0.3 s, of new seeds",
             "valve": "valve: its loss is missing, none when open",
             "misplaced": "valve, taken as open at 0.8",
         },
@@ -294,8 +410,10 @@ class Vanishing(Experiment):
     )
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """A wrong place is of the vanishing delta alone."""
-        return () if kind[0] == "misplaced" and kind[1] != "vanishing" else self.seeds
+        """Other places are of the vanishing delta alone, and one was chosen after the first run."""
+        if kind[0] in ("early", "misplaced") and kind[1] != "vanishing":
+            return ()
+        return range(3000, 3000 + self.runs) if kind[0] == "early" else self.seeds
 
 
 @dataclass(frozen=True, kw_only=True)

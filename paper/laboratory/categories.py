@@ -205,7 +205,7 @@ def draw(runs: Sequence[Run], experiment: Categories) -> list[Path]:
         axes[0].text(0.02, i - 0.22, label, transform=axes[0].get_yaxis_transform(), va="bottom")
     axes[0].set(xscale="log", xlabel="RMSE [m]", yticks=[], ylim=(4.5, -0.8))
     for each in (r for r in runs if r["model"] == "ours"):
-        (mean, sd), true = each["offsets"], np.array(each["true_offsets"])
+        (mean, _), true = each["offsets"], np.array(each["true_offsets"])
         # Of all rigs together only the differences are known.
         mean, true = np.array(mean) - np.mean(mean), true - true.mean()
         axes[1].plot(true, mean, "o", color=_COLORS[-1], ms=4, alpha=0.6)

@@ -30,7 +30,6 @@ SAYS = {
     "relative": "residuals grow",
     "positive": "cannot be negative",
     "decades": "spans",
-    "copies": "there again",
     "rigs": "names rather than sizes",
 }
 
@@ -49,8 +48,6 @@ def data_of(found: Pair, kind: str, seed: int) -> tuple[Tensor, Tensor, bool]:
         rows = torch.randperm(POINTS, generator=draw)[: POINTS // 20]
         size, sign = torch.rand(2, len(rows), 1, generator=draw, dtype=torch.float64)
         Y[rows] += noise * 10 ** (1 + size) * (sign - 0.5).sign()
-    if kind == "copies":
-        X, Y = torch.cat([X, X[:3]]), torch.cat([Y, Y[:3]])
     if kind == "rigs":
         rig = torch.randint(4, (POINTS, 1), generator=draw)
         X = torch.cat([X, rig.double()], dim=-1)

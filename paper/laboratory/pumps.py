@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -92,3 +93,37 @@ def inputs(number: int, generator: torch.Generator) -> Tensor:
 def measured(head: Tensor, generator: torch.Generator) -> Tensor:
     """Heads with noise."""
     return head + NOISE * torch.randn(head.shape, generator=generator, dtype=torch.float64)
+
+
+class Wear:
+    """Observations of a pump that wears slowly, and breaks a little once.
+
+    Args:
+        steps: Number of them.
+        seed: Of the pump, and all else.
+        wears: False for a pump that stays as it is.
+
+    Attributes:
+        X: Inputs, ``steps x 2``, which wander through the range.
+        truth: Heads, ``steps x 1``, and ``Y`` with noise.
+        breaks: The step of the sudden change.
+    """
+
+    def __init__(self, steps: int, seed: int, wears: bool = True) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        pump = Pump.drawn(generator)
+        low, high = (torch.tensor(end, dtype=torch.float64) for end in (LOWER, UPPER))
+        drawn = torch.randn(steps, 2, generator=generator, dtype=torch.float64)
+        kept = torch.tensor([math.exp(-1 / 6), math.exp(-1 / 12)], dtype=torch.float64)
+        z = drawn.clone()
+        for i in range(1, steps):
+            z[i] = kept * z[i - 1] + (1 - kept.square()).sqrt() * drawn[i]
+        share = 0.5 * (1 + torch.erf(z / math.sqrt(2)))
+        self.X = low + (high - low) * share
+        self.breaks = int(steps * (0.55 + 0.2 * torch.rand(1, generator=generator).item()))
+        time = torch.arange(steps, dtype=torch.float64).unsqueeze(-1) / steps * wears
+        broken = (torch.arange(steps).unsqueeze(-1) >= self.breaks) * float(wears)
+        worn: Any = pump.worn + 0.08 * time
+        leak: Any = pump.leak + 0.08 * time + 0.06 * broken
+        self.truth = replace(pump, worn=worn, leak=leak).head(self.X)
+        self.Y = measured(self.truth, generator)

@@ -1,15 +1,18 @@
 """Does a delta that is zero where the formula is right hand the truth to the parameters?
 
-Tried before the first run, of the ball, on seeds 1000 to 1047 (twelve of them for the first
-two rows). The valve had one form from the start, which held 0.98 there.
+Tried of the ball, on seeds 1000 and up: before the first run on 48 of them (the first two rows on
+twelve), and after it, as it held 0.84 on seeds 0 to 99, on 130. The row until 0.3 s was then run on
+new seeds. The valve had one form from the start, which held 0.98 of 48.
 
-| zero at | g held | median width in m/s² |
-|---|---|---|
-| nowhere | 0.17 | 2.19 |
-| 0 s | 0.08 | 2.08 |
-| 0, 0.2 and 0.4 s | 0.96 | 0.85 |
-| 0, 0.25 and 0.5 s | 0.96 | 0.73 |
-| 0, 0.1, ..., 0.5 s | 0.81 | 0.49 |
+| zero at | g held of 48 | of 130 | median width in m/s² |
+|---|---|---|---|
+| nowhere | 0.17 | - | 2.19 |
+| 0 s | 0.08 | - | 2.08 |
+| 0, 0.1 and 0.2 s | - | 0.92 | 1.48 |
+| 0, 0.15 and 0.3 s | - | 0.92 | 1.16 |
+| 0, 0.2 and 0.4 s | 0.96 | 0.92 | 0.89 |
+| 0, 0.25 and 0.5 s | 0.96 | - | 0.73 |
+| 0, 0.1, ..., 0.5 s | 0.81 | - | 0.49 |
 """
 
 from __future__ import annotations
@@ -56,7 +59,7 @@ class Case(NamedTuple):
     truth: Tensor  # without noise
 
 
-def _ball(draw: np.random.Generator) -> Case:
+def _ball(draw: np.random.Generator, until: float = 0.5) -> Case:
     """A ball that is dropped, seen with an sd of 5 cm: f_p has no drag, which is small at first."""
     height, drag = draw.uniform(40, 60), draw.uniform(0.002, 0.02)  # m, 1/m
 
@@ -68,7 +71,7 @@ def _ball(draw: np.random.Generator) -> Case:
     t, test = (torch.linspace(0.05, 2, n, dtype=torch.float64).unsqueeze(-1) for n in (20, 101))
     Y = system(t) + 0.05 * torch.from_numpy(draw.normal(size=(20, 1)))
     X, test_X = (pd.DataFrame({"time": each[:, 0]}) for each in (t, test))
-    where = {"time": [0.0, 0.25, 0.5]}
+    where = {"time": [0.0, until / 2, until]}
     return Case(X, Y, law, "g", _GRAVITY, where, test_X, system(test))
 
 
@@ -92,6 +95,7 @@ def _valve(draw: np.random.Generator, open_at: float = 1.0) -> Case:
 
 PROBLEMS: Mapping[str, Callable[[np.random.Generator], Case]] = {
     "ball": _ball,
+    "early": partial(_ball, until=0.3),
     "valve": _valve,
     "misplaced": partial(_valve, open_at=0.8),
 }
@@ -174,17 +178,20 @@ def judge(found: pd.DataFrame) -> list[Judged]:
     """The verdict on the target."""
     ours = found[found["model"] == "vanishing"].groupby("problem")["held"].mean()
     shares = {name: ours[name] for name in ("ball", "valve") if name in ours}
+    later = (
+        f"; the ball until 0.3 s, chosen after it, {ours['early']:.2f}" if "early" in ours else ""
+    )
     text = (
         "95 % intervals hold the ball's true g and the valve's true friction in 0.90 of the seeds"
     )
     is_met = len(shares) == 2 and all(share >= _HELD for share in shares.values())
-    measured = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
+    measured = ", ".join(f"{name} {share:.2f}" for name, share in shares.items()) + later
     return [Judged("V1", text, met(is_met), measured)]
 
 
 def draw(runs: Sequence[Run], experiment: Vanishing) -> list[Path]:
     """Draw the intervals of the first seeds, as multiples of the true value."""
-    titles = {k: v for k, v in experiment.axes["problem"].items() if k != "misplaced"}
+    titles = {k: v for k, v in experiment.axes["problem"].items() if k in ("ball", "valve")}
     figure, axes = panels([*titles.values()], 2, (4.6, 3.4), share=False)
     for ax, problem in zip(axes, titles, strict=True):
         for offset, (model, label) in enumerate(experiment.axes["model"].items()):

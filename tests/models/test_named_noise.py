@@ -142,7 +142,7 @@ def test_known_noise_has_outliers_too(gross: tuple[Tensor, Tensor]) -> None:
 
 def test_bad_input(gross: tuple[Tensor, Tensor]) -> None:
     X, Y = gross
-    with pytest.raises(TypeError, match="a sequence of both, or a Gaussian"):
+    with pytest.raises(ValueError, match="a sequence of both, or a Gaussian"):
         CKA(X, Y, physics=wave, likelihood="Student")
     with pytest.raises(ValueError, match="relative already"):
         CKA(

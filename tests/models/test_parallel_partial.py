@@ -114,7 +114,7 @@ def test_a_row_left_out_is_predicted_by_a_model_without_it(options):
     mean, variance = model.left_out()
     rest = make(X[1:], Y[1:], **options)
     settled(rest)
-    for name in ("scales", "along", "profile"):
+    for name in ("scales", "noises", "along", "profile"):
         setattr(rest, name, getattr(model, name))
     rest.unit, rest._remembered = model.unit, None
     rest._prepare(decay(X[1:]))
@@ -140,8 +140,8 @@ def test_the_whole_house(options, tmp_path):
     noisy = model.interval(TEST, observation_noise=True, simultaneous=True)
     assert (noisy[1] - noisy[0] > whole[1] - whole[0]).all()
     loo = leave_one_out(model)
-    assert (loo.score().coverage.mean() > 0.85)
-    assert (loo.score().rmse.mean() < 0.1)
+    assert loo.score().coverage.mean() > 0.85
+    assert loo.score().rmse.mean() < 0.1
     more = model.condition_on_observations(TEST, truth(TEST))
     assert more.components(TEST, False)[1].mean() < model.components(TEST, False)[1].mean()
     save(model, tmp_path / "model.pt")

@@ -44,6 +44,12 @@ def rra(**options):
     return RRA(X, Y, physics=wave, num_features=20, **options)
 
 
+def calm(model):
+    """Take errors of recent observations as predicted, so that variances are the kernels'."""
+    model.local_errors.recent = 0 * model.local_errors.recent
+    return model
+
+
 def assert_same(one, two, tolerance=1e-8):
     for name in ("rho", "delta"):
         for moment in ("mean", "variance"):
@@ -120,7 +126,7 @@ def test_an_exact_model_keeps_a_window(model_class, samples):
     want.train_targets, want.prediction_strategy = grown.train_targets[..., -10:], None
     for i in range(9):
         model.update(NEW_X[i : i + 1], NEW_Y[i : i + 1], forget=10)
-    pair = zip(model.predict(AT), want.predict(AT), strict=True)
+    pair = zip(calm(model).predict(AT), want.predict(AT), strict=True)
     for one, two in pair:
         torch.testing.assert_close(one, two)
     assert model.train_targets.shape[-1] == 10
@@ -156,13 +162,17 @@ def test_the_whole_house(build, tmp_path):
     assert_same(model, deepcopy(model), 1e-12)
     save(model, tmp_path / "model.pt")
     assert_same(model, load(tmp_path / "model.pt"), 1e-9)
+    wider = deepcopy(model)
+    wider.local_errors.recent = 0 * model.local_errors.recent + 30.0 * torch.tensor([2.0, 1.0])
+    ratio = wider.predict(AT).variance / calm(deepcopy(model)).predict(AT).variance
+    assert ((ratio > 1.5) & (ratio < 2)).all()
     drawn = model.sample_functions(400, seed=0)(AT)
     sd = model.predict(AT).variance.sqrt()
     assert ((drawn.mean(0) - model.predict(AT).mean).abs() < 0.4 * sd + 1e-3).all()
     more = model.condition_on_observations(*rows(3, 2))
     again = deepcopy(model)
     again.update(*rows(3, 2), forget=10**9)
-    assert_same(more, again, 1e-5)
+    assert_same(calm(more), calm(again), 1e-5)
     assert "noise" in model.summary()
     if isinstance(model, RRA):
         kept = model.predict(AT).mean
@@ -174,6 +184,16 @@ def test_the_whole_house(build, tmp_path):
     else:
         leave_one_out(model)
         fit(model, "map")
+
+
+def test_variances_follow_the_errors_of_what_was_predicted():
+    model = rra().eval()
+    predicted = model.predict(NEW_X, observation_noise=True)
+    squares = ((NEW_Y - predicted.mean).square() / predicted.variance).squeeze(-1)
+    model.update(NEW_X, NEW_Y, forget=5)
+    weights = torch.exp(torch.arange(8, -1, -1) / -5.0).double()
+    want = torch.stack([(weights * squares).sum(), weights.sum()])
+    torch.testing.assert_close(model.local_errors.recent, want)
 
 
 @pytest.mark.parametrize("more", [False, True])

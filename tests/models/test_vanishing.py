@@ -108,6 +108,19 @@ def test_several_outputs_and_a_transform_of_inputs(valve, at_open):
     assert model.sample_functions(2, seed=0)(at_open).shape == (2, 7, 2)
 
 
+def test_beside_and_for_categories(valve):
+    X, Y = valve
+    X = X.assign(metal=["brass", "steel"] * 8)
+    for where, there in [({"valve": 1.0}, {"valve": 1.0}), ({"metal": 1}, {"metal": "steel"})]:
+        kernels = dict.fromkeys(["rho_covar_module", "delta_covar_module"], vanishing_rbf(where))
+        model = CKA(X, Y, physics=lambda X: X[:, 1] ** 2, **kernels)
+        table = model.adjustments(X.assign(**there))
+        assert table["delta upper"].abs().max() < 1e-6
+        assert model.adjustments(X)["delta upper"].max() > 0.01
+    with pytest.raises(ValueError, match=r"category.*level"):
+        vanishing_rbf({"metal": "steel"})
+
+
 def test_places_as_frames_arrays_and_numbers():
     names = ("valve", "flow")
     for where, expected in [

@@ -235,3 +235,39 @@ def test_help_has_an_example_and_needs_no_torch():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert "--inputs flow,speed --outputs head --physics pump:head" in run.stdout
+
+
+def test_kinds_of_data(folder, read, undrawn):
+    rigs = ["old", "new", "lent"]
+    rows = [f"{x},{rigs[i % 3]},{y + 3}" for i, (x, y) in enumerate(ROWS)]
+    (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
+    (folder / "hill.py").write_text("def wave(X):\n    return 4 + X[:, 0].sin()\n")
+    kinds = "--positive --outliers --batches rig --input-noise time=0.01"
+    options = ["--inputs", "time,rig", "--outputs", "head", "--physics", "hill:wave"]
+    assert main(["report", "data.csv", "--fit", "map", *options, *kinds.split()]) == 0
+    text = read(folder / "report.html").text
+    assert "The physics reads rig as a number: 0 is lent, 1 is new and 2 is old." in text
+    for words in ("heavy tails", "time by 0.01 s", "head above 0"):
+        assert words in text
+    model = load(folder / "report.pt", physics=lambda X: 4 + X[:, :1].sin())
+    assert model.link is not None
+    assert model.levels == {1: ("lent", "new", "old")}
+    kinds = "--noise relative --categories rig"
+    assert main(["report", "data.csv", "--fit", "map", *options, *kinds.split()]) == 0
+    text = read(folder / "report.html").text
+    assert "Assumed: noise that grows with the physics" in text
+    assert "categories in rig" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    {
+        ("--inputs", "time,note"): "If these are names, say so by --categories note.",
+        ("--categories", "note"): "The category 'note' is none of --inputs.",
+        ("--bounds", "1,0"): "Expected --bounds as two numbers, the lower first: 0,1; found '1,0'",
+        ("--input-noise", "head=1"): "--input-noise names 'head', which is none of --inputs",
+        ("--input-noise", "time=-1"): "standard deviations in the inputs' units, such as time=0.5",
+    }.items(),
+)
+def test_kinds_that_are_none(folder, capsys, options, says):
+    assert says in _fails(capsys, *options)

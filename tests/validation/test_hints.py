@@ -60,14 +60,12 @@ def test_positive_outputs(noise):
     assert "outcome_transform='log' (--positive)" in sentence
 
 
-def test_copies_and_categories(noise):
+def test_categories(noise):
     rig = torch.arange(40).remainder(4).double().unsqueeze(-1)
     inputs, Y = torch.cat([X, rig], -1), truth(X) + 100 + noise
     (hint,) = found(inputs, Y)
     assert "x2 has 4 different values, 0 to 3" in hint
     assert "categorical=['x2'] (--categories x2)" in hint
-    (hint,) = found(torch.cat([X, X[:3]]), torch.cat([Y, Y[:3]]))
-    assert hint.startswith("3 rows are there again with the same inputs and outputs")
 
 
 def test_of_a_comparison_each_output_has_its_own(noise):

@@ -85,7 +85,7 @@ def plot_adjustment(
         x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
         X = base.repeat(num_points, 1)
         X[:, i] = x
-        X = on_levels(X, getattr(model, "levels", {}))
+        X = on_levels(X, model.levels) if getattr(model, "levels", None) else X
         for ax, name in zip(axes[:, i], names, strict=True):
             with torch.no_grad():
                 mean, half = mean_and_half_width(model.term(name, X), output, level)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_whole
+from gpadjust.models.levels import on_levels
 from gpadjust.validation.leave_one_out import observations
 from gpadjust.validation.plots.adjustments import adjustments_of, domain, plot_adjustment
 from gpadjust.validation.plots.drawing import (
@@ -66,6 +67,7 @@ def plot_model(
     for i, ax in enumerate(axes[0]):
         X = base.repeat(num_points, 1)
         X[:, i] = x = torch.linspace(bounds[0, i], bounds[1, i], num_points, dtype=base.dtype)
+        X = on_levels(X, getattr(model, "levels", {}))
         with torch.no_grad():
             mean, half = mean_and_half_width(model.posterior(X), output, level)
             styles = cycle(("--", "-.", ":"))
