@@ -20,7 +20,7 @@ from tests.systems import line
 
 ROOT = Path(__file__).parents[1]
 WITH_DATA = {"control", "records", "saving"}  # pages that are tested below
-GUIDE = [p for p in sorted((ROOT / "docs" / "guide").glob("*.md")) if p.stem not in WITH_DATA]
+GUIDE = [p for p in sorted((ROOT / "docs" / "guide").rglob("*.md")) if p.stem not in WITH_DATA]
 FIRST = [ROOT / "docs" / f"{name}.md" for name in ("start", "install", "choose")]
 
 

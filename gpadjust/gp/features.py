@@ -168,7 +168,9 @@ class SisterFeatures(Module):
         for term, form in zip(terms, forms, strict=True) if num_features else ():
             own = deepcopy(term.kernel)
             base, outer, _ = stationary_parts(own, term.num_inputs) or (own, None, None)
-            base.lengthscale, outer.outputscale = form.lengthscale, form.scale
+            base.lengthscale = form.lengthscale
+            if outer is not None:
+                outer.outputscale = form.scale
             maps += _feature_maps(own, term.num_inputs, num_features)
         self.maps = ModuleList(maps)
         size = kernel.sister.root.shape[-1] + len(maps) * num_features

@@ -286,7 +286,9 @@ class SumOfTerms(CompositeKernel):
         shift: Any = 0.0
         for term in terms:
             shift = shift + getattr(term.basis, "moved_mean", 0.0)
-        return self.weighted(x, [(term, term.weights(x)) for term in terms], shift)
+        parts = [(term, term.weights(x)) for term in terms]
+        taught = None if self.sister is None else self.sister.at(x, parts, self.terms)
+        return WeightedSum(x, parts, shift, taught)
 
     def weighted(
         self, x: Tensor, parts: Sequence[tuple[Term, Tensor | None]], shift: Tensor | float

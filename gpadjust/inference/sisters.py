@@ -53,7 +53,7 @@ def fit_with_prior(
     model.covar_module.sister = None
     taught.covar_module.sister = sister_of(model, others)
     if isinstance(result, FitResult):
-        found = run(taught, search, **own)
+        found: Any = run(taught, search, **own)
         share = (found.log_likelihood + _ODDS > result.log_likelihood).to(model.train_targets)
         samples = _values(taught)
     else:
@@ -196,10 +196,10 @@ def sister_of(model: TermsGP, others: Sequence[TermsGP]) -> Sister:
         covariance = covariance / len(each) + between * (1 + 1 / len(each))
     values, vectors = torch.linalg.eigh(covariance)
     root = vectors * values.clamp_min(0).sqrt().unsqueeze(-2)
-    own = [
+    given = [
         [model.term_mean(model.terms[i].name, j) for i in terms] for j in range(model.num_outputs)
     ]
-    own = mean.new_tensor(own).repeat_interleave(len(points), -1)
+    own = mean.new_tensor(given).repeat_interleave(len(points), -1)
     mean = mean - own.reshape(mean.shape)
     lead = model._aug_batch_shape
     forms = [_form(others, i) for i in terms]
@@ -309,6 +309,8 @@ def _check_terms(model: TermsGP, which: str) -> None:
         )
     elif model.rho_names and any(p.requires_grad for p in model.physics.parameters()):
         why = "has a physics that is trained: train it first, and stop its gradients"
+    elif any(term.scaled_by for term in model.terms):
+        why = "has a physics that is emulated: take its emulator as exact, FunctionPhysics(physics)"
     elif any(term.learns_mean for term in model.terms):
         why = "has unknown prior means: give them as numbers (rho_mean=1.0)"
     elif getattr(getattr(model, "input_transform", None), "base", None) is not None:

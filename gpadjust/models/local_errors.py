@@ -60,21 +60,20 @@ class LocalErrors(Module):
     @property
     def are_expected(self) -> bool:
         """True if no error is larger than predicted, so that no variance is changed."""
-        return bool((self.squares <= 1).all() and (self._factor() <= 1).all())
+        return bool((self.squares <= 1).all() and (self.recent.diff(dim=-1) >= 0).all())
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Return the factor of variances at inputs ``... x (m) x q x d``, ``... x (m) x q``."""
-        return self.near(x) * self._factor()
+    def forward(self, x: Tensor, recent: bool = True) -> Tensor:
+        """Return the factor of variances at inputs ``... x (m) x q x d``, ``... x (m) x q``.
 
-    def near(self, x: Tensor) -> Tensor:
-        """The part of left-out observations in that, of the same shape."""
+        Without ``recent`` it is that of left-out observations alone.
+        """
         near = Stationary(self.lengthscale, x.new_ones(()), RBF).covariance(x, self.points)
         total = (near @ self.squares.unsqueeze(-1)).squeeze(-1)
-        return ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0)
-
-    def _factor(self) -> Tensor:
-        errors, number = self.recent.unsqueeze(-2).unbind(-1)
-        return ((_RECENT + errors) / (_RECENT + number)).clamp_min(1.0)
+        factor = ((_EXPECTED + total) / (_EXPECTED + near.sum(-1))).clamp_min(1.0)
+        if recent:
+            errors, number = self.recent.unsqueeze(-2).unbind(-1)
+            factor = factor * ((_RECENT + errors) / (_RECENT + number)).clamp_min(1.0)
+        return factor
 
     def observe(self, squares: Tensor, forget: float) -> None:
         """Take squared errors of new observations, ``batch_shape x (m) x k``; NaN for none."""

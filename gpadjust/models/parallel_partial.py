@@ -40,7 +40,6 @@ DEGREES = 2.0  # of freedom of the prior of an output's variance, around that of
 _VAGUE = 100.0  # prior standard deviation of an unknown constant, in residuals' standard deviations
 _CAUTION = 0.5  # standard errors that left-out errors are taken as larger by
 _DRAWS = 2_000  # of curves, for intervals that hold all of one
-_AT_ONCE = 2**22  # numbers in these draws
 _MOST = 4_000  # points times outputs, of a joint covariance of coupled outputs
 
 
@@ -142,6 +141,11 @@ class ParallelPartialGP(TermsModel):
                     "not learn: learn them with a CKA of a few outputs, and give the physics with "
                     "their values."
                 )
+            if made.is_emulated:
+                raise ValueError(
+                    f"Physics {made.name!r} is emulated, with an error that a ParallelPartialGP has "
+                    "no term for: FunctionPhysics(physics) takes the emulator's mean as exact."
+                )
             self.input_transform = PhysicsInput(made, data.X.shape[-1], input_transform)
             with torch.no_grad():
                 f_p = self.input_transform.values(data.X)
@@ -207,7 +211,7 @@ class ParallelPartialGP(TermsModel):
     # What a TermsModel has, of the shared kernel.
 
     @property
-    def covar_module(self) -> SumOfTerms:
+    def covar_module(self) -> SumOfTerms:  # type: ignore[override]
         """The shared kernel."""
         return self.shared.covar_module
 
@@ -222,7 +226,7 @@ class ParallelPartialGP(TermsModel):
         return self.shared.train_inputs
 
     @property
-    def train_targets(self) -> Tensor:
+    def train_targets(self) -> Tensor:  # type: ignore[override]
         """Targets in the user's units, ``m x n``."""
         return self._Y.mT
 
@@ -237,7 +241,7 @@ class ParallelPartialGP(TermsModel):
         return self.scales.shape[:1]
 
     @property
-    def num_samples(self) -> int:
+    def num_samples(self) -> int:  # type: ignore[override]
         """The number ``S`` of samples; 1 before a fit."""
         return len(self.scales)
 
@@ -548,7 +552,7 @@ class ParallelPartialGP(TermsModel):
         number = -(-_DRAWS // self.num_samples)
         points = mean.movedim(MCMC_DIM, 0).flatten(1, -2).transpose(0, 1)  # q x S x m
         middle, whole = middle.flatten(0, -2), whole.flatten(0, -2)
-        noise = self._noise_of(observation_noise, mean.shape[-2])
+        noise: Any = self._noise_of(observation_noise, mean.shape[-2])
         found = []
         if self.coordinate is not None:
             inputs, _ = self._inputs(X)
@@ -560,21 +564,19 @@ class ParallelPartialGP(TermsModel):
         variance = variance.movedim(MCMC_DIM, 0).flatten(1, -2).transpose(0, 1)
         generator = torch.Generator().manual_seed(0)
         options: Any = {"generator": generator, "dtype": mean.dtype}
-        at_once = max(1, _AT_ONCE // (number * self.num_outputs))
-        for i in range(len(points)):
-            for s, part in enumerate(points[i].unbind(0)):
-                maxima = []
-                for size_of in torch.arange(number).split(at_once):
-                    white = torch.randn(len(size_of), self.num_outputs, **options)
-                    if self.coordinate is None:
-                        drawn = white * variance[i, s].sqrt()
-                    else:
-                        own = torch.randn(len(size_of), basis.shape[-1], **options) * roots[i, s]
-                        drawn = own @ basis[s].mT * size[s] + white * noise[i, s].sqrt()
-                    deviation = (drawn + part - middle[i]).abs() / whole[i].sqrt()
-                    maxima.append(deviation.amax(-1))
-                found.append(torch.cat(maxima))
-        every = torch.stack(found).reshape(len(points), -1).mT
+        for s in range(self.num_samples):  # with the same draws at all points
+            white = torch.randn(number, self.num_outputs, **options)
+            if self.coordinate is not None:
+                own = torch.randn(number, basis.shape[-1], **options)
+            maxima = []
+            for i, part in enumerate(points[:, s]):
+                if self.coordinate is None:
+                    drawn = white * variance[i, s].sqrt()
+                else:
+                    drawn = (own * roots[i, s]) @ basis[s].mT * size[s] + white * noise[i, s].sqrt()
+                maxima.append(((drawn + part - middle[i]).abs() / whole[i].sqrt()).amax(-1))
+            found.append(torch.stack(maxima))
+        every = torch.cat(found, -1).mT
         return every.reshape(-1, *mean.shape[:MCMC_DIM], mean.shape[-2])
 
     @torch.no_grad()

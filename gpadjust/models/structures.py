@@ -76,10 +76,13 @@ class CKA(TermsGP):
             its levels, sorted, from 0.
         batch: Names or numbers of columns of which each level has an offset of its own, a term of
             the column's name; other levels are new ones.
+        train_Xvar: Known variances of errors of measured inputs: of the shape of ``train_X``, one for
+            each input, or one number; zero where they are exact. Predictions are at exact inputs.
 
     Warns:
         PhysicsWarning: If f_p is obviously off at the training inputs, and shows why.
-        UserWarning: Of more than 5,000 points; take :class:`~gpadjust.VariationalCKA`.
+        UserWarning: Of rows that equal an earlier one, outputs included, where this is no rounding;
+            of more than 5,000 points; take :class:`~gpadjust.VariationalCKA`.
 
     Raises:
         TypeError: If data are no float64 tensors, arrays or frames, or the physics is not callable.

@@ -255,8 +255,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        rows, targets = self.noise.rows, self.train_targets
-        targets = targets if rows is None else self.noise.trusted(targets)
+        targets, noise = self.train_targets, self.noise
+        targets = targets if noise.rows is None else noise.trusted(targets)
         squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)

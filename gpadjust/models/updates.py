@@ -52,7 +52,7 @@ def judge(model: Any, new: NewRows, forget: float) -> None:
     if model.num_samples is not None:
         variance = variance.mean(0) + mean.var(0, correction=0)
         missed, x = missed.mean(0), x[0]
-    errors.observe(missed.square() / (variance * errors.near(x)), forget)
+    errors.observe(missed.square() / (variance * errors(x, recent=False)), forget)
 
 
 @torch.no_grad()

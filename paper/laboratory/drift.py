@@ -1,10 +1,12 @@
 """Half a year of a pump that wears, predicted a step of two hours ahead.
 
 What is fitted again: a CKA of the last two weeks, to its most likely hyper-parameters, each day;
-between it is updated at each step. Tried on other seeds (900 and 901): two weeks for this one, as of
-one it errs by 0.34 m, and the updated models by 0.29 m. An RRA whose weights return to their prior
-as a random walk does forgets too much (0.30 m beside 0.14 m, of a faster drift), as its prior is
-vague. Intervals of fixed hyper-parameters hold 0.89; so variances follow recent errors.
+between it is updated at each step.
+
+Tried on other seeds (900 and 901): of one week it errs by 0.34 m, where updated models err by
+0.29 m. An RRA whose weights wander and return to their prior forgets too much (0.30 m, where fading
+observations err by 0.14 m, of a faster drift), as its prior is vague. Intervals with the noise of
+the first fit hold 0.89, so that variances follow recent errors.
 """
 
 from __future__ import annotations

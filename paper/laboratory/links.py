@@ -218,6 +218,8 @@ def judge(found: pd.DataFrame) -> list[Judged]:
 def draw(runs: Sequence[Run], experiment: Links) -> list[Path]:
     """Draw the intervals of observations of the first seed, with and without the link."""
     shown = [p for p in ("diode", "reactor") if any(r["problem"] == p for r in runs)]
+    if not shown:
+        return []
     titles = [experiment.axes["problem"][p] for p in shown]
     figure, axes = panels(titles, len(shown), (4.6, 3.2), share=False)
     for ax, problem in zip(axes, shown, strict=True):

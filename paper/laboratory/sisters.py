@@ -112,7 +112,7 @@ def ratio(runs: pd.DataFrame) -> tuple[float, float, float]:
     """The geometric mean of the error with over that without, and its interval of 95 %."""
     logs = np.log(runs["rmse_with"] / runs["rmse_without"]).to_numpy()
     error = logs.std(ddof=1) / np.sqrt(len(logs)) if len(logs) > 1 else 0.0
-    return tuple(np.exp(logs.mean() + k * error) for k in (0, -1.96, 1.96))  # type: ignore[return-value]
+    return tuple(np.exp(logs.mean() + k * error) for k in (0, -1.96, 1.96))
 
 
 def draw(runs: Sequence[Run], experiment: Sisters) -> list[Path]:

@@ -7,6 +7,7 @@ import pytest
 from paper.__main__ import main
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "only", "number"),
     [("links", ["rate", "pump", "linked", "default"], 8), ("categories", ["each", "ours"], 4)],
