@@ -71,8 +71,9 @@ class CKA(TermsGP):
             ``"logit"`` of shares, or bounds ``(lower, upper)``, see
             :class:`~gpadjust.models.Logit`; rho, delta and noise are then of its values.
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
-        train_Xvar: Known variances of errors of measured inputs: of the shape of ``train_X``, one for
-            each input, or one number; zero where they are exact. Predictions are at exact inputs.
+        train_Xvar: Known variances of errors of measured inputs: of the shape of ``train_X``, one
+            for each input, or one number; zero where they are exact. Predictions are at exact
+            inputs.
         categorical: Names or numbers of the columns that are categories, or a mapping from these to
             their levels. Text in a DataFrame is one without being named; f_p gets the numbers of
             its levels, sorted, from 0.

@@ -337,7 +337,7 @@ class RepeatsSettings:
 class Repeats(Experiment):
     """Repeated rows: the same answers at the cost of distinct ones; and rows that stand twice."""
 
-    runs: int = 6
+    runs: int = 3
     """cases of each size"""
     seed: int = 5000
     """the first seed; 1000 to 1099 were for trying"""
@@ -414,76 +414,3 @@ class Vanishing(Experiment):
         if kind[0] in ("early", "misplaced") and kind[1] != "vanishing":
             return ()
         return range(3000, 3000 + self.runs) if kind[0] == "early" else self.seeds
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoisyinputsSettings:
-    """Settings that decide the numbers, fixed before the first run."""
-
-    observations: int = 40
-    """of a function"""
-    observations_of_law: int = 100
-    """of a law whose parameters are asked for"""
-    input_noise: float = 0.05
-    """standard deviation of an input's error, in its range"""
-    noise: float = 0.02
-    """standard deviation of an output's error, in its range"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Noisyinputs(Experiment):
-    """Inputs that were measured with noise: errors, coverage, and parameters without bias."""
-
-    runs: int = 12
-    """cases of each problem"""
-    seed: int = 5000
-    """the first seed; 1000 to 1099 were for trying"""
-    out: Path = Path("results/noisyinputs")
-    settings: NoisyinputsSettings = field(default_factory=NoisyinputsSettings)
-
-    axes: ClassVar[Axes] = {
-        "problem": {
-            "wave": "wave",
-            "step": "step",
-            "forrester": "Forrester",
-            "heat": "heat (2 inputs)",
-            "pump": "pump (2 inputs)",
-            "line": "line: slope",
-            "decay": "decay: rate",
-            "saturation": "saturation: limit",
-        },
-        "model": {"ignoring": "ignoring it", "noisy": "train_Xvar"},
-    }
-    calls: ClassVar[tuple[str, ...]] = (
-        *("gpadjust.fit", "gpadjust.CKA", "gpadjust.CalibratedPhysics"),
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class RepeatsSettings:
-    """Settings that decide the numbers, fixed before the first run."""
-
-    distinct: int = 40
-    """inputs that differ"""
-    noise: float = 0.1
-    """standard deviation of the noise"""
-    copied: float = 0.3
-    """share of the rows that a careless join has twice"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Repeats(Experiment):
-    """Repeated rows: the same answers at the cost of distinct ones; and rows that stand twice."""
-
-    runs: int = 3
-    """cases of each size"""
-    seed: int = 5000
-    """the first seed; 1000 to 1099 were for trying"""
-    out: Path = Path("results/repeats")
-    settings: RepeatsSettings = field(default_factory=RepeatsSettings)
-
-    axes: ClassVar[Axes] = {
-        "rows": {"400": "400", "1000": "1000", "copies": "80, of which 0.3 stand twice"},
-        "method": {"map": "map", "bayes": "bayes"},
-    }
-    calls: ClassVar[tuple[str, ...]] = ("gpadjust.fit", "gpadjust.CKA")
