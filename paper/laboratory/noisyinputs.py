@@ -1,8 +1,8 @@
 """Inputs that were measured with noise: is a model that knows of it nearer to the function?
 
 Leads that were tried on five or six seeds from 1000, 40 observations, before the first run: the
-ratio of the error to that of ignoring the noise, geometric mean of the wave, the step,
-Forrester's function and the heat, and the coverage, by full Bayes unless said.
+ratio of the error to that of ignoring the noise, geometric mean of the wave, the step, Forrester's
+function and the heat, and the coverage, by full Bayes unless said.
 
 | lead | ratio | coverage |
 |---|---|---|
