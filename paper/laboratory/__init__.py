@@ -1,13 +1,13 @@
 """Data as laboratories have them: each kind beside what ignores it."""
 
 from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from paper.common.experiment import Axes, Experiment
 from pathlib import Path
 from typing import Any, ClassVar
 
-
+from paper.common.experiment import Axes, Experiment
 
 
 @dataclass(frozen=True, kw_only=True)
