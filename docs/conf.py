@@ -49,7 +49,7 @@ default_role = "py:obj"  # single backticks link where they can, and are code el
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(?!gpadjust\.).*"),  # links to other libraries need the network
-    ("py:class", r"gpadjust(\.\w+){3,}"),  # inner classes, which signatures name
+    ("py:(class|obj)", r"gpadjust(\.\w+){3,}"),  # inner classes, which signatures name
 ]
 
 autodoc_default_options = {"members": True, "show-inheritance": True}

@@ -105,7 +105,7 @@ class EmulatedPhysics(Physics):
                     f"{', '.join(absent)}: call the columns of unknown parameters by their names."
                 )
             others = [each for each in columns if each not in self.unknowns.names]
-            runs_X = runs_X[[*others, *self.unknowns.names]]  # type: ignore[index]
+            runs_X = runs_X[[*others, *self.unknowns.names]]
         failed = torch.as_tensor(_missing_rows(runs_Y))
         if failed.any():
             runs_X, runs_Y = (_rows(each, ~failed) for each in (runs_X, runs_Y))

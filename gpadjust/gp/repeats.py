@@ -12,8 +12,8 @@ from torch import Tensor
 class Within(NamedTuple):
     r"""What observations of equal inputs say of their noise, beside their means.
 
-    Of ``n`` observations with the mean :math:`\bar y` and variances :math:`v_i = V c / p_i`, where
-    V is that of the mean and :math:`c = \sum_i p_i`,
+    Of ``n`` observations with the mean :math:`\bar y`, its variance V and their variances
+    :math:`v_i = V c / p_i` with :math:`c = \sum_i p_i`,
 
     .. math::
 
@@ -23,25 +23,25 @@ class Within(NamedTuple):
     with :math:`S = \sum_i p_i (y_i - \bar y)^2 / c`.
 
     Attributes:
-        count: The numbers n, ``... x u``.
+        number: The numbers n, ``... x u``.
         square: S, of the same shape.
         constant: All of R that does not depend on V, of all groups, but for :math:`\log 2 \pi`,
             ``...``.
     """
 
-    count: Tensor
+    number: Tensor
     square: Tensor
     constant: Tensor
 
     def at(self, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Numbers, squares and logarithms that R sums, ``...``, at variances of the means."""
-        more = (self.count - 1).clamp_min(0)
+        more = (self.number - 1).clamp_min(0)
         logs = (more * variance.log()).sum(-1) + self.constant
         return more.sum(-1), (self.square / variance).sum(-1), logs
 
     def slope(self, variance: Tensor, scale: Tensor) -> Tensor:
         """The derivative of R / 2 by the variances, which a factor ``...`` multiplies."""
-        more, scale = (self.count - 1).clamp_min(0), scale.unsqueeze(-1)
+        more, scale = (self.number - 1).clamp_min(0), scale.unsqueeze(-1)
         return 0.5 * (more - self.square / (variance * scale)) / variance
 
 

@@ -331,8 +331,10 @@ class ByModules:
         if noise is None:
             likelihood = Noise(model.likelihood)
             noise = likelihood.at(inputs)
-            alone = self.share is None
-            noise = likelihood.of_rows(noise, self.kept) if alone else noise * self.share
+            if self.share is None:
+                noise = likelihood.of_rows(noise, self.kept)
+            else:
+                noise = noise * self.share
         noise = noise.expand(torch.broadcast_shapes(noise.shape, covariance.shape[:-1]))
         mean = model.mean_module(inputs).expand(noise.shape)
         return mean, covariance + torch.diag_embed(noise), basis, noise

@@ -247,7 +247,8 @@ def fit(
 def _refine_noise(model: TermsGP, search: Search) -> None:
     """Bring what is said of the noise of training rows to rest, by rough fits of a copy."""
     copy = deepcopy(model)
-    copy.noise.rows.forget()
+    rows: Any = copy.noise.rows
+    rows.forget()
     search = search._replace(num_starts=4, num_screened=64)
     if not model.has_unknowns:
         register_priors(copy)
@@ -259,11 +260,11 @@ def _refine_noise(model: TermsGP, search: Search) -> None:
             vectors, values = optima(target, search)
             target.assign(vectors[values.argmin(0), torch.arange(values.shape[1])])
             copy.eval()
-        if not copy.noise.rows.refine(copy):
+        if not rows.refine(copy):
             break
     for own, found in (
         (model.likelihood, copy.likelihood),
-        (model.noise.rows, copy.noise.rows),
+        (model.noise.rows, rows),
     ):
         for name, buffer in found.named_buffers(recurse=False):
             setattr(own, name, buffer)
@@ -273,7 +274,8 @@ def _refine_noise(model: TermsGP, search: Search) -> None:
 
 def _is_unconfirmed(model: TermsGP) -> bool:
     """Return whether a fit contradicts the noise of its rows; then they are others, for another."""
-    if not model.noise.rows.confirm(model.eval()):
+    rows: Any = model.noise.rows
+    if not rows.confirm(model.eval()):
         return False
     if model.num_samples is not None:
         model.release_samples()

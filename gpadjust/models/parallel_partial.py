@@ -143,8 +143,8 @@ class ParallelPartialGP(TermsModel):
                 )
             if made.is_emulated:
                 raise ValueError(
-                    f"Physics {made.name!r} is emulated, with an error that a ParallelPartialGP has "
-                    "no term for: FunctionPhysics(physics) takes the emulator's mean as exact."
+                    f"Physics {made.name!r} is emulated, with an error that a ParallelPartialGP "
+                    "has no term for: FunctionPhysics(physics) takes the emulator's mean as exact."
                 )
             self.input_transform = PhysicsInput(made, data.X.shape[-1], input_transform)
             with torch.no_grad():
@@ -211,7 +211,7 @@ class ParallelPartialGP(TermsModel):
     # What a TermsModel has, of the shared kernel.
 
     @property
-    def covar_module(self) -> SumOfTerms:
+    def covar_module(self) -> SumOfTerms:  # type: ignore[override]
         """The shared kernel."""
         return self.shared.covar_module
 
@@ -226,7 +226,7 @@ class ParallelPartialGP(TermsModel):
         return self.shared.train_inputs
 
     @property
-    def train_targets(self) -> Tensor:
+    def train_targets(self) -> Tensor:  # type: ignore[override]
         """Targets in the user's units, ``m x n``."""
         return self._Y.mT
 
@@ -241,7 +241,7 @@ class ParallelPartialGP(TermsModel):
         return self.scales.shape[:1]
 
     @property
-    def num_samples(self) -> int:
+    def num_samples(self) -> int:  # type: ignore[override]
         """The number ``S`` of samples; 1 before a fit."""
         return len(self.scales)
 
@@ -552,7 +552,7 @@ class ParallelPartialGP(TermsModel):
         number = -(-_DRAWS // self.num_samples)
         points = mean.movedim(MCMC_DIM, 0).flatten(1, -2).transpose(0, 1)  # q x S x m
         middle, whole = middle.flatten(0, -2), whole.flatten(0, -2)
-        noise = self._noise_of(observation_noise, mean.shape[-2])
+        noise: Any = self._noise_of(observation_noise, mean.shape[-2])
         found = []
         if self.coordinate is not None:
             inputs, _ = self._inputs(X)

@@ -71,6 +71,8 @@ class CKA(TermsGP):
             ``"logit"`` of shares, or bounds ``(lower, upper)``, see
             :class:`~gpadjust.models.Logit`; rho, delta and noise are then of its values.
         input_transform: A one-to-one BoTorch input transform; the physics still sees raw inputs.
+        train_Xvar: Known variances of errors of measured inputs: of the shape of ``train_X``, one
+            for each input, or one number; 0 where they are exact. Predictions are at exact inputs.
         categorical: Names or numbers of the columns that are categories, or a mapping from these to
             their levels. Text in a DataFrame is one without being named; f_p gets the numbers of
             its levels, sorted, from 0.
@@ -79,7 +81,8 @@ class CKA(TermsGP):
 
     Warns:
         PhysicsWarning: If f_p is obviously off at the training inputs, and shows why.
-        UserWarning: Of more than 5,000 points; take :class:`~gpadjust.VariationalCKA`.
+        UserWarning: Of rows that equal an earlier one, outputs included, where this is no rounding;
+            of more than 5,000 points; take :class:`~gpadjust.VariationalCKA`.
 
     Raises:
         TypeError: If data are no float64 tensors, arrays or frames, or the physics is not callable.

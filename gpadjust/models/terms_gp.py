@@ -255,8 +255,8 @@ class TermsGP(TermsModel, SingleTaskGP):
         mean, variance = self.left_out()
         spread = _ROUNDING * (self.train_targets - self.train_targets.nanmean(-1, keepdim=True))
         least = spread.square().nanmean(-1, keepdim=True)
-        rows, targets = self.noise.rows, self.train_targets
-        targets = targets if rows is None else self.noise.trusted(targets)
+        targets, noise = self.train_targets, self.noise
+        targets = targets if noise.rows is None else noise.trusted(targets)
         squares = (targets - mean).square().mean(0) / variance.maximum(least).mean(0)
         _, rows = self.measured_rows(train)
         found = torch.ones_like(squares)
@@ -486,8 +486,8 @@ class TermsGP(TermsModel, SingleTaskGP):
 
         Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
         observations; so do places of larger errors. Where new observations are missed by more than
-        predicted, as while a machine drifts, variances grow by the ratio (with ``forget``). To fit them again, build a model of recent
-        observations.
+        predicted, as while a machine drifts, variances grow by the ratio (with ``forget``). To fit
+        them again, build a model of recent observations.
 
         Args:
             X: Raw inputs, ``k x d``, of ``k`` observations in their order.

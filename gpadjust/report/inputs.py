@@ -10,6 +10,7 @@ import re
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
@@ -173,7 +174,10 @@ def _numbers(table: CsvColumns, name: str, may_miss: bool) -> Tensor:
     try:
         return table.numbers(name, may_miss=may_miss)
     except ValueError as error:
-        if may_miss or any(c.isdigit() for text in table.texts(name) for c in text):
+        texts: list[str] = []
+        with suppress(ValueError):  # of an empty field, which the first error may be of
+            texts = table.texts(name)
+        if may_miss or not texts or any(c.isdigit() for c in "".join(texts)):
             raise
         bare = name_and_unit(name)[0]
         raise ValueError(f"{error} If these are names, say so by --categories {bare}.") from error

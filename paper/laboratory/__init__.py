@@ -337,7 +337,7 @@ class RepeatsSettings:
 class Repeats(Experiment):
     """Repeated rows: the same answers at the cost of distinct ones; and rows that stand twice."""
 
-    runs: int = 6
+    runs: int = 3
     """cases of each size"""
     seed: int = 5000
     """the first seed; 1000 to 1099 were for trying"""

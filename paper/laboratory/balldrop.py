@@ -74,10 +74,9 @@ def run(experiment: Balldrop, physics: str, left: str, model: str, seed: int) ->
     if physics == "runs":
         f_p, seconds = emulated(experiment.settings, seed)
     out = (field["R_ball"] == BALLS.get(left)).to_numpy()
-    X, Y = (
-        torch.from_numpy(field[c].to_numpy()) for c in (["R_ball", "rho_ball", "height"], ["time"])
-    )
-    noise = torch.from_numpy(field[["sd"]].to_numpy()).square()
+    named = ["R_ball", "rho_ball", "height"], ["time"]
+    X, Y = (torch.from_numpy(field[columns].to_numpy(copy=True)) for columns in named)
+    noise = torch.from_numpy(field[["sd"]].to_numpy(copy=True)).square()
     begin = time.perf_counter()
     fitted = _MODELS[model](X[~out], Y[~out], noise[~out], physics=f_p)
     fit(fitted, seed=seed)

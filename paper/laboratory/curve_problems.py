@@ -73,7 +73,7 @@ def oscillator(m: int = 200) -> CurveProblem:
         return every[:, low].lerp(every[:, low + 1], place - low)
 
     ends = torch.tensor([[0.8, 0.1, 0.5], [1.4, 0.3, 1.5]], dtype=torch.float64)
-    return CurveProblem(t, *ends, linear, cubic, 30, 0.02)
+    return CurveProblem(t, ends[0], ends[1], linear, cubic, 30, 0.02)
 
 
 def diffusion() -> CurveProblem:
@@ -95,7 +95,7 @@ def diffusion() -> CurveProblem:
         return 0.5 * (near + reach.exp() * torch.erfc(x / spread + rest))
 
     ends = torch.tensor([[0.05, 0.2], [0.3, 1.5]], dtype=torch.float64)
-    return CurveProblem(x, *ends, diffuses, decays, 20, 0.01)
+    return CurveProblem(x, ends[0], ends[1], diffuses, decays, 20, 0.01)
 
 
 def spectrum() -> CurveProblem:
@@ -119,7 +119,7 @@ def spectrum() -> CurveProblem:
         return f / (1 + 0.3 * f) + background
 
     ends = torch.tensor([[0.1, 0.1, 2.5], [1.0, 1.0, 4.0]], dtype=torch.float64)
-    return CurveProblem(w, *ends, beer, measured, 40, 0.005)
+    return CurveProblem(w, ends[0], ends[1], beer, measured, 40, 0.005)
 
 
 PROBLEMS: dict[str, Callable[[], CurveProblem]] = {

@@ -25,7 +25,7 @@ import torch
 from botorch.exceptions.warnings import OptimizationWarning
 from scipy.stats import gmean
 
-from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, PhysicsWarning, fit
+from gpadjust import CKA, EmulatedPhysics, FunctionPhysics, Physics, PhysicsWarning, fit
 from gpadjust.inference import SamplingWarning
 from gpadjust.validation import rmse
 from paper.common.experiment import Run, Table
@@ -47,7 +47,7 @@ def run(experiment: Emulated, name: str, model: str, seed: int) -> Run:
     X, Y = observations(found, settings.per_input * found.d, seed)
     test_X = found.sobol(settings.num_test, 10_000 + seed)
     truth, low, begin, own = found.truth(test_X), found.physics(), time.perf_counter(), {}
-    physics: EmulatedPhysics | FunctionPhysics = low
+    physics: Physics = low
     if model != "exact":
         runs_X = low_inputs(found, X, settings.runs_per_input * found.d, 20_000 + seed)
         emulated = EmulatedPhysics(runs_X, low(runs_X))

@@ -162,8 +162,8 @@ def judge(found: pd.DataFrame) -> list[Judged]:
     ours = found[(found["noise"] == "relative") & (found["structure"] == "CKA")]
     judged = []
     for number_of, what in (("R1", "observations"), ("R2", "function")):
-        shares = ours.groupby("decade")[what].mean() if len(ours) else {}
-        is_met = len(shares) == 3 and bool((shares >= _HOLDS).all())
+        shares: dict[Any, float] = ours.groupby("decade")[what].mean().to_dict()
+        is_met = len(shares) == 3 and all(share >= _HOLDS for share in shares.values())
         measured = ", ".join(f"{d} {shares[d]:.3f}" for d in _DECADES if d in shares)
         of = "new observations" if what == "observations" else "the function"
         text = f"95 % intervals hold {of} in 0.93 of the test points of each decade"

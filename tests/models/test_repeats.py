@@ -145,7 +145,7 @@ def test_groups_of_rows():
     assert repeats.group.tolist() == [0, 1, 0, 2, 1]
     means = repeats.means(torch.tensor([1.0, 2.0, 3.0, math.nan, 4.0]).double(), torch.ones(5))
     assert means.targets.nan_to_num(-1.0).tolist() == [2.0, 3.0, -1.0]
-    assert means.within.count.tolist() == [2.0, 2.0, 0.0]
+    assert means.within.number.tolist() == [2.0, 2.0, 0.0]
 
 
 def test_rows_count_by_themselves_where_few_are_repeated():
