@@ -134,7 +134,7 @@ class DriftSettings:
 class Drift(Experiment):
     """Half a year of a pump that wears, predicted a step ahead by models that are updated."""
 
-    runs: int = 2
+    runs: int = 6
     """pumps"""
     out: Path = Path("results/drift")
     settings: DriftSettings = field(default_factory=DriftSettings)
