@@ -17,7 +17,8 @@ def named_noise(names: str | Sequence[str], make: Any) -> Likelihood | None:
     """The likelihood of names, for a builder of terms; None for the model's own.
 
     Raises:
-        ValueError: If there is no noise of a name, or noise is to be relative in the units of a link.
+        ValueError: If there is no noise of a name, or noise is to be relative in the units
+            of a link.
     """
     names = [names] if isinstance(names, str) else [*names]
     if unknown := [name for name in names if name not in _NAMES]:

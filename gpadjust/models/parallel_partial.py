@@ -143,8 +143,8 @@ class ParallelPartialGP(TermsModel):
                 )
             if made.is_emulated:
                 raise ValueError(
-                    f"Physics {made.name!r} is emulated, with an error that a ParallelPartialGP has "
-                    "no term for: FunctionPhysics(physics) takes the emulator's mean as exact."
+                    f"Physics {made.name!r} is emulated, with an error that a ParallelPartialGP "
+                    "has no term for: FunctionPhysics(physics) takes the emulator's mean as exact."
                 )
             self.input_transform = PhysicsInput(made, data.X.shape[-1], input_transform)
             with torch.no_grad():

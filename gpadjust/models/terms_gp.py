@@ -486,8 +486,8 @@ class TermsGP(TermsModel, SingleTaskGP):
 
         Hyper-parameters stay, also which samples of them a model holds, all of which learn from the
         observations; so do places of larger errors. Where new observations are missed by more than
-        predicted, as while a machine drifts, variances grow by the ratio (with ``forget``). To fit them again, build a model of recent
-        observations.
+        predicted, as while a machine drifts, variances grow by the ratio (with ``forget``). To fit
+        them again, build a model of recent observations.
 
         Args:
             X: Raw inputs, ``k x d``, of ``k`` observations in their order.

@@ -173,10 +173,21 @@ def _numbers(table: CsvColumns, name: str, may_miss: bool) -> Tensor:
     try:
         return table.numbers(name, may_miss=may_miss)
     except ValueError as error:
-        if may_miss or any(c.isdigit() for text in table.texts(name) for c in text):
+        if may_miss or not _are_names(table, name):
             raise
         bare = name_and_unit(name)[0]
-        raise ValueError(f"{error} If these are names, say so by --categories {bare}.") from error
+        raise ValueError(
+            f"{error} If these are names, say so by --categories {bare}, or by --batches {bare} if "
+            "each only shifts the outputs, as a rig does."
+        ) from error
+
+
+def _are_names(table: CsvColumns, name: str) -> bool:
+    """Return whether all fields of a column begin with a letter; not if one is empty."""
+    try:
+        return all(text[0].isalpha() for text in table.texts(name))
+    except ValueError:
+        return False
 
 
 def names_of(text: str, option: str) -> list[str]:
