@@ -570,8 +570,8 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
         imports.append("from gpadjust import load")
         if "physics" in missing:
             words.append(
-                "The file could not hold the physics, which has no name in a module: give what the "
-                "model was built with as f_p."
+                "The file could not hold the physics, which has no name in a module, or is known "
+                "by runs: give what the model was built with as f_p."
             )
         elif saved.physics:
             by = ", ".join(saved.physics)
