@@ -118,8 +118,8 @@ class DriftSettings:
     """observations between refits of what is fitted again: a day"""
     window: int = 84
     """observations that an exact model keeps: a week"""
-    refit_window: int = 168
-    """observations that are fitted again: two weeks"""
+    refit_window: int = 84
+    """observations that are fitted again: a week"""
     forget: int = 42
     """observations in which an RRA forgets"""
     method: str = "map"
