@@ -202,7 +202,8 @@ def _adjusted(
     """The structure of most weight that adjusts a physics, of what predicts an output."""
     candidates: list[tuple[str, TermsGP, int, float]]
     if comparison is not None:
-        ranked = [*comparison.table.values()][output]
+        rows = [*comparison.table.values()][output]
+        ranked = sorted(rows, key=lambda row: -row.weight)
         candidates = [
             (row.structure, comparison.models[row.structure], output, row.weight) for row in ranked
         ]

@@ -332,7 +332,8 @@ def compare(
     loo = found.leave_one_out()
     # An error with outliers would not be comparable with the others, which leave them out.
     alone = {name: replace(own, is_outlier=loo.is_outlier) for name, own in alone.items()}
-    return replace(found, alone=alone, hints=hints(found.recommended, loo))
+    with threads_for(len(data.X)):
+        return replace(found, alone=alone, hints=hints(found.recommended, loo))
 
 
 def _thinned(model: TermsGP) -> TermsGP:

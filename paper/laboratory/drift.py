@@ -1,7 +1,7 @@
 """Half a year of a pump that wears, predicted a step of two hours ahead.
 
 What is fitted again: a CKA of the last week, to its most likely hyper-parameters, each day; between
-it is updated at each step. On the seeds of the table it was of two weeks first, and erred by 0.39 m.
+it is updated at each step. On the seeds of the table it was of two weeks first, erring by 0.39 m.
 
 Tried on other seeds (900 and 901): an RRA whose weights wander and return to their prior
 forgets too much (0.30 m, where fading
