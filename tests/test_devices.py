@@ -36,6 +36,16 @@ ALLOWED = {
     "numbers that become Python's, a file's, or are moved by their callers": {
         "models/posteriors.py mixture_quantile",
         "models/saving.py content_of",
+        "inference/fitting.py _refine_noise",
+        "inference/shared_kernel.py fit_shared",
+        "inference/shared_kernel.py of",
+        "inference/sisters.py fit_with_prior",
+        "models/along_coordinate.py _basis",
+        "models/along_coordinate.py learn",
+        "models/along_coordinate.py smoothed",
+        "models/copies.py warn_of_copies",
+        "models/parallel_partial.py _largest_deviations",
+        "models/parallel_partial.py hold",
         "models/vanishing.py __init__",
         "models/training_data.py standardize",
         "physics/black_box.py _slope",
@@ -43,7 +53,10 @@ ALLOWED = {
         "physics/unknown.py guess",
     },
     "parameters and buffers, which move with their model": {
+        "gp/categories.py untransform",
+        "gp/noise.py __init__",
         "gp/orthogonal_kernel.py __init__",
+        "models/links.py __init__",
         "models/local_errors.py __init__",
     },
 }

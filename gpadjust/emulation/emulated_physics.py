@@ -42,7 +42,8 @@ class EmulatedPhysics(Physics):
 
     Args:
         runs_X: Inputs of the runs, ``N x (d + p)``: those that the data have, and then values of
-            the unknown parameters; in a frame these are the columns of their names.
+            the unknown parameters; in a frame these are the columns of their names, with or
+            without a unit, as ``"drag [1]"``.
         runs_Y: Outputs of the runs, ``N x m``; NaN where one is missing, a row of NaN is a run
             that failed.
         inputs: The columns of the data that are the first ``d`` inputs of the runs, in their order.
@@ -98,14 +99,17 @@ class EmulatedPhysics(Physics):
         super().__init__(unknowns=unknowns, inputs=inputs, name=name)
         columns = getattr(runs_X, "columns", None)
         if columns is not None and self._p:
-            absent = [each for each in self.unknowns.names if each not in columns]
+            bare = {str(each).partition(" [")[0]: each for each in columns}  # "drag [1]" is drag
+            bare |= {each: each for each in columns}
+            absent = [each for each in self.unknowns.names if each not in bare]
             if absent:
                 raise ValueError(
                     f"The runs of {self.name!r} have the columns {[*columns]}, none named "
                     f"{', '.join(absent)}: call the columns of unknown parameters by their names."
                 )
-            others = [each for each in columns if each not in self.unknowns.names]
-            runs_X = runs_X[[*others, *self.unknowns.names]]
+            unknown = [bare[each] for each in self.unknowns.names]
+            others = [each for each in columns if each not in unknown]
+            runs_X = runs_X[[*others, *unknown]]
         failed = torch.as_tensor(_missing_rows(runs_Y))
         if failed.any():
             runs_X, runs_Y = (_rows(each, ~failed) for each in (runs_X, runs_Y))

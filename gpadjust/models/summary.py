@@ -85,10 +85,15 @@ def _lines(model: Any) -> list[str]:
     else:
         lines.append(f"  noise: sd {_text(noise.sqrt() * scale)}{''.join(at)}")
     if model.has_heavy_tails:
-        rows = (model.outliers().squeeze(-1) > 0.5).reshape(-1, model.train_targets.shape[-1])[0]
-        numbers = ", ".join(map(str, rows.nonzero().flatten().tolist()))
-        lines.append(f"  outliers: {f'rows {numbers}' if numbers else 'none'}")
+        which = _outliers(model)
+        numbers = ", ".join(map(str, which.nonzero().flatten().tolist()))
+        lines.append(f"  outliers: {f'rows {numbers}, counted from 0' if numbers else 'none'}")
     return lines
+
+
+def _outliers(model: Any) -> Tensor:
+    """Return which observations of one output are likelier outliers than not, ``n``."""
+    return (model.outliers().squeeze(-1) > 0.5).reshape(-1, model.train_targets.shape[-1])[0]
 
 
 def _alone(model: Any) -> list[str]:
@@ -96,12 +101,13 @@ def _alone(model: Any) -> list[str]:
     inputs, y, link = model.train_inputs[0], model.outputs_first(model.user_targets()), model.link
     named = [term for term in model.terms if isinstance(term.basis, AppendedPhysics)]
     fitted = ", with these parameters" if model.has_unknowns else ""
+    judged = y.masked_fill(_outliers(model), torch.nan) if model.has_heavy_tails else y
     lines = []
     for term in named:
         f_p = (inputs[..., term.basis.num_inputs :] * term.basis.select).sum(-1)
         f_p = f_p if model.num_samples is None else f_p.mean(0)
         f_p = f_p if link is None else link.inverse(f_p)
-        rmse = (y - f_p).square().nanmean().sqrt()
+        rmse = (judged - f_p).square().nanmean().sqrt()
         spread = float(nanstd(y.reshape(-1, y.shape[-1]), dim=-1).mean())
         of = f" of {term.name.removeprefix('rho_')}" if len(named) > 1 else ""
         lines.append(

@@ -146,11 +146,17 @@ def held(subject: Subject, inputs: list[int]) -> str:
     """At what the other inputs stay."""
     if len(subject.inputs) == 1:
         return ""
-    values = zip(subject.inputs, subject.base.tolist(), strict=True)
-    pairs = [f"{name_and_unit(name)[0]} = {with_unit(number(v), name)}" for name, v in values]
+    values = zip(subject.inputs, point(subject, subject.base, 3), strict=True)
+    pairs = [f"{name_and_unit(name)[0]} = {with_unit(value, name)}" for name, value in values]
     drawn_of = f" (drawn: {len(inputs)} of {len(pairs)} inputs, those that move predictions most)"
     few = drawn_of if len(inputs) < len(pairs) else ""
     return f"Along each input the others stay at the median of the data: {', '.join(pairs)}{few}."
+
+
+def point(subject: Subject, X: Tensor, digits: int = 4) -> list[str]:
+    """The inputs of a point, ``d``, in words: numbers, and the names of categories."""
+    names, values = subject.names, enumerate(X.tolist())
+    return [names[i][int(x)] if i in names else number(x, digits) for i, x in values]
 
 
 def _figures(number_of_figures: int, height: float = 2.9) -> list[Figure]:

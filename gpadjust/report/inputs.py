@@ -10,7 +10,6 @@ import re
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
@@ -174,13 +173,21 @@ def _numbers(table: CsvColumns, name: str, may_miss: bool) -> Tensor:
     try:
         return table.numbers(name, may_miss=may_miss)
     except ValueError as error:
-        texts: list[str] = []
-        with suppress(ValueError):  # of an empty field, which the first error may be of
-            texts = table.texts(name)
-        if may_miss or not texts or any(c.isdigit() for c in "".join(texts)):
+        if may_miss or not _are_names(table, name):
             raise
         bare = name_and_unit(name)[0]
-        raise ValueError(f"{error} If these are names, say so by --categories {bare}.") from error
+        raise ValueError(
+            f"{error} If these are names, say so by --categories {bare}, or by --batches {bare} if "
+            "each only shifts the outputs, as a rig does."
+        ) from error
+
+
+def _are_names(table: CsvColumns, name: str) -> bool:
+    """Return whether all fields of a column begin with a letter; not if one is empty."""
+    try:
+        return all(text[0].isalpha() for text in table.texts(name))
+    except ValueError:
+        return False
 
 
 def names_of(text: str, option: str) -> list[str]:

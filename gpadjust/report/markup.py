@@ -153,7 +153,7 @@ def name_and_unit(name: str) -> tuple[str, str]:
 def with_unit(value: str, name: str, form: str = "{} {}") -> str:
     """A number, or words, and the unit that a name carries; as they are if it carries none."""
     unit = name_and_unit(name)[1]
-    return form.format(value, unit) if unit else value
+    return form.format(value, unit) if unit not in ("", "1") else value
 
 
 def listed(items: Iterable[str]) -> str:

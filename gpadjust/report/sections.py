@@ -211,7 +211,7 @@ def _errors(subject: Subject, output: int) -> list[Markup]:
     if subject.comparison is not None:
         errors = subject.comparison.errors()[name]
     else:
-        Y, shown = subject.Y[:, output], subject.physics_at(subject.X, output)
+        Y, shown = subject.judged[:, output], subject.physics_at(subject.X, output)
         errors = {
             ALONE if len(shown) == 1 else f"{ALONE} of {physics}": float(
                 (Y - values).square().nanmean().sqrt()
@@ -314,7 +314,7 @@ def _words(subject: Subject, shown: Adjusted | None, output: int) -> list[str]:
     name = subject.outputs[output]
     found = []
     for physics, values in subject.physics_at(subject.X, output):
-        off = subject.Y[:, output] - values
+        off = subject.judged[:, output] - values
         off = off[~off.isnan()]
         rms, mean = float(off.square().mean().sqrt()), float(off.mean())
         found.append(
@@ -355,6 +355,9 @@ def predictions(subject: Subject) -> Markup:
             f"{with_unit(number(rmse), name)}, {percent(rmse / spread_of(subject, j))} of the "
             "standard deviation of the observations."
         )
+        if out := subject.outliers(j):
+            are = "is taken for an outlier" if len(out) == 1 else "are taken for outliers"
+            words += f" {listed(out)} {are}: errors and coverage on this page leave them out."
         drawing = drawn(partial(figures.left_out, subject, j))
         parts += [tag("p", words), drawing, _worst(subject, j)]
     return join(parts)
@@ -408,15 +411,16 @@ def _worst(subject: Subject, j: int) -> Markup:
     few = len(subject.inputs) <= 4
     said = [with_unit(what, name, "{} [{}]") for what in ("observed", "predicted")]
     head = ["", *said, "95 %", "residual / sd", *(subject.inputs if few else ())]
-    rows = []
+    rows, outliers = [], {*subject.outliers(j)}
     for i in order:
         half = quantile(0.95) * float(loo.variance[i, j].sqrt())
         mean = float(loo.mean[i, j])
         cells = [number(float(loo.Y[i, j]), 4), number(mean, 4)]
         cells += [f"{number(mean - half, 4)} to {number(mean + half, 4)}"]
         cells += [f"{float(loo.residuals[i, j]):+.1f}"]
-        cells += [number(x, 4) for x in subject.X[i].tolist()] if few else []
-        rows.append([subject.rows[i], *cells])
+        cells += figures.point(subject, subject.X[i]) if few else []
+        row = subject.rows[i]
+        rows.append([f"{row} (outlier)" if row in outliers else row, *cells])
     caption = f"The {len(rows)} observations of {name} that are farthest from their predictions"
     return table(caption, head, rows)
 
@@ -461,13 +465,15 @@ def summary(subject: Subject) -> Markup:
 
 def data(subject: Subject, origin: Origin) -> Markup:
     """An overview of the columns, and what is missing or repeated."""
-    rows = []
+    rows: list[list[str]] = []
     kinds = (("input", subject.inputs, subject.X), ("output", subject.outputs, subject.Y))
     for kind, names, values in kinds:
         for name, column in zip(names, values.unbind(-1), strict=True):
             seen = column[~column.isnan()]
             short, unit = name_and_unit(name)
-            numbers = [number(float(end), 4) for end in (seen.min(), seen.median(), seen.max())]
+            ends = (seen.min(), seen.median(), seen.max())
+            is_name = kind == "input" and len(rows) in subject.names  # of which none is the least
+            numbers = ["-"] * 3 if is_name else [number(float(end), 4) for end in ends]
             rows.append([short, kind, unit or "-", *numbers, str(len(column) - len(seen))])
     head = ["column", "is", "unit", "least", "median", "most", "missing"]
     remarks = [f"{plural(len(subject.X), 'row')} of data.", *_repeats(subject), *origin.remarks]
@@ -492,8 +498,11 @@ def _assumed(model: TermsGP | StackedGP) -> list[str]:
         found.append(f"inputs that are noisy themselves: {listed(each)} (standard deviations)")
     if (link := told.get("link")) is not None:
         found.append(f"{outputs} {getattr(link, 'where', 'within bounds')}")
-    if "categorical" in told:
-        found.append(f"categories in {listed(map(str, told['categorical']))}")
+    batches = [model.input_names[i] for i in model.batches]
+    if plain := [name for name in told.get("categorical", []) if name not in batches]:
+        found.append(f"categories in {listed(map(str, plain))}")
+    if batches:
+        found.append(f"offsets of {listed(map(str, batches))}, whatever the other inputs are")
     if not found:
         return ["Assumed: noise of one size, exact inputs, numbers that may be of any size."]
     return [f"Assumed: {'; '.join(found)}."]
@@ -561,8 +570,8 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
         imports.append("from gpadjust import load")
         if "physics" in missing:
             words.append(
-                "The file could not hold the physics, which has no name in a module: give what the "
-                "model was built with as f_p."
+                "The file could not hold the physics, which has no name in a module, or is known "
+                "by runs: give what the model was built with as f_p."
             )
         elif saved.physics:
             by = ", ".join(saved.physics)
@@ -570,11 +579,17 @@ def loading(subject: Subject, saved: Saved | str, origin: Origin) -> Markup:
     arguments += [f"{name}={'f_p' if name == 'physics' else name}" for name in missing]
     call = ", ".join([repr(file), *arguments])
     point = ", ".join(f"{x:.6g}" for x in subject.base.tolist())
+    numbered = []
+    for i, own in subject.names.items():
+        each = [f"{k} is {name}" for k, name in enumerate(own)]
+        each += ["any other number is a new one"] if i in subject.model.batches else []
+        numbered.append(f"# {subject.inputs[i]}: {', '.join(each)}")
     lines = [
         *imports,
         "",
         f"model = load({call})",
         f"# a row for each point: {', '.join(map(repr, subject.inputs))}",
+        *numbered,
         f"X = torch.tensor([[{point}]], dtype=torch.float64)",
         "",
         f"mean, variance = model.predict(X)  # of {', '.join(map(repr, subject.outputs))}",

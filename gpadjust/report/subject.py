@@ -73,9 +73,28 @@ class Subject:
 
     @property
     def counts(self) -> list[int]:
-        """The number of observations of each output."""
-        counts: list[int] = (~self.Y.isnan()).sum(0).tolist()
+        """The number of observations of each output, without outliers."""
+        counts: list[int] = (~self.judged.isnan()).sum(0).tolist()
         return counts
+
+    @property
+    def judged(self) -> Tensor:
+        """Observations that errors and coverage are of, ``n x m``, NaN where it is an outlier."""
+        outlier = self.loo.is_outlier
+        return self.Y if outlier is None else self.Y.masked_fill(outlier, torch.nan)
+
+    def outliers(self, output: int) -> list[str]:
+        """The names of the rows whose observation of an output counts as an outlier."""
+        outlier = self.loo.is_outlier
+        if outlier is None:
+            return []
+        return [self.rows[i] for i in outlier[:, output].nonzero().flatten().tolist()]
+
+    @property
+    def names(self) -> dict[int, tuple[str, ...]]:
+        """The names of the categories that are texts, by their column; their numbers are from 0."""
+        levels = self.model.levels.items()
+        return {i: (*own,) for i, own in levels if all(isinstance(name, str) for name in own)}
 
     @property
     def base(self) -> Tensor:
@@ -183,7 +202,8 @@ def _adjusted(
     """The structure of most weight that adjusts a physics, of what predicts an output."""
     candidates: list[tuple[str, TermsGP, int, float]]
     if comparison is not None:
-        ranked = [*comparison.table.values()][output]
+        rows = [*comparison.table.values()][output]
+        ranked = sorted(rows, key=lambda row: -row.weight)
         candidates = [
             (row.structure, comparison.models[row.structure], output, row.weight) for row in ranked
         ]

@@ -329,7 +329,11 @@ def compare(
     gain, sentences = advice(fitted, models, left_out, converged, relevance, table, data.X)
     alone = physics_alone(given_physics, data)
     found = Comparison(models, stacked, table, sentences, gain, left_out, alone)
-    return replace(found, hints=hints(found.recommended, found.leave_one_out()))
+    loo = found.leave_one_out()
+    # An error with outliers would not be comparable with the others, which leave them out.
+    alone = {name: replace(own, is_outlier=loo.is_outlier) for name, own in alone.items()}
+    with threads_for(len(data.X)):
+        return replace(found, alone=alone, hints=hints(found.recommended, loo))
 
 
 def _thinned(model: TermsGP) -> TermsGP:

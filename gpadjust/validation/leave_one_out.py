@@ -311,4 +311,9 @@ def _join(parts: list[LeaveOneOut]) -> LeaveOneOut:
     names = tuple(name for part in parts for name in part.output_names)
     linked = any(part.pit is not None for part in parts)
     pit = torch.cat([part.below() for part in parts], dim=-1) if linked else None
-    return LeaveOneOut(X, Y, mean, variance, density, names, pit)
+    masks = [part.is_outlier for part in parts]
+    told = any(mask is not None for mask in masks)
+    pairs = zip(parts, masks, strict=True)
+    none_too = [torch.zeros_like(p.Y, dtype=torch.bool) if m is None else m for p, m in pairs]
+    is_outlier = torch.cat(none_too, dim=-1) if told else None
+    return LeaveOneOut(X, Y, mean, variance, density, names, pit, is_outlier)

@@ -161,6 +161,9 @@ def test_columns_of_a_frame_are_unknown_parameters_by_their_names():
     x, w = torch.tensor([[3.0]]).double(), torch.tensor([3.0]).double()
     assert len(physics.emulator.data()["train_X"]) == 8
     assert abs(physics(x, w) - np.sin(9)) < 0.05
+    with_units = runs.rename(columns={"w": "w [1/s]", "x": "x [s]"})
+    again = EmulatedPhysics(with_units, Y, unknowns=W, fit_options=MAP)
+    assert torch.equal(again(x, w), physics(x, w))
 
 
 @pytest.mark.filterwarnings("ignore:The draws of")

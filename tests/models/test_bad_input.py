@@ -189,7 +189,7 @@ BAD_OPTIONS = [
     *(
         (kind, {"likelihood": likelihood}, error, "likelihood")
         for kind in ("CKA", "ZeroMeanGP", "RRA")
-        for likelihood, error in (("x", TypeError), (BernoulliLikelihood(), TypeError))
+        for likelihood, error in (("x", ValueError), (BernoulliLikelihood(), TypeError))
     ),
 ]
 

@@ -45,8 +45,8 @@ FAULTS = (
     ),
     Fault(
         "gpadjust/inference/distributions.py",
-        "by_length if shape[-1] > 1 else by_length.sum(-1, keepdim=True)",
-        "by_length if shape[-1] > 1 else by_length.mean(-1, keepdim=True)",
+        "by_length = by_length.sum(-1, keepdim=True)",
+        "by_length = by_length.mean(-1, keepdim=True)",
         "The gradient of a lengthscale that several inputs share is too small.",
     ),
     Fault(

@@ -259,10 +259,19 @@ def test_kinds_of_data(folder, read, undrawn):
     assert "categories in rig" in text
 
 
+def test_names_that_have_digits_are_names(folder, capsys):
+    rows = [f"{x},R{i % 3},{y}" for i, (x, y) in enumerate(ROWS)]
+    (folder / "data.csv").write_text("\n".join(["time [s],rig,head [m]", *rows, ""]))
+    assert "by --batches rig" in _fails(capsys, "--inputs", "time,rig")
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     {
-        ("--inputs", "time,note"): "If these are names, say so by --categories note.",
+        (
+            "--inputs",
+            "time,note",
+        ): "If these are names, say so by --categories note, or by --batches note",
         ("--categories", "note"): "The category 'note' is none of --inputs.",
         ("--bounds", "1,0"): "Expected --bounds as two numbers, the lower first: 0,1; found '1,0'",
         ("--input-noise", "head=1"): "--input-noise names 'head', which is none of --inputs",

@@ -180,3 +180,46 @@ def test_the_whole_command_by_an_interpreter_of_its_own(tmp_path, read, monkeypa
     assert f"{run.stdout.partition('.')[0]} " in page.text
     (code,) = [text for text in page.codes if "load(" in text]
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_errors_and_coverage_are_without_outliers(tmp_path, read):
+    X = torch.linspace(0, 1, 20, dtype=torch.float64).unsqueeze(-1)
+    noise = torch.randn(20, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    f_p = physics(1)
+    Y = f_p(X) + 0.3 * X + 0.03 * noise
+    Y[5] += 20
+    told = {"likelihood": "heavy-tailed", "structures": ["CKA"], **QUICK}
+    comparison = compare(X, Y, f_p, **told)
+    others = torch.arange(20) != 5
+    alone = (Y - f_p(X))[others].square().mean().sqrt()
+    errors = comparison.errors()["y"]
+    assert errors["physics alone"] == pytest.approx(float(alone))
+    page = read(
+        report(comparison, tmp_path / "report.html", rows=[f"line {i + 2}" for i in range(20)])
+    )
+    assert "line 7 is taken for an outlier" in page.text
+    assert f"is off by {float(alone):.3g} " in page.text
+    caption = "The 5 observations of y that are farthest from their predictions"
+    assert page.tables[caption][1][0] == "line 7 (outlier)"
+    for row in page.tables["Coverage of left-out intervals"][1:]:
+        held, _, n = row[1].split()
+        assert (n, row[2]) == ("19", f"{100 * int(held) / 19:.0f} %")
+
+
+def test_categories_have_their_names(tmp_path, read):
+    pandas = pytest.importorskip("pandas")
+    x = torch.linspace(0, 1, 12, dtype=torch.float64)
+    frame = pandas.DataFrame({"x": x, "rig": ["R1", "R2", "R3"] * 4})
+    model = CKA(
+        frame, (x + 0.1 * (3 * x).sin()).unsqueeze(-1), physics=lambda X: X[:, :1], batch="rig"
+    )
+    fit(model, "map", **QUICK)
+    page = read(report(model, tmp_path / "report.html"))
+    assert "rig = R2" in page.text
+    assert "offsets of rig" in page.text
+    assert "categories in" not in page.text
+    caption = "The 5 observations of y that are farthest from their predictions"
+    assert {row[-1] for row in page.tables[caption][1:]} <= {"R1", "R2", "R3"}
+    assert page.tables["Columns"][2][3:6] == ["-", "-", "-"]
+    (code,) = [text for text in page.codes if "load(" in text]
+    assert "# rig: 0 is R1, 1 is R2, 2 is R3, any other number is a new one" in code
