@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.ticker import NullFormatter
 
 from gpadjust import CKA, fit
 from gpadjust.validation import rmse
@@ -128,5 +129,7 @@ def draw(runs: Sequence[Run], experiment: Sisters) -> list[Path]:
         ax.plot(ends, ends, color="0.4", lw=1)
         ax.plot(ends, [0.6 * end for end in ends], color="0.4", lw=1, ls=":")
         ax.set(xlabel="RMSE without [m]")
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_minor_formatter(NullFormatter())
     axes[0].set(ylabel="RMSE with the prior [m]")
     return [save(figure, experiment.out / "sisters.png")]
