@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 
 from gpadjust import CKA, PhysicsMeanGP, fit
 
-pytestmark = pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::botorch.exceptions.warnings.OptimizationWarning"),
+    pytest.mark.filterwarnings("ignore:.* rows? equals? an earlier row"),
+]
 FIT = {"num_screened": 16, "num_starts": 2, "max_iterations": 60}
 BUILD = {
     "CKA": CKA,

@@ -1,5 +1,7 @@
 """Rows of a simulator on the nodes of a cluster."""
 
+import time
+
 import joblib
 import numpy as np
 import pytest
@@ -18,10 +20,12 @@ def test_rows_run_on_both_nodes_of_a_cluster():
     def simulator(x):
         if x[0] > 90:
             raise ValueError("no solution here")
+        time.sleep(0.3)  # or one node does all while the other starts
         ray_node = ray.get_runtime_context().get_node_id()
         return [x[0] ** 2, float(int(ray_node[:8], 16))]
 
     physics = BlackBoxPhysics(simulator, batched=False, memo=0)
+    ray.shutdown()  # of what another test of the process has opened
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
         cluster.add_node(num_cpus=1)
@@ -29,7 +33,8 @@ def test_rows_run_on_both_nodes_of_a_cluster():
         cluster.wait_for_nodes()
         register_ray()
         X = torch.arange(40.0).double().unsqueeze(-1)
-        with joblib.parallel_config(backend="ray", n_jobs=2):
+        one_each = {"num_cpus": 1}  # or a node may get both workers
+        with joblib.parallel_config(backend="ray", n_jobs=2, ray_remote_args=one_each):
             values = physics(X)
             with pytest.raises(PhysicsError, match="no solution here") as caught:
                 physics(X + 60)
