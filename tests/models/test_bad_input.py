@@ -187,7 +187,7 @@ BAD_OPTIONS = [
         for kind in ("CKA", "ZeroMeanGP", "RRA", "AR1")
     ),
     *(
-        (kind, {"likelihood": likelihood}, error, "likelihood")
+        (kind, {"likelihood": likelihood}, error, "ikelihood of GPyTorch, got")
         for kind in ("CKA", "ZeroMeanGP", "RRA")
         for likelihood, error in (("x", ValueError), (BernoulliLikelihood(), TypeError))
     ),
