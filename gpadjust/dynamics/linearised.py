@@ -1,0 +1,55 @@
+"""Dynamics near some states: means, slopes and variances of the next ones."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpadjust.dynamics.base import Dynamics
+
+
+class Linearised(NamedTuple):
+    """Next states near ``N`` states and actions.
+
+    Args:
+        mean: Their mean at these, ``N x state_dim``; of angles, not wrapped.
+        slope: Its derivatives by the states, ``N x state_dim x state_dim``.
+        variance: The predicted variance there, with the noise, ``N x state_dim``.
+    """
+
+    mean: Tensor
+    slope: Tensor
+    variance: Tensor
+
+    def carry(self, covariance: Tensor) -> Tensor:
+        """Covariances of the next states, from ``N x state_dim x state_dim`` of the states."""
+        carried = self.slope @ covariance @ self.slope.mT + torch.diag_embed(self.variance)
+        return (carried + carried.mT) / 2
+
+
+def linearised(dynamics: Dynamics, states: Tensor, actions: Tensor) -> Linearised:
+    """Linearise the mean of dynamics by its gradients.
+
+    Args:
+        dynamics: The dynamics; they must be fitted.
+        states: ``N x state_dim``.
+        actions: ``N x action_dim``.
+
+    Raises:
+        RuntimeError: If the dynamics have learnt nothing yet.
+        PhysicsError: If the physics fails.
+    """
+    with torch.enable_grad():
+        at = states.detach().clone().requires_grad_(True)
+        mean = dynamics.mean_function()(at.unsqueeze(0), actions.unsqueeze(0)).squeeze(0)
+        rows = [
+            torch.autograd.grad(column.sum(), at, retain_graph=True, materialize_grads=True)[0]
+            if column.requires_grad
+            else torch.zeros_like(at)
+            for column in mean.unbind(-1)
+        ]
+    with torch.no_grad():
+        variance = dynamics.predict(states, actions).variance
+    return Linearised(mean.detach(), torch.stack(rows, dim=-2), variance)
