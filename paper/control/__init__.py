@@ -1,14 +1,23 @@
-"""Controllers for systems that people know."""
+"""Controllers for machines as they are: systems that people know."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 from paper.common.experiment import Axes, Experiment
 from paper.common.learners import labels
+
+HORIZONS = {
+    "pendulum": 12,
+    "furuta": 10,
+    "quadrotor": 12,
+    "double_pendulum": 10,
+    "tanks": 8,
+    "reacher": 8,
+}
+"""Steps that are planned ahead at each step, by the name of a known system."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,10 +26,8 @@ class KnownSettings:
 
     trials: int = 3
     """real trials of a run, of which the first goes by f_p, or is random where there is none"""
-    horizon: int = 10
-    """steps that are planned ahead at each step"""
     sequences: int = 64
-    """of these, in each round of the cross-entropy method"""
+    """that are planned, in each round of the cross-entropy method"""
     spread: float = 0.15
     """of these about the earlier plan, in shares of the range of the actions"""
     rounds: int = 1
@@ -35,10 +42,6 @@ class KnownSettings:
     """steps of Adam after each trial, of these"""
 
 
-SEEDS = {"furuta": 5, "quadrotor": 5, "double_pendulum": 5}
-"""The most seeds of systems on which a run takes long."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Known(Experiment):
     """Systems that people know, with rivals on the same trials."""
@@ -50,7 +53,7 @@ class Known(Experiment):
         "system": {
             "pendulum": "Pendulum-v1",
             "furuta": "Furuta pendulum",
-            "quadrotor": "planar quadrotor",
+            "quadrotor": "quadrotor",
             "double_pendulum": "pendubot",
             "tanks": "two tanks",
             "reacher": "Reacher-v5",
@@ -69,6 +72,6 @@ class Known(Experiment):
         "gpadjust.control.CrossEntropy",
     )
 
-    def seeds_of(self, *kind: Any) -> Sequence[int]:
-        """Some systems have few seeds."""
-        return self.seeds[: SEEDS.get(kind[0])]
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings, and how far plans look."""
+        return {**asdict(self.settings), "horizon": HORIZONS[kind[0]]}

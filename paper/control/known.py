@@ -21,7 +21,7 @@ from paper.common.figures import curves as draw_curves
 from paper.common.learners import LEARNERS
 from paper.common.tables import frame, groups, markdown, number
 from paper.common.verdicts import Curves, paired
-from paper.control import Known, KnownSettings
+from paper.control import HORIZONS, Known, KnownSettings
 from paper.control.systems import SYSTEMS, Physics
 from paper.machines.networks import NetworkDynamics
 
@@ -38,8 +38,7 @@ def run(experiment: Known, system: str, learner: str, seed: int) -> Run:
         warnings.simplefilter("ignore", category)
     warnings.filterwarnings("ignore", message="A step of the last real episode")
     warnings.filterwarnings("ignore", message=".*WARN.*")  # Gymnasium's on spaces
-    known = SYSTEMS[system](_PHYSICS.get(learner, "crude"))
-    agent = make_agent(experiment.settings, known, learner, seed)
+    agent, known = make_agent(experiment.settings, system, learner, seed)
     length = known.episode_length or 0
     rows: list[dict[str, Any]] = []
     for _ in range(experiment.settings.trials):
@@ -57,12 +56,15 @@ def run(experiment: Known, system: str, learner: str, seed: int) -> Run:
     return {"trials": {name: [row[name] for row in rows] for name in rows[0]}}
 
 
-def make_agent(settings: KnownSettings, known: System, learner: str, seed: int) -> MPCAgent:
-    """The agent of a run, at its start."""
+def make_agent(
+    settings: KnownSettings, system: str, learner: str, seed: int
+) -> tuple[MPCAgent, System]:
+    """The agent of a run, at its start, and what it controls."""
+    known = SYSTEMS[system](_PHYSICS.get(learner, "crude"))
     task = known.task(dynamics(settings, known, learner))
     each_step = Planner(
         search=CrossEntropy(settings.rounds, num_elites=settings.elites, correlation=0.5),
-        horizon=settings.horizon,
+        horizon=HORIZONS[system],
         num_random=settings.sequences,
         spread=settings.spread,
     )
@@ -71,7 +73,7 @@ def make_agent(settings: KnownSettings, known: System, learner: str, seed: int) 
         num_random=settings.sequences,
     )
     options: dict[str, Any] = {"score_horizons": (), "seed": seed}
-    return MPCAgent(known.make(), task, each_step, first=first, **options)
+    return MPCAgent(known.make(), task, each_step, first=first, **options), known
 
 
 def dynamics(settings: KnownSettings, known: System, learner: str) -> Dynamics:

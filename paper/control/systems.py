@@ -43,6 +43,7 @@ class Machine:
         episode_length: In steps.
         substeps: Of the integration of f_p, in a step; the real one, whose friction is stiff, has
             twice as many.
+        bounds: The least and the largest values that states can have, if that is known.
     """
 
     spec: StateSpec
@@ -54,6 +55,7 @@ class Machine:
     starts: tuple[list[float], list[float]]
     episode_length: int
     substeps: int = 2
+    bounds: tuple[list[float], list[float]] | None = None
 
     def physics(self, kind: Physics = "crude") -> ODEPhysics:
         """The next values of the states that move.
@@ -91,6 +93,7 @@ class Machine:
             self.reward,
             start=self.start,
             episode_length=self.episode_length,
+            state_bounds=None if self.bounds is None else torch.tensor(self.bounds).double(),
         )
 
 
@@ -342,6 +345,7 @@ TANKS = Machine(
     actions=([0.0], [10.0]),
     starts=([1.0, 1.0, 2.0], [2.0, 2.0, 7.0]),
     episode_length=30,
+    bounds=([-1.0] * 3, [15.0] * 3),  # the tanks' height
 )  # fmt: skip
 
 

@@ -12,7 +12,6 @@ from paper.control.systems import FURUTA, SYSTEMS
 
 LIGHT = KnownSettings(
     trials=2,
-    horizon=2,
     sequences=8,
     rounds=0,
     first_rounds=0,
