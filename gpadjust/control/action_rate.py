@@ -46,16 +46,13 @@ class ActionRate:
             checked_number("the most of an action rate", each, above=0)
         checked_number("price", self.price, least=0)
 
-    @classmethod
-    def of(cls, given: Any, action_dim: int) -> ActionRate:
-        """The rate that a task is given as None, as limits alone or as a rate; checked."""
-        rate = given if isinstance(given, cls) else cls(given)
-        if len(rate._limits) not in (1, action_dim):
+    def check(self, action_dim: int) -> None:
+        """Raise a ValueError unless there is one limit, or one for each action."""
+        if len(self._limits) not in (1, action_dim):
             raise ValueError(
                 f"action_rate must have one limit, or one for each of {action_dim} actions; found "
-                f"{len(rate._limits)}."
+                f"{len(self._limits)}."
             )
-        return rate
 
     @property
     def _limits(self) -> list[Any]:

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gpadjust.checks import checked_number
-from gpadjust.control.action_rate import ActionRate
 from gpadjust.control.task import Task, per_row
 
 Policy = Callable[[Tensor], Tensor]
@@ -93,8 +92,8 @@ class Rollouts:
             sequences: ``n x T x action_dim``.
         """
         n, num_steps = sequences.shape[:2]
-        rate = ActionRate.of(self.task.action_rate, sequences.shape[-1])
-        sequences = rate.limited(sequences, self.before)
+        if self.task.rate is not None:
+            sequences = self.task.rate.limited(sequences, self.before)
         every = sequences.expand(self.num_functions, *sequences.shape)
         return self._run(state.expand(n, -1), num_steps, lambda t, states: every[:, :, t])
 
@@ -258,14 +257,14 @@ class Return(Objective):
     def of(self, task: Task) -> Score:
         """The return of rollouts."""
         largest = torch.zeros((), dtype=torch.float64)
-        rate = ActionRate.of(task.action_rate, task.dynamics.spec.action_dim)
+        rate = task.rate
 
         def score(rollout: Rollout) -> Tensor:
             nonlocal largest
             rewards = rollout.rewards.double()
             if self.effort:
                 rewards = rewards - self.effort * rollout.actions.square().sum(-1)
-            if rate.price:
+            if rate is not None:
                 rewards = rewards - rate.cost(rollout.actions, rollout.before)
             weights = self.discount ** torch.arange(rewards.shape[-1] + 1, dtype=torch.float64)
             ends = weights[-1] * self._at_the_end(rollout)

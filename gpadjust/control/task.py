@@ -122,7 +122,14 @@ class Task:
             object.__setattr__(self, "state_bounds", bounds)
         if self.probability is not None:
             checked_number("probability", self.probability, above=0, below=1)
-        ActionRate.of(self.action_rate, self.dynamics.spec.action_dim)
+        if self.rate is not None:
+            self.rate.check(self.dynamics.spec.action_dim)
+
+    @property
+    def rate(self) -> ActionRate | None:
+        """``action_rate`` as an object, None if there is none."""
+        given = self.action_rate
+        return given if isinstance(given, ActionRate | None) else ActionRate(given)
 
     def try_functions(self, states: Tensor, actions: Tensor) -> None:
         """Call physics and functions once, to find what is wrong with them before it costs data.

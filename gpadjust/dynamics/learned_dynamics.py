@@ -21,9 +21,9 @@ from gpadjust.dynamics.learning import (
     made_by,
 )
 from gpadjust.dynamics.particles import varying_parameters
-from gpadjust.dynamics.physics_dynamics import PhysicsDynamics, checked_physics_error
+from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state import check_fingerprint, fingerprint
-from gpadjust.dynamics.targets import Target, Targets, check_physics
+from gpadjust.dynamics.targets import Target, Targets, check_physics, checked_physics_error
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
 from gpadjust.models.factory import ModelFactory

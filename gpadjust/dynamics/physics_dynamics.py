@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpadjust.checks import checked_number, checked_whole
+from gpadjust.checks import checked_whole
 from gpadjust.dynamics.base import Dynamics, TransitionFunctions
 from gpadjust.dynamics.state import (
     PhysicsProbes,
@@ -20,7 +20,12 @@ from gpadjust.dynamics.state import (
     loaded,
     saved,
 )
-from gpadjust.dynamics.targets import check_next_values, one_physics, warn_of_differences
+from gpadjust.dynamics.targets import (
+    check_next_values,
+    checked_physics_error,
+    one_physics,
+    warn_of_differences,
+)
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.inference.calibrate import warn_of_parameters
 from gpadjust.inference.calibration import Misfit, or_infinite
@@ -242,16 +247,6 @@ class PhysicsDynamics(Dynamics):
         check_next_values(self.physics, Y, len(moving))
         following[..., moving] = Y
         return self.spec.remember(following, states, actions)
-
-
-def checked_physics_error(spec: StateSpec, given: Mapping[str, float] | None) -> dict[str, float]:
-    """Standard deviations of the error of a step of the physics, by state; empty for None."""
-    moving = [spec.states[i] for i in spec.moving]
-    for name, sd in {**(given or {})}.items():
-        if name not in moving:
-            raise ValueError(f"physics_error is of states among {moving}; found {name!r}.")
-        checked_number(f"physics_error[{name!r}]", sd, least=0)
-    return {**(given or {})}
 
 
 class _Fitted(NamedTuple):
