@@ -164,6 +164,17 @@ class Task:
                     f"{tuple(spec.actions)}."
                 )
 
+    def refuse(self, learner: str, name: str, way_out: str) -> None:
+        """Raise a ValueError if the task has a part of this name, with which a learner cannot do.
+
+        Args:
+            learner: The name of the learner.
+            name: That of the part.
+            way_out: Who can.
+        """
+        if getattr(self, name) is not None:
+            raise ValueError(f"{learner} cannot learn a task with {name}; {way_out}.")
+
     def draw_initial_states(self, n: int) -> Tensor:
         """Draw ``n x state_dim`` states at which episodes start.
 
