@@ -82,5 +82,5 @@ def test_bad_rates_are_refused(rate, error, message):
 
 
 def test_a_price_is_not_negative():
-    with pytest.raises(ValueError, match="price must be .* at least 0"):
+    with pytest.raises(ValueError, match=r"price must be .* at least 0"):
         ActionRate(price=-1.0)
