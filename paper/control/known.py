@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.physics import as_physics
 from gpadjust.systems import System
@@ -87,7 +88,9 @@ def dynamics(settings: KnownSettings, known: System, learner: str) -> Dynamics:
         number, steps = settings.networks, settings.training
         return NetworkDynamics(known.spec, given, number=number, steps=steps)
     made = LEARNERS[learner]
-    return LearnedDynamics(known.spec, physics if made.adjusts else None, model=made.make)
+    given = physics if made.adjusts else None
+    fit: DynamicsFitOptions = {"method": settings.fit}
+    return LearnedDynamics(known.spec, given, model=made.make, fit_options=fit)
 
 
 def tables(runs: Sequence[Run], experiment: Known) -> dict[str, Table]:
