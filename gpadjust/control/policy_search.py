@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy
-from gpadjust.control.rollouts import Objective, Return, Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, Score
 from gpadjust.control.task import Task
 
 
@@ -23,7 +23,8 @@ class SearchResult(NamedTuple):
 
     Args:
         values: What the objective said in each update, ``updates``; of drawn functions and starts.
-        reward: The mean reward of a step in the last tenth of the updates.
+        reward: The mean reward of a step of the policy that was kept, in the draws that were held
+            out.
         left_bounds: The share of episodes that left the bounds there.
         seconds: How long it took.
     """
@@ -45,7 +46,9 @@ class PolicySearch:
     goes on, so that the policy cannot lean on the errors of a few. A black box as physics has the
     gradients of its finite differences.
 
-    Of the last tenth of the updates, if that is more than one, the best policy is kept.
+    Whenever functions are drawn again, the policy is judged in functions and from starts that no
+    update sees, the same each time. The best policy is kept, be it the one that the search began
+    with: a search that goes on for too long, or too fast, does no harm.
 
     Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
     matters), plans do: with a ``guide`` the policy first imitates plans of some episodes.
@@ -55,8 +58,10 @@ class PolicySearch:
         updates: Gradient steps (Adam).
         num_starts: Number of starts of each update, in each function.
         num_functions: Number of functions that each is followed through; None for the mean.
-        redraw_every: Number of updates after which other functions are drawn.
-        learning_rate: At the start; it decays to a tenth along a cosine.
+        redraw_every: Number of updates after which other functions are drawn, and the policy is
+            judged.
+        learning_rate: At the start; it decays to a tenth along a cosine. Three times the default
+            made a policy forget in a few updates what it had learnt.
         max_grad_norm: The norm at which gradients are clipped.
         guide: Plans the episodes that the policy imitates before it is improved.
         num_guides: How many.
@@ -85,7 +90,7 @@ class PolicySearch:
 
     objective: Objective = field(default_factory=Return)
     _: KW_ONLY
-    updates: int = 150
+    updates: int = 100
     num_starts: int = 24
     num_functions: int | None = 6
     redraw_every: int = 5
@@ -185,11 +190,12 @@ class PolicySearch:
             optimizer, self.updates, eta_min=self.learning_rate / 10
         )
         score = self.objective.of(task)
-        values, rewards, left = [], [], []
-        late = max(1, self.updates // 10)
-        best, kept = -math.inf, policy.state_dict()
+        held_out = Rollouts(task, self.num_functions)
+        best = _Best(held_out, self._starts(task, held_out.num_functions), score, length)
+        values = []
         for i in range(self.updates):
             if i % self.redraw_every == 0:
+                best.judge(policy)
                 rollouts = Rollouts(task, self.num_functions)
             rollout = rollouts.act(self._starts(task, rollouts.num_functions), policy, length)
             value = score(rollout).mean() / length
@@ -199,9 +205,6 @@ class PolicySearch:
                     "dynamics are computed without PyTorch's autograd. Write the reward in torch, "
                     "without .detach() and .numpy()."
                 )
-            if late > 1 and i >= self.updates - late and float(value.detach()) > best:
-                best = float(value.detach())
-                kept = {name: t.detach().clone() for name, t in policy.state_dict().items()}
             optimizer.zero_grad()
             (-value).backward()
             norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
@@ -209,14 +212,14 @@ class PolicySearch:
                 optimizer.step()
             rate.step()
             values.append(value.detach())
-            rewards.append(rollout.rewards.detach()[rollout.made].mean())
-            left.append(rollout.left_bounds.double().mean())
             if progress is not None:
                 progress(i + 1, float(value.detach()))
-        if late > 1:
-            policy.load_state_dict(kept)
-        reward, share = (float(torch.stack(each[-late:]).mean()) for each in (rewards, left))
-        return SearchResult(torch.stack(values), reward, share, time.perf_counter() - begun)
+        best.judge(policy)
+        policy.load_state_dict(best.kept)
+        rewards, left = best.rollout.rewards[best.rollout.made], best.rollout.left_bounds
+        seconds = time.perf_counter() - begun
+        share = float(left.double().mean())
+        return SearchResult(torch.stack(values), float(rewards.mean()), share, seconds)
 
     def _starts(self, task: Task, num_functions: int) -> Tensor:
         """Starts of an update: others in each function, unless these are compared at the same."""
@@ -224,6 +227,32 @@ class PolicySearch:
             return task.draw_initial_states(self.num_starts)
         starts = task.draw_initial_states(num_functions * self.num_starts)
         return starts.unflatten(0, (num_functions, self.num_starts))
+
+
+class _Best:
+    """The best policy so far, by functions and starts that no update sees.
+
+    Args:
+        rollouts: In the functions.
+        starts: As of :meth:`Rollouts.act`.
+        score: The worth of a rollout.
+        length: Steps of an episode.
+    """
+
+    kept: dict[str, Tensor]
+    rollout: Rollout
+
+    def __init__(self, rollouts: Rollouts, starts: Tensor, score: Score, length: int) -> None:
+        self.rollouts, self.starts, self.score, self.length = rollouts, starts, score, length
+        self.worth: float | None = None
+
+    def judge(self, policy: nn.Module) -> None:
+        """Keep a policy, if it is better than the one that is kept."""
+        with torch.no_grad():
+            rollout = self.rollouts.act(self.starts, policy, self.length)
+            worth = float(self.score(rollout).mean())
+        if self.worth is None or worth > self.worth:
+            self.worth, self.rollout, self.kept = worth, rollout, deepcopy(policy.state_dict())
 
 
 def imitate(
