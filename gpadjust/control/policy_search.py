@@ -37,18 +37,18 @@ class SearchResult(NamedTuple):
 
 @dataclass(frozen=True)
 class PolicySearch:
-    """Improves a policy along whole episodes in functions drawn from the dynamics.
+    """Improves a policy along whole episodes in the mean of the dynamics, or in functions.
 
-    Each update lets the policy act in ``num_functions`` functions from ``num_starts`` states each,
-    and follows the gradient of the objective back through all steps, through policy, f_p and what
-    was learnt (Deisenroth and Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). Each
-    function is deterministic and stays the same along an episode; new ones are drawn as the search
-    goes on, so that the policy cannot lean on the errors of a few. A black box as physics has the
-    gradients of its finite differences.
+    Each update lets the policy act from ``num_starts`` states, and follows the gradient of the
+    objective back through all steps, through policy, f_p and what was learnt (Deisenroth and
+    Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). With ``num_functions`` it acts in as
+    many functions, each of them deterministic and the same along an episode; new ones are drawn as
+    the search goes on, so that the policy cannot lean on the errors of a few. After one or two real
+    episodes they may differ too much for one policy. A black box as physics has the gradients of
+    its finite differences.
 
-    Whenever functions are drawn again, the policy is judged in functions and from starts that no
-    update sees, the same each time. The best policy is kept, be it the one that the search began
-    with: a search that goes on for too long, or too fast, does no harm.
+    Every few updates the policy is judged from starts, and in functions, that no update sees, the
+    same each time. The best one is kept, be it the one that the search began with.
 
     Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
     matters), plans do: with a ``guide`` the policy first imitates plans of some episodes.
@@ -57,11 +57,11 @@ class PolicySearch:
         objective: What to look for. Default: the mean return; ``Return(quantile=0.2)`` is careful.
         updates: Gradient steps (Adam).
         num_starts: Number of starts of each update, in each function.
-        num_functions: Number of functions that each is followed through; None for the mean.
-        redraw_every: Number of updates after which other functions are drawn, and the policy is
-            judged.
-        learning_rate: At the start; it decays to a tenth along a cosine. Three times the default
-            made a policy forget in a few updates what it had learnt.
+        num_functions: Number of functions that each is followed through, such as 6; None for the
+            mean.
+        redraw_every: Number of updates after which the policy is judged, and other functions are
+            drawn.
+        learning_rate: At the start; it decays to a tenth along a cosine.
         max_grad_norm: The norm at which gradients are clipped.
         guide: Plans the episodes that the policy imitates before it is improved.
         num_guides: How many.
@@ -91,8 +91,8 @@ class PolicySearch:
     objective: Objective = field(default_factory=Return)
     _: KW_ONLY
     updates: int = 100
-    num_starts: int = 24
-    num_functions: int | None = 6
+    num_starts: int = 48
+    num_functions: int | None = None
     redraw_every: int = 5
     learning_rate: float = 3e-3
     max_grad_norm: float = 1.0
