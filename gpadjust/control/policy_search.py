@@ -91,7 +91,7 @@ class PolicySearch:
     objective: Objective = field(default_factory=Return)
     _: KW_ONLY
     updates: int = 100
-    num_starts: int = 48
+    num_starts: int = 24
     num_functions: int | None = None
     redraw_every: int = 5
     learning_rate: float = 3e-3

@@ -104,9 +104,9 @@ class ReachingSettings:
     """of CKA on the paper's arm"""
     episode_length: int = 15
     """steps of 0.2 s"""
-    updates: int = 75
+    updates: int = 60
     """gradient steps after each trial, and before the first one"""
-    starts: int = 48
+    starts: int = 24
     """of each update, along the mean of the model"""
     learning_rate: float = 3e-3
     """at the start of the updates"""

@@ -272,7 +272,7 @@ def test_a_search_that_does_harm_keeps_the_policy_that_it_began_with():
 
 
 def test_the_result_is_that_of_the_policy_that_is_kept():
-    fixed = torch.linspace(-1, 1, 48, dtype=torch.float64).unsqueeze(-1)
+    fixed = torch.linspace(-1, 1, 24, dtype=torch.float64).unsqueeze(-1)
     task = replace(task_of(PhysicsDynamics(SPEC, step)), initial_states=lambda n: fixed[:n])
     policy = linear_policy(SPEC, BOUNDS)
     result = PolicySearch(updates=7, learning_rate=0.1).improve(policy, task)
