@@ -1,0 +1,1 @@
+"""Controllers for systems that people know."""

@@ -1,0 +1,427 @@
+"""Systems that people know: the real one with friction, drag or losses, and an f_p without."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpadjust.physics import ODEPhysics, Unknown
+from gpadjust.states import StateSpec
+from gpadjust.systems import System
+from paper.control import equations
+from paper.machines.pendulums import DOUBLE_PENDULUM
+
+Physics = Literal["crude", "unknown", "true"]
+"""What is given as f_p: the crude one, the same with unknown parameters, or the true system."""
+Rates = Callable[[Tensor, Tensor, Mapping[str, Any]], Tensor]
+Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A real system and what is believed of it.
+
+    Args:
+        spec: What states and actions are, with the duration of a step.
+        rates: Its equation of motion.
+        true: The parameters of the real system.
+        believed: Those that f_p has, with the crude value as the guess; the others are zero there.
+        reward: Known rewards, in [-1, 0].
+        actions: The least and the largest values of the actions.
+        starts: The least and the largest values of the states at which episodes start.
+        episode_length: In steps.
+        substeps: Of the integration, in a step.
+    """
+
+    spec: StateSpec
+    rates: Rates
+    true: Mapping[str, float]
+    believed: Mapping[str, Unknown]
+    reward: Reward
+    actions: tuple[list[float], list[float]]
+    starts: tuple[list[float], list[float]]
+    episode_length: int
+    substeps: int = 5
+
+    def physics(self, kind: Physics = "crude") -> ODEPhysics:
+        """The next values of the states that move.
+
+        Raises:
+            ValueError: If there is no such kind.
+        """
+        if kind not in ("crude", "unknown", "true"):
+            raise ValueError(f"physics must be 'crude', 'unknown' or 'true'; found {kind!r}.")
+        lacking = dict.fromkeys(self.true, 0.0)
+        guesses = {name: known.guess for name, known in self.believed.items()}
+        step, dim = self.spec.step or 1.0, len(self.spec.moving)
+        make = partial(ODEPhysics, step=step, state_dim=dim, substeps=self.substeps)
+        name = self.rates.__name__
+        if kind == "unknown":
+            rates = partial(_rates, self.rates, lacking)
+            return make(rates, unknowns=self.believed, name=name)
+        known = self.true if kind == "true" else {**lacking, **guesses}
+        return make(partial(_rates, self.rates, known), name=name)
+
+    def start(self, n: int) -> Tensor:
+        """States at which episodes start, ``n x state_dim``, by PyTorch's generator."""
+        low, high = torch.tensor(self.starts, dtype=torch.float64)
+        return low + (high - low) * torch.rand(n, len(low), dtype=torch.float64)
+
+    def system(
+        self, physics: Physics = "crude", env: Callable[..., gym.Env[Any, Any]] | None = None
+    ) -> System:
+        """The system; its environment is :class:`MachineEnv` unless there is another."""
+        return System(
+            env or partial(MachineEnv, self),
+            self.spec,
+            self.physics(physics),
+            self.reward,
+            start=self.start,
+            episode_length=self.episode_length,
+        )
+
+
+def _rates(
+    rates: Rates, fixed: Mapping[str, float], state: Tensor, action: Tensor, p: Any = None
+) -> Tensor:
+    return rates(state, action, {**fixed, **(p or {})})
+
+
+class MachineEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]]):
+    """The real system: observations are the states, with sine and cosine of angles."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine = machine
+        self.physics = machine.physics("true")
+        dim = machine.spec.observation_dim
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (dim,), np.float64)
+        low, high = np.array(machine.actions, dtype=np.float32)
+        self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.state = torch.zeros(machine.spec.state_dim, dtype=torch.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Start an episode, at random or at ``options["state"]``."""
+        super().reset(seed=seed)
+        state = (options or {}).get("state")
+        drawn = self.np_random.uniform(*self.machine.starts) if state is None else state
+        self.state = torch.as_tensor(drawn, dtype=torch.float64)
+        return self._observation(), {}
+
+    def step(self, action: NDArray[Any]) -> Any:
+        """Make a step, with the actions clipped to what there is."""
+        low, high = np.array(self.machine.actions)
+        row = torch.as_tensor(np.clip(np.asarray(action, dtype=float), low, high))[None]
+        spec, state = self.machine.spec, self.state[None]
+        following = state.clone()
+        with torch.no_grad():
+            moving = torch.cat([state[:, spec.moving], row], dim=-1)
+            following[:, spec.moving] = self.physics(moving)
+            reward = self.machine.reward(state, row, following).item()
+        self.state = following[0]
+        return self._observation(), reward, False, False, {}
+
+    def _observation(self) -> NDArray[np.float64]:
+        return self.machine.spec.observe(self.state).numpy()
+
+
+def _wrapped(angle: Tensor) -> Tensor:
+    return torch.atan2(angle.sin(), angle.cos())
+
+
+def _near(*errors: Tensor) -> Tensor:
+    """The reward of errors, each in the unit in which it is large: 0 if none, -1 if any is."""
+    return torch.expm1(-torch.stack(errors).square().sum(0))
+
+
+def pendulum_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """Pendulum-v1's, of the state that was reached, by its largest cost."""
+    theta, rate = _wrapped(next_states[:, 0]), next_states[:, 1]
+    cost = theta.square() + 0.1 * rate.square() + 0.001 * actions[:, 0].square()
+    return -cost / (math.pi**2 + 0.1 * 8**2 + 0.001 * 2**2)
+
+
+PENDULUM = Machine(
+    StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"], step=0.1),
+    equations.pendulum,
+    true={"mass": 1.0, "length": 1.0, "viscous": 0.05, "dry": 0.15},
+    believed={
+        "mass": Unknown(1.3, factor=1.5, unit="kg"),
+        "length": Unknown(1.0, factor=1.1, unit="m"),
+        "viscous": Unknown(0.0, sd=0.1, unit="N m s"),
+    },
+    reward=pendulum_reward,
+    actions=([-2.0], [2.0]),
+    starts=([math.pi - 0.2, -0.2], [math.pi + 0.2, 0.2]),
+    episode_length=50,
+    substeps=4,
+)
+
+
+class FrictionPendulumEnv(PendulumEnv):
+    """Gymnasium's Pendulum-v1 from hanging, with friction: a torque is held for ten short steps.
+
+    It observes sine and cosine in the order of a spec.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.dt = 0.01
+        self.max_torque = 10.0  # of its own steps, where friction comes on top
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Start from hanging, nearly at rest."""
+        super().reset(seed=seed)
+        self.state = self.np_random.uniform(*PENDULUM.starts)
+        return self._get_obs(), {}
+
+    def step(self, u: NDArray[Any]) -> Any:
+        """Hold a torque."""
+        torque = np.asarray(u, dtype=float).clip(*np.array(PENDULUM.actions))
+        before = self.state
+        for _ in range(10):
+            lost = equations.friction(torch.tensor(self.state[1:]), PENDULUM.true)
+            super().step(torque - lost.numpy())
+        rows = (torch.from_numpy(each)[None] for each in (before, torque, self.state))
+        return self._get_obs(), pendulum_reward(*rows).item(), False, False, {}
+
+    def _get_obs(self) -> NDArray[np.float32]:
+        cos, sin, rate = super()._get_obs()
+        return np.array([sin, cos, rate])
+
+
+def pendulum(physics: Physics = "crude") -> System:
+    """Gymnasium's Pendulum-v1 with friction, from hanging; f_p is 30 % too heavy and has none.
+
+    Torques of at most 2 N m, held for 0.1 s, an episode of 5 s.
+    """
+    return PENDULUM.system(physics, FrictionPendulumEnv)
+
+
+def furuta_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """By the pendulum's angle from upright and the arm's from where it began."""
+    return _near(_wrapped(next_states[:, 1]) / 2, next_states[:, 0] / 2)
+
+
+FURUTA = Machine(
+    StateSpec(
+        ["arm", "theta", "arm_dot", "theta_dot"], ["voltage"], angles=["theta"], step=0.04
+    ),
+    equations.furuta,
+    true={
+        "mass": 0.024, "length": 0.129, "arm_mass": 0.095, "arm_length": 0.085,
+        "torque": 0.042 / 8.4, "induced": 0.042, "viscous": 0.0001, "dry": 0.0015, "joint": 5e-5,
+    },
+    believed={
+        "mass": Unknown(0.03, factor=1.5, unit="kg"),
+        "length": Unknown(0.129, factor=1.1, unit="m"),
+        "arm_mass": Unknown(0.08, factor=1.5, unit="kg"),
+        "arm_length": Unknown(0.085, factor=1.1, unit="m"),
+        "torque": Unknown(0.006, factor=1.5, unit="N m/V"),
+        "viscous": Unknown(0.0, sd=0.0005, unit="N m s"),
+    },
+    reward=furuta_reward,
+    actions=([-10.0], [10.0]),
+    starts=([-0.1, math.pi - 0.1, -0.1, -0.1], [0.1, math.pi + 0.1, 0.1, 0.1]),
+    episode_length=40,
+    substeps=4,
+)  # fmt: skip
+
+
+def furuta(physics: Physics = "crude") -> System:
+    """A Furuta pendulum of a QUBE-Servo's size; f_p lacks friction and the induced voltage.
+
+    Masses and torque of f_p are 16 to 25 % off. At most 10 V, held for 0.04 s, an episode of 1.6 s.
+    """
+    return FURUTA.system(physics)
+
+
+def quadrotor_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """By the distance from the origin and the speed of turning."""
+    x, z, _, _, _, turn = next_states.unbind(-1)
+    return _near(x, z, turn / 10)
+
+
+QUADROTOR = Machine(
+    StateSpec(
+        ["x", "z", "phi", "x_dot", "z_dot", "phi_dot"],
+        ["left", "right"],
+        angles=["phi"],
+        step=0.05,
+    ),
+    equations.quadrotor,
+    true={"mass": 0.5, "arm": 0.15, "inertia": 0.006, "drag": 0.2, "turning_drag": 0.005},
+    believed={
+        "mass": Unknown(0.4, factor=1.5, unit="kg"),
+        "arm": Unknown(0.18, factor=1.5, unit="m"),
+        "inertia": Unknown(0.006, factor=1.5, unit="kg m²"),
+        "turning_drag": Unknown(0.0, sd=0.01, unit="N m s"),
+    },
+    reward=quadrotor_reward,
+    actions=([0.0, 0.0], [6.0, 6.0]),
+    starts=([-1.0, -1.0, -0.3, -0.5, -0.5, -0.5], [1.0, 1.0, 0.3, 0.5, 0.5, 0.5]),
+    episode_length=50,
+)
+
+
+def quadrotor(physics: Physics = "crude") -> System:
+    """A planar quadrotor that flies to the origin; f_p lacks drag, and is a fifth too light.
+
+    Thrusts of at most 6 N each, held for 0.05 s, an episode of 2.5 s.
+    """
+    return QUADROTOR.system(physics)
+
+
+def double_pendulum_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """By the angles of both links from upright."""
+    first, second = next_states[:, 0] - math.pi, next_states[:, :2].sum(-1) - math.pi
+    return _near(_wrapped(first) / 2, _wrapped(second) / 2)
+
+
+def _pendubot(state: Tensor, action: Tensor, p: Mapping[str, Any]) -> Tensor:
+    return DOUBLE_PENDULUM.rates(state, torch.cat([action, 0 * action], dim=-1), p)
+
+
+_IDENTIFIED, _CRUDE = (DOUBLE_PENDULUM.known[kind] for kind in ("identified", "crude"))
+PENDUBOT = Machine(
+    StateSpec(["q1", "q2", "dq1", "dq2"], ["torque"], angles=["q1", "q2"], step=0.05),
+    _pendubot,
+    true=_IDENTIFIED,
+    believed={
+        name: known
+        for name, known in DOUBLE_PENDULUM.unknowns.items()
+        if not name.startswith(("viscous", "coulomb"))
+    }
+    | {f"viscous_{i}": Unknown(0.0, sd=0.05, unit="N m s") for i in (1, 2)},
+    reward=double_pendulum_reward,
+    actions=([-10.0], [10.0]),
+    starts=([-0.1] * 4, [0.1] * 4),
+    episode_length=50,
+)
+
+
+def double_pendulum(physics: Physics = "crude") -> System:
+    """RealAIGym's pendubot, hanging at first: two links, of which the first alone has a drive.
+
+    The real one has the identified parameters of the makers' design A.0 with Coulomb friction, f_p
+    masses and inertias that are 15 % off, and no friction. At most 10 N m, held for 0.05 s, an
+    episode of 2.5 s.
+    """
+    return PENDUBOT.system(physics)
+
+
+def tanks_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """By the distance of the lower level from its set-point."""
+    return _near((next_states[:, 1] - next_states[:, 2]) / 2)
+
+
+TANKS = Machine(
+    StateSpec(["upper", "lower", "set_point"], ["pump"], exogenous=["set_point"], step=5.0),
+    equations.tanks,
+    true={
+        "pump": 0.08, "upper_outflow": 0.14, "lower_outflow": 0.12,
+        "back_pressure": 0.05, "overflow": equations.OVERFLOW,
+    },
+    believed={
+        "pump": Unknown(0.1, factor=1.5, unit="cm/(V s)"),
+        "upper_outflow": Unknown(0.18, factor=1.5, unit="cm^0.5/s"),
+        "lower_outflow": Unknown(0.16, factor=1.5, unit="cm^0.5/s"),
+    },
+    reward=tanks_reward,
+    actions=([0.0], [10.0]),
+    starts=([1.0, 1.0, 2.0], [2.0, 2.0, 7.0]),
+    episode_length=30,
+    substeps=10,
+)  # fmt: skip
+
+
+def tanks(physics: Physics = "crude") -> System:
+    """Two tanks below each other, whose lower level is to come to a set-point of the episode.
+
+    The pump of the real one loses against the pressure, and the tanks can flow over; f_p lacks
+    both, and its flows are 25 to 33 % too strong. At most 10 V, held for 5 s, an episode of 150 s.
+    """
+    return TANKS.system(physics)
+
+
+_EFFORT = 0.1  # Reacher-v5's own, 1, is up to ten times the distance
+
+
+def reacher_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+    """Reacher-v5's: the fingertip's distance from the target in m, and a tenth of the effort."""
+    first, both = next_states[:, 0], next_states[:, :2].sum(-1)
+    x = 0.1 * first.cos() + 0.11 * both.cos() - next_states[:, 4]
+    y = 0.1 * first.sin() + 0.11 * both.sin() - next_states[:, 5]
+    return -(x.square() + y.square()).sqrt() - _EFFORT * actions.square().sum(-1)
+
+
+REACHER = Machine(
+    StateSpec(
+        ["q1", "q2", "dq1", "dq2", "x", "y"],
+        ["drive_1", "drive_2"],
+        angles=["q1", "q2"],
+        exogenous=["x", "y"],
+        step=0.02,
+    ),
+    equations.drives,
+    true={"gain": 200.0, "inertia": 1.0, "viscous": 1.0},
+    believed={
+        "gain": Unknown(140.0, factor=1.5, unit="N m"),
+        "inertia": Unknown(1.0, factor=1.1, unit="kg m²"),
+    },
+    reward=reacher_reward,
+    actions=([-1.0, -1.0], [1.0, 1.0]),
+    starts=([-0.1, -0.1, 0.0, 0.0, -0.14, -0.14], [0.1, 0.1, 0.0, 0.0, 0.14, 0.14]),
+    episode_length=50,
+    substeps=1,
+)
+
+
+class ReacherStates(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+    """Reacher-v5 that observes the states of a spec."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (8,), np.float64)
+
+    def observation(self, observation: NDArray[Any]) -> NDArray[Any]:
+        """Sine and cosine of each joint, the rates, and the target."""
+        return observation[[2, 0, 3, 1, 6, 7, 4, 5]]
+
+
+def _reacher_env(**options: Any) -> gym.Env[Any, Any]:
+    try:
+        env = gym.make("Reacher-v5", reward_control_weight=_EFFORT, **options)
+    except gym.error.DependencyNotInstalled as error:
+        raise ImportError("The reacher needs MuJoCo: pip install 'mujoco<4' imageio.") from error
+    return ReacherStates(env)
+
+
+def reacher(physics: Physics = "crude") -> System:
+    """MuJoCo's Reacher-v5: two joints reach for a target; f_p lacks damping, its drives are weak.
+
+    Drives in [-1, 1], held for 0.02 s, an episode of 1 s. It needs MuJoCo.
+    """
+    return REACHER.system(physics, _reacher_env)
+
+
+SYSTEMS: Mapping[str, Callable[[Physics], System]] = {
+    "pendulum": pendulum,
+    "furuta": furuta,
+    "quadrotor": quadrotor,
+    "double_pendulum": double_pendulum,
+    "tanks": tanks,
+    "reacher": reacher,
+}
+"""The systems, by their names."""
