@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -75,3 +76,54 @@ class Known(Experiment):
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and how far plans look."""
         return {**asdict(self.settings), "horizon": HORIZONS[kind[0]]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallsSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p with its stated error"""
+    probability: float = 0.95
+    """of constraints holding through a trial"""
+    sequences: int = 48
+    """that are planned, in each round of the cross-entropy method"""
+    horizon: int = 8
+    """steps that are planned ahead at each step"""
+    rounds: int = 1
+    """of these after the first"""
+    first_sequences: int = 96
+    """that are planned when a trial begins, of all its steps"""
+    first_rounds: int = 4
+    """of these after the first"""
+    elites: int = 8
+    """of a round"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walls(Experiment):
+    """Systems near walls, with margins of the constraints and without."""
+
+    runs: int = 14
+    """seeds of the controllers that are judged; of the others a third"""
+    out: Path = Path("results/walls")
+    settings: WallsSettings = field(default_factory=WallsSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {"cart": "cart in gusts", "cart-pole": "cart-pole", "tanks": "two tanks"},
+        "controller": {
+            "margin": "CKA, probability 0.95",
+            "hard": "CKA, no margin",
+            "none": "CKA, no constraint",
+            "truth": "true model, no margin",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Fewer seeds of the rivals."""
+        return self.seeds if kind[1] in ("margin", "truth") else self.seeds[: -(-self.runs // 3)]
