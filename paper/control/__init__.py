@@ -86,13 +86,13 @@ class WallsSettings:
     """real trials of a run, of which the first goes by f_p with its stated error"""
     probability: float = 0.95
     """of constraints holding through a trial"""
-    sequences: int = 48
+    sequences: int = 40
     """that are planned, in each round of the cross-entropy method"""
     horizon: int = 8
     """steps that are planned ahead at each step"""
     rounds: int = 1
     """of these after the first"""
-    first_sequences: int = 96
+    first_sequences: int = 64
     """that are planned when a trial begins, of all its steps"""
     first_rounds: int = 4
     """of these after the first"""
@@ -105,7 +105,7 @@ class Walls(Experiment):
     """Systems near walls, with margins of the constraints and without."""
 
     runs: int = 14
-    """seeds of the controllers that are judged; of the others a third"""
+    """seeds of the controllers that are judged; of the others a quarter"""
     out: Path = Path("results/walls")
     settings: WallsSettings = field(default_factory=WallsSettings)
 
@@ -126,4 +126,4 @@ class Walls(Experiment):
 
     def seeds_of(self, *kind: Any) -> Sequence[int]:
         """Fewer seeds of the rivals."""
-        return self.seeds if kind[1] in ("margin", "truth") else self.seeds[: -(-self.runs // 3)]
+        return self.seeds if kind[1] in ("margin", "truth") else self.seeds[: -(-self.runs // 4)]
