@@ -10,6 +10,7 @@ from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
+from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "Callback",
     "CrossEntropy",
     "EpisodeCheckpoint",
+    "Estimate",
     "InitialStates",
     "MPCAgent",
     "Objective",
@@ -35,6 +37,7 @@ __all__ = [
     "Rollouts",
     "Search",
     "SearchResult",
+    "StateFilter",
     "Step",
     "Task",
     "Termination",

@@ -13,6 +13,7 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_whole
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
+from gpadjust.states import Sensors, StateSpec
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rewards ``N`` of states, actions and next states, ``N`` rows each."""
@@ -64,10 +65,13 @@ class Task:
         state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
             model is not followed; infinite where there is none. Default: far beyond all that was
             seen, of an agent that has seen some; else none.
+        sensors: What is measured of the states, of which observations then are; it takes
+            ``initial_states``. Default: all of the states.
 
     Raises:
         TypeError: If something is of another kind, or a function takes other arguments.
-        ValueError: If a number or the bounds are out of range.
+        ValueError: If a number or the bounds are out of range, or there are sensors of no such
+            states, or without ``initial_states``.
 
     Example:
         >>> import torch
@@ -84,6 +88,7 @@ class Task:
     initial_states: InitialStates | None = None
     episode_length: int | None = None
     state_bounds: Tensor | None = None
+    sensors: Sensors | None = None
 
     def __post_init__(self) -> None:
         """Check what can be checked without a state."""
@@ -99,6 +104,20 @@ class Task:
         if self.state_bounds is not None:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)
+        check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
+        if self.sensors is not None:
+            self.sensors.spec(self.dynamics.spec)  # checks the names
+            if self.initial_states is None:
+                raise ValueError(
+                    "Of hidden states it must be known where episodes start; pass initial_states, "
+                    "or start of a System, as well as sensors."
+                )
+
+    @property
+    def observed(self) -> StateSpec:
+        """What is observed, as a spec: the states, or the outputs of the sensors."""
+        spec = self.dynamics.spec
+        return spec if self.sensors is None else self.sensors.spec(spec)
 
     def try_functions(self, states: Tensor, actions: Tensor) -> None:
         """Call physics and functions once, to find what is wrong with them before it costs data.
@@ -113,24 +132,37 @@ class Task:
         """
         if self.initial_states is not None:
             self.draw_initial_states(len(states))
+        if self.sensors is not None:
+            self.sensors.measure(self.dynamics.spec, states)
         self.rewards(states, actions, states)
         self.terminations(states)
         self.dynamics.try_physics(states, actions)
 
     def check_spaces(self, observation_space: Any, action_space: Any) -> None:
-        """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
-        spec = self.dynamics.spec
+        """Raise a ValueError unless the spaces are boxes of what is observed and of actions."""
+        spec, whose = self.observed, "dynamics" if self.sensors is None else "sensors"
         for name, space, size in (
             ("observation", observation_space, spec.observation_dim),
             ("action", action_space, spec.action_dim),
         ):
             if not hasattr(space, "high") or space.shape != (size,):
                 raise ValueError(
-                    f"The spec of the dynamics says that the {name} has {size} entries, so a Box "
+                    f"The spec of the {whose} says that the {name} has {size} entries, so a Box "
                     f"of shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, "
                     f"of which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
                     f"{tuple(spec.actions)}."
                 )
+
+    def refuse(self, learner: str, name: str, way_out: str) -> None:
+        """Raise a ValueError if the task has a part of this name, with which a learner cannot do.
+
+        Args:
+            learner: The name of the learner.
+            name: That of the part.
+            way_out: Who can.
+        """
+        if getattr(self, name) is not None:
+            raise ValueError(f"{learner} cannot learn a task with {name}; {way_out}.")
 
     def draw_initial_states(self, n: int) -> Tensor:
         """Draw ``n x state_dim`` states at which episodes start.
@@ -225,6 +257,7 @@ class Task:
             "initial_states": self.initial_states is not None,
             "episode_length": self.episode_length,
             "state_bounds": None if bounds is None else bounds.tolist(),
+            "sensors": None if self.sensors is None else self.sensors.describe(),
         }
 
 

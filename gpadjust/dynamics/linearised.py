@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -41,15 +42,28 @@ def linearised(dynamics: Dynamics, states: Tensor, actions: Tensor) -> Linearise
         RuntimeError: If the dynamics have learnt nothing yet.
         PhysicsError: If the physics fails.
     """
+
+    def mean(at: Tensor) -> Tensor:
+        return dynamics.mean_function()(at.unsqueeze(0), actions.unsqueeze(0)).squeeze(0)
+
+    values, slope = with_slope(mean, states)
+    with torch.no_grad():
+        variance = dynamics.predict(states, actions).variance
+    return Linearised(values, slope, variance)
+
+
+def with_slope(function: Callable[[Tensor], Tensor], states: Tensor) -> tuple[Tensor, Tensor]:
+    """Values ``N x m`` at states ``N x state_dim``, row by row, and their derivatives by these.
+
+    The derivatives are ``N x m x state_dim``.
+    """
     with torch.enable_grad():
         at = states.detach().clone().requires_grad_(True)
-        mean = dynamics.mean_function()(at.unsqueeze(0), actions.unsqueeze(0)).squeeze(0)
+        values = function(at)
         rows = [
             torch.autograd.grad(column.sum(), at, retain_graph=True, materialize_grads=True)[0]
             if column.requires_grad
             else torch.zeros_like(at)
-            for column in mean.unbind(-1)
+            for column in values.unbind(-1)
         ]
-    with torch.no_grad():
-        variance = dynamics.predict(states, actions).variance
-    return Linearised(mean.detach(), torch.stack(rows, dim=-2), variance)
+    return values.detach(), torch.stack(rows, dim=-2)
