@@ -11,7 +11,7 @@ from torch import Tensor
 from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import random_sequences
 from gpadjust.control.task import Task
-from gpadjust.dynamics.linearised import linearised, with_slope
+from gpadjust.dynamics.linearised import derivatives, linearised
 from gpadjust.models.sampled_functions import seeded
 from gpadjust.records.kalman import Array, measure
 
@@ -128,9 +128,12 @@ def measured_near(task: Task, states: Tensor, observations: Tensor) -> tuple[Ten
     """
     spec, sensors = task.dynamics.spec, task.sensors
     assert sensors is not None, "asked before"
-    values, slope = with_slope(lambda at: sensors.measure(spec, at), states)
+    with torch.enable_grad():
+        at = states.detach().clone().requires_grad_(True)
+        values = sensors.measure(spec, at)
+        (slope,) = derivatives(values, [at])
     seen = sensors.spec(spec)
-    off = seen.change(values, seen.decode(observations))
+    off = seen.change(values.detach(), seen.decode(observations))
     return slope, off + (slope @ states.unsqueeze(-1)).squeeze(-1)
 
 
