@@ -120,16 +120,27 @@ def scramble():
     random.seed(99)
 
 
-class Falls(gymnasium.Wrapper):
-    """A robot that has to be set up again after its eighth step."""
+FAULTS = ("nan", "inf", "1e30", "reward nan", "reward 1e30", "raises")
 
-    steps = 0
+
+class Faulty(gymnasium.Wrapper):
+    """A machine of which some steps fail, by their numbers from 1, each in its way of `FAULTS`."""
+
+    def __init__(self, env, faults):
+        super().__init__(env)
+        self.faults, self.steps = faults, 0
 
     def step(self, action):
         self.steps += 1
-        if self.steps == 8:
+        fault = self.faults.get(self.steps, "")
+        if fault == "raises":
             raise OSError("the robot fell")
-        return super().step(action)
+        observation, reward, *others = self.env.step(action)
+        if fault.startswith("reward"):
+            reward = float(fault.split()[1])
+        elif fault:
+            observation = np.full_like(observation, float(fault))
+        return observation, reward, *others
 
 
 class Shouting(gymnasium.Wrapper):

@@ -1,15 +1,17 @@
 """Tasks, planning and policy search in dynamics models, and agents that control by them."""
 
-from gpadjust.control.agent import Agent, Callback, print_progress
+from gpadjust.control.agent import Agent, Callback
 from gpadjust.control.agents import MPCAgent, PolicySearchAgent
 from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
 from gpadjust.control.mpc import MPC, Planned
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.policies import BoundedPolicy, linear_policy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
+from gpadjust.control.progress import print_progress
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
+from gpadjust.control.step_guard import FailedStepWarning, StepGuard
 from gpadjust.control.task import InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
@@ -19,6 +21,7 @@ __all__ = [
     "Callback",
     "CrossEntropy",
     "EpisodeCheckpoint",
+    "FailedStepWarning",
     "InitialStates",
     "MPCAgent",
     "Objective",
@@ -36,6 +39,7 @@ __all__ = [
     "Search",
     "SearchResult",
     "Step",
+    "StepGuard",
     "Task",
     "Termination",
     "imitate",

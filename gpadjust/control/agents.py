@@ -20,6 +20,7 @@ from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch
 from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import random_sequences
+from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -51,7 +52,7 @@ class MPCAgent(Agent):
         >>> quick = Planner(search=CrossEntropy(1), horizon=3, num_random=16)  # or leave it out
         >>> agent = MPCAgent(system.make(), system.task(), quick, first=quick, seed=0)
         >>> agent.learn(total_timesteps=2 * 25)
-        MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps)
+        MPCAgent(CartPoleSwingUpEnv, LearnedDynamics, 2 episodes learnt, 50 steps, last reward ...)
     """
 
     def __init__(
@@ -148,7 +149,7 @@ class PolicySearchAgent(Agent):
         >>> search = PolicySearch(updates=2, num_starts=4, num_functions=2)
         >>> agent = PolicySearchAgent(system.make(), system.task(), linear_policy, search, seed=0)
         >>> agent.learn(total_timesteps=25)
-        PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps)
+        PolicySearchAgent(CartPoleSwingUpEnv, LearnedDynamics, 1 episodes learnt, 25 steps, ...)
     """
 
     def __init__(
@@ -208,6 +209,7 @@ class PolicySearchAgent(Agent):
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
         """The policy's actions, always the same at an observation; see :meth:`Agent.predict`."""
+        check_observation(observation)
         with torch.no_grad():
             actions = self.policy.act(torch.as_tensor(np.asarray(observation)).double())
         return actions.numpy().astype(np.float32), state

@@ -14,6 +14,7 @@ from torch import Tensor
 from gpadjust.checks import check_kind, checked_bounds, checked_number
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
+from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
@@ -152,6 +153,7 @@ class MPC:
         always the same.
         """
         spec = self.task.dynamics.spec
+        check_observation(observation)
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
         states = spec.decode(rows)
         episodes: list[Planned | None] = [None] * len(states)

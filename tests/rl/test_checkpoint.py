@@ -190,7 +190,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_unpickled(
     wide = point_env()
     wide.action_space = gymnasium.spaces.Box(-3, 3, (1,))
     for env, given, algorithm, message in [
-        (Shouting(point_env()), task, DynaSAC, "DummyVecEnv of Monitor of Shout"),
+        (Shouting(point_env()), task, DynaSAC, "DummyVecEnv of StepGuard of Monitor of Shout"),
         *(
             (wrapped([layer]), task, DynaSAC, "wrappers is")
             for layer in ("normalised", "monitored")
