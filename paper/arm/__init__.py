@@ -104,11 +104,11 @@ class ReachingSettings:
     """of CKA on the paper's arm"""
     episode_length: int = 15
     """steps of 0.2 s"""
-    updates: int = 150
+    updates: int = 60
     """gradient steps after each trial, and before the first one"""
-    starts: int = 96
+    starts: int = 24
     """of each update, along the mean of the model"""
-    learning_rate: float = 1e-2
+    learning_rate: float = 3e-3
     """at the start of the updates"""
     first_action: float = 0.05
     """of all muscles, before there are data; at rest they are not tense"""
