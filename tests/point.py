@@ -4,14 +4,9 @@ Its fixtures are imported by rooms.
 """
 
 import io
-import os
 import pickle
 import random
-import subprocess
-import sys
-import textwrap
 import threading
-import time
 import zipfile
 
 import gymnasium
@@ -185,29 +180,6 @@ def forbid_unpickling(monkeypatch):
     calls = [f"{room}.{call}" for room in ("pickle", "cloudpickle") for call in ("load", "loads")]
     for name in (*calls, "gpadjust.control.agent._Unpickler"):
         monkeypatch.setattr(name, unpickled)
-
-
-def last_lines(script, folder):
-    """The last line that a script prints, and that of one which is killed at random moments."""
-    file = folder / "run.py"
-    file.write_text(textwrap.dedent(script))
-
-    def start(name):
-        command = [sys.executable, str(file), str(folder / name)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-
-    def last(process):
-        return process.communicate()[0].splitlines()[-1]
-
-    whole, moments = last(start("whole.ckpt")), random.Random(0)
-    for _ in range(3):
-        process = start("run.ckpt")
-        assert process.stdout.readline() == "written\n"
-        time.sleep(moments.uniform(0.0, 0.4))
-        process.kill()
-        process.communicate()
-    return whole, last(start("run.ckpt"))
 
 
 def flat(name, value, found):

@@ -28,7 +28,6 @@ from tests.point import (
     assert_equal,
     assert_read_without_pickle,
     forbid_unpickling,
-    last_lines,
     robot,
     scramble,
 )
@@ -96,38 +95,6 @@ def test_checkpoints_come_every_so_many_episodes(make_agent, tmp_path, monkeypat
     assert saved == [0, 10, 20, 25]
     with pytest.raises(ValueError, match="every must be at least 1; found 0"):
         EpisodeCheckpoint(tmp_path / "run.ckpt", every=0)
-
-
-SCRIPT = """
-    import hashlib, sys
-    from pathlib import Path
-
-    import torch
-
-    torch.set_num_threads(1)
-    from gpadjust.control import CrossEntropy, EpisodeCheckpoint, MPCAgent, Planner, resume
-    from gpadjust.dynamics import LearnedDynamics
-    from gpadjust.systems import cart_pole
-
-    path, system = Path(sys.argv[1]), cart_pole()
-    quick = {"method": "map", "num_starts": 1, "num_screened": 0}
-    env, dynamics = system.make(), LearnedDynamics(system.spec, system.physics, fit_options=quick)
-    task = system.task(dynamics)
-    if path.exists():
-        agent = resume(path, env, task)
-    else:
-        plan = Planner(search=CrossEntropy(1), horizon=4, num_random=16)
-        agent = MPCAgent(env, task, plan, first=plan, score_horizons=(), seed=0)
-    tells = lambda agent, event, values: event == "episode" and print("written", flush=True)
-    agent.learn(100 - agent.num_timesteps, [EpisodeCheckpoint(path), tells])
-    print(hashlib.sha256(agent.recorded_episodes().states.numpy().tobytes()).hexdigest())
-"""
-
-
-@pytest.mark.slow
-def test_a_process_that_is_killed_at_random_moments(tmp_path):
-    whole, killed = last_lines(SCRIPT, tmp_path)
-    assert whole == killed
 
 
 # Files
