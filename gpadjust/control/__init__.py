@@ -12,6 +12,7 @@ from gpadjust.control.progress import print_progress
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
+from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.step_guard import FailedStepWarning, StepGuard
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
 
@@ -24,6 +25,7 @@ __all__ = [
     "Constraints",
     "CrossEntropy",
     "EpisodeCheckpoint",
+    "Estimate",
     "FailedStepWarning",
     "InitialStates",
     "MPCAgent",
@@ -41,6 +43,7 @@ __all__ = [
     "Rollouts",
     "Search",
     "SearchResult",
+    "StateFilter",
     "Step",
     "StepGuard",
     "Task",
