@@ -179,13 +179,18 @@ class MPC:
         left = None if length is None else max(length - steps_done, 1)
         if earlier is not None and len(earlier.actions):
             plan = self.each_step.plan(
-                self.task, state, self.action_bounds, left, known=earlier.actions
+                self.task,
+                state,
+                self.action_bounds,
+                left,
+                known=earlier.actions,
+                steps_done=steps_done,
             )
             if not self._disappoints(plan, earlier):
                 beyond = earlier.actions[len(plan.actions) :]
                 actions = torch.cat([plan.actions, beyond])
                 return earlier._replace(actions=actions, left_bounds=plan.left_bounds)
-        plan = self.first.plan(self.task, state, self.action_bounds, left)
+        plan = self.first.plan(self.task, state, self.action_bounds, left, steps_done=steps_done)
         made = plan.rewards[:0] if earlier is None else earlier.promised[:steps_done]
         promised = torch.cat([made, plan.rewards])
         reward = float(plan.rewards.sum() / plan.made.sum().clamp_min(1e-12))

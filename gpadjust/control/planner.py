@@ -115,6 +115,7 @@ class Planner:
         num_steps: int | None = None,
         *,
         known: Tensor | None = None,
+        steps_done: int = 0,
     ) -> Plan:
         """Choose the actions of the next steps; the randomness is PyTorch's global generator.
 
@@ -126,6 +127,7 @@ class Planner:
             num_steps: How many steps are ahead; the plan is of these or of the horizon, ``T``.
                 Default: the episode length of the task.
             known: An earlier plan, ``t x action_dim``; its last action is held where it is shorter.
+            steps_done: How many steps the episode has made by then.
 
         Raises:
             ValueError: If ``state`` or ``action_bounds`` have another shape, bounds are not finite,
@@ -146,7 +148,7 @@ class Planner:
             asked: list[tuple[Tensor, ...]] = []
 
             def scored(sequences: Tensor) -> Tensor:
-                rollout = rollouts.follow(state, sequences)
+                rollout = rollouts.follow(state, sequences, steps_done)
                 rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
                 left, made = (part.double().mean(0) for part in (rollout.left_bounds, rollout.made))
                 asked.append((sequences, rewards, left, made))

@@ -20,6 +20,9 @@ Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 Termination = Callable[[Tensor], Tensor]
 """Whether states ``N x state_dim`` end an episode, ``N`` booleans."""
 
+Reference = Callable[[Tensor, Tensor], Tensor]
+"""Values of the exogenous states after a step, of the states before it and its number, from 1."""
+
 InitialStates = Callable[[int], Tensor]
 """Draws ``n`` states at which episodes start, ``n x state_dim``."""
 
@@ -64,6 +67,11 @@ class Task:
         state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
             model is not followed; infinite where there is none. Default: far beyond all that was
             seen, of an agent that has seen some; else none.
+        reference: Set-points that move during an episode, such as
+            ``lambda states, steps: torch.sin(0.1 * steps).unsqueeze(-1)``: the values of the
+            exogenous states, ``N x len(spec.exogenous)``, after ``steps`` steps of an episode,
+            ``N``, of which the last was made at ``states``, ``N x state_dim``. The environment
+            observes them; plans know them beforehand. Default: they stay as they are.
 
     Raises:
         TypeError: If something is of another kind, or a function takes other arguments.
@@ -84,6 +92,7 @@ class Task:
     initial_states: InitialStates | None = None
     episode_length: int | None = None
     state_bounds: Tensor | None = None
+    reference: Reference | None = None
 
     def __post_init__(self) -> None:
         """Check what can be checked without a state."""
@@ -92,8 +101,18 @@ class Task:
             raise TypeError(
                 "reward must be a function of states, actions, next states; found None."
             )
-        for name, arguments in (("reward", 3), ("terminated", 1), ("initial_states", 1)):
+        for name, arguments in (
+            ("reward", 3),
+            ("terminated", 1),
+            ("initial_states", 1),
+            ("reference", 2),
+        ):
             _check_function(getattr(self, name), name, arguments)
+        if self.reference is not None and not self.dynamics.spec.exogenous:
+            raise ValueError(
+                "reference says the values of exogenous states, but the spec has none; name the "
+                "set-points among `exogenous`, and let the environment observe them."
+            )
         if self.episode_length is not None:
             checked_whole("episode_length", self.episode_length, 1)
         if self.state_bounds is not None:
@@ -115,6 +134,7 @@ class Task:
             self.draw_initial_states(len(states))
         self.rewards(states, actions, states)
         self.terminations(states)
+        self.set_points(states, torch.ones(len(states), dtype=torch.long))
         self.dynamics.try_physics(states, actions)
 
     def check_spaces(self, observation_space: Any, action_space: Any) -> None:
@@ -165,12 +185,36 @@ class Task:
             return torch.zeros(len(states), dtype=torch.bool)
         return per_row(self.terminated(states.detach()), len(states), "terminated").bool()
 
+    def set_points(self, states: Tensor, steps: Tensor | int) -> Tensor | None:
+        """Return the exogenous states after a step, ``N x len(spec.exogenous)``, checked.
+
+        Args:
+            states: Those before the step, ``N x state_dim``.
+            steps: The number of the step, from 1, ``N`` or one for all.
+
+        Returns:
+            Their values; None without a ``reference``, as they stay.
+        """
+        if self.reference is None:
+            return None
+        numbers = torch.as_tensor(steps).expand(len(states))
+        found = torch.as_tensor(self.reference(states.detach(), numbers), dtype=torch.float64)
+        shape = (len(states), len(self.dynamics.spec.exogenous))
+        if found.shape != shape or not found.isfinite().all():
+            raise ValueError(
+                f"reference(states, steps) must return finite values of shape {shape}, a column "
+                f"for each of {tuple(self.dynamics.spec.exogenous)}; found "
+                f"{tuple(found.shape) if found.shape != shape else found.tolist()}."
+            )
+        return found
+
     def step(
         self,
         states: Tensor,
         actions: Tensor,
         move: Callable[[Tensor, Tensor], Tensor] | None = None,
         *,
+        set_points: Tensor | None = None,
         some_must_succeed: bool = False,
     ) -> Step:
         """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
@@ -179,6 +223,7 @@ class Task:
             states: The states.
             actions: The actions.
             move: Next states of these. Default: drawn from the dynamics, row by row.
+            set_points: The exogenous states afterwards, see :meth:`set_points`. Default: as before.
             some_must_succeed: Whether it is an error that the physics fails for all rows.
 
         Raises:
@@ -187,6 +232,9 @@ class Task:
         """
         move = self.dynamics.sample if move is None else move
         following = step_or_nan(move, states, actions, some_must_succeed=some_must_succeed)
+        if set_points is not None:
+            following = following.clone()
+            following[:, self.dynamics.spec.exogenous_columns] = set_points
         left = ~following.isfinite().all(-1)
         overshoot = following.new_zeros(len(following))
         if self.state_bounds is not None:
@@ -225,6 +273,7 @@ class Task:
             "initial_states": self.initial_states is not None,
             "episode_length": self.episode_length,
             "state_bounds": None if bounds is None else bounds.tolist(),
+            "reference": self.reference is not None,
         }
 
 
