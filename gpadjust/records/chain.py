@@ -131,12 +131,8 @@ class Chain:
         states, N = np.concatenate([x[:-1] for x in path.states]), len(path.following)
         moves = np.vstack([np.diag(_STEP * self.spread), np.zeros((p, d))])
         turns = np.vstack([np.zeros((d, p)), _STEP * np.eye(p)])
-        ends = [
-            self.asked(
-                states + sign * moves[:, None], self.recorded, path.parameters + sign * turns
-            )
-            for sign in (1.0, -1.0)
-        ]
+        beside = [(states + s * moves[:, None], path.parameters + s * turns) for s in (1.0, -1.0)]
+        ends = [self.asked(near, self.recorded, parameters) for near, parameters in beside]
         sizes = 2 * np.concatenate([_STEP * self.spread, _STEP * np.ones(p)])
         slope = (ends[0] - ends[1]) / sizes[:, None, None]
         matrices = np.zeros((N, d + p, d + p))
@@ -210,10 +206,11 @@ class Chain:
         found = self.asked(states, recorded, parameters)
         if not np.isfinite(found).all():
             failed = np.flatnonzero(~np.isfinite(found).all(1))
+            action = recorded[failed[0], self.spec.state_dim :].tolist()
             raise PhysicsError(
                 f"Physics {self.physics.name!r} fails at {len(failed)} of {len(found)} states "
                 f"where smoothing begins, the first of which is {states[failed[0]].tolist()} under "
-                f"the action {recorded[failed[0], self.spec.state_dim :].tolist()}. They are measured ones, which may be "
+                f"the action {action}. They are measured ones, which may be "
                 "some noise beyond what is possible, or where the physics leads from `start` with "
                 "its guesses: let it go on smoothly beyond its limits, or say another start."
             )

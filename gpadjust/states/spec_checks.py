@@ -15,9 +15,9 @@ def check_exogenous(name: str, change: Tensor, rounding: Tensor) -> None:
         row = int(moved[0])
         raise ValueError(
             f"State {name!r} is said to be exogenous, which stays as it is during an episode, but "
-            f"it changes by {float(change[row]):.3g} in row {row}. If it is a set-point that moves, "
-            "give the task its `reference`; else take it out of `exogenous`, so that the model "
-            "predicts it, or leave out transitions from one episode into the next."
+            f"it changes by {float(change[row]):.3g} in row {row}. Of a set-point that moves give "
+            "the task its `reference`; else take it out of `exogenous`, so that the model predicts "
+            "it, or leave out transitions from one episode into the next."
         )
 
 
