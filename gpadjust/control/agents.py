@@ -98,6 +98,15 @@ class MPCAgent(Agent):
     def promise(self, state: PlanState) -> dict[str, float]:
         """Return the promised reward of a step by the plan of a whole episode."""
         (plan,) = state
+        if plan.violation > 0:
+            warnings.warn(
+                f"No plan of an episode was found that holds the constraints with their margins: "
+                f"the best one violates them by {plan.violation:.3g}, in the worst step. A lower "
+                "probability of the task has smaller margins; so have a better physics, or more "
+                "data.",
+                UserWarning,
+                stacklevel=2,
+            )
         if plan.left_bounds > 0.1:
             warnings.warn(
                 f"The best plan of an episode leaves the bounds of the states in "
@@ -108,9 +117,9 @@ class MPCAgent(Agent):
                 stacklevel=2,
             )
         whole = len(plan.promised) >= self.episode_length()
-        return {"left_bounds": plan.left_bounds} | (
-            {"promised_reward": plan.reward} if whole else {}
-        )
+        said = {"left_bounds": plan.left_bounds}
+        said |= {} if self.task.constraints is None else {"violation": plan.violation}
+        return said | ({"promised_reward": plan.reward} if whole else {})
 
 
 class PolicySearchAgent(Agent):
@@ -168,6 +177,12 @@ class PolicySearchAgent(Agent):
         self.policy = made
         self.is_trained = False
         self._reward = math.nan  # of a step, as the last search foresaw it
+
+    def try_task(self, observations: NDArray[Any], action_space: Any) -> None:
+        """Call the task's functions, and refuse what a policy cannot keep."""
+        for part in ("constraints", "action_rate"):
+            self.task.refuse(type(self).__name__, part, "MPCAgent can")
+        super().try_task(observations, action_space)
 
     def improve(self, task: Task) -> bool:
         """Improve the policy, if it is known where episodes start."""

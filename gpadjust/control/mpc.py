@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number
+from gpadjust.control.constraints import margins
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.task import Task
@@ -46,6 +47,9 @@ class Planned(NamedTuple):
         left_bounds: As of the newest :class:`Plan`.
         reward: What was promised of a step that is made, on average, when it was last planned to
             its end.
+        next_states: Those to which the actions ahead lead, ``T x state_dim``.
+        violation: As of the newest :class:`Plan`.
+        before: The last action that was made, ``action_dim``; None where an episode begins.
     """
 
     actions: Tensor
@@ -53,6 +57,9 @@ class Planned(NamedTuple):
     steps_done: int
     left_bounds: float = 0.0
     reward: float = math.nan
+    next_states: Tensor = torch.zeros(0)
+    violation: float = 0.0
+    before: Tensor | None = None
 
 
 PlanState = tuple[Planned, ...]
@@ -163,21 +170,32 @@ class MPC:
             plans = [self.plan(*pair) for pair in zip(states, episodes, strict=True)]
         actions = torch.stack([plan.actions[0] for plan in plans]).numpy().astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), tuple(
-            plan._replace(actions=plan.actions[1:], steps_done=plan.steps_done + 1)
+            plan._replace(
+                actions=plan.actions[1:],
+                next_states=plan.next_states[1:],
+                steps_done=plan.steps_done + 1,
+                before=plan.actions[0],
+            )
             for plan in plans
         )
 
-    def plan(self, state: Tensor, earlier: Planned | None = None) -> Planned:
+    def plan(
+        self, state: Tensor, earlier: Planned | None = None, covariance: Tensor | None = None
+    ) -> Planned:
         """Plan the steps ahead of an episode that is at a state.
 
         Args:
             state: Where it is, ``state_dim``.
             earlier: What was planned by then; None at the start.
+            covariance: That of the state, ``state_dim x state_dim``, if it is estimated.
         """
         steps_done = 0 if earlier is None else earlier.steps_done
         length = self.task.episode_length
         left = None if length is None else max(length - steps_done, 1)
+        before = None if earlier is None else earlier.before
         if earlier is not None and len(earlier.actions):
+            horizon = self.each_step.horizon
+            tight = self._margins(state, earlier.actions[:horizon], earlier, covariance)
             plan = self.each_step.plan(
                 self.task,
                 state,
@@ -185,16 +203,47 @@ class MPC:
                 left,
                 known=earlier.actions,
                 steps_done=steps_done,
+                before=before,
+                margins=tight,
             )
             if not self._disappoints(plan, earlier):
-                beyond = earlier.actions[len(plan.actions) :]
-                actions = torch.cat([plan.actions, beyond])
-                return earlier._replace(actions=actions, left_bounds=plan.left_bounds)
-        plan = self.first.plan(self.task, state, self.action_bounds, left, steps_done=steps_done)
+                k = len(plan.actions)
+                return earlier._replace(
+                    actions=torch.cat([plan.actions, earlier.actions[k:]]),
+                    next_states=torch.cat([plan.next_states, earlier.next_states[k:]]),
+                    left_bounds=plan.left_bounds,
+                    violation=plan.violation,
+                )
+        how: dict[str, Any] = {"before": before, "steps_done": steps_done}
+        plan = self.first.plan(self.task, state, self.action_bounds, left, **how)
+        if self.task.constraints is not None:
+            # The margins are those of a plan that has none yet.
+            how["margins"] = self._margins(state, plan.actions, plan, covariance)
+            plan = self.first.plan(
+                self.task, state, self.action_bounds, left, known=plan.actions, **how
+            )
         made = plan.rewards[:0] if earlier is None else earlier.promised[:steps_done]
         promised = torch.cat([made, plan.rewards])
         reward = float(plan.rewards.sum() / plan.made.sum().clamp_min(1e-12))
-        return Planned(plan.actions, promised, steps_done, plan.left_bounds, reward)
+        return Planned(
+            plan.actions,
+            promised,
+            steps_done,
+            plan.left_bounds,
+            reward,
+            plan.next_states,
+            plan.violation,
+            before,
+        )
+
+    def _margins(
+        self, state: Tensor, actions: Tensor, along: Plan | Planned, covariance: Tensor | None
+    ) -> Tensor | None:
+        """The margins of the constraints along a plan from a state; None without constraints."""
+        if self.task.constraints is None:
+            return None
+        states = torch.cat([state.unsqueeze(0), along.next_states])[: len(actions)]
+        return margins(self.task, states, actions, self.action_bounds, covariance)
 
     def _disappoints(self, plan: Plan, earlier: Planned) -> bool:
         """Return whether a plan is worth much less than its steps had promised."""

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_whole
+from gpadjust.checks import check_kind, checked_number, checked_whole
+from gpadjust.control.action_rate import ActionRate
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
 
@@ -22,6 +23,8 @@ Termination = Callable[[Tensor], Tensor]
 
 Reference = Callable[[Tensor, Tensor], Tensor]
 """Values of the exogenous states after a step, of the states before it and its number, from 1."""
+Constraints = Callable[[Tensor, Tensor], Tensor]
+"""Numbers ``N x c`` of states and actions that led to them, ``N`` rows each; 0 or less is right."""
 
 InitialStates = Callable[[int], Tensor]
 """Draws ``n`` states at which episodes start, ``n x state_dim``."""
@@ -72,6 +75,15 @@ class Task:
             exogenous states, ``N x len(spec.exogenous)``, after ``steps`` steps of an episode,
             ``N``, of which the last was made at ``states``, ``N x state_dim``. The environment
             observes them; plans know them beforehand. Default: they stay as they are.
+        constraints: Numbers ``N x c``, in PyTorch's functions, of states ``N x state_dim`` and the
+            actions ``N x action_dim`` that led to them: each constraint holds where its number is
+            at most 0, such as ``states[:, :1] - 0.5`` before a wall at 0.5. A planner looks for
+            plans that hold them, or violate them least. Default: none.
+        probability: Of all constraints holding through a whole episode: plans keep a margin for
+            what is not known of the next states (:func:`~gpadjust.control.constraints.margins`).
+            None: they hold in the mean of the model, without margin.
+        action_rate: The most that an action changes in a step, one number for all actions or one
+            for each; or an :class:`ActionRate`, which may have a price, too. Default: no limit.
 
     Raises:
         TypeError: If something is of another kind, or a function takes other arguments.
@@ -93,6 +105,9 @@ class Task:
     episode_length: int | None = None
     state_bounds: Tensor | None = None
     reference: Reference | None = None
+    constraints: Constraints | None = None
+    probability: float | None = 0.95
+    action_rate: ActionRate | float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         """Check what can be checked without a state."""
@@ -106,6 +121,7 @@ class Task:
             ("terminated", 1),
             ("initial_states", 1),
             ("reference", 2),
+            ("constraints", 2),
         ):
             _check_function(getattr(self, name), name, arguments)
         if self.reference is not None and not self.dynamics.spec.exogenous:
@@ -118,6 +134,16 @@ class Task:
         if self.state_bounds is not None:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)
+        if self.probability is not None:
+            checked_number("probability", self.probability, above=0, below=1)
+        if self.rate is not None:
+            self.rate.check(self.dynamics.spec.action_dim)
+
+    @property
+    def rate(self) -> ActionRate | None:
+        """``action_rate`` as an object, None if there is none."""
+        given = self.action_rate
+        return given if isinstance(given, ActionRate | None) else ActionRate(given)
 
     def try_functions(self, states: Tensor, actions: Tensor) -> None:
         """Call physics and functions once, to find what is wrong with them before it costs data.
@@ -135,6 +161,7 @@ class Task:
         self.rewards(states, actions, states)
         self.terminations(states)
         self.set_points(states, torch.ones(len(states), dtype=torch.long))
+        self.constraint_values(states, actions)
         self.dynamics.try_physics(states, actions)
 
     def check_spaces(self, observation_space: Any, action_space: Any) -> None:
@@ -151,6 +178,17 @@ class Task:
                     f"of which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
                     f"{tuple(spec.actions)}."
                 )
+
+    def refuse(self, learner: str, name: str, way_out: str) -> None:
+        """Raise a ValueError if the task has a part of this name, with which a learner cannot do.
+
+        Args:
+            learner: The name of the learner.
+            name: That of the part.
+            way_out: Who can.
+        """
+        if getattr(self, name) is not None:
+            raise ValueError(f"{learner} cannot learn a task with {name}; {way_out}.")
 
     def draw_initial_states(self, n: int) -> Tensor:
         """Draw ``n x state_dim`` states at which episodes start.
@@ -207,6 +245,24 @@ class Task:
                 f"{tuple(found.shape) if found.shape != shape else found.tolist()}."
             )
         return found
+
+    def constraint_values(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The values of the constraints, checked: ``N x c`` with their gradient, ``N x 0`` of none.
+
+        Args:
+            states: ``N x state_dim``.
+            actions: The actions that led to them, ``N x action_dim``.
+        """
+        if self.constraints is None:
+            return states.new_zeros(len(states), 0)
+        values = torch.as_tensor(self.constraints(states, actions))
+        if values.dim() != 2 or len(values) != len(states):
+            raise ValueError(
+                f"constraints must return a column for each constraint, shape ({len(states)}, c); "
+                f"found {tuple(values.shape)}."
+            )
+        per_row(values.detach().sum(-1), len(states), "constraints")
+        return values
 
     def step(
         self,
@@ -274,6 +330,9 @@ class Task:
             "episode_length": self.episode_length,
             "state_bounds": None if bounds is None else bounds.tolist(),
             "reference": self.reference is not None,
+            "constraints": self.constraints is not None,
+            "probability": self.probability,
+            "action_rate": None if self.action_rate is None else repr(self.action_rate),
         }
 
 

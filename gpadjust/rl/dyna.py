@@ -339,7 +339,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         """The task, if the agent can learn with it.
 
         Raises:
-            ValueError: If it is missing.
+            ValueError: If it is missing, or has constraints or an action rate.
             TypeError: If task or options are of another kind.
         """
         name = type(self).__name__
@@ -351,6 +351,8 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             )
         check_kind("task", self.task, Task, "a Task(dynamics, reward, ...)")
         check_kind("options", self.options, DynaOptions, "DynaOptions(...)")
+        for part in ("constraints", "action_rate"):
+            self.task.refuse(name, part, "MPCAgent can")
         return self.task
 
     def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:

@@ -38,6 +38,11 @@ class System:
             may only be longer. Default: the time limit of the environment.
         state_bounds: As of a :class:`~gpadjust.control.Task`.
         reference: Set-points that move, as of a :class:`~gpadjust.control.Task`.
+        constraints: As of a :class:`~gpadjust.control.Task`.
+        probability: As of a :class:`~gpadjust.control.Task`.
+        action_rate: As of a :class:`~gpadjust.control.Task`.
+        physics_error: As of :class:`~gpadjust.dynamics.LearnedDynamics`, of the dynamics that
+            :meth:`task` makes.
         noise: Standard deviations of the sensors' noise, by the name of the state, which
             :class:`NoisySensors` adds to what the environment observes.
 
@@ -63,6 +68,10 @@ class System:
     episode_length: int | None = None
     state_bounds: Tensor | None = None
     reference: Callable[[Tensor, Tensor], Tensor] | None = None
+    constraints: Callable[[Tensor, Tensor], Tensor] | None = None
+    probability: float | None = 0.95
+    action_rate: Any = None
+    physics_error: Mapping[str, float] | None = None
     noise: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
@@ -115,12 +124,18 @@ class System:
         from gpadjust.control import Task
         from gpadjust.dynamics import LearnedDynamics
 
+        if dynamics is None:
+            error = self.physics_error
+            dynamics = LearnedDynamics(self.spec, self.physics, physics_error=error)
         return Task(
-            LearnedDynamics(self.spec, self.physics) if dynamics is None else dynamics,
+            dynamics,
             self.reward,
             terminated=self.terminated,
             initial_states=self.start,
             episode_length=self.episode_length,
             state_bounds=self.state_bounds,
             reference=self.reference,
+            constraints=self.constraints,
+            probability=self.probability,
+            action_rate=self.action_rate,
         )

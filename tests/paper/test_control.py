@@ -6,7 +6,19 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
+from paper.control import Known, KnownSettings
+from paper.control.known import draw, run, tables
 from paper.control.systems import FURUTA, SYSTEMS
+
+LIGHT = KnownSettings(
+    trials=2,
+    sequences=8,
+    rounds=0,
+    first_rounds=0,
+    elites=2,
+    networks=3,
+    training=20,
+)
 
 
 @pytest.fixture(params=SYSTEMS)
@@ -72,3 +84,17 @@ def test_environments_are_gymnasiums(name):
 def test_a_physics_of_another_name_is_refused():
     with pytest.raises(ValueError, match="'crude', 'unknown' or 'true'; found 'fitted'"):
         FURUTA.physics("fitted")
+
+
+def test_rivals_of_a_system_make_a_table(tmp_path):
+    known = Known(settings=LIGHT, out=tmp_path)
+    runs = []
+    for learner in ("fitted", "ensemble", "networks"):
+        found = run(known, "tanks", learner, 0)
+        assert {len(values) for values in found["trials"].values()} == {2}
+        runs.append({"system": "tanks", "learner": learner, "seed": 0, **found})
+    first = [found["trials"]["cost"][0] for found in runs]
+    assert first[0] == first[1] != first[2]  # planned in f_p; random without
+    text = tables(runs, known)["costs"].text
+    assert "| f_p and an ensemble of networks | 0.0" in text
+    assert draw(runs, known)[0].exists()
