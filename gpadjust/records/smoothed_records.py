@@ -284,8 +284,10 @@ def _known_inputs(stretches: Sequence[Stretch], spec: StateSpec) -> list[Stretch
         gap = stretch.states[:-1, beside].isnan().any(1)
         first = int(gap.nonzero().max()) + 1 if gap.any() else 0
         if first < len(stretch.actions):
-            parts = (part[first:] for part in (stretch.states, stretch.actions, stretch.times))
-            found.append(Stretch(*parts, stretch.record))
+            parts = {
+                name: getattr(stretch, name)[first:] for name in ("states", "actions", "times")
+            }
+            found.append(stretch._replace(**parts))
     if not found:
         names = ", ".join(spec.states[i] for i in beside)
         raise ValueError(f"Expected stretches with all of {names}, which the physics reads.")
