@@ -82,6 +82,12 @@ class RecordedEpisodes:
         lost = (first < 0) | (self.episode[first] != self.episode)
         return (rows - first + 1).masked_fill(lost, 0)
 
+    def with_still_set_points(self) -> Self:
+        """These episodes, but the exogenous states of a step stay as they were before it."""
+        next_states, still = self.next_states.clone(), self.spec.exogenous_columns
+        next_states[:, still] = self.states[:, still]
+        return replace(self, next_states=next_states)
+
     def bounds(self, reached: Tensor | None = None) -> Tensor | None:
         """Bounds ``2 x state_dim`` far beyond the states of episodes that have ended.
 
@@ -224,9 +230,15 @@ class RecordedEpisodes:
 
 
 def learn_dynamics(
-    task: Task, new: RecordedEpisodes, recorded: RecordedEpisodes, horizons: tuple[int, ...]
+    task: Task,
+    new: RecordedEpisodes,
+    recorded: RecordedEpisodes,
+    horizons: tuple[int, ...],
 ) -> dict[str, float]:
     """Score the dynamics of a task on new episodes, and update them with these.
+
+    With sensors they forget what they have learnt, and learn all episodes again, as the states
+    behind all of them are estimated better by now.
 
     PyTorch's generator is left as it is by the scores. Scores that are not defined (densities of
     dynamics without variances, horizons longer than the episodes) are left out.
@@ -245,18 +257,30 @@ def learn_dynamics(
         ``energy_15`` of a horizon of 15; ``score_seconds``, ``fit_seconds``.
     """
     start, found = time.perf_counter(), {}
+    if task.reference is not None:  # set-points stay as they are in the dynamics
+        new, recorded = (each.with_still_set_points() for each in (new, recorded))
     learnable = new.learnable(task.dynamics)
-    if task.reference is not None:  # of which dynamics know nothing
-        still = task.dynamics.spec.exogenous_columns
-        learnable.next_states[:, still] = learnable.states[:, still]
     if task.dynamics.is_fitted:
         before = time.perf_counter()
         found = _scores(task, learnable, recorded, horizons)
         found["score_seconds"] = time.perf_counter() - before
-    task.dynamics.update(*learnable)
+    if task.sensors is None:
+        task.dynamics.update(*learnable)
+    else:
+        _learn_again(task.dynamics, recorded.learnable(task.dynamics))
     _warn_of_delay(task.dynamics, new, recorded)
     found["fit_seconds"] = time.perf_counter() - start - found.get("score_seconds", 0.0)
     return {name: value for name, value in found.items() if not math.isnan(value)}
+
+
+def _learn_again(dynamics: Dynamics, data: Trajectories) -> None:
+    before = dynamics.state_dict()
+    dynamics.load_state_dict({})
+    try:
+        dynamics.update(*data)
+    except BaseException:
+        dynamics.load_state_dict(before)
+        raise
 
 
 def _warn_of_delay(dynamics: Dynamics, new: RecordedEpisodes, recorded: RecordedEpisodes) -> None:
