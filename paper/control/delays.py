@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -123,16 +123,17 @@ def tables(runs: Sequence[Run], experiment: Delays) -> dict[str, Table]:
         )
     }
     every = frame(runs)
-    said = {
-        "runs": of("seed", "nunique", ".0f"),
-        **{
-            f"said after trial {n}": of("found_after", lambda after, n=n: (after <= n).sum(), ".0f")
-            for n in range(1, experiment.settings.hint_trials + 1)
-        },
-    }
+    said = {"runs": of("seed", "nunique", ".0f")}
+    for trial in range(1, experiment.settings.hint_trials + 1):
+        said[f"said by trial {trial}"] = of("found_after", _by(trial), ".0f")
     rows = groups(every[every["told"].str.startswith(_HINT)], "told", labels)
     found["found"] = Table("A delay that was not told", table(rows, said, "system"))
     return found
+
+
+def _by(trial: int) -> Callable[[Any], float]:
+    """Number of runs in which it was found by then."""
+    return lambda found: float((found <= trial).sum())
 
 
 def _in_trial(trial: int) -> Any:
@@ -142,7 +143,7 @@ def _in_trial(trial: int) -> Any:
 
 def draw(runs: Sequence[Run], experiment: Delays) -> list[Path]:
     """The cost of each trial, run by run."""
-    figure, axes = panels(1, 1, width=5.5, height=3.0)
+    figure, axes = panels(["A cart-pole that follows its force a step late"], 1, (5.5, 3.0))
     colors = {"not": "tab:red", "previous": "tab:orange", "physics": "navy", "none": "0.6"}
     for told, color in colors.items():
         own = [run["trials"]["cost"] for run in runs if run["told"] == told]

@@ -101,8 +101,8 @@ def test_a_physics_that_fails_everywhere_reaches_nothing(moved):
 
 
 def test_an_episode_that_a_bound_may_have_held_is_told(moved):
-    with pytest.warns(UserWarning, match=r"came to x = 1\.2, .*beyond 1\.21: .*state_bounds"):
-        moved.warn_of_bounds(torch.tensor([[-1.0], [1.21]]))
+    with pytest.warns(UserWarning, match=r"came to x = 1\.3, .*beyond 1\.31: .*state_bounds"):
+        moved.warn_of_bounds(torch.tensor([[-1.0], [1.31]]))
     moved.warn_of_bounds(torch.tensor([[-3.0], [3.0]]))
 
 
