@@ -166,9 +166,9 @@ class Setpoints(Experiment):
 class DelaysSettings:
     """Settings that decide the numbers; found with seeds of 100 and more."""
 
-    trials: int = 4
+    trials: int = 3
     """real trials of a run, of which the first goes by f_p"""
-    hint_trials: int = 2
+    hint_trials: int = 1
     """of the runs that only ask whether the delay is found, in which f_p alone plans"""
     sequences: int = 64
     """that are planned, in each round of the cross-entropy method"""

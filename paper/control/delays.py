@@ -13,8 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
-from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.inference import SamplingWarning
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.states import StateSpec
 from gpadjust.systems import RememberAction, System, cart_pole
 from gpadjust.systems.swing_up import CART_POLE_SPEC
@@ -58,7 +57,6 @@ def run(experiment: Delays, told: str, seed: int) -> Run:
     for trial in range(1, (settings.hint_trials if asks else settings.trials) + 1):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            warnings.simplefilter("ignore", SamplingWarning)
             agent.learn(length)
         episode = agent.recorded_episodes(newest=length)
         costs.append(-episode.rewards.mean().item())
@@ -90,7 +88,10 @@ def _agent(experiment: Delays, told: str, seed: int) -> tuple[MPCAgent, int]:
         search=CrossEntropy(settings.first_rounds, num_elites=12, correlation=0.5),
         num_random=settings.sequences,
     )
-    dynamics = PhysicsDynamics(system.spec, system.physics) if asks else None
+    dynamics: Dynamics = PhysicsDynamics(system.spec, system.physics)
+    if not asks:
+        likely: Any = {"method": "map"}
+        dynamics = LearnedDynamics(system.spec, system.physics, fit_options=likely)
     how: dict[str, Any] = {"reward_tolerance": None, "score_horizons": (), "seed": seed}
     agent = MPCAgent(env, system.task(dynamics), each_step, first=first, **how)
     return agent, system.episode_length or 0

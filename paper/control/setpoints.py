@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
-from gpadjust.dynamics import PhysicsDynamics
-from gpadjust.inference import SamplingWarning
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
 from gpadjust.systems import System
 from paper.common.experiment import Run, Table
 from paper.common.tables import frame, groups, of, table
@@ -75,7 +74,6 @@ class Moving(gym.Wrapper[Any, Any, Any, Any]):
 
 def run(experiment: Setpoints, moves: str, plans: str, seed: int) -> Run:
     """Make the trials; return the cost of each, and of its last third."""
-    warnings.simplefilter("ignore", SamplingWarning)
     warnings.filterwarnings("ignore", message="A step of the last|The best plan|An episode came")
     agent, system = _agent(experiment, moves, plans, seed)
     length = system.episode_length or 0
@@ -98,7 +96,10 @@ def _agent(experiment: Setpoints, moves: str, plans: str, seed: int) -> tuple[MP
     system = replace(system, start=None, state_bounds=far if given else None)
     if moves == "within":
         system = replace(system, reference=stays if plans == "constant" else sine)
-    dynamics = PhysicsDynamics(system.spec, system.physics) if plans == "oracle" else None
+    dynamics: Dynamics = PhysicsDynamics(system.spec, system.physics)
+    if plans != "oracle":
+        likely: Any = {"method": "map"}
+        dynamics = LearnedDynamics(system.spec, system.physics, fit_options=likely)
     each_step = Planner(
         search=CrossEntropy(1, num_elites=8, correlation=0.5),
         horizon=HORIZONS["tanks"],
