@@ -321,8 +321,11 @@ class Agent(TaskAgent):
         if self.reward_tolerance is not None and self.task.sensors is None:
             new.check(self.task, self.reward_tolerance)
         with self.timed("fit"):
-            task = recorded.complete(self.task, self.episode_length())
+            task = recorded.complete(self.task, self.episode_length(), self.action_bounds())
             values = learn_dynamics(task, new, recorded, self.score_horizons)
+        bounds = None if self.model is None else self.model.state_bounds
+        if bounds is not None and self.task.state_bounds is None:
+            new.warn_of_bounds(bounds)
         self.model, self._is_improved = None, False  # it is not the newest any more
         promises, self.num_episodes = self._promises[self.num_episodes :], len(self._promises)
         kept = [each for each in promises if each is not None]

@@ -20,6 +20,7 @@ import cloudpickle
 import numpy as np
 import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
+from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_whole
 from gpadjust.control.recorded_episodes import RecordedEpisodes
@@ -54,7 +55,13 @@ class TaskAgent(ABC):
         Raises:
             ValueError: If nobody says how long an episode is.
         """
-        return self.recorded_episodes().complete(self.ready_task(), self.episode_length())
+        return self.recorded_episodes().complete(
+            self.ready_task(), self.episode_length(), self.action_bounds()
+        )
+
+    @abstractmethod
+    def action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the actions, ``2 x action_dim``."""
 
     def episode_length(self) -> int:
         """Steps of an episode: those of the task, or else the time limit of the environment.

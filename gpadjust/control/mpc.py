@@ -222,6 +222,7 @@ class MPC:
                 self.action_bounds,
                 left,
                 known=earlier.actions,
+                steps_done=steps_done,
                 before=before,
                 margins=tight,
             )
@@ -233,7 +234,7 @@ class MPC:
                     left_bounds=plan.left_bounds,
                     violation=plan.violation,
                 )
-        how = {"before": before}
+        how: dict[str, Any] = {"before": before, "steps_done": steps_done}
         plan = self.first.plan(self.task, state, self.action_bounds, left, **how)
         if self.task.constraints is not None:
             # The margins are those of a plan that has none yet.

@@ -28,6 +28,7 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
 
 from gpadjust.checks import check_kind
 from gpadjust.control import EpisodeCheckpoint, RecordedEpisodes, Task
@@ -384,6 +385,11 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         return None if self.env is None else self.env.get_attr(name)[0]
 
     # The model
+
+    def action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the actions, ``2 x action_dim``."""
+        space = self.action_space
+        return torch.from_numpy(np.stack([space.low, space.high]).astype(np.float64))
 
     def model_env(self, num_envs: int) -> ModelVecEnv:
         """The dynamics, as they stand, as an environment of ``num_envs`` particles.
