@@ -224,7 +224,7 @@ def _tables(
         kernel: Any = term.kernel
         if isinstance(getattr(kernel, "base_kernel", None), RFFKernel):
             kind, base, outer = "waves", kernel.base_kernel, kernel
-            frequencies = base.randn_weights.flatten(0, -3)[0].mT
+            frequencies = base.randn_weights.reshape(-1, *base.randn_weights.shape[-2:])[0].mT
         elif (found := stationary_parts(kernel, d)) is not None:
             base, outer, _ = found
             kind = "rbf" if isinstance(base, RBFKernel) else f"matern{base.nu}"

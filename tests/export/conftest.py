@@ -92,7 +92,13 @@ MODELS = {
     "ScaleGP": lambda: ScaleGP(X, Y, physics=crude),
     "ZeroMeanGP": lambda: ZeroMeanGP(X, Y),
     "RRA": lambda: RRA(X, Y, physics=crude, num_features=20),
+    "RRA, one output": lambda: RRA(
+        X, Y[:, :1], physics=lambda X: crude(X)[..., :1], num_features=20
+    ),
     "RRA, unknown mean": lambda: RRA(X, Y, physics=crude, num_features=20, delta_mean="learn"),
+    "VariationalCKA, one output": lambda: VariationalCKA(
+        X, Y[:, :1], physics=lambda X: crude(X)[..., :1], num_inducing=8
+    ),
     "VariationalCKA": lambda: VariationalCKA(X, Y, physics=crude, num_inducing=8),
 }
 FITTED_BEFORE = ("CKA, samples", "CKA, larger errors", "CKA, later observations")
