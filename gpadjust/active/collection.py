@@ -15,6 +15,7 @@ from botorch.models.model import Model
 from torch import Tensor
 from tqdm import tqdm
 
+from gpadjust.active.keep import Keep
 from gpadjust.active.measurement_log import LogError, MeasurementLog, Record
 from gpadjust.active.measurements import (
     Measurements,
@@ -25,7 +26,7 @@ from gpadjust.active.measurements import (
 )
 from gpadjust.active.points import among, best_points, sobol_points
 from gpadjust.active.warm_refit import load_parameter_values, parameter_values, refit
-from gpadjust.checks import checked_bounds, checked_points, checked_whole
+from gpadjust.checks import checked_bounds, checked_number, checked_points, checked_whole
 from gpadjust.models.factory import ModelFactory, make_model
 from gpadjust.models.sampled_functions import seeded
 
@@ -79,6 +80,11 @@ class Collection(Measurements):
         initial: Number of measurements, those of ``data`` included, before the first model; or the
             first points, ``k x d``, no two alike, in place of Sobol's. Default: ``2 (d + 1)``.
         data: ``(X, Y)`` measured before. They are not logged: give them each time.
+        keep: Numbers ``... x c`` of outputs ``... x m``, each of which is to be at most 0, such as
+            ``lambda Y: Y - 3`` for outputs below 3: measurements are made only where the model says
+            so with a ``probability``. First points, of ``initial`` or ``data``, are then to be
+            given, safe by what you know, such as f_p; they are not checked. Default: no limits.
+        probability: That of a measurement, noise included, being within the limits of ``keep``.
         num_outputs: Number ``m`` of outputs. Default: that of the first measurement.
         fit: Fits a new model, in place. Default: :func:`gpadjust.fit`. A point fit,
             ``lambda model: fit(model, "map")``, begins where the last one was.
@@ -119,6 +125,8 @@ class Collection(Measurements):
         batch_size: int = 1,
         initial: int | Tensor | list[list[float]] | None = None,
         data: tuple[Tensor, Tensor] | None = None,
+        keep: Callable[[Tensor], Tensor] | None = None,
+        probability: float = 0.95,
         num_outputs: int | None = None,
         fit: Callable[[Any], Any] | None = None,
         optimizer_options: dict[str, Any] | None = None,
@@ -134,8 +142,11 @@ class Collection(Measurements):
                 "Expected acquisition to be a function that makes an acquisition function of each "
                 f"new model, got one of a model; pass `lambda model: {kind}(model, ...)`."
             )
-        if fit is not None and not callable(fit):
-            raise TypeError(f"Expected fit to be callable, got {fit!r}.")
+        for name, option in (("fit", fit), ("keep", keep)):
+            if option is not None and not callable(option):
+                raise TypeError(f"Expected {name} to be callable, got {option!r}.")
+        checked_number("probability", probability, above=0, below=1)
+        self.keep = None if keep is None else Keep(keep, probability)
         self.model_factory, self.acquisition = model_factory, acquisition
         self.bounds = checked_bounds("bounds", bounds)
         d = self.bounds.shape[-1]
@@ -145,7 +156,8 @@ class Collection(Measurements):
                 f"Expected seed to be a whole number >= 0 and below 2^63, got {seed!r}."
             )
         self.batch_size, self.seed = batch_size, int(seed)
-        initial = 2 * (d + 1) if initial is None else initial
+        if initial is None:
+            initial = 2 * (d + 1) if keep is None else 2
         self._first_points = self.bounds[:0]
         if not isinstance(initial, int | float | str):
             self._first_points = checked_points("initial", initial, d, self.bounds)
@@ -160,6 +172,12 @@ class Collection(Measurements):
         if num_outputs is not None:
             checked_whole("num_outputs", num_outputs, 1)
         super().__init__(self.bounds, num_outputs, data)
+        if keep is not None and len(self._first_points) + self.num_observed < 2:
+            raise ValueError(
+                "With keep, the first points must be known as safe, by f_p for example: give two "
+                "or more as initial=[[...], ...], or measurements as data=(X, Y); found "
+                f"{len(self._first_points)} and {self.num_observed}."
+            )
         self._model: Any = None
         self._last_model: tuple[Any, int] = (None, 0)
         if not isinstance(log, str | os.PathLike | None):
@@ -181,9 +199,10 @@ class Collection(Measurements):
     def __repr__(self) -> str:
         """The state of the collection in a line."""
         m = "unknown" if self.num_outputs is None else self.num_outputs
+        left = "" if self.keep is None else f", {len(self.left_out)} left out"
         return (
             f"Collection({len(self.X)} measurements, {len(self.failed_X)} failed, "
-            f"{len(self.pending)} pending; inputs: {self.bounds.shape[-1]}, outputs: {m}; "
+            f"{len(self.pending)} pending{left}; inputs: {self.bounds.shape[-1]}, outputs: {m}; "
             f"{self._place()})"
         )
 
@@ -223,6 +242,7 @@ class Collection(Measurements):
             The points, ``q x d``, which are pending from now on.
 
         Raises:
+            RuntimeError: If no point is safe by ``keep``, or the first ones told too little.
             TypeError: If ``acquisition`` makes no acquisition function.
             ValueError: If it takes single points, and ``q`` is larger.
             LogError: If the points cannot be logged; then they are not pending.
@@ -234,10 +254,15 @@ class Collection(Measurements):
         if points is None:
             with seeded((1_000_003 * self.seed + self._num_asks) % 2**63):
                 function = self._acquisition_function(q)
-                points = best_points(
-                    function, self.bounds, q, self.pending, self.failed_X, self._options
-                )
-            record = {"parameters": parameter_values(self.model)}
+                taken = self.pending, self.failed_X
+                if self.keep is None:
+                    points = best_points(function, self.bounds, q, *taken, self._options)
+                else:
+                    points, left_out = self.keep.best_points(
+                        function, self.model, self.bounds, q, self.X, *taken
+                    )
+                    record = {"left_out": left_out.tolist()}
+            record["parameters"] = parameter_values(self.model)
         self._enter([{"asked": points.tolist(), **record}])
         return points
 
@@ -360,6 +385,13 @@ class Collection(Measurements):
         first = self._first_points[~among(self._first_points, known)]
         if not len(first) and len(self.X) >= self._initial and self.num_observed >= 2:
             return None
+        if self.keep is not None:
+            if len(first):
+                return first[:q]
+            raise RuntimeError(
+                f"{self.num_observed} measurements came of the first points, but a model that is "
+                "to keep limits needs two of each output; tell others that are safe."
+            )
         return torch.cat([first, sobol_points(self.bounds, q, known, self.seed)])[:q]
 
     def _acquisition_function(self, q: int) -> AcquisitionFunction:

@@ -19,8 +19,9 @@ class Measurements:
 
     A record is one of
 
-    - ``{"asked": [x, ...], "parameters": {...}}``: points that are to be measured, and the
-      parameters of the model that chose them, if one did;
+    - ``{"asked": [x, ...], "parameters": {...}, "left_out": [x, ...]}``: points that are to be
+      measured; the parameters of the model that chose them, if one did; and what it left out, if
+      there are limits to keep;
     - ``{"x": x, "y": y}``: a measurement, null where an output was not measured;
     - ``{"x": x, "failed": message}``: one that failed, whether it has a ``"y"`` or not;
     - ``{"withdrawn": [x, ...]}``: points that are not to be measured any more;
@@ -40,6 +41,8 @@ class Measurements:
         Y: The values measured there, ``n x m``; NaN where an output was not.
         failed_X: Points at which measuring failed, ``k x d``.
         pending: Points asked for and not told yet, ``l x d``.
+        left_out: Points that were not asked for, though best, as limits might be left there,
+            ``k x d``.
         num_measured: Number of measurements, failed ones included, those of ``data`` not.
         num_outputs: Number ``m`` of outputs; None before the first measurement.
     """
@@ -48,7 +51,7 @@ class Measurements:
         self, bounds: Tensor, num_outputs: int | None, data: tuple[Tensor, Tensor] | None
     ) -> None:
         self.bounds = bounds
-        self.X = self.failed_X = self.pending = self._asked = bounds[:0]
+        self.X = self.failed_X = self.pending = self.left_out = self._asked = bounds[:0]
         self.Y = torch.zeros(0, num_outputs or 0, dtype=torch.float64)
         self.num_measured = 0
         self.num_outputs = num_outputs
@@ -75,6 +78,7 @@ class Measurements:
             asked = self._points(record["asked"])
             self.pending = torch.cat([self.pending, asked])
             self._asked = torch.cat([self._asked, asked])
+            self.left_out = torch.cat([self.left_out, self._points(record.get("left_out", []))])
             self._num_asks += 1
             if record.get("parameters"):
                 self._last_fit = (len(self.X), record["parameters"])

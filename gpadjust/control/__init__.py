@@ -1,5 +1,6 @@
 """Tasks, planning and policy search in dynamics models, and agents that control by them."""
 
+from gpadjust.control.action_rate import ActionRate
 from gpadjust.control.agent import Agent, Callback, print_progress
 from gpadjust.control.agents import MPCAgent, PolicySearchAgent
 from gpadjust.control.checkpoint import EpisodeCheckpoint, resume
@@ -10,15 +11,19 @@ from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
-from gpadjust.control.task import InitialStates, Reward, Step, Task, Termination
+from gpadjust.control.state_filter import Estimate, StateFilter
+from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
     "MPC",
+    "ActionRate",
     "Agent",
     "BoundedPolicy",
     "Callback",
+    "Constraints",
     "CrossEntropy",
     "EpisodeCheckpoint",
+    "Estimate",
     "InitialStates",
     "MPCAgent",
     "Objective",
@@ -35,6 +40,7 @@ __all__ = [
     "Rollouts",
     "Search",
     "SearchResult",
+    "StateFilter",
     "Step",
     "Task",
     "Termination",

@@ -14,12 +14,13 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind
 from gpadjust.control.agent import MAX_HOLD, Agent
-from gpadjust.control.mpc import MPC, PlanState
+from gpadjust.control.mpc import MPC, PlanState, going_on
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch
 from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import random_sequences
+from gpadjust.control.state_filter import Estimate
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -78,7 +79,11 @@ class MPCAgent(Agent):
         Raises:
             RuntimeError: If there is neither a physics nor a real episode to plan with.
         """
-        how: dict[str, Any] = {"first": self.first, "tolerance": self.tolerance}
+        how: dict[str, Any] = {
+            "first": self.first,
+            "tolerance": self.tolerance,
+            "state_filter": self.filter,
+        }
         return MPC(self.newest_model, self.action_bounds(), self.each_step, **how)
 
     def predict(
@@ -98,6 +103,15 @@ class MPCAgent(Agent):
     def promise(self, state: PlanState) -> dict[str, float]:
         """Return the promised reward of a step by the plan of a whole episode."""
         (plan,) = state
+        if plan.violation > 0:
+            warnings.warn(
+                f"No plan of an episode was found that holds the constraints with their margins: "
+                f"the best one violates them by {plan.violation:.3g}, in the worst step. A lower "
+                "probability of the task has smaller margins; so have a better physics, or more "
+                "data.",
+                UserWarning,
+                stacklevel=2,
+            )
         if plan.left_bounds > 0.1:
             warnings.warn(
                 f"The best plan of an episode leaves the bounds of the states in "
@@ -108,9 +122,9 @@ class MPCAgent(Agent):
                 stacklevel=2,
             )
         whole = len(plan.promised) >= self.episode_length()
-        return {"left_bounds": plan.left_bounds} | (
-            {"promised_reward": plan.reward} if whole else {}
-        )
+        said = {"left_bounds": plan.left_bounds}
+        said |= {} if self.task.constraints is None else {"violation": plan.violation}
+        return said | ({"promised_reward": plan.reward} if whole else {})
 
 
 class PolicySearchAgent(Agent):
@@ -169,6 +183,12 @@ class PolicySearchAgent(Agent):
         self.is_trained = False
         self._reward = math.nan  # of a step, as the last search foresaw it
 
+    def try_task(self, observations: NDArray[Any], action_space: Any) -> None:
+        """Call the task's functions, and refuse what a policy cannot keep."""
+        for part in ("constraints", "action_rate"):
+            self.task.refuse(type(self).__name__, part, "MPCAgent can")
+        super().try_task(observations, action_space)
+
     def improve(self, task: Task) -> bool:
         """Improve the policy, if it is known where episodes start."""
         if task.initial_states is None:
@@ -207,9 +227,22 @@ class PolicySearchAgent(Agent):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """The policy's actions, always the same at an observation; see :meth:`Agent.predict`."""
+        """The policy's actions, always the same at an observation; see :meth:`Agent.predict`.
+
+        With sensors the state is an :class:`Estimate` of each episode, at whose mean they are.
+        """
+        seen, found = torch.as_tensor(np.asarray(observation)).double(), list[Estimate]()
+        if self.filter is not None:
+            rows = torch.atleast_2d(seen)
+            earlier = going_on(state, episode_start, len(rows))
+            found = self.filter.follow(self.newest_model, rows, earlier)
+            means = self.task.dynamics.spec.observe(torch.stack([each.mean for each in found]))
+            seen = means.reshape(*seen.shape[:-1], -1)
         with torch.no_grad():
-            actions = self.policy.act(torch.as_tensor(np.asarray(observation)).double())
+            actions = self.policy.act(seen)
+        if found:
+            taken = zip(found, torch.atleast_2d(actions), strict=True)
+            state = tuple(each._replace(action=action) for each, action in taken)
         return actions.numpy().astype(np.float32), state
 
     def _random_states(self, task: Task) -> Tensor:

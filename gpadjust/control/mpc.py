@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -12,8 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_bounds, checked_number
+from gpadjust.control.constraints import margins
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
+from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
@@ -46,6 +49,11 @@ class Planned(NamedTuple):
         left_bounds: As of the newest :class:`Plan`.
         reward: What was promised of a step that is made, on average, when it was last planned to
             its end.
+        next_states: Those to which the actions ahead lead, ``T x state_dim``.
+        violation: As of the newest :class:`Plan`.
+        before: The last action that was made, ``action_dim``; None where an episode begins.
+        estimate: The state as sensors have shown it, and the action that was taken there; None of a
+            task without sensors.
     """
 
     actions: Tensor
@@ -53,10 +61,16 @@ class Planned(NamedTuple):
     steps_done: int
     left_bounds: float = 0.0
     reward: float = math.nan
+    next_states: Tensor = torch.zeros(0)
+    violation: float = 0.0
+    before: Tensor | None = None
+    estimate: Estimate | None = None
 
 
 PlanState = tuple[Planned, ...]
 """What is planned of each episode."""
+
+Kept = TypeVar("Kept")
 
 
 class MPC:
@@ -80,6 +94,8 @@ class MPC:
             step, on average), the rest is planned as when it began. None for never.
         seed: Of the searches of deterministic actions, which are the same for the same observation
             and plan.
+        state_filter: Of a task with sensors, by which observations are states. Default: that before
+            there are data.
 
     Raises:
         TypeError: If a planner is none.
@@ -109,6 +125,7 @@ class MPC:
         first: Planner | None = None,
         tolerance: float | None = 0.25,
         seed: int = 0,
+        state_filter: StateFilter | None = None,
     ) -> None:
         for name, planner in (("each_step", each_step), ("first", first)):
             check_kind(name, planner, Planner | None, "a Planner(...)")
@@ -138,6 +155,9 @@ class MPC:
         self.first = first
         self.tolerance = tolerance
         self.seed = seed
+        if task.sensors is not None and state_filter is None:
+            state_filter = StateFilter.guessed(task, self.action_bounds)
+        self.filter = state_filter
 
     def predict(
         self,
@@ -151,45 +171,96 @@ class MPC:
         The state is the plan. Without one all episodes begin. If ``deterministic``, the search is
         always the same.
         """
-        spec = self.task.dynamics.spec
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
-        states = spec.decode(rows)
-        episodes: list[Planned | None] = [None] * len(states)
-        if state is not None:
-            begins = np.zeros(len(states), dtype=bool) if episode_start is None else episode_start
-            pairs = zip(state, np.atleast_1d(begins), strict=True)
-            episodes = [None if new else earlier for earlier, new in pairs]
+        episodes = going_on(state, episode_start, len(rows))
+        known: Sequence[Estimate | None] = [None] * len(rows)
+        if self.filter is None:
+            states = [*self.task.dynamics.spec.decode(rows)]
+        else:
+            before = [None if each is None else each.estimate for each in episodes]
+            found = known = self.filter.follow(self.task, rows, before)
+            states = [each.mean for each in found]
         with seeded(self.seed if deterministic else None):
-            plans = [self.plan(*pair) for pair in zip(states, episodes, strict=True)]
+            plans = [
+                self.plan(at, earlier, None if seen is None else seen.covariance)
+                for at, earlier, seen in zip(states, episodes, known, strict=True)
+            ]
         actions = torch.stack([plan.actions[0] for plan in plans]).numpy().astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), tuple(
-            plan._replace(actions=plan.actions[1:], steps_done=plan.steps_done + 1)
-            for plan in plans
+            plan._replace(
+                actions=plan.actions[1:],
+                next_states=plan.next_states[1:],
+                steps_done=plan.steps_done + 1,
+                before=plan.actions[0],
+                estimate=None if seen is None else seen._replace(action=plan.actions[0]),
+            )
+            for plan, seen in zip(plans, known, strict=True)
         )
 
-    def plan(self, state: Tensor, earlier: Planned | None = None) -> Planned:
+    def plan(
+        self, state: Tensor, earlier: Planned | None = None, covariance: Tensor | None = None
+    ) -> Planned:
         """Plan the steps ahead of an episode that is at a state.
 
         Args:
             state: Where it is, ``state_dim``.
             earlier: What was planned by then; None at the start.
+            covariance: That of the state, ``state_dim x state_dim``, if it is estimated.
         """
         steps_done = 0 if earlier is None else earlier.steps_done
         length = self.task.episode_length
         left = None if length is None else max(length - steps_done, 1)
+        before = None if earlier is None else earlier.before
         if earlier is not None and len(earlier.actions):
+            horizon = self.each_step.horizon
+            tight = self._margins(state, earlier.actions[:horizon], earlier, covariance)
             plan = self.each_step.plan(
-                self.task, state, self.action_bounds, left, known=earlier.actions
+                self.task,
+                state,
+                self.action_bounds,
+                left,
+                known=earlier.actions,
+                before=before,
+                margins=tight,
             )
             if not self._disappoints(plan, earlier):
-                beyond = earlier.actions[len(plan.actions) :]
-                actions = torch.cat([plan.actions, beyond])
-                return earlier._replace(actions=actions, left_bounds=plan.left_bounds)
-        plan = self.first.plan(self.task, state, self.action_bounds, left)
+                k = len(plan.actions)
+                return earlier._replace(
+                    actions=torch.cat([plan.actions, earlier.actions[k:]]),
+                    next_states=torch.cat([plan.next_states, earlier.next_states[k:]]),
+                    left_bounds=plan.left_bounds,
+                    violation=plan.violation,
+                )
+        how = {"before": before}
+        plan = self.first.plan(self.task, state, self.action_bounds, left, **how)
+        if self.task.constraints is not None:
+            # The margins are those of a plan that has none yet.
+            how["margins"] = self._margins(state, plan.actions, plan, covariance)
+            plan = self.first.plan(
+                self.task, state, self.action_bounds, left, known=plan.actions, **how
+            )
         made = plan.rewards[:0] if earlier is None else earlier.promised[:steps_done]
         promised = torch.cat([made, plan.rewards])
         reward = float(plan.rewards.sum() / plan.made.sum().clamp_min(1e-12))
-        return Planned(plan.actions, promised, steps_done, plan.left_bounds, reward)
+        return Planned(
+            plan.actions,
+            promised,
+            steps_done,
+            plan.left_bounds,
+            reward,
+            plan.next_states,
+            plan.violation,
+            before,
+        )
+
+    def _margins(
+        self, state: Tensor, actions: Tensor, along: Plan | Planned, covariance: Tensor | None
+    ) -> Tensor | None:
+        """The margins of the constraints along a plan from a state; None without constraints."""
+        if self.task.constraints is None:
+            return None
+        states = torch.cat([state.unsqueeze(0), along.next_states])[: len(actions)]
+        return margins(self.task, states, actions, self.action_bounds, covariance)
 
     def _disappoints(self, plan: Plan, earlier: Planned) -> bool:
         """Return whether a plan is worth much less than its steps had promised."""
@@ -202,3 +273,11 @@ class MPC:
             return False
         loss = (promised - plan.rewards[: len(promised)]).mean()
         return bool(loss > self.tolerance * (earlier.promised.max() - earlier.promised.min()))
+
+
+def going_on(state: Sequence[Kept] | None, episode_start: Any, n: int) -> list[Kept | None]:
+    """What a policy kept of each of ``n`` episodes, its state; None of those that begin."""
+    if state is None:
+        return [None] * n
+    begins = np.zeros(n, dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
+    return [None if new else kept for kept, new in zip(state, begins, strict=True)]

@@ -28,6 +28,8 @@ class Plan(NamedTuple):
         left_bounds: The share of the functions in which it leaves the bounds of the states, or
             meets a failure of the physics.
         made: The share of the functions in which each step is made, ``T``: 0 after the end.
+        next_states: The states that it comes to, ``T x state_dim``, averaged over the functions.
+        violation: How far constraints with their margins are violated in the worst step; 0 if none.
     """
 
     actions: Tensor
@@ -35,6 +37,8 @@ class Plan(NamedTuple):
     rewards: Tensor
     left_bounds: float
     made: Tensor
+    next_states: Tensor
+    violation: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,8 @@ class Planner:
         num_steps: int | None = None,
         *,
         known: Tensor | None = None,
+        before: Tensor | None = None,
+        margins: Tensor | None = None,
     ) -> Plan:
         """Choose the actions of the next steps; the randomness is PyTorch's global generator.
 
@@ -126,6 +132,10 @@ class Planner:
             num_steps: How many steps are ahead; the plan is of these or of the horizon, ``T``.
                 Default: the episode length of the task.
             known: An earlier plan, ``t x action_dim``; its last action is held where it is shorter.
+            before: The last action that was made, from which the next one may differ by the task's
+                ``action_rate`` alone. Default: none, where an episode begins.
+            margins: Those of the constraints, ``T x c``; see
+                :func:`~gpadjust.control.constraints.margins`. Default: they hold in the mean.
 
         Raises:
             ValueError: If ``state`` or ``action_bounds`` have another shape, bounds are not finite,
@@ -138,7 +148,7 @@ class Planner:
         action_bounds = checked_bounds("action_bounds", action_bounds, dim)
         num_steps = self._checked_steps(task, state, num_steps)
         score = self.objective.of(task)
-        rollouts = Rollouts(task, self.num_functions)
+        rollouts = Rollouts(task, self.num_functions, margins=margins, before=before)
         known = None if known is None or not len(known) else known
         deadline = math.inf if self.seconds is None else begun + self.seconds
 
@@ -149,15 +159,18 @@ class Planner:
                 rollout = rollouts.follow(state, sequences)
                 rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
                 left, made = (part.double().mean(0) for part in (rollout.left_bounds, rollout.made))
-                asked.append((sequences, rewards, left, made))
+                reached, violation = rollout.next_states.mean(0), rollout.violation.mean(0).amax(-1)
+                taken = rollout.actions[0]
+                asked.append((sequences, taken, rewards, left, made, reached, violation))
                 return self._checked_scores(score(rollout), len(sequences))
 
             first = self._proposed(num_steps, action_bounds, known)
             actions, value = self.search.best(scored, first, action_bounds, deadline)
-            columns = (torch.cat(column) for column in zip(*asked, strict=True))
-            sequences, rewards, left, made = columns
+            columns = [torch.cat(column) for column in zip(*asked, strict=True)]
+            sequences, *columns = columns
             found = int((sequences == actions).all(-1).all(-1).nonzero()[0])
-            return Plan(actions, value, rewards[found], float(left[found]), made[found])
+            taken, rewards, left, made, reached, violation = (column[found] for column in columns)
+            return Plan(taken, value, rewards, float(left), made, reached, float(violation))
 
         plans = [search()]
         while len(plans) < (self.restarts if known is None else 1):

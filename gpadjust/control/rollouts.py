@@ -18,6 +18,7 @@ Policy = Callable[[Tensor], Tensor]
 
 
 _MOST_MEDIANS = 30.0
+_NEVER = 1e6  # largest rewards of a step: it never pays
 _BACK = 10.0  # largest rewards of a step: few episodes of a policy must outweigh those that stay
 
 
@@ -35,6 +36,9 @@ class Rollout(NamedTuple):
             or the physics failed there, ``k x n`` booleans.
         overshoot: How far that step would have left them, ``k x n``; 0 where none would have. See
             :class:`~gpadjust.control.task.Step`.
+        violation: How far the constraints with their margins are violated, summed over these,
+            ``k x n x T``; 0 where they hold.
+        before: The action before the first step, ``action_dim``; None where an episode begins.
     """
 
     states: Tensor
@@ -44,6 +48,8 @@ class Rollout(NamedTuple):
     made: Tensor
     left_bounds: Tensor
     overshoot: Tensor
+    violation: Tensor
+    before: Tensor | None = None
 
 
 class Rollouts:
@@ -58,10 +64,20 @@ class Rollouts:
         task: The task; its dynamics must be fitted.
         num_functions: Number ``k`` of functions, drawn from PyTorch's generator; None for the mean
             of the dynamics, as a single one.
+        margins: By how much constraints must hold in each step, ``T x c``; the last ones beyond.
+            Default: not at all.
+        before: The action before the first step, ``action_dim``; None where an episode begins.
     """
 
-    def __init__(self, task: Task, num_functions: int | None) -> None:
-        self.task = task
+    def __init__(
+        self,
+        task: Task,
+        num_functions: int | None,
+        *,
+        margins: Tensor | None = None,
+        before: Tensor | None = None,
+    ) -> None:
+        self.task, self.margins, self.before = task, margins, before
         if num_functions is None:
             self.num_functions, self.functions = 1, task.dynamics.mean_function()
         else:
@@ -69,13 +85,15 @@ class Rollouts:
             self.functions = task.dynamics.sample_functions(num_functions)
 
     def follow(self, state: Tensor, sequences: Tensor) -> Rollout:
-        """Take given actions, whatever happens.
+        """Take given actions, whatever happens, as fast as they may change.
 
         Args:
             state: Where the episodes start, ``state_dim``.
             sequences: ``n x T x action_dim``.
         """
         n, num_steps = sequences.shape[:2]
+        if self.task.rate is not None:
+            sequences = self.task.rate.limited(sequences, self.before)
         every = sequences.expand(self.num_functions, *sequences.shape)
         return self._run(state.expand(n, -1), num_steps, lambda t, states: every[:, :, t])
 
@@ -115,11 +133,21 @@ class Rollouts:
             made = running & ~lost
             left = left | (running & lost)
             overshoot = torch.where(running, beyond, overshoot)
-            steps.append((states, actions, following, rewards, made))
+            violation = self._violation(t, *(part.flatten(0, 1) for part in (following, actions)))
+            violation = violation.view_as(rewards).masked_fill(~made, 0.0)
+            steps.append((states, actions, following, rewards, made, violation))
             running = made & ~ended
             states = torch.where(running.unsqueeze(-1), following, states)
         columns = [torch.stack(parts, dim=2) for parts in zip(*steps, strict=True)]
-        return Rollout._make([*columns, left, overshoot])
+        *columns, violation = columns
+        return Rollout._make([*columns, left, overshoot, violation, self.before])
+
+    def _violation(self, t: int, states: Tensor, actions: Tensor) -> Tensor:
+        """How far the constraints of a step are violated, with their margins, ``N``."""
+        values = self.task.constraint_values(states, actions)
+        if self.margins is not None:
+            values = values + self.margins[min(t, len(self.margins) - 1)]
+        return values.clamp_min(0.0).sum(-1)
 
     def _move(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states of rows, of which each function has as many."""
@@ -178,6 +206,8 @@ class Return(Objective):
     times the largest that was at stake in the first rollouts (reward, effort or terminal value of
     an episode), so that sequences that leave come after all others, and those that leave later
     first. Beside it such an episode has the gradient of how far it left, for a policy to come back.
+    A unit of a constraint's violation costs as much as such a step, and where none can hold, the
+    least violation is the best.
 
     Args:
         discount: Factor of the rewards from a step to the next one.
@@ -227,22 +257,27 @@ class Return(Objective):
     def of(self, task: Task) -> Score:
         """The return of rollouts."""
         largest = torch.zeros((), dtype=torch.float64)
+        rate = task.rate
 
         def score(rollout: Rollout) -> Tensor:
             nonlocal largest
             rewards = rollout.rewards.double()
             if self.effort:
                 rewards = rewards - self.effort * rollout.actions.square().sum(-1)
+            if rate is not None:
+                rewards = rewards - rate.cost(rollout.actions, rollout.before)
             weights = self.discount ** torch.arange(rewards.shape[-1] + 1, dtype=torch.float64)
             ends = weights[-1] * self._at_the_end(rollout)
             if not largest:  # of the first rollouts, so that later ones compare
                 largest = torch.maximum(*(part.detach().abs().max() for part in (rewards, ends)))
             returns = (weights[:-1] * rewards.masked_fill(~rollout.made, 0.0)).sum(-1) + ends
+            price = torch.where(largest > 0, largest, 1.0)
             if rollout.left_bounds.any():
                 lost = rollout.left_bounds.unsqueeze(-1) & ~rollout.made
-                missed = 1e6 * (weights[:-1] * lost).sum(-1)
-                price = torch.where(largest > 0, largest, 1.0)
+                missed = _NEVER * (weights[:-1] * lost).sum(-1)
                 returns = returns - price * (missed + _BACK * len(weights) * rollout.overshoot)
+            if rollout.violation.any():
+                returns = returns - price * _NEVER * (weights[:-1] * rollout.violation).sum(-1)
             if self.quantile is None:
                 return returns.mean(0)
             return returns.quantile(self.quantile, dim=0)

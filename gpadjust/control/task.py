@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_kind, checked_whole
+from gpadjust.checks import check_kind, checked_number, checked_whole
+from gpadjust.control.action_rate import ActionRate
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
+from gpadjust.states import Sensors, StateSpec
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rewards ``N`` of states, actions and next states, ``N`` rows each."""
 
 Termination = Callable[[Tensor], Tensor]
 """Whether states ``N x state_dim`` end an episode, ``N`` booleans."""
+
+Constraints = Callable[[Tensor, Tensor], Tensor]
+"""Numbers ``N x c`` of states and actions that led to them, ``N`` rows each; 0 or less is right."""
 
 InitialStates = Callable[[int], Tensor]
 """Draws ``n`` states at which episodes start, ``n x state_dim``."""
@@ -64,10 +69,22 @@ class Task:
         state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
             model is not followed; infinite where there is none. Default: far beyond all that was
             seen, of an agent that has seen some; else none.
+        sensors: What is measured of the states, of which observations then are; it takes
+            ``initial_states``. Default: all of the states.
+        constraints: Numbers ``N x c``, in PyTorch's functions, of states ``N x state_dim`` and the
+            actions ``N x action_dim`` that led to them: each constraint holds where its number is
+            at most 0, such as ``states[:, :1] - 0.5`` before a wall at 0.5. A planner looks for
+            plans that hold them, or violate them least. Default: none.
+        probability: Of all constraints holding through a whole episode: plans keep a margin for
+            what is not known of the next states (:func:`~gpadjust.control.constraints.margins`).
+            None: they hold in the mean of the model, without margin.
+        action_rate: The most that an action changes in a step, one number for all actions or one
+            for each; or an :class:`ActionRate`, which may have a price, too. Default: no limit.
 
     Raises:
         TypeError: If something is of another kind, or a function takes other arguments.
-        ValueError: If a number or the bounds are out of range.
+        ValueError: If a number or the bounds are out of range, or there are sensors of no such
+            states, or without ``initial_states``.
 
     Example:
         >>> import torch
@@ -84,6 +101,10 @@ class Task:
     initial_states: InitialStates | None = None
     episode_length: int | None = None
     state_bounds: Tensor | None = None
+    sensors: Sensors | None = None
+    constraints: Constraints | None = None
+    probability: float | None = 0.95
+    action_rate: ActionRate | float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         """Check what can be checked without a state."""
@@ -92,13 +113,42 @@ class Task:
             raise TypeError(
                 "reward must be a function of states, actions, next states; found None."
             )
-        for name, arguments in (("reward", 3), ("terminated", 1), ("initial_states", 1)):
+        for name, arguments in (
+            ("reward", 3),
+            ("terminated", 1),
+            ("initial_states", 1),
+            ("constraints", 2),
+        ):
             _check_function(getattr(self, name), name, arguments)
         if self.episode_length is not None:
             checked_whole("episode_length", self.episode_length, 1)
         if self.state_bounds is not None:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)
+        check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
+        if self.sensors is not None:
+            self.sensors.spec(self.dynamics.spec)  # checks the names
+            if self.initial_states is None:
+                raise ValueError(
+                    "Of hidden states it must be known where episodes start; pass initial_states, "
+                    "or start of a System, as well as sensors."
+                )
+        if self.probability is not None:
+            checked_number("probability", self.probability, above=0, below=1)
+        if self.rate is not None:
+            self.rate.check(self.dynamics.spec.action_dim)
+
+    @property
+    def observed(self) -> StateSpec:
+        """What is observed, as a spec: the states, or the outputs of the sensors."""
+        spec = self.dynamics.spec
+        return spec if self.sensors is None else self.sensors.spec(spec)
+
+    @property
+    def rate(self) -> ActionRate | None:
+        """``action_rate`` as an object, None if there is none."""
+        given = self.action_rate
+        return given if isinstance(given, ActionRate | None) else ActionRate(given)
 
     def try_functions(self, states: Tensor, actions: Tensor) -> None:
         """Call physics and functions once, to find what is wrong with them before it costs data.
@@ -113,24 +163,38 @@ class Task:
         """
         if self.initial_states is not None:
             self.draw_initial_states(len(states))
+        if self.sensors is not None:
+            self.sensors.measure(self.dynamics.spec, states)
         self.rewards(states, actions, states)
         self.terminations(states)
+        self.constraint_values(states, actions)
         self.dynamics.try_physics(states, actions)
 
     def check_spaces(self, observation_space: Any, action_space: Any) -> None:
-        """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
-        spec = self.dynamics.spec
+        """Raise a ValueError unless the spaces are boxes of what is observed and of actions."""
+        spec, whose = self.observed, "dynamics" if self.sensors is None else "sensors"
         for name, space, size in (
             ("observation", observation_space, spec.observation_dim),
             ("action", action_space, spec.action_dim),
         ):
             if not hasattr(space, "high") or space.shape != (size,):
                 raise ValueError(
-                    f"The spec of the dynamics says that the {name} has {size} entries, so a Box "
+                    f"The spec of the {whose} says that the {name} has {size} entries, so a Box "
                     f"of shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, "
                     f"of which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
                     f"{tuple(spec.actions)}."
                 )
+
+    def refuse(self, learner: str, name: str, way_out: str) -> None:
+        """Raise a ValueError if the task has a part of this name, with which a learner cannot do.
+
+        Args:
+            learner: The name of the learner.
+            name: That of the part.
+            way_out: Who can.
+        """
+        if getattr(self, name) is not None:
+            raise ValueError(f"{learner} cannot learn a task with {name}; {way_out}.")
 
     def draw_initial_states(self, n: int) -> Tensor:
         """Draw ``n x state_dim`` states at which episodes start.
@@ -164,6 +228,24 @@ class Task:
         if self.terminated is None:
             return torch.zeros(len(states), dtype=torch.bool)
         return per_row(self.terminated(states.detach()), len(states), "terminated").bool()
+
+    def constraint_values(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The values of the constraints, checked: ``N x c`` with their gradient, ``N x 0`` of none.
+
+        Args:
+            states: ``N x state_dim``.
+            actions: The actions that led to them, ``N x action_dim``.
+        """
+        if self.constraints is None:
+            return states.new_zeros(len(states), 0)
+        values = torch.as_tensor(self.constraints(states, actions))
+        if values.dim() != 2 or len(values) != len(states):
+            raise ValueError(
+                f"constraints must return a column for each constraint, shape ({len(states)}, c); "
+                f"found {tuple(values.shape)}."
+            )
+        per_row(values.detach().sum(-1), len(states), "constraints")
+        return values
 
     def step(
         self,
@@ -225,6 +307,10 @@ class Task:
             "initial_states": self.initial_states is not None,
             "episode_length": self.episode_length,
             "state_bounds": None if bounds is None else bounds.tolist(),
+            "sensors": None if self.sensors is None else self.sensors.describe(),
+            "constraints": self.constraints is not None,
+            "probability": self.probability,
+            "action_rate": None if self.action_rate is None else repr(self.action_rate),
         }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -23,7 +23,7 @@ from gpadjust.dynamics.learning import (
 from gpadjust.dynamics.particles import varying_parameters
 from gpadjust.dynamics.physics_dynamics import PhysicsDynamics
 from gpadjust.dynamics.state import check_fingerprint, fingerprint
-from gpadjust.dynamics.targets import Target, Targets, check_physics
+from gpadjust.dynamics.targets import Target, Targets, check_physics, checked_physics_error
 from gpadjust.inference import FitResult, SampleResult
 from gpadjust.models import CKA, Prediction, TermsModel
 from gpadjust.models.factory import ModelFactory
@@ -66,6 +66,9 @@ class LearnedDynamics(Dynamics):
             ``"map"`` takes the most likely ones.
         num_features: Number of random features that stand for each kernel in sampled functions, an
             even one. Fewer are faster: 256 for a policy search, whose functions are many.
+        physics_error: Standard deviations of the error of a step of the physics, by the name of the
+            state, for which plans before the first transitions keep margins; see
+            :class:`PhysicsDynamics`.
 
     Raises:
         TypeError: If an argument is of another type, or ``model`` needs a physics (or another
@@ -95,6 +98,7 @@ class LearnedDynamics(Dynamics):
         encode_angles: bool = True,
         fit_options: DynamicsFitOptions | None = None,
         num_features: int = 1024,
+        physics_error: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(spec)
         check_num_features(num_features)
@@ -107,6 +111,7 @@ class LearnedDynamics(Dynamics):
         self._recipe = Recipe(self.targets, self.physics, model, encode_angles)
         self.fit_options = checked_fit_options(fit_options, model)
         self.num_features = num_features
+        self.physics_error = checked_physics_error(spec, physics_error)
         self._learnt: Learnt | None = None
         self._compared = False  # the physics with transitions
         self._means: tuple[TermsModel, Any] | None = None  # of a model, made once
@@ -211,7 +216,9 @@ class LearnedDynamics(Dynamics):
         if self.is_fitted:
             return self
         alone = self.physics is not None and len(self._recipe.parts) == 1
-        return PhysicsDynamics(self.spec, self.physics) if alone and self.physics else None
+        if not (alone and self.physics):
+            return None
+        return PhysicsDynamics(self.spec, self.physics, physics_error=self.physics_error)
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """Draw next states, noise included, row by row, from PyTorch's generator."""

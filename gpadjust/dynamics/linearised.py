@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,11 +18,13 @@ class Linearised(NamedTuple):
         mean: Their mean at these, ``N x state_dim``; of angles, not wrapped.
         slope: Its derivatives by the states, ``N x state_dim x state_dim``.
         variance: The predicted variance there, with the noise, ``N x state_dim``.
+        gain: The derivatives of the mean by the actions, ``N x state_dim x action_dim``.
     """
 
     mean: Tensor
     slope: Tensor
     variance: Tensor
+    gain: Tensor
 
     def carry(self, covariance: Tensor) -> Tensor:
         """Covariances of the next states, from ``N x state_dim x state_dim`` of the states."""
@@ -42,14 +45,20 @@ def linearised(dynamics: Dynamics, states: Tensor, actions: Tensor) -> Linearise
         PhysicsError: If the physics fails.
     """
     with torch.enable_grad():
-        at = states.detach().clone().requires_grad_(True)
-        mean = dynamics.mean_function()(at.unsqueeze(0), actions.unsqueeze(0)).squeeze(0)
-        rows = [
-            torch.autograd.grad(column.sum(), at, retain_graph=True, materialize_grads=True)[0]
-            if column.requires_grad
-            else torch.zeros_like(at)
-            for column in mean.unbind(-1)
-        ]
+        given = [part.detach().clone().requires_grad_(True) for part in (states, actions)]
+        mean = dynamics.mean_function()(*(part.unsqueeze(0) for part in given)).squeeze(0)
+        slope, gain = derivatives(mean, given)
     with torch.no_grad():
         variance = dynamics.predict(states, actions).variance
-    return Linearised(mean.detach(), torch.stack(rows, dim=-2), variance)
+    return Linearised(mean.detach(), slope, variance, gain)
+
+
+def derivatives(values: Tensor, given: Sequence[Tensor]) -> list[Tensor]:
+    """The derivatives of values ``N x c``, row by row, by each of some ``N x d``: ``N x c x d``."""
+    rows = [
+        torch.autograd.grad(column.sum(), given, retain_graph=True, materialize_grads=True)
+        if column.requires_grad
+        else [torch.zeros_like(part) for part in given]
+        for column in values.unbind(-1)
+    ]
+    return [torch.stack(columns, dim=-2) for columns in zip(*rows, strict=True)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +20,12 @@ from gpadjust.dynamics.state import (
     loaded,
     saved,
 )
-from gpadjust.dynamics.targets import check_next_values, one_physics, warn_of_differences
+from gpadjust.dynamics.targets import (
+    check_next_values,
+    checked_physics_error,
+    one_physics,
+    warn_of_differences,
+)
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.inference.calibrate import warn_of_parameters
 from gpadjust.inference.calibration import Misfit, or_infinite
@@ -55,10 +60,13 @@ class PhysicsDynamics(Dynamics):
         spec: What the entries of states and actions are.
         physics: The next values of the states that are neither exogenous nor previous values,
             from these and the actions: columns ``[states, actions]`` in the order of the spec.
+        physics_error: Standard deviations of the error of a step of the physics, by the name of the
+            state; until unknown parameters are fitted they are its noise. Default: none.
 
     Raises:
         TypeError: If ``spec`` is no :class:`StateSpec`, or the physics is not callable.
-        ValueError: If there are several physics, or one returns the change of the state.
+        ValueError: If there are several physics, one returns the change of the state, or
+            ``physics_error`` is of no state that moves, or negative.
 
     Example:
         >>> import torch
@@ -74,8 +82,15 @@ class PhysicsDynamics(Dynamics):
         tensor([0.3000], dtype=torch.float64)
     """
 
-    def __init__(self, spec: StateSpec, physics: Physics | Callable[[Tensor], Tensor]) -> None:
+    def __init__(
+        self,
+        spec: StateSpec,
+        physics: Physics | Callable[[Tensor], Tensor],
+        *,
+        physics_error: Mapping[str, float] | None = None,
+    ) -> None:
         super().__init__(spec)
+        self.physics_error = checked_physics_error(spec, physics_error)
         self.physics = one_physics(physics, spec, "LearnedDynamics learns the weights of several")
         self._probes: PhysicsProbes | None = None
         self._compared = False  # with transitions
@@ -140,20 +155,21 @@ class PhysicsDynamics(Dynamics):
         self._compared = True
 
     def predict(self, states: Tensor, actions: Tensor) -> Prediction[Tensor]:
-        """The next states, and the variance of the noise, zero without unknown parameters."""
+        """The next states, and the variance of the noise (:meth:`noise_variance`)."""
         with torch.no_grad():
             following = self._step(states, actions, self._values)
         return Prediction(following, self.noise_variance(following, actions))
 
     def noise_variance(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Mean squares of the errors that the fitted parameters leave; else zero."""
-        if self._fitted is None:
-            return torch.zeros_like(states)
-        return self._fitted.noise.expand_as(states)
+        """Mean squares of the errors that the fitted parameters leave; before, as was stated."""
+        stated = [self.physics_error.get(name, 0.0) ** 2 for name in self.spec.states]
+        noise = states.new_tensor(stated) if self._fitted is None else self._fitted.noise
+        return noise.expand_as(states)
 
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states, with the noise if there is any."""
-        return super().sample(states, actions) if self._fitted else self.predict(states, actions)[0]
+        noisy = self._fitted is not None or self.physics_error
+        return super().sample(states, actions) if noisy else self.predict(states, actions)[0]
 
     def mean_function(self) -> TransitionFunctions:
         """The physics, with gradients as far as it has them."""
@@ -177,7 +193,8 @@ class PhysicsDynamics(Dynamics):
     def describe(self) -> dict[str, str]:
         """Return the settings, each as a text."""
         unknowns = {name: repr(u) for name, u in self.physics.unknowns.items()}
-        return fingerprint(type(self), self.spec, **({"unknowns": unknowns} if unknowns else {}))
+        more = {"unknowns": unknowns, "physics_error": self.physics_error}
+        return fingerprint(type(self), self.spec, **{k: v for k, v in more.items() if v})
 
     def state_dict(self) -> dict[str, Any]:
         """Return settings, fitted values, and the physics' outputs at some transitions.

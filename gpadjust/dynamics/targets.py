@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Literal, cast, get_args
 
 import torch
 from torch import Tensor
 
-from gpadjust.checks import check_choice
+from gpadjust.checks import check_choice, checked_number
 from gpadjust.dynamics.trajectories import Trajectories
 from gpadjust.models.term_builder import PhysicsLike
 from gpadjust.physics import (
@@ -249,3 +249,13 @@ def warn_of_differences(
             UserWarning,
             stacklevel=4,
         )
+
+
+def checked_physics_error(spec: StateSpec, given: Mapping[str, float] | None) -> dict[str, float]:
+    """Standard deviations of the error of a step of the physics, by state; empty for None."""
+    moving = [spec.states[i] for i in spec.moving]
+    for name, sd in {**(given or {})}.items():
+        if name not in moving:
+            raise ValueError(f"physics_error is of states among {moving}; found {name!r}.")
+        checked_number(f"physics_error[{name!r}]", sd, least=0)
+    return {**(given or {})}

@@ -338,7 +338,7 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
         """The task, if the agent can learn with it.
 
         Raises:
-            ValueError: If it is missing.
+            ValueError: If it is missing, or has constraints or an action rate.
             TypeError: If task or options are of another kind.
         """
         name = type(self).__name__
@@ -350,6 +350,8 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
             )
         check_kind("task", self.task, Task, "a Task(dynamics, reward, ...)")
         check_kind("options", self.options, DynaOptions, "DynaOptions(...)")
+        for part in ("constraints", "action_rate"):
+            self.task.refuse(name, part, "MPCAgent can")
         return self.task
 
     def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
@@ -421,6 +423,8 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         if self.task is not None:
+            way_out = "MPCAgent and PolicySearchAgent can"
+            self.task.refuse(type(self).__name__, "sensors", way_out)
             self.task.check_spaces(self.observation_space, self.action_space)
         self.replay_buffer_kwargs |= {
             "real_fraction": self.options.real_fraction,

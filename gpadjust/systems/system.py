@@ -10,7 +10,7 @@ import gymnasium as gym
 from torch import Tensor
 
 from gpadjust.physics import Physics, Unknown, as_physics
-from gpadjust.states import StateSpec
+from gpadjust.states import Sensors, StateSpec
 from gpadjust.systems.wrappers import NoisySensors
 
 if TYPE_CHECKING:
@@ -36,8 +36,15 @@ class System:
         episode_length: Steps after which an episode is truncated; an environment's own time limit
             may only be longer. Default: the time limit of the environment.
         state_bounds: As of a :class:`~gpadjust.control.Task`.
-        noise: Standard deviations of the sensors' noise, by the name of the state, which
+        constraints: As of a :class:`~gpadjust.control.Task`.
+        probability: As of a :class:`~gpadjust.control.Task`.
+        action_rate: As of a :class:`~gpadjust.control.Task`.
+        physics_error: As of :class:`~gpadjust.dynamics.LearnedDynamics`, of the dynamics that
+            :meth:`task` makes.
+        noise: Standard deviations of the sensors' noise, by the name of the state or output, which
             :class:`NoisySensors` adds to what the environment observes.
+        sensors: What is measured of the states, as of a :class:`~gpadjust.control.Task`; the
+            environment observes nothing else. Default: all of the states.
 
     Raises:
         TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec`` no
@@ -60,7 +67,12 @@ class System:
     terminated: Callable[[Tensor], Tensor] | None = None
     episode_length: int | None = None
     state_bounds: Tensor | None = None
+    constraints: Callable[[Tensor, Tensor], Tensor] | None = None
+    probability: float | None = 0.95
+    action_rate: Any = None
+    physics_error: Mapping[str, float] | None = None
     noise: Mapping[str, float] | None = None
+    sensors: Sensors | None = None
 
     def __post_init__(self) -> None:
         """Check the parts that a task does not check."""
@@ -96,7 +108,9 @@ class System:
             )
         if self.episode_length not in (None, limit):
             env = gym.wrappers.TimeLimit(env, self.episode_length)
-        return NoisySensors(env, self.spec, self.noise) if self.noise else env
+        if not self.noise and self.sensors is None:
+            return env
+        return NoisySensors(env, self.spec, self.noise or {}, self.sensors)
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
         """The task that agents and planners take.
@@ -112,11 +126,18 @@ class System:
         from gpadjust.control import Task
         from gpadjust.dynamics import LearnedDynamics
 
+        if dynamics is None:
+            error = self.physics_error
+            dynamics = LearnedDynamics(self.spec, self.physics, physics_error=error)
         return Task(
-            LearnedDynamics(self.spec, self.physics) if dynamics is None else dynamics,
+            dynamics,
             self.reward,
             terminated=self.terminated,
             initial_states=self.start,
             episode_length=self.episode_length,
             state_bounds=self.state_bounds,
+            sensors=self.sensors,
+            constraints=self.constraints,
+            probability=self.probability,
+            action_rate=self.action_rate,
         )

@@ -1,1 +1,123 @@
-"""Controllers for systems that people know."""
+"""Controllers for machines as they are: systems that people know."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from paper.common.experiment import Axes, Experiment
+from paper.common.learners import labels
+
+HORIZONS = {
+    "pendulum": 12,
+    "furuta": 10,
+    "quadrotor": 12,
+    "double_pendulum": 12,
+    "tanks": 8,
+    "reacher": 8,
+}
+"""Steps that are planned ahead at each step, by the name of a known system."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownSettings:
+    """Settings that decide the numbers; found with the true systems and seeds of 20 and more."""
+
+    trials: int = 3
+    """real trials of a run, of which the first goes by f_p, or is random where there is none"""
+    sequences: int = 128
+    """that are planned, in each round of the cross-entropy method"""
+    spread: float = 0.15
+    """of these about the earlier plan, in shares of the range of the actions"""
+    rounds: int = 0
+    """of these after the first"""
+    first_rounds: int = 2
+    """of these when a trial begins, with all its steps"""
+    elites: int = 12
+    """of these"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models; "bayes", the default of the library, takes twice as long"""
+    networks: int = 5
+    """of an ensemble"""
+    training: int = 250
+    """steps of Adam after each trial, of these"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known(Experiment):
+    """Systems that people know, with rivals on the same trials."""
+
+    out: Path = Path("results/known")
+    settings: KnownSettings = field(default_factory=KnownSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {
+            "pendulum": "Pendulum-v1",
+            "furuta": "Furuta pendulum",
+            "quadrotor": "quadrotor",
+            "double_pendulum": "pendubot",
+            "tanks": "two tanks",
+            "reacher": "Reacher-v5",
+        },
+        "learner": labels("cka", "phymean", "phy", "fitted", "gp")
+        | {
+            "ensemble": "f_p and an ensemble of networks",
+            "networks": "an ensemble of networks",
+        }
+        | labels("oracle"),
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium", "mujoco")
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+    def describe(self, *kind: Any) -> dict[str, Any]:
+        """The settings, and how far plans look."""
+        return {**asdict(self.settings), "horizon": HORIZONS[kind[0]]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class HiddenSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p"""
+    noise: float = 0.01
+    """standard deviation of the sensors' noise, in m and rad"""
+    sequences: int = 64
+    """that are planned, in each round of the cross-entropy method"""
+    rounds: int = 1
+    """of these after the first"""
+    first_rounds: int = 8
+    """of these when a trial begins, with all its steps"""
+    elites: int = 8
+    """of these"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models, as of `gpadjust.fit`"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hidden(Experiment):
+    """Systems of which positions and angles alone are measured, with noise."""
+
+    runs: int = 5
+    out: Path = Path("results/hidden")
+    settings: HiddenSettings = field(default_factory=HiddenSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {"cart_pole": "cart-pole", "furuta": "Furuta pendulum"},
+        "learner": {
+            "full": "all states, without noise",
+            "filter": "positions and angles, by the filter",
+            "quotient": "positions and angles, by difference quotients",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )

@@ -41,7 +41,9 @@ class Machine:
         actions: The least and the largest values of the actions.
         starts: The least and the largest values of the states at which episodes start.
         episode_length: In steps.
-        substeps: Of the integration, in a step.
+        substeps: Of the integration of f_p, in a step; the real one, whose friction is stiff, has
+            twice as many.
+        bounds: The least and the largest values that states can have, if that is known.
     """
 
     spec: StateSpec
@@ -52,7 +54,8 @@ class Machine:
     actions: tuple[list[float], list[float]]
     starts: tuple[list[float], list[float]]
     episode_length: int
-    substeps: int = 5
+    substeps: int = 2
+    bounds: tuple[list[float], list[float]] | None = None
 
     def physics(self, kind: Physics = "crude") -> ODEPhysics:
         """The next values of the states that move.
@@ -65,7 +68,8 @@ class Machine:
         lacking = dict.fromkeys(self.true, 0.0)
         guesses = {name: known.guess for name, known in self.believed.items()}
         step, dim = self.spec.step or 1.0, len(self.spec.moving)
-        make = partial(ODEPhysics, step=step, state_dim=dim, substeps=self.substeps)
+        substeps = self.substeps * (2 if kind == "true" else 1)
+        make = partial(ODEPhysics, step=step, state_dim=dim, substeps=substeps)
         name = self.rates.__name__
         if kind == "unknown":
             rates = partial(_rates, self.rates, lacking)
@@ -89,6 +93,7 @@ class Machine:
             self.reward,
             start=self.start,
             episode_length=self.episode_length,
+            state_bounds=None if self.bounds is None else torch.tensor(self.bounds).double(),
         )
 
 
@@ -154,7 +159,7 @@ def pendulum_reward(states: Tensor, actions: Tensor, next_states: Tensor) -> Ten
 PENDULUM = Machine(
     StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"], step=0.1),
     equations.pendulum,
-    true={"mass": 1.0, "length": 1.0, "viscous": 0.05, "dry": 0.15},
+    true={"mass": 1.0, "length": 1.0, "viscous": 0.05, "dry": 0.2},
     believed={
         "mass": Unknown(1.3, factor=1.5, unit="kg"),
         "length": Unknown(1.0, factor=1.1, unit="m"),
@@ -164,7 +169,6 @@ PENDULUM = Machine(
     actions=([-2.0], [2.0]),
     starts=([math.pi - 0.2, -0.2], [math.pi + 0.2, 0.2]),
     episode_length=50,
-    substeps=4,
 )
 
 
@@ -234,7 +238,6 @@ FURUTA = Machine(
     actions=([-10.0], [10.0]),
     starts=([-0.1, math.pi - 0.1, -0.1, -0.1], [0.1, math.pi + 0.1, 0.1, 0.1]),
     episode_length=40,
-    substeps=4,
 )  # fmt: skip
 
 
@@ -270,14 +273,14 @@ QUADROTOR = Machine(
     reward=quadrotor_reward,
     actions=([0.0, 0.0], [6.0, 6.0]),
     starts=([-1.0, -1.0, -0.3, -0.5, -0.5, -0.5], [1.0, 1.0, 0.3, 0.5, 0.5, 0.5]),
-    episode_length=50,
+    episode_length=40,
 )
 
 
 def quadrotor(physics: Physics = "crude") -> System:
     """A planar quadrotor that flies to the origin; f_p lacks drag, and is a fifth too light.
 
-    Thrusts of at most 6 N each, held for 0.05 s, an episode of 2.5 s.
+    Thrusts of at most 6 N each, held for 0.05 s, an episode of 2 s.
     """
     return QUADROTOR.system(physics)
 
@@ -306,7 +309,8 @@ PENDUBOT = Machine(
     reward=double_pendulum_reward,
     actions=([-10.0], [10.0]),
     starts=([-0.1] * 4, [0.1] * 4),
-    episode_length=50,
+    episode_length=40,
+    substeps=3,
 )
 
 
@@ -315,7 +319,7 @@ def double_pendulum(physics: Physics = "crude") -> System:
 
     The real one has the identified parameters of the makers' design A.0 with Coulomb friction, f_p
     masses and inertias that are 15 % off, and no friction. At most 10 N m, held for 0.05 s, an
-    episode of 2.5 s.
+    episode of 2 s.
     """
     return PENDUBOT.system(physics)
 
@@ -341,7 +345,7 @@ TANKS = Machine(
     actions=([0.0], [10.0]),
     starts=([1.0, 1.0, 2.0], [2.0, 2.0, 7.0]),
     episode_length=30,
-    substeps=10,
+    bounds=([-1.0] * 3, [15.0] * 3),  # the tanks' height
 )  # fmt: skip
 
 

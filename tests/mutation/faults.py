@@ -140,6 +140,12 @@ FAULTS = (
         "The generators are restored when the agent is read, not when it goes on to learn.",
     ),
     Fault(
+        "gpadjust/control/policy_search.py",
+        "policy.load_state_dict(best.kept)",
+        "best.kept.clear()",
+        "A search ends with its last policy, not with the best one.",
+    ),
+    Fault(
         "gpadjust/control/search.py",
         "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
         "drawn, score(drawn)",
@@ -158,7 +164,7 @@ FAULTS = (
         "The stretches of a drawn path have constants of their own.",
     ),
     Fault(
-        "gpadjust/records/chain.py",
+        "gpadjust/records/kalman.py",
         "added.append(step**2 + (of_last - 2 * of_both + of_first).clip(0))",
         "added.append(step**2)",
         "The process noise is that of the most likely path: too small.",

@@ -1,0 +1,141 @@
+"""Trials of systems that people know, each planned in what is known of them by then."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.axes import Axes
+
+from gpadjust.control import CrossEntropy, MPCAgent, Planner
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.dynamics.learning import DynamicsFitOptions
+from gpadjust.inference import ParameterWarning, SamplingWarning
+from gpadjust.physics import as_physics
+from gpadjust.systems import System
+from paper.common.experiment import Run, Table
+from paper.common.figures import curves as draw_curves
+from paper.common.learners import LEARNERS
+from paper.common.tables import frame, groups, markdown, number
+from paper.common.verdicts import Curves, Difference, paired
+from paper.control import HORIZONS, Known, KnownSettings
+from paper.control.systems import SYSTEMS, Physics
+from paper.machines.networks import NetworkDynamics
+
+_SYSTEMS, _LEARNERS = Known.axes["system"], Known.axes["learner"]
+_PHYSICS: dict[str, Physics] = {"oracle": "true", "fitted": "unknown"}  # else the crude one
+_RATIOS = ("phymean", "fitted", "gp", "ensemble")  # to which CKA is compared
+_COLORS = {name: known.color for name, known in LEARNERS.items()}
+_COLORS |= {"ensemble": "tab:cyan", "networks": "tab:pink"}
+
+
+def run(experiment: Known, system: str, learner: str, seed: int) -> Run:
+    """Make the trials; return cost and times of each."""
+    for category in (SamplingWarning, ParameterWarning):
+        warnings.simplefilter("ignore", category)
+    warnings.filterwarnings("ignore", message="A step of the last real episode")
+    warnings.filterwarnings("ignore", message=".*WARN.*")  # Gymnasium's on spaces
+    agent, known = make_agent(experiment.settings, system, learner, seed)
+    length = known.episode_length or 0
+    rows: list[dict[str, Any]] = []
+    for _ in range(experiment.settings.trials):
+        before, start = dict(agent.wall_time), time.process_time()
+        agent.learn(length)
+        costs = -agent.recorded_episodes(newest=length).rewards
+        rows.append(
+            {
+                "cost": costs.mean().item(),
+                "last_cost": costs[-length // 4 :].mean().item(),
+                "fit_seconds": agent.wall_time["fit"] - before["fit"],
+                "cpu_seconds": time.process_time() - start,
+            }
+        )
+    return {"trials": {name: [row[name] for row in rows] for name in rows[0]}}
+
+
+def make_agent(
+    settings: KnownSettings, system: str, learner: str, seed: int
+) -> tuple[MPCAgent, System]:
+    """The agent of a run, at its start, and what it controls."""
+    known = SYSTEMS[system](_PHYSICS.get(learner, "crude"))
+    task = known.task(dynamics(settings, known, learner))
+    each_step = Planner(
+        search=CrossEntropy(settings.rounds, num_elites=settings.elites, correlation=0.5),
+        horizon=HORIZONS[system],
+        num_random=settings.sequences,
+        spread=settings.spread,
+    )
+    first = Planner(
+        search=CrossEntropy(settings.first_rounds, num_elites=settings.elites, correlation=0.5),
+        num_random=settings.sequences,
+    )
+    options: dict[str, Any] = {"score_horizons": (), "seed": seed}
+    return MPCAgent(known.make(), task, each_step, first=first, **options), known
+
+
+def dynamics(settings: KnownSettings, known: System, learner: str) -> Dynamics:
+    """The model that is planned in, at its start."""
+    physics = as_physics(known.physics)
+    if learner in ("phy", "fitted", "oracle"):
+        return PhysicsDynamics(known.spec, physics)
+    if learner in ("ensemble", "networks"):
+        given = physics if learner == "ensemble" else None
+        number, steps = settings.networks, settings.training
+        return NetworkDynamics(known.spec, given, number=number, steps=steps)
+    made = LEARNERS[learner]
+    given = physics if made.adjusts else None
+    fit: DynamicsFitOptions = {"method": settings.fit}
+    return LearnedDynamics(known.spec, given, model=made.make, fit_options=fit)
+
+
+def tables(runs: Sequence[Run], experiment: Known) -> dict[str, Table]:
+    """All tables, by name."""
+    trials = frame(runs, "trials")
+    by_system = groups(trials, "system", _SYSTEMS)
+    curves = [Curves(own, "cost") for own in by_system.values()]
+    rows = [
+        [label, *(_costs(own, learner) for own in curves), ""]
+        for learner, label in _LEARNERS.items()
+    ]
+    late = trials[trials["episode"] > 1].groupby([*Known.key], sort=False)["cost"].mean()
+    later = late.reset_index()
+    parts = groups(later, "system", _SYSTEMS).values()
+    for other in _RATIOS:
+        cells = [number(math.exp(_ratio(part, other).mean), ".2f") for part in parts]
+        label = f"CKA / {_LEARNERS[other]}, trials 2 and 3"
+        rows.append([label, *cells, _ratio(later, other).ratio(".2f")])
+    heads = [f"{name} ({own['seed'].nunique()} runs)" for name, own in by_system.items()]
+    text = markdown(["mean cost of trials 1; 2; 3", *heads, "all systems"], rows)
+    return {"costs": Table("Costs of trials, and their ratios", text)}
+
+
+def _ratio(later: pd.DataFrame, other: str) -> Difference:
+    """The cost of CKA beside that of another in the later trials, pair by pair."""
+    return paired(later, "cost", "learner", "cka", other, ("system", "seed"), ratio=True)
+
+
+def _costs(curves: Curves, learner: str) -> str:
+    """The mean cost of each trial, with the standard error of the mean over the later ones."""
+    if learner not in curves.names:
+        return ""
+    means = "; ".join(number(mean, ".2f") for mean in curves.mean(learner))
+    return f"{means} (± {number(curves.window(learner, 2, 3).sem(), '.2f')})"
+
+
+def draw(runs: Sequence[Run], experiment: Known) -> list[Path]:
+    """Draw the cost of the trials, rivals over each other, a panel for each system."""
+    parts = groups(frame(runs, "trials"), "system", _SYSTEMS)
+    lines = {name: (label, _COLORS[name]) for name, label in _LEARNERS.items()}
+    path = experiment.out / "known.png"
+    labels = ("trial", "cost, median and quartiles")
+    options: dict[str, Any] = {"columns": 3, "size": (3.4, 2.6), "share": False}
+    return [draw_curves(path, parts, "cost", lines, labels=labels, finish=_ticks, **options)]
+
+
+def _ticks(ax: Axes, title: str, own: pd.DataFrame) -> None:
+    ax.set_xticks(sorted({*own["episode"]}))

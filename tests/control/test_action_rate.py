@@ -1,0 +1,86 @@
+"""Limits and prices of the change of actions."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.control import MPC, ActionRate, CrossEntropy, Planner, Return, Rollouts, Task
+from gpadjust.dynamics import PhysicsDynamics, StateSpec
+
+SPEC = StateSpec(["x"], ["v"])
+BOUNDS = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+
+
+def to_one(states, actions, next_states):
+    return -(next_states[:, 0] - 1).abs()
+
+
+def task(**parts):
+    dynamics = PhysicsDynamics(SPEC, lambda X: X[:, :1] + 0.5 * X[:, 1:])
+    return Task(dynamics, to_one, episode_length=8, **parts)
+
+
+def actions(task, steps=8):
+    quick = Planner(search=CrossEntropy(3), num_random=48, horizon=4)
+    x, plan, taken = np.zeros(1), None, []
+    mpc = MPC(task, BOUNDS, quick, first=quick)
+    for _ in range(steps):
+        action, plan = mpc.predict(x, plan)
+        x = x + 0.5 * action
+        taken.append(float(action[0]))
+    return np.array(taken)
+
+
+@pytest.mark.parametrize("rate", [0.25, [0.25], ActionRate(0.25), ActionRate(0.25, price=0.1)])
+def test_no_action_changes_by_more_than_it_may(rate):
+    changes = np.abs(np.diff(actions(task(action_rate=rate))))
+    assert changes.max() <= 0.25 + 1e-6
+    assert changes.max() > 0.1
+    assert np.abs(np.diff(actions(task()))).max() > 0.5
+
+
+def test_a_price_makes_actions_smoother():
+    rough, smooth = (
+        np.square(np.diff(actions(task(action_rate=rate)))).sum()
+        for rate in (None, ActionRate(price=5.0))
+    )
+    assert smooth < 0.5 * rough
+
+
+def test_sequences_follow_as_fast_as_they_may():
+    wanted = torch.tensor([[[0.0, 0.0], [1.0, 1.0], [-1.0, 1.0]]])
+    rate = ActionRate([0.5, 0.25])
+    expected = [[0.0, 0.0], [0.5, 0.25], [0.0, 0.5]]
+    assert rate.limited(wanted)[0].tolist() == expected
+    before = torch.tensor([1.0, 0.0])
+    assert rate.limited(wanted, before)[0].tolist() == [[0.5, 0.0], [1.0, 0.25], [0.5, 0.5]]
+    assert torch.equal(
+        rate.limited(rate.limited(wanted, before), before), rate.limited(wanted, before)
+    )
+
+
+def test_the_price_is_of_squared_changes_from_the_action_before():
+    priced = task(action_rate=ActionRate(price=2.0))
+    way = torch.tensor([[[1.0], [0.0]]]).double()
+    for before, expected in ((None, 2.0), (torch.zeros(1).double(), 4.0)):
+        rollout = Rollouts(priced, None, before=before).follow(torch.zeros(1).double(), way)
+        loss = Return().of(task())(rollout) - Return().of(priced)(rollout)
+        assert loss.item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("rate", "error", "message"),
+    [
+        (0.0, ValueError, "most of an action rate must be .* above 0"),
+        ("fast", TypeError, "most of an action rate must be a number"),
+        ([0.1, 0.2], ValueError, "one for each of 1 actions; found 2"),
+    ],
+)
+def test_bad_rates_are_refused(rate, error, message):
+    with pytest.raises(error, match=message):
+        task(action_rate=rate)
+
+
+def test_a_price_is_not_negative():
+    with pytest.raises(ValueError, match=r"price must be .* at least 0"):
+        ActionRate(price=-1.0)

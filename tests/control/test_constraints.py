@@ -1,0 +1,200 @@
+"""Constraints that hold with a probability."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.control import (
+    MPC,
+    CrossEntropy,
+    MPCAgent,
+    Planner,
+    PolicySearchAgent,
+    Return,
+    Rollouts,
+    Task,
+)
+from gpadjust.control.constraints import margins
+from gpadjust.dynamics import PhysicsDynamics, StateSpec
+from gpadjust.rl import DynaSAC
+from gpadjust.systems import System
+from tests.point import Point, near_one
+
+SPEC = StateSpec(["x"], ["v"])
+BOUNDS = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+WALL = 1.0
+
+
+def step(X):
+    return X[:, :1] + 0.5 * X[:, 1:]
+
+
+def to_the_wall(states, actions, next_states):
+    return -(next_states[:, 0] - WALL).abs()
+
+
+def before_the_wall(states, actions):
+    return states[:, :1] - WALL
+
+
+def task(error=0.1, **parts):
+    dynamics = PhysicsDynamics(SPEC, step, physics_error={"x": error} if error else None)
+    known = {"episode_length": 10, "constraints": before_the_wall}
+    return Task(dynamics, to_the_wall, **{**known, **parts})
+
+
+def rows(*values):
+    return torch.tensor(values, dtype=torch.float64).unsqueeze(-1)
+
+
+def quantile(risk):
+    return torch.special.ndtri(torch.tensor(1 - risk).double())
+
+
+def test_margins_of_a_step_are_quantiles_of_its_error():
+    found = margins(task(), rows(0.0), rows(0.5), BOUNDS)
+    assert torch.allclose(found, 0.1 * quantile(0.05 / 10).reshape(1, 1))
+    three = replace(task(), constraints=lambda s, a: torch.cat([s - 1, -2 * s, a], -1))
+    found = margins(three, rows(0.0), rows(0.5), BOUNDS)
+    assert torch.allclose(found[0], torch.tensor([0.1, 0.2, 0.0]).double() * quantile(0.05 / 30))
+
+
+def test_margins_of_later_steps_are_those_of_a_closed_loop():
+    found = margins(task(), rows(*[0.0] * 30), rows(*[0.0] * 30), BOUNDS)
+    assert (found[1:] > found[0]).all()
+    assert found.max() < 1.5 * found[0]  # open loop it would be 5.5 times
+    strong = margins(task(), rows(*[0.0] * 30), rows(*[0.0] * 30), 1e4 * BOUNDS)
+    assert torch.allclose(strong[:-1], found[:1], rtol=1e-3)  # what can be corrected at once is
+    weak = margins(task(), rows(*[0.0] * 30), rows(*[0.0] * 30), 1e-4 * BOUNDS)
+    roots = torch.arange(1, 31).double().sqrt().unsqueeze(-1)
+    assert torch.allclose(weak, found[0] * roots, rtol=1e-3)  # open loop
+
+
+def test_the_error_of_an_estimate_stays():
+    """It is in each margin, and is no less after a step."""
+    estimated = torch.full((1, 1), 0.3**2, dtype=torch.float64)
+    found = margins(task(), rows(*[0.0] * 9), rows(*[0.0] * 9), BOUNDS, estimated)
+    assert torch.allclose(found[0], math.hypot(0.1, 0.3) * quantile(0.05 / 10))
+    exact = margins(task(error=None), rows(0.0, 0.0), rows(0.0, 0.0), BOUNDS, estimated)
+    assert torch.allclose(exact, 0.3 * quantile(0.05 / 10).expand(2, 1))
+
+
+def test_without_a_probability_there_are_no_margins():
+    assert not margins(replace(task(), probability=None), rows(0.0), rows(0.5), BOUNDS).any()
+    assert not margins(task(error=None), rows(0.0), rows(0.5), BOUNDS).any()
+
+
+def quick(rounds=2, **options):
+    return Planner(search=CrossEntropy(rounds), num_random=48, **options)
+
+
+def end(task, start=0.0, steps=10, noise=0.0, seed=0):
+    """The positions of an episode."""
+    mpc = MPC(task, BOUNDS, quick(horizon=4), first=quick(4))
+    generator = np.random.default_rng(seed)
+    x, plan, passed = np.full(1, start), None, []
+    for _ in range(steps):
+        action, plan = mpc.predict(x, plan)
+        x = x + 0.5 * action + noise * generator.normal()
+        passed.append(float(x[0]))
+    return np.array(passed), plan[0]
+
+
+def test_a_plan_keeps_its_margin_of_a_wall():
+    margin = float(0.1 * quantile(0.05 / 10))
+    passed, plan = end(task())
+    assert passed.max() < WALL - margin + 1e-3
+    assert passed[-1] == pytest.approx(WALL - margin, abs=0.08)
+    assert plan.violation < 1e-3
+    passed, _ = end(replace(task(), probability=None))
+    assert passed[-1] == pytest.approx(WALL, abs=0.05)
+    assert passed.max() < WALL + 1e-3
+
+
+@pytest.mark.slow
+def test_an_episode_violates_constraints_as_seldom_as_it_says():
+    """Noise has the stated sd: of 60 episodes 5 % may pass the wall, at 0.95."""
+    beyond = {
+        p: sum(
+            end(replace(task(), probability=p), noise=0.1, seed=seed)[0].max() > WALL
+            for seed in range(60)
+        )
+        for p in (0.95, None)
+    }
+    assert beyond[0.95] <= 6
+    assert beyond[None] >= 40
+
+
+def test_where_none_can_hold_the_least_violation_is_sought():
+    passed, _ = end(task(), start=3.0, steps=6)
+    assert passed[0] == pytest.approx(2.5, abs=0.1)
+    assert passed[-1] < 0.85
+    assert end(task(), start=3.0, steps=1)[1].violation > 1
+
+
+def test_a_violation_costs_more_than_any_reward_and_as_much_as_it_is():
+    """Of rollouts that go up, stop at the wall, and pass it by one and by two."""
+    sure = task(error=None)
+    ways = torch.stack([rows(*way) for way in ([1.0, 0.0], [1.0, 1.0], [2.0, 2.0], [2.0, 4.0])])
+    rollout = Rollouts(sure, None).follow(torch.zeros(1).double(), ways)
+    assert torch.allclose(rollout.violation[0, :, 1], torch.tensor([0.0, 0.0, 1.0, 2.0]).double())
+    values = Return().of(sure)(rollout)
+    assert (values[2:] < values[0] - 1e5).all()
+    assert values.argsort(descending=True).tolist() == [1, 0, 2, 3]
+    tight = Rollouts(sure, None, margins=rows(0.25)).follow(torch.zeros(1).double(), ways)
+    assert tight.violation[0, :, 1].tolist() == [0.0, 0.25, 1.25, 2.25]
+
+
+def test_an_agent_keeps_walls_from_the_first_episode_on():
+    error = {"x": 0.05}
+    system = System(
+        Point, SPEC, lambda X: X[:, :1] + 0.4 * X[:, 1:], lambda s, a, n: -n[:, 0].square(),
+        episode_length=5, constraints=lambda s, a: 0.4 - s, physics_error=error, start=near_one,
+    )  # fmt: skip
+    said = []
+    agent = MPCAgent(system.make(), system.task(), quick(horizon=3), first=quick(), seed=0)
+    agent.learn(15, lambda agent, event, values: said.append(values.get("violation")))
+    found = agent.recorded_episodes().next_states
+    assert found[:5].min() > 0.4  # by f_p and its stated error
+    assert (found < 0.4).sum() <= 1  # a few steps tell little of the noise
+    assert max(value for value in said if value is not None) < 1e-3
+
+
+@pytest.mark.parametrize("part", ["constraints", "action_rate"])
+def test_who_cannot_keep_them_refuses_before_a_real_step(point_task, point_env, part):
+    given = point_task(**{part: before_the_wall if part == "constraints" else 0.5})
+    env = point_env()
+    agent = PolicySearchAgent(env, given)
+    with pytest.raises(ValueError, match=f"PolicySearchAgent .* {part}; MPCAgent can"):
+        agent.learn(5)
+    assert agent.num_timesteps == 0
+    with pytest.raises(ValueError, match=f"DynaSAC .* {part}; MPCAgent can"):
+        DynaSAC("MlpPolicy", env, given)
+
+
+@pytest.mark.parametrize(
+    ("parts", "error", "message"),
+    [
+        ({"probability": 95}, ValueError, "probability must be above 0 and below 1; found 95"),
+        ({"constraints": lambda states: states}, TypeError, "constraints is called with 2"),
+    ],
+)
+def test_bad_constraints_are_refused(parts, error, message):
+    with pytest.raises(error, match=message):
+        task(**parts)
+
+
+def test_constraints_return_a_column_each():
+    flat = task(constraints=lambda states, actions: states[:, 0] - 1)
+    with pytest.raises(ValueError, match=r"shape \(2, c\); found \(2,\)"):
+        flat.try_functions(rows(0.0, 0.0), rows(0.0, 0.0))
+
+
+def test_errors_are_of_states_that_move():
+    with pytest.raises(ValueError, match=r"physics_error is of states among .'x'.; found 'y'"):
+        PhysicsDynamics(SPEC, step, physics_error={"y": 0.1})
+    with pytest.raises(ValueError, match="at least 0; found -1"):
+        PhysicsDynamics(SPEC, step, physics_error={"x": -1})
