@@ -16,7 +16,7 @@ from gpadjust.export.transition import (
     model_inputs,
     next_state,
     next_variance,
-    physics_columns,
+    target_columns,
 )
 from gpadjust.models import TermsModel
 
@@ -64,21 +64,21 @@ _VARIANCE = """\
         double found = 0.0;
 """
 _LOWER = """\
-        const double *row = lower[g];
+        const double *column = lower[g];
         found = prior;
-        for (int i = 0; i < FEATURES; row += ++i) {
-            for (int k = 0; k < i; k++) phi[i] -= row[k] * phi[k];
-            phi[i] /= row[i];
-            found -= phi[i] * phi[i];
+        for (int k = 0; k < FEATURES; column += FEATURES - k, k++) {
+            const double u = phi[k] / column[0];
+            found -= u * u;
+            for (int i = 0; i < FEATURES - k; i++) phi[k + i] -= column[i] * u;
+            phi[k] = u;
         }
 """
 _ROOT = """\
-        const double *column = root[g];
-        for (int i = 0; i < FEATURES; column += ++i) {
-            double u = 0.0;
-            for (int k = 0; k <= i; k++) u += column[k] * phi[k];
-            found += u * u;
-        }
+        const double *row = root[g];
+        double u[FEATURES] = {0.0};
+        for (int k = 0; k < FEATURES; row += FEATURES - k, k++)
+            for (int i = 0; i < FEATURES - k; i++) u[k + i] += row[i] * phi[k];
+        for (int i = 0; i < FEATURES; i++) found += u[i] * u[i];
 """
 _SPREAD = """\
         spread[g] = scale[g] * scale[g] * (fmax(found, $least * prior) + noise[g]);
@@ -210,11 +210,11 @@ def _tables(s: FiniteSum) -> dict[str, Tensor]:
     if s.points.numel():
         found["points"] = s.points
     size = s.weights.shape[-1]
-    rows, columns = torch.tril_indices(size, size)
+    rows, columns = torch.triu_indices(size, size)  # loops along them have no sum to wait for
     if s.lower is not None:
-        found["lower"] = s.lower[:, rows, columns]
+        found["lower"] = s.lower[:, columns, rows]
     if s.root is not None:
-        found["root"] = s.root[:, columns, rows]
+        found["root"] = s.root[:, rows, columns]
     if s.errors is not None:
         found |= {"error_points": s.errors.points, "error_rate": 1 / s.errors.lengthscale}
         found |= {"squares": s.errors.squares, "recent": s.errors.factor}
@@ -289,7 +289,7 @@ def _step(
     yield f"    const double x[{len(x)}] = {{{', '.join(x)}}};"
     if num_physics:
         f_p = _entries("f_p", num_physics // m * len(spec.moving))
-        columns = physics_columns(dynamics, state, f_p, _wrapped)
+        columns = target_columns(dynamics, state, f_p, _wrapped)
         yield f"    const double columns[{num_physics}] = {{{', '.join(columns)}}};"
         arguments.append("columns")
     has_variance = "double *variance" in given

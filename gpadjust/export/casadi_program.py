@@ -14,7 +14,8 @@ from gpadjust.export.transition import (
     model_inputs,
     next_state,
     next_variance,
-    physics_columns,
+    physics_inputs,
+    target_columns,
 )
 from gpadjust.models import TermsModel
 
@@ -81,7 +82,7 @@ def casadi_function(
         given = {entry: ca.MX.sym(entry, size) for entry, size in sizes.items()}
         state, action = map(ca.vertsplit, given.values())
         x, count = model_inputs(dynamics, state, action), found.num_physics // m * len(spec.moving)
-        read = x[: len(spec.moving) + spec.action_dim]
+        read = physics_inputs(dynamics, state, action)
     if physics is None:
         given |= {"f_p": ca.MX.sym("f_p", count)} if count else {}
         values = given.get("f_p", ca.MX(0, 1))
@@ -96,7 +97,7 @@ def casadi_function(
     if dynamics is None:
         mean, spread = _moments(found, m, x, f_p)
     else:
-        columns = physics_columns(
+        columns = target_columns(
             dynamics, state, f_p, lambda angle: ca.atan2(ca.sin(angle), ca.cos(angle))
         )
         mean, spread = _moments(found, m, x, columns)

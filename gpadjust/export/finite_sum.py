@@ -217,12 +217,12 @@ def check_finite_sum(model: TermsModel, observation_noise: bool) -> None:
 def _tables(
     term: Term, each: Any, size: int, num_outputs: int, basis: dict[str, Tensor | None]
 ) -> TermTables:
-    """The numbers of a term, whose basis at the points is given by its name."""
+    """The numbers of a term, whose basis at the points is given by its name; of waves, none is."""
     zero, d = torch.zeros_like(term.mean), term.num_inputs
     kind, amplitude, lengthscale, frequencies = "", zero, zero.unsqueeze(-1) + 1.0, None
     if term.kernel is not None:
         kernel: Any = term.kernel
-        if isinstance(getattr(kernel, "base_kernel", None), RFFKernel):
+        if not basis and isinstance(getattr(kernel, "base_kernel", None), RFFKernel):
             kind, base, outer = "waves", kernel.base_kernel, kernel
             frequencies = base.randn_weights.reshape(-1, *base.randn_weights.shape[-2:])[0].mT
         elif (found := stationary_parts(kernel, d)) is not None:

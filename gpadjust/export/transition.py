@@ -1,4 +1,4 @@
-"""A step of dynamics in scalars of any kind: the text of C, or symbols of CasADi."""
+"""A step of dynamics in scalars of any kind: texts of C, or symbols of CasADi."""
 
 from __future__ import annotations
 
@@ -7,23 +7,24 @@ from typing import Any
 
 from gpadjust.dynamics import LearnedDynamics
 
+Scalars = Sequence[Any]
 
-def model_inputs(
-    dynamics: LearnedDynamics, state: Sequence[Any], action: Sequence[Any]
+
+def physics_inputs(dynamics: LearnedDynamics, state: Scalars, action: Scalars) -> list[Any]:
+    """What the physics reads."""
+    return [*(state[i] for i in dynamics.spec.moving), *action]
+
+
+def model_inputs(dynamics: LearnedDynamics, state: Scalars, action: Scalars) -> list[Any]:
+    """The raw inputs of the model, as of :meth:`Targets.inputs`."""
+    previous = [state[i] for i in dynamics.spec.previous_columns]
+    return [*physics_inputs(dynamics, state, action), *previous]
+
+
+def target_columns(
+    dynamics: LearnedDynamics, state: Scalars, f_p: Scalars, wrapped: Callable[[Any], Any]
 ) -> list[Any]:
-    """The raw inputs of the model, as :meth:`Targets.inputs` has them."""
-    spec = dynamics.spec
-    previous = [state[i] for i in spec.previous_columns]
-    return [*(state[i] for i in spec.moving), *action, *previous]
-
-
-def physics_columns(
-    dynamics: LearnedDynamics,
-    state: Sequence[Any],
-    f_p: Sequence[Any],
-    wrapped: Callable[[Any], Any],
-) -> list[Any]:
-    """The columns of f_p in the model, by next states, as :class:`TargetPhysics` has them."""
+    """The columns of f_p in the model, made of next values, as :class:`TargetPhysics` does."""
     spec, targets = dynamics.spec, dynamics.targets
     found = []
     for first in range(0, len(f_p), len(spec.moving)):
@@ -35,9 +36,9 @@ def physics_columns(
 
 
 def next_state(
-    dynamics: LearnedDynamics, state: Sequence[Any], action: Sequence[Any], learnt: Sequence[Any]
+    dynamics: LearnedDynamics, state: Scalars, action: Scalars, learnt: Scalars
 ) -> list[Any]:
-    """The next state, by what the model says of it, as :meth:`StateSpec.complete` has it."""
+    """The next state by what the model says, as :meth:`StateSpec.complete` makes it."""
     spec, found = dynamics.spec, [*state]
     for i, value in zip(spec.predicted, learnt, strict=True):
         found[i] = state[i] + value if dynamics.targets.target == "difference" else value
@@ -50,14 +51,12 @@ def next_state(
     return found
 
 
-def next_variance(dynamics: LearnedDynamics, learnt: Sequence[Any], zero: Any) -> list[Any]:
-    """The variance of the next state, as :meth:`StateSpec.complete_variance` has it."""
+def next_variance(dynamics: LearnedDynamics, learnt: Scalars, zero: Any) -> list[Any]:
+    """The variance of the next state, as :meth:`StateSpec.complete_variance` makes it."""
     spec = dynamics.spec
-    found = [zero] * spec.state_dim
-    for i, value in zip(spec.predicted, learnt, strict=True):
-        found[i] = value
+    known = dict(zip(spec.predicted, learnt, strict=True))
+    found = [known.get(i, zero) for i in range(spec.state_dim)]
     for name, velocity in spec.integrated.items():
-        found[spec.states.index(name)] = ((spec.step or 0.0) / 2) ** 2 * found[
-            spec.states.index(velocity)
-        ]
+        variance = ((spec.step or 0.0) / 2) ** 2 * found[spec.states.index(velocity)]
+        found[spec.states.index(name)] = variance
     return found

@@ -1,7 +1,7 @@
 """Files that are the same, and what is no finite sum."""
 
 import pytest
-from gpytorch.kernels import PeriodicKernel
+from gpytorch.kernels import PeriodicKernel, RFFKernel, ScaleKernel
 
 from gpadjust import AR1, CKA, ParallelPartialGP, fit
 from gpadjust.dynamics import LearnedDynamics
@@ -13,6 +13,12 @@ from tests.systems import crude
 
 def periodic(d, batch):
     return PeriodicKernel(batch_shape=batch)
+
+
+def features(d, batch):
+    kernel = RFFKernel(4, ard_num_dims=d, batch_shape=batch)
+    kernel._init_weights(d, 4)
+    return ScaleKernel(kernel, batch_shape=batch)
 
 
 def with_samples_of_parameters():
@@ -29,6 +35,10 @@ REFUSED = {
     "batch": (lambda: CKA(X.repeat(2, 1, 1), Y.repeat(2, 1, 1), physics=crude), "data sets"),
     "link": (lambda: CKA(X, Y, physics=crude, outcome_transform="log"), "with a link"),
     "kernel": (lambda: CKA(X, Y, physics=crude, delta_covar_module=periodic), "PeriodicKernel"),
+    "features of an exact model": (
+        lambda: CKA(X, Y, physics=crude, delta_covar_module=features),
+        "kernel of 'delta'",
+    ),
     "categories": (
         lambda: CKA(X.round(), Y, physics=crude, categorical=[0]),
         "CategoricalInput|GroupedRBF",
