@@ -13,7 +13,6 @@ from torch import Tensor
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export.finite_sum import Column, FiniteSum, finite_sum, model_of
 from gpadjust.export.transition import (
-    model_inputs,
     next_state,
     next_variance,
     target_columns,
@@ -285,7 +284,7 @@ def _step(
     yield f" * f_p: the next {', '.join(spec.states[i] for i in spec.moving)} by the physics. */"
     yield f"void {name}_step(const double *state, const double *action, {', '.join(given)})"
     yield "{"
-    x, arguments = model_inputs(dynamics, state, action), ["x"]
+    x, arguments = [(*state, *action)[i] for i in spec.model_columns], ["x"]
     yield f"    const double x[{len(x)}] = {{{', '.join(x)}}};"
     if num_physics:
         f_p = _entries("f_p", num_physics // m * len(spec.moving))

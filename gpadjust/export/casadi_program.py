@@ -11,10 +11,8 @@ from torch import Tensor
 from gpadjust.dynamics import LearnedDynamics
 from gpadjust.export.finite_sum import ErrorTables, FiniteSum, finite_sum, model_of
 from gpadjust.export.transition import (
-    model_inputs,
     next_state,
     next_variance,
-    physics_inputs,
     target_columns,
 )
 from gpadjust.models import TermsModel
@@ -81,8 +79,11 @@ def casadi_function(
         sizes = {"state": spec.state_dim, "action": spec.action_dim}
         given = {entry: ca.MX.sym(entry, size) for entry, size in sizes.items()}
         state, action = map(ca.vertsplit, given.values())
-        x, count = model_inputs(dynamics, state, action), found.num_physics // m * len(spec.moving)
-        read = physics_inputs(dynamics, state, action)
+        x, read = (
+            [(*state, *action)[i] for i in columns]
+            for columns in (spec.model_columns, spec.physics_columns)
+        )
+        count = found.num_physics // m * len(spec.moving)
     if physics is None:
         given |= {"f_p": ca.MX.sym("f_p", count)} if count else {}
         values = given.get("f_p", ca.MX(0, 1))

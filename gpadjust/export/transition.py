@@ -10,17 +10,6 @@ from gpadjust.dynamics import LearnedDynamics
 Scalars = Sequence[Any]
 
 
-def physics_inputs(dynamics: LearnedDynamics, state: Scalars, action: Scalars) -> list[Any]:
-    """What the physics reads."""
-    return [*(state[i] for i in dynamics.spec.moving), *action]
-
-
-def model_inputs(dynamics: LearnedDynamics, state: Scalars, action: Scalars) -> list[Any]:
-    """The raw inputs of the model, as of :meth:`Targets.inputs`."""
-    previous = [state[i] for i in dynamics.spec.previous_columns]
-    return [*physics_inputs(dynamics, state, action), *previous]
-
-
 def target_columns(
     dynamics: LearnedDynamics, state: Scalars, f_p: Scalars, wrapped: Callable[[Any], Any]
 ) -> list[Any]:

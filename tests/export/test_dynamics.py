@@ -1,6 +1,7 @@
 """Programs of dynamics say what the dynamics predict."""
 
 import functools
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -52,10 +53,12 @@ def transitions():
 
 
 @functools.cache
-def learnt(target="difference", model=CKA, physics=pushed):
+def learnt(target="difference", model=CKA, physics=pushed, reads=()):
     options = {"method": "map", "num_starts": 1, "num_screened": 8, "max_iterations": 5}
     physics = STILL if physics is None else physics
-    dynamics = LearnedDynamics(SPEC, physics, model=model, target=target, fit_options=options)
+    dynamics = LearnedDynamics(
+        replace(SPEC, physics_reads=reads), physics, model=model, target=target, fit_options=options
+    )
     dynamics.update(*transitions())
     return dynamics
 
@@ -64,6 +67,7 @@ CASES = {
     "difference": learnt,
     "absolute": partial(learnt, "absolute", partial(RRA, num_features=20)),
     "two physics": partial(learnt, physics=None),
+    "late": partial(learnt, reads=("angle", "x", "rate", "speed", "last")),
 }
 
 
@@ -72,7 +76,7 @@ def test_programs_say_the_next_state_and_its_variance(case, tmp_path):
     pytest.importorskip("casadi")
     dynamics = CASES[case]()
     states, actions = 2 * uniform(5, 6, low=-2.0, high=2.0, seed=3), uniform(5, 1, seed=4)
-    f_p = dynamics.physics(torch.cat([states[:, 1:5], actions], dim=-1))
+    f_p = dynamics.physics(dynamics.spec.physics_inputs(states, actions))
     expected = dynamics.predict(states, actions, observation_noise=False)
     program = compiled(c_source(dynamics, "cart"), tmp_path)
     function = casadi_function(dynamics)
@@ -86,9 +90,10 @@ def test_programs_say_the_next_state_and_its_variance(case, tmp_path):
             torch.testing.assert_close(found[1], variance, rtol=1e-8, atol=1e-14)
 
 
-def test_a_physics_in_casadi_takes_the_place_of_its_values():
+@pytest.mark.parametrize("case", ["difference", "late"])
+def test_a_physics_in_casadi_takes_the_place_of_its_values(case):
     pytest.importorskip("casadi")
-    dynamics = learnt()
+    dynamics = CASES[case]()
     state, action = normal(6, seed=5), normal(1, seed=6)
     step = casadi_function(dynamics, "step", physics=pushed_in_casadi, observation_noise=True)
     assert (step.name_in(), step.name_out()) == (["state", "action"], ["mean", "variance"])
