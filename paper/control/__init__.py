@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -77,3 +78,98 @@ class Known(Experiment):
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and how far plans look."""
         return {**asdict(self.settings), "horizon": HORIZONS[kind[0]]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class HiddenSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p"""
+    noise: float = 0.01
+    """standard deviation of the sensors' noise, in m and rad"""
+    sequences: int = 64
+    """that are planned, in each round of the cross-entropy method"""
+    rounds: int = 1
+    """of these after the first"""
+    first_rounds: int = 8
+    """of these when a trial begins, with all its steps"""
+    elites: int = 8
+    """of these"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models, as of `gpadjust.fit`"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hidden(Experiment):
+    """Systems of which positions and angles alone are measured, with noise."""
+
+    runs: int = 5
+    out: Path = Path("results/hidden")
+    settings: HiddenSettings = field(default_factory=HiddenSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {"cart_pole": "cart-pole", "furuta": "Furuta pendulum"},
+        "learner": {
+            "full": "all states, without noise",
+            "filter": "positions and angles, by the filter",
+            "quotient": "positions and angles, by difference quotients",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallsSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p with its stated error"""
+    probability: float = 0.95
+    """of constraints holding through a trial"""
+    sequences: int = 40
+    """that are planned, in each round of the cross-entropy method"""
+    horizon: int = 8
+    """steps that are planned ahead at each step"""
+    rounds: int = 1
+    """of these after the first"""
+    first_sequences: int = 64
+    """that are planned when a trial begins, of all its steps"""
+    first_rounds: int = 4
+    """of these after the first"""
+    elites: int = 8
+    """of a round"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walls(Experiment):
+    """Systems near walls, with margins of the constraints and without."""
+
+    runs: int = 14
+    """seeds of the controllers that are judged; of the others a quarter"""
+    out: Path = Path("results/walls")
+    settings: WallsSettings = field(default_factory=WallsSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {"cart": "cart in gusts", "cart-pole": "cart-pole", "tanks": "two tanks"},
+        "controller": {
+            "margin": "CKA, probability 0.95",
+            "hard": "CKA, no margin",
+            "none": "CKA, no constraint",
+            "truth": "true model, no margin",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Fewer seeds of the rivals."""
+        return self.seeds if kind[1] in ("margin", "truth") else self.seeds[: -(-self.runs // 4)]
