@@ -140,10 +140,12 @@ class WallsSettings:
     """of these after the first"""
     first_sequences: int = 64
     """that are planned when a trial begins, of all its steps"""
-    first_rounds: int = 4
+    first_rounds: int = 2
     """of these after the first"""
     elites: int = 8
     """of a round"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models, as of `gpadjust.fit`"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from gpadjust import systems
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
-from gpadjust.dynamics import PhysicsDynamics
+from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.physics import Physics
 from gpadjust.states import StateSpec
 from gpadjust.systems import System
@@ -139,7 +140,11 @@ def run(experiment: Walls, system: str, controller: str, seed: int) -> Run:
         "none": {"constraints": None},
     }
     here = replace(here, **changes.get(controller, {"probability": None}))
-    dynamics = PhysicsDynamics(here.spec, walled.truth) if controller == "truth" else None
+    dynamics: Dynamics = PhysicsDynamics(here.spec, walled.truth)
+    if controller != "truth":
+        fit: DynamicsFitOptions = {"method": settings.fit}
+        error = here.physics_error
+        dynamics = LearnedDynamics(here.spec, here.physics, fit_options=fit, physics_error=error)
     search = partial(CrossEntropy, num_elites=settings.elites, correlation=0.5)
     agent = MPCAgent(
         here.make(),
