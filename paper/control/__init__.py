@@ -176,3 +176,85 @@ class Walls(Experiment):
         """Fewer seeds of the rivals."""
         share = {"margin": 1, "truth": 2}.get(kind[1], 4)
         return self.seeds[: -(-self.runs // share)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetpointsSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 2
+    """real trials of a run, of which the first goes by f_p"""
+    sequences: int = 48
+    """that are planned, in each round of the cross-entropy method"""
+    first_rounds: int = 4
+    """of these when a trial begins, with all its steps"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setpoints(Experiment):
+    """Two tanks whose set-point moves: from trial to trial, and within a trial."""
+
+    out: Path = Path("results/setpoints")
+    settings: SetpointsSettings = field(default_factory=SetpointsSettings)
+
+    axes: ClassVar[Axes] = {
+        ("moves", "plans"): {
+            ("between", "seen"): "bounds by what was seen alone",
+            ("between", "default"): "default bounds",
+            ("between", "wide"): "bounds given, far away",
+            ("between", "oracle"): "the true system, bounds far away",
+            ("within", "constant"): "believed to stay",
+            ("within", "known"): "reference given",
+            ("within", "oracle"): "the true system, reference given",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelaysSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 3
+    """real trials of a run, of which the first goes by f_p"""
+    hint_trials: int = 1
+    """of the runs that only ask whether the delay is found, in which f_p alone plans"""
+    sequences: int = 64
+    """that are planned, in each round of the cross-entropy method"""
+    first_rounds: int = 8
+    """of these when a trial begins, with all its steps"""
+    dry: float = 0.5
+    """dry friction of the cart in the runs that only ask, in N, which f_p lacks"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delays(Experiment):
+    """The cart-pole that follows its force a step late: told or not, and found or not."""
+
+    out: Path = Path("results/delays")
+    settings: DelaysSettings = field(default_factory=DelaysSettings)
+    runs: int = 5
+
+    axes: ClassVar[Axes] = {
+        "told": {
+            "not": "late, not told",
+            "previous": "late, told to the model (previous)",
+            "physics": "late, told to f_p (physics_reads)",
+            "none": "not late",
+            "hint_late": "late",
+            "hint_dry": "not late, dry friction",
+            "hint_noisy": "not late, dry friction and noisy sensors",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = Setpoints.calls
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Four times as many of the runs that only ask whether the delay is found."""
+        more = 4 if str(kind[0]).startswith("hint") else 1
+        return range(self.seed, self.seed + more * self.runs)
