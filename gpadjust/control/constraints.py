@@ -24,7 +24,8 @@ def margins(
     The covariance of the states is carried along the plan: noise is another one in each step, and
     what is not known of the mean errs in the same direction all along. Deviations are corrected by
     a linear feedback, as far as the actions of the plan leave room for it, as they will be by the
-    plans to come: open loop they would grow without limit. With the slope g of a constraint its margin is
+    plans to come: open loop they would grow without limit. With the slope g of a constraint its
+    margin is
 
     .. math:: \Phi^{-1}(1 - \epsilon)\, \sqrt{g^\top \Sigma\, g},
 
