@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy
-from gpadjust.control.rollouts import Objective, Return, Rollouts
+from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts, Score
 from gpadjust.control.task import Task
 
 
@@ -23,7 +23,8 @@ class SearchResult(NamedTuple):
 
     Args:
         values: What the objective said in each update, ``updates``; of drawn functions and starts.
-        reward: The mean reward of a step in the last tenth of the updates.
+        reward: The mean reward of a step of the policy that was kept, in the draws that were held
+            out.
         left_bounds: The share of episodes that left the bounds there.
         seconds: How long it took.
     """
@@ -36,16 +37,18 @@ class SearchResult(NamedTuple):
 
 @dataclass(frozen=True)
 class PolicySearch:
-    """Improves a policy along whole episodes in functions drawn from the dynamics.
+    """Improves a policy along whole episodes in the mean of the dynamics, or in functions.
 
-    Each update lets the policy act in ``num_functions`` functions from ``num_starts`` states each,
-    and follows the gradient of the objective back through all steps, through policy, f_p and what
-    was learnt (Deisenroth and Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). Each
-    function is deterministic and stays the same along an episode; new ones are drawn as the search
-    goes on, so that the policy cannot lean on the errors of a few. A black box as physics has the
-    gradients of its finite differences.
+    Each update lets the policy act from ``num_starts`` states, and follows the gradient of the
+    objective back through all steps, through policy, f_p and what was learnt (Deisenroth and
+    Rasmussen 2011; Parmas et al. 2018; Amadio et al. 2022). With ``num_functions`` it acts in as
+    many functions, each of them deterministic and the same along an episode; new ones are drawn as
+    the search goes on, so that the policy cannot lean on the errors of a few. After one or two real
+    episodes they may differ too much for one policy. A black box as physics has the gradients of
+    its finite differences.
 
-    Of the last tenth of the updates, if that is more than one, the best policy is kept.
+    Every few updates the policy is judged from starts, and in functions, that no update sees, the
+    same each time. The best one is kept, be it the one that the search began with.
 
     Where gradients do not find the task by themselves (a swing-up: at first no action of the policy
     matters), plans do: with a ``guide`` the policy first imitates plans of some episodes.
@@ -54,8 +57,10 @@ class PolicySearch:
         objective: What to look for. Default: the mean return; ``Return(quantile=0.2)`` is careful.
         updates: Gradient steps (Adam).
         num_starts: Number of starts of each update, in each function.
-        num_functions: Number of functions that each is followed through; None for the mean.
-        redraw_every: Number of updates after which other functions are drawn.
+        num_functions: Number of functions that each is followed through, such as 6; None for the
+            mean.
+        redraw_every: Number of updates after which the policy is judged, and other functions are
+            drawn.
         learning_rate: At the start; it decays to a tenth along a cosine.
         max_grad_norm: The norm at which gradients are clipped.
         guide: Plans the episodes that the policy imitates before it is improved.
@@ -85,9 +90,9 @@ class PolicySearch:
 
     objective: Objective = field(default_factory=Return)
     _: KW_ONLY
-    updates: int = 150
+    updates: int = 100
     num_starts: int = 24
-    num_functions: int | None = 6
+    num_functions: int | None = None
     redraw_every: int = 5
     learning_rate: float = 3e-3
     max_grad_norm: float = 1.0
@@ -185,11 +190,12 @@ class PolicySearch:
             optimizer, self.updates, eta_min=self.learning_rate / 10
         )
         score = self.objective.of(task)
-        values, rewards, left = [], [], []
-        late = max(1, self.updates // 10)
-        best, kept = -math.inf, policy.state_dict()
+        held_out = Rollouts(task, self.num_functions)
+        best = _Best(held_out, self._starts(task, held_out.num_functions), score, length)
+        values = []
         for i in range(self.updates):
             if i % self.redraw_every == 0:
+                best.judge(policy)
                 rollouts = Rollouts(task, self.num_functions)
             rollout = rollouts.act(self._starts(task, rollouts.num_functions), policy, length)
             value = score(rollout).mean() / length
@@ -199,9 +205,6 @@ class PolicySearch:
                     "dynamics are computed without PyTorch's autograd. Write the reward in torch, "
                     "without .detach() and .numpy()."
                 )
-            if late > 1 and i >= self.updates - late and float(value.detach()) > best:
-                best = float(value.detach())
-                kept = {name: t.detach().clone() for name, t in policy.state_dict().items()}
             optimizer.zero_grad()
             (-value).backward()
             norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
@@ -209,14 +212,14 @@ class PolicySearch:
                 optimizer.step()
             rate.step()
             values.append(value.detach())
-            rewards.append(rollout.rewards.detach()[rollout.made].mean())
-            left.append(rollout.left_bounds.double().mean())
             if progress is not None:
                 progress(i + 1, float(value.detach()))
-        if late > 1:
-            policy.load_state_dict(kept)
-        reward, share = (float(torch.stack(each[-late:]).mean()) for each in (rewards, left))
-        return SearchResult(torch.stack(values), reward, share, time.perf_counter() - begun)
+        best.judge(policy)
+        policy.load_state_dict(best.kept)
+        rewards, left = best.rollout.rewards[best.rollout.made], best.rollout.left_bounds
+        seconds = time.perf_counter() - begun
+        share = float(left.double().mean())
+        return SearchResult(torch.stack(values), float(rewards.mean()), share, seconds)
 
     def _starts(self, task: Task, num_functions: int) -> Tensor:
         """Starts of an update: others in each function, unless these are compared at the same."""
@@ -224,6 +227,32 @@ class PolicySearch:
             return task.draw_initial_states(self.num_starts)
         starts = task.draw_initial_states(num_functions * self.num_starts)
         return starts.unflatten(0, (num_functions, self.num_starts))
+
+
+class _Best:
+    """The best policy so far, by functions and starts that no update sees.
+
+    Args:
+        rollouts: In the functions.
+        starts: As of :meth:`Rollouts.act`.
+        score: The worth of a rollout.
+        length: Steps of an episode.
+    """
+
+    kept: dict[str, Tensor]
+    rollout: Rollout
+
+    def __init__(self, rollouts: Rollouts, starts: Tensor, score: Score, length: int) -> None:
+        self.rollouts, self.starts, self.score, self.length = rollouts, starts, score, length
+        self.worth: float | None = None
+
+    def judge(self, policy: nn.Module) -> None:
+        """Keep a policy, if it is better than the one that is kept."""
+        with torch.no_grad():
+            rollout = self.rollouts.act(self.starts, policy, self.length)
+            worth = float(self.score(rollout).mean())
+        if self.worth is None or worth > self.worth:
+            self.worth, self.rollout, self.kept = worth, rollout, deepcopy(policy.state_dict())
 
 
 def imitate(

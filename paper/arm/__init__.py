@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -122,6 +122,10 @@ class ReachingSettings:
     """of the muscles; a healthy arm's is 1"""
 
 
+SLOW: dict[str, Any] = {"updates": 60, "starts": 24, "learning_rate": 3e-3}
+"""Settings of the learner that searches at the library's learning rate."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reaching(Experiment):
     """An arm of six muscles reaches after a few trials, computed by OpenSim."""
@@ -137,7 +141,7 @@ class Reaching(Experiment):
             "strength": "f_p twice as strong",
         },
         "learner": labels("cka", "phymean", "phy", "fitted", "gp")
-        | {"ensemble": "f_p and an ensemble of networks"},
+        | {"ensemble": "f_p and an ensemble of networks", "cka-slow": "CKA, learning rate 0.003"},
     }
     packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "stable_baselines3", "opensim")
     calls: ClassVar[tuple[str, ...]] = (
@@ -151,15 +155,22 @@ class Reaching(Experiment):
             raise ValueError(f"--trials: expected at least 1, got {self.settings.trials}")
         _check_opensim()
 
-    def trials(self, system: str, learner: str) -> int:
-        """The number of trials of a run."""
-        is_long = (system, learner) == ("plain", "cka")
-        return self.settings.long_trials if is_long else self.settings.trials
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """All seeds; none of the slow learner on other arms than the paper's."""
+        system, learner = kind
+        return self.seeds if learner != "cka-slow" or system == "plain" else ()
+
+    def settings_of(self, system: str, learner: str) -> ReachingSettings:
+        """The settings of a run."""
+        settings = self.settings
+        if system == "plain" and learner in ("cka", "cka-slow"):
+            settings = replace(settings, trials=settings.long_trials)
+        return replace(settings, **SLOW) if learner == "cka-slow" else settings
 
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and what the arm has beside."""
         system, learner = kind
-        settings = {**asdict(self.settings), "trials": self.trials(system, learner)}
+        settings = asdict(self.settings_of(system, learner))
         del settings["long_trials"]
         more: dict[str, Any] = {"sensors": SENSORS} if system == "sensors" else {}
         more |= {"fitted_by": "PhysicsDynamics"} if learner == "fitted" else {}

@@ -13,7 +13,7 @@ HORIZONS = {
     "pendulum": 12,
     "furuta": 10,
     "quadrotor": 12,
-    "double_pendulum": 10,
+    "double_pendulum": 12,
     "tanks": 8,
     "reacher": 8,
 }
@@ -26,19 +26,21 @@ class KnownSettings:
 
     trials: int = 3
     """real trials of a run, of which the first goes by f_p, or is random where there is none"""
-    sequences: int = 64
+    sequences: int = 128
     """that are planned, in each round of the cross-entropy method"""
     spread: float = 0.15
     """of these about the earlier plan, in shares of the range of the actions"""
-    rounds: int = 1
+    rounds: int = 0
     """of these after the first"""
-    first_rounds: int = 4
+    first_rounds: int = 2
     """of these when a trial begins, with all its steps"""
-    elites: int = 8
+    elites: int = 12
     """of these"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models; "bayes", the default of the library, takes twice as long"""
     networks: int = 5
     """of an ensemble"""
-    training: int = 400
+    training: int = 250
     """steps of Adam after each trial, of these"""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from matplotlib.axes import Axes
 
 from gpadjust.control import CrossEntropy, MPCAgent, Planner
 from gpadjust.dynamics import Dynamics, LearnedDynamics, PhysicsDynamics
+from gpadjust.dynamics.learning import DynamicsFitOptions
 from gpadjust.inference import ParameterWarning, SamplingWarning
 from gpadjust.physics import as_physics
 from gpadjust.systems import System
@@ -20,7 +22,7 @@ from paper.common.experiment import Run, Table
 from paper.common.figures import curves as draw_curves
 from paper.common.learners import LEARNERS
 from paper.common.tables import frame, groups, markdown, number
-from paper.common.verdicts import Curves, paired
+from paper.common.verdicts import Curves, Difference, paired
 from paper.control import HORIZONS, Known, KnownSettings
 from paper.control.systems import SYSTEMS, Physics
 from paper.machines.networks import NetworkDynamics
@@ -86,26 +88,35 @@ def dynamics(settings: KnownSettings, known: System, learner: str) -> Dynamics:
         number, steps = settings.networks, settings.training
         return NetworkDynamics(known.spec, given, number=number, steps=steps)
     made = LEARNERS[learner]
-    return LearnedDynamics(known.spec, physics if made.adjusts else None, model=made.make)
+    given = physics if made.adjusts else None
+    fit: DynamicsFitOptions = {"method": settings.fit}
+    return LearnedDynamics(known.spec, given, model=made.make, fit_options=fit)
 
 
 def tables(runs: Sequence[Run], experiment: Known) -> dict[str, Table]:
     """All tables, by name."""
     trials = frame(runs, "trials")
     by_system = groups(trials, "system", _SYSTEMS)
-    rows = []
-    for learner, label in _LEARNERS.items():
-        cells = [_costs(Curves(own, "cost"), learner) for own in by_system.values()]
-        rows.append([label, *cells])
-    late = trials[trials["episode"] > 1].groupby(["system", "learner", "seed"], sort=False)
-    late = late["cost"].mean().reset_index()
+    curves = [Curves(own, "cost") for own in by_system.values()]
+    rows = [
+        [label, *(_costs(own, learner) for own in curves), ""]
+        for learner, label in _LEARNERS.items()
+    ]
+    late = trials[trials["episode"] > 1].groupby([*Known.key], sort=False)["cost"].mean()
+    later = late.reset_index()
+    parts = groups(later, "system", _SYSTEMS).values()
     for other in _RATIOS:
-        parts = groups(late, "system", _SYSTEMS).values()
-        found = [paired(part, "cost", "learner", "cka", other, ratio=True) for part in parts]
-        rows.append([f"CKA / {_LEARNERS[other]}", *(each.ratio(".2f") for each in found)])
+        cells = [number(math.exp(_ratio(part, other).mean), ".2f") for part in parts]
+        label = f"CKA / {_LEARNERS[other]}, trials 2 and 3"
+        rows.append([label, *cells, _ratio(later, other).ratio(".2f")])
     heads = [f"{name} ({own['seed'].nunique()} runs)" for name, own in by_system.items()]
-    text = markdown(["mean cost of trials 1; 2; 3", *heads], rows)
-    return {"costs": Table("Costs of trials, and their ratios in trials 2 and 3", text)}
+    text = markdown(["mean cost of trials 1; 2; 3", *heads, "all systems"], rows)
+    return {"costs": Table("Costs of trials, and their ratios", text)}
+
+
+def _ratio(later: pd.DataFrame, other: str) -> Difference:
+    """The cost of CKA beside that of another in the later trials, pair by pair."""
+    return paired(later, "cost", "learner", "cka", other, ("system", "seed"), ratio=True)
 
 
 def _costs(curves: Curves, learner: str) -> str:

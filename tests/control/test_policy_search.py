@@ -1,5 +1,7 @@
 """Policies that gradients improve."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -253,6 +255,31 @@ def test_a_policy_comes_back_from_the_bounds():
         rollout = Rollouts(task, None).act(task.draw_initial_states(64), policy, 5)
     assert rollout.left_bounds.double().mean() < 0.3
     assert rollout.rewards.mean() > -6  # to stay where it is costs 9
+
+
+def test_a_search_that_does_harm_keeps_the_policy_that_it_began_with():
+    """In one step -2 x is the optimum; updates of this size throw it far away."""
+    policy = linear_policy(SPEC, torch.tensor([[-1e3], [1e3]], dtype=torch.float64))
+    with torch.no_grad():
+        policy.body[0].weight.fill_(-2e-3)
+        policy.body[0].bias.zero_()
+    before = {name: t.clone() for name, t in policy.state_dict().items()}
+    task = task_of(PhysicsDynamics(SPEC, step))
+    result = PolicySearch(updates=5, redraw_every=1, learning_rate=1.0).improve(policy, task)
+    torch.testing.assert_close(policy.state_dict(), before, rtol=0, atol=0)
+    assert result.reward == pytest.approx(0, abs=1e-6)
+    assert result.values[-1] < -1
+
+
+def test_the_result_is_that_of_the_policy_that_is_kept():
+    fixed = torch.linspace(-1, 1, 24, dtype=torch.float64).unsqueeze(-1)
+    task = replace(task_of(PhysicsDynamics(SPEC, step)), initial_states=lambda n: fixed[:n])
+    policy = linear_policy(SPEC, BOUNDS)
+    result = PolicySearch(updates=7, learning_rate=0.1).improve(policy, task)
+    with torch.no_grad():
+        rewards = Rollouts(task, None).act(fixed, policy, 4).rewards
+    assert result.reward == pytest.approx(rewards.mean().item(), rel=1e-12)
+    assert result.reward > result.values[0]
 
 
 def test_a_careful_search_needs_functions():

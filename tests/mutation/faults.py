@@ -140,6 +140,12 @@ FAULTS = (
         "The generators are restored when the agent is read, not when it goes on to learn.",
     ),
     Fault(
+        "gpadjust/control/policy_search.py",
+        "policy.load_state_dict(best.kept)",
+        "best.kept.clear()",
+        "A search ends with its last policy, not with the best one.",
+    ),
+    Fault(
         "gpadjust/control/search.py",
         "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
         "drawn, score(drawn)",

@@ -9,7 +9,7 @@ import torch
 from gpadjust.control.checkpoint import RandomState
 from gpadjust.physics import ODEPhysics
 from gpadjust.systems.torque_arm import ARM_TIME_STEP, believed_arm
-from paper.arm import Arm, Reaching, ReachingSettings, Settings
+from paper.arm import SLOW, Arm, Reaching, ReachingSettings, Settings
 from paper.arm import system as arm_system
 from paper.arm.arm import load_maps
 from paper.arm.claims import claims as arm_claims
@@ -165,6 +165,14 @@ def test_reaching_runs_and_their_tables(tmp_path):
     }
     assert "too few runs of cka" in tables["targets"].text
     assert [path.name for path in experiment.draw(records)] == ["curves.png", "map.png"]
+
+
+def test_the_slow_learner_is_told_apart_by_its_settings():
+    experiment = Reaching(runs=2, settings=FEW)
+    slow = [case for case in experiment.cases() if case[1] == "cka-slow"]
+    assert slow == [("plain", "cka-slow", 0), ("plain", "cka-slow", 1)]
+    told = experiment.describe("plain", "cka-slow")
+    assert told == {**experiment.describe("plain", "cka"), **SLOW}
 
 
 @pytest.mark.parametrize("learner", Reaching.axes["learner"])
