@@ -225,3 +225,44 @@ def test_learners_of_stable_baselines_refuse_sensors():
         DynaSAC("MlpPolicy", env, task)
     with pytest.raises(ValueError, match="ModelVecEnv cannot learn a task with sensors"):
         ModelVecEnv(task, 1, env.observation_space, env.action_space)
+
+
+@pytest.mark.parametrize(
+    "sensors",
+    [
+        Sensors(["x"]),
+        Sensors(["side", "height"], lambda s: torch.stack([s[:, 0].sin(), s[:, 0].cos()], -1)),
+    ],
+)
+def test_intervals_hold_the_hidden_states_of_a_pendulum(sensors):
+    spec = StateSpec(["x", "v"], ["force"], angles=["x"])
+
+    def swing(X):
+        x, v, force = X.unbind(-1)
+        new = v + STEP * (force - 3 * x.sin())
+        return torch.stack([x + STEP * (v + new) / 2, new], dim=-1)
+
+    task, (added, noise) = task_of(sensors, swing, spec), (0.1, 0.05)
+    first = Estimate(
+        torch.tensor([1.0, 0.0]).double(), torch.diag(torch.tensor([0.01, 0.09])).double()
+    )
+    outputs = len(sensors.outputs)
+    known = StateFilter(
+        first, torch.full([outputs], noise).double(), torch.tensor([0.0, added]).double()
+    )
+    torch.manual_seed(0)
+    state = first.mean + first.covariance.diagonal().sqrt() * torch.randn(40, 2).double()
+    found, held = [None] * 40, []
+    for _ in range(30):
+        values = sensors.measure(spec, state)
+        seen = sensors.spec(spec).observe(values + noise * torch.randn(40, outputs).double())
+        found = known.follow(task, seen, found)
+        off = torch.stack([each.mean[1] - s[1] for each, s in zip(found, state, strict=True)])
+        sd = torch.stack([each.covariance[1, 1] for each in found]).sqrt()
+        held.append((off.abs() < 1.96 * sd).double())
+        forces = 2 * torch.rand(40, 1).double() - 1
+        found = [each._replace(action=force) for each, force in zip(found, forces, strict=True)]
+        state = swing(torch.cat([state, forces], -1))
+        state[:, 1] += added * torch.randn(40).double()
+    assert 0.93 < torch.cat(held).mean() < 0.97
+    assert sd.mean() < 0.25  # of rates of about 2
