@@ -119,6 +119,7 @@ class Planner:
         num_steps: int | None = None,
         *,
         known: Tensor | None = None,
+        steps_done: int = 0,
         before: Tensor | None = None,
         margins: Tensor | None = None,
     ) -> Plan:
@@ -132,6 +133,7 @@ class Planner:
             num_steps: How many steps are ahead; the plan is of these or of the horizon, ``T``.
                 Default: the episode length of the task.
             known: An earlier plan, ``t x action_dim``; its last action is held where it is shorter.
+            steps_done: How many steps the episode has made by then.
             before: The last action that was made, from which the next one may differ by the task's
                 ``action_rate`` alone. Default: none, where an episode begins.
             margins: Those of the constraints, ``T x c``; see
@@ -156,7 +158,7 @@ class Planner:
             asked: list[tuple[Tensor, ...]] = []
 
             def scored(sequences: Tensor) -> Tensor:
-                rollout = rollouts.follow(state, sequences)
+                rollout = rollouts.follow(state, sequences, steps_done)
                 rewards = rollout.rewards.masked_fill(~rollout.made, 0.0).mean(0)
                 left, made = (part.double().mean(0) for part in (rollout.left_bounds, rollout.made))
                 reached, violation = rollout.next_states.mean(0), rollout.violation.mean(0).amax(-1)
