@@ -30,7 +30,7 @@ from gpadjust.control.checkpoint import (
     pickled_environment,
     unpacked,
 )
-from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
+from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_again, learn_dynamics
 from gpadjust.control.search import random_sequences
 from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
 from gpadjust.control.state_filter import StateFilter
@@ -310,19 +310,24 @@ class Agent(TaskAgent):
 
     def _learn_dynamics(self) -> None:
         """Let the dynamics learn the episodes that they have not, if there are any."""
-        if self.task.sensors is not None:
+        dynamics, sensors = self.task.dynamics, self.task.sensors
+        by_physics = not dynamics.is_fitted
+        if sensors is not None and len(self._promises) > self.num_episodes:
             with self.timed("fit"):
                 self._smooth()
-        recorded, dynamics = self.recorded_episodes(), self.task.dynamics
+        recorded = self.recorded_episodes()
         new = recorded.some(recorded.episode >= (self.num_episodes if dynamics.has_learnt else 0))
         if new.num_transitions < (1 if dynamics.is_fitted else 2):  # a first fit needs two
             self._is_improved &= new.num_transitions == 0  # there is another start
             return
-        if self.reward_tolerance is not None and self.task.sensors is None:
+        if self.reward_tolerance is not None and sensors is None:
             new.check(self.task, self.reward_tolerance)
         with self.timed("fit"):
             task = recorded.complete(self.task, self.episode_length(), self.action_bounds())
             values = learn_dynamics(task, new, recorded, self.score_horizons)
+            if sensors is not None and by_physics:  # whose errors were noise in the states
+                self._smooth()
+                learn_again(dynamics, self.recorded_episodes())
         bounds = None if self.model is None else self.model.state_bounds
         if bounds is not None and self.task.state_bounds is None:
             new.warn_of_bounds(bounds)
@@ -349,7 +354,9 @@ class Agent(TaskAgent):
             )
             for steps in by_episode
         ]
-        task = replace(self.task, dynamics=self.newest_model.dynamics)
+        newest = self.task.dynamics.before_data()
+        assert newest is not None, "checked at the start"
+        task = replace(self.task, dynamics=newest)
         known = self.filter
         assert known is not None, "there are sensors"
         self._filter, self._states = smooth_episodes(task, known, seen, len(seen))
