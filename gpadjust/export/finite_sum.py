@@ -272,7 +272,7 @@ def _columns(transform: Any, num_inputs: int) -> list[Column]:
             found = [
                 column._replace(function=function)
                 for i, column in enumerate(found)
-                for function in (("sin", "cos") if i in part.columns else ("",))
+                for function in (("sin", "cos") if i in part.columns else (column.function,))
             ]
         elif type(part) in (AffineInputTransform, Normalize, InputStandardize):
             offset, size = torch.zeros(len(found)).double(), torch.ones(len(found)).double()
