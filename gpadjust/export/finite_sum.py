@@ -49,8 +49,8 @@ class TermTables(NamedTuple):
             ``"constant"`` without a kernel; empty of a term without features.
         amplitude: a, ``G``.
         constant: c, the prior variance of an unknown mean, ``G``.
-        lengthscale: ``G x d``.
-        at_points: The basis at the points, ``G x P``; None for 1.
+        rate: One over the lengthscales, ``G x d``.
+        at_points: The basis at the points, ``G x P``; none of waves.
         frequencies: Of waves, ``D/2 x d``; else None.
     """
 
@@ -62,8 +62,8 @@ class TermTables(NamedTuple):
     kind: str
     amplitude: Tensor
     constant: Tensor
-    lengthscale: Tensor
-    at_points: Tensor | None
+    rate: Tensor
+    at_points: Tensor
     frequencies: Tensor | None
 
 
@@ -72,7 +72,7 @@ class ErrorTables(NamedTuple):
 
     points: Tensor  # n x d
     squares: Tensor  # m x n
-    lengthscale: Tensor  # m x d
+    rate: Tensor  # one over the lengthscales, m x d
     factor: Tensor  # by recent errors, m
 
 
@@ -256,8 +256,8 @@ def _tables(
         kind,
         amplitude,
         constant,
-        each(lengthscale, 1, d).squeeze(-2),
-        None if at_points is None else each(at_points, size),
+        1 / each(lengthscale, 1, d).squeeze(-2),
+        each(zero.new_ones(size) if at_points is None else at_points, size),
         frequencies,
     )
 
@@ -298,6 +298,6 @@ def _errors(model: TermsModel) -> ErrorTables | None:
     return ErrorTables(
         errors.points,
         errors.squares.reshape(m, n),
-        errors.lengthscale.reshape(m, d),
+        1 / errors.lengthscale.reshape(m, d),
         (errors(anywhere) / errors(anywhere, recent=False)).reshape(m),
     )
