@@ -146,6 +146,12 @@ FAULTS = (
         "A search ends with its last policy, not with the best one.",
     ),
     Fault(
+        "gpadjust/control/constraints.py",
+        ".clamp(0.0, 1.0).amin(-1)",
+        ".clamp(1.0, 1.0).amin(-1)",
+        "Margins count on corrections that the actions leave no room for.",
+    ),
+    Fault(
         "gpadjust/control/search.py",
         "torch.cat([sequences, drawn]), torch.cat([scores, score(drawn)])",
         "drawn, score(drawn)",
