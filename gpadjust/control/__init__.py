@@ -11,6 +11,7 @@ from gpadjust.control.policy_search import PolicySearch, SearchResult, imitate
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.rollouts import Objective, Return, Rollout, Rollouts
 from gpadjust.control.search import CrossEntropy, PathIntegral, Search
+from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import Constraints, InitialStates, Reward, Step, Task, Termination
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "Constraints",
     "CrossEntropy",
     "EpisodeCheckpoint",
+    "Estimate",
     "InitialStates",
     "MPCAgent",
     "Objective",
@@ -38,6 +40,7 @@ __all__ = [
     "Rollouts",
     "Search",
     "SearchResult",
+    "StateFilter",
     "Step",
     "Task",
     "Termination",

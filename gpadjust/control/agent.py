@@ -8,6 +8,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import groupby
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -31,10 +32,13 @@ from gpadjust.control.checkpoint import (
 )
 from gpadjust.control.recorded_episodes import RecordedEpisodes, learn_dynamics
 from gpadjust.control.search import random_sequences
+from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
+from gpadjust.control.state_filter import StateFilter
 from gpadjust.control.task import Task
 from gpadjust.dynamics.free_run import checked_horizons
 
 MAX_HOLD = 5  # steps of a random action
+_ENDS = slice(None, -1), slice(1, None)  # of the steps along a path
 
 Callback = Callable[["Agent", str, dict[str, float]], Any]
 """What is called with the agent, the name of an event, and its numbers; see :class:`Agent`."""
@@ -112,13 +116,20 @@ class Agent(TaskAgent):
             should; after a real episode, if its rewards or terminations are not those of the task.
     """
 
-    not_saved: ClassVar[tuple[str, ...]] = ("env", "_steps", "_callbacks", "_random_state")
+    not_saved: ClassVar[tuple[str, ...]] = (
+        "env",
+        "_steps",
+        "_states",
+        "_callbacks",
+        "_random_state",
+    )
     """Attributes that are not in checkpoints, beside those of the classes above.
 
     A subclass names those that cannot be pickled; a resumed agent lacks them.
     """
 
     model: Task | None
+    _filter: StateFilter | None
 
     def __init__(
         self,
@@ -149,6 +160,7 @@ class Agent(TaskAgent):
         self.wall_time = dict.fromkeys(("plan", "fit", "update"), 0.0)
         self.notes: dict[str, Any] = {}
         self._steps: list[_Step] = []
+        self._states: list[Tensor] = []  # of each episode that was smoothed, T + 1 x state_dim
         self._promises: list[float | None] = []  # one for each episode
         self._start: NDArray[Any] | None = None  # where the next episode begins, after a reset
         self._env_seed = seed  # of the first reset
@@ -282,11 +294,14 @@ class Agent(TaskAgent):
 
     def _learn_dynamics(self) -> bool:
         """Let the dynamics learn the episodes that they have not; return whether there were any."""
+        if self.task.sensors is not None:
+            with self.timed("fit"):
+                self._smooth()
         recorded, dynamics = self.recorded_episodes(), self.task.dynamics
         new = recorded.some(recorded.episode >= (self.num_episodes if dynamics.has_learnt else 0))
         if new.num_transitions < (1 if dynamics.is_fitted else 2):  # a first fit needs two
             return False
-        if self.reward_tolerance is not None:
+        if self.reward_tolerance is not None and self.task.sensors is None:
             new.check(self.task, self.reward_tolerance)
         with self.timed("fit"):
             task = recorded.complete(self.task, self.episode_length())
@@ -302,6 +317,23 @@ class Agent(TaskAgent):
             self._compare(values, recorded.rewards)
         self.tell("fit", values)
         return True
+
+    def _smooth(self) -> None:
+        """Estimate the states behind all episodes, and the noises, in the newest model."""
+        by_episode = [[*steps] for _, steps in groupby(self._steps, key=lambda step: step.episode)]
+        if not by_episode:
+            return
+        seen = [
+            Seen(
+                torch.from_numpy(np.array([steps[0].observation, *(s.following for s in steps)])),
+                torch.from_numpy(self._unscaled(np.array([s.action for s in steps]))),
+            )
+            for steps in by_episode
+        ]
+        task = replace(self.task, dynamics=self.newest_model.dynamics)
+        known = self.filter
+        assert known is not None, "there are sensors"
+        self._filter, self._states = smooth_episodes(task, known, seen, len(seen))
 
     def _improve(self) -> None:
         """Improve in what is known, if that is something and actions are not to be random."""
@@ -338,11 +370,27 @@ class Agent(TaskAgent):
         check_kind("task", task, Task, told)
         self._task = task
         self.model = None
+        self._filter = None
+
+    @property
+    def filter(self) -> StateFilter | None:
+        """The filter of what sensors show, with the noises that were learnt; None without sensors.
+
+        Raises:
+            RuntimeError: If there is neither a physics nor a real episode.
+        """
+        if self._filter is None and self.task.sensors is not None:
+            self._filter = StateFilter.guessed(self.newest_model, self.action_bounds())
+        return self._filter
 
     def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
-        """The real steps; or the newest of them only."""
-        spec, steps = self.task.dynamics.spec, self._steps
-        steps = steps if newest is None else steps[len(steps) - min(newest, len(steps)) :]
+        """The real steps; or the newest of them only.
+
+        With sensors the states are drawn from what is known of them since they were last learnt.
+        """
+        spec, steps, states = self.task.observed, self._steps, self._states
+        if self.task.sensors is not None:
+            steps = steps[: sum(len(path) - 1 for path in states)]
         shapes = [(), (spec.observation_dim,), (spec.action_dim,), (spec.observation_dim,), (), ()]
         columns = zip(*steps, strict=True) if steps else [()] * len(shapes)
         episode, seen, actions, following, rewards, terminated = (
@@ -350,8 +398,8 @@ class Agent(TaskAgent):
             for column, shape in zip(columns, shapes, strict=True)
         )
         episode = episode.long()
-        return RecordedEpisodes(
-            spec,
+        found = RecordedEpisodes(
+            self.task.dynamics.spec,
             spec.decode(seen),
             torch.from_numpy(self._unscaled(actions.numpy())),
             spec.decode(following),
@@ -361,6 +409,10 @@ class Agent(TaskAgent):
             begins=torch.cat([torch.tensor([True]), episode.diff() > 0])[: len(steps)],
             whole=torch.ones(len(steps), dtype=torch.bool),
         )
+        if self.task.sensors is not None and steps:
+            ends = [torch.cat([path[part] for path in states]) for part in _ENDS]
+            found = replace(found, states=ends[0], next_states=ends[1])
+        return found if newest is None else found.some(slice(max(len(steps) - newest, 0), None))
 
     def env_attribute(self, name: str) -> Any:
         """An attribute of the environment or of one that it wraps."""
@@ -407,9 +459,24 @@ class Agent(TaskAgent):
         if self._random_state is not None:  # a run that goes on
             self._random_state.restore()
             self._random_state = None
+        if self.task.sensors is not None:
+            self._check_sensors()
         self.try_task(np.atleast_2d(self._reset()), self.env.action_space)
         if self.model is None:
             self._improve()
+
+    def _check_sensors(self) -> None:
+        """Raise a ValueError if hidden states could not be estimated."""
+        if self.known_task() is None:
+            raise ValueError(
+                "Hidden states are estimated in a model of the system; give the dynamics a "
+                "physics, or leave the sensors out."
+            )
+        if self.action_noise is not None:
+            raise ValueError(
+                "The estimate of hidden states takes the actions for those that were chosen; leave "
+                "action_noise out, or the sensors."
+            )
 
     def _reset(self) -> NDArray[Any]:
         """The observation at which the next episode begins."""
@@ -482,7 +549,7 @@ class Agent(TaskAgent):
             state["_start"] = None  # it will be reset
         return {
             "agent.pkl": self._pickled(state),
-            "steps.pt": packed(columns),
+            "steps.pt": packed({"columns": columns, "states": self._states}),
             "dynamics.pt": packed(self.task.dynamics.state_dict()),
             "environment.pkl": env or b"",
         }
@@ -501,15 +568,16 @@ class Agent(TaskAgent):
     @classmethod
     def from_parts(cls, parts: dict[str, bytes], env: Any, task: Task) -> Self:
         """The agent that :meth:`saved_parts` saved."""
-        rows = zip(*unpacked(parts["steps.pt"]), strict=True)
+        steps = unpacked(parts["steps.pt"])
         task.dynamics.load_state_dict(unpacked(parts["dynamics.pt"]))
         agent = cls.__new__(cls)
         agent.task, agent._callbacks = task, []
         agent.env = cloudpickle.loads(parts["environment.pkl"]) if parts["environment.pkl"] else env
         agent._steps = [
             _Step(*(value.numpy() if value.dim() else value.item() for value in row))
-            for row in rows
+            for row in zip(*steps["columns"], strict=True)
         ]
+        agent._states = steps["states"]
         vars(agent).update(_Unpickler(io.BytesIO(parts["agent.pkl"]), agent).load())
         return agent
 

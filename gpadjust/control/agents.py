@@ -14,12 +14,13 @@ from torch import Tensor
 
 from gpadjust.checks import check_kind
 from gpadjust.control.agent import MAX_HOLD, Agent
-from gpadjust.control.mpc import MPC, PlanState
+from gpadjust.control.mpc import MPC, PlanState, going_on
 from gpadjust.control.planner import Planner
 from gpadjust.control.policies import BoundedPolicy, mlp_policy
 from gpadjust.control.policy_search import PolicySearch
 from gpadjust.control.rollouts import Rollouts
 from gpadjust.control.search import random_sequences
+from gpadjust.control.state_filter import Estimate
 from gpadjust.control.task import Task
 from gpadjust.states import StateSpec
 
@@ -78,7 +79,11 @@ class MPCAgent(Agent):
         Raises:
             RuntimeError: If there is neither a physics nor a real episode to plan with.
         """
-        how: dict[str, Any] = {"first": self.first, "tolerance": self.tolerance}
+        how: dict[str, Any] = {
+            "first": self.first,
+            "tolerance": self.tolerance,
+            "state_filter": self.filter,
+        }
         return MPC(self.newest_model, self.action_bounds(), self.each_step, **how)
 
     def predict(
@@ -222,9 +227,22 @@ class PolicySearchAgent(Agent):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """The policy's actions, always the same at an observation; see :meth:`Agent.predict`."""
+        """The policy's actions, always the same at an observation; see :meth:`Agent.predict`.
+
+        With sensors the state is an :class:`Estimate` of each episode, at whose mean they are.
+        """
+        seen, found = torch.as_tensor(np.asarray(observation)).double(), list[Estimate]()
+        if self.filter is not None:
+            rows = torch.atleast_2d(seen)
+            earlier = going_on(state, episode_start, len(rows))
+            found = self.filter.follow(self.newest_model, rows, earlier)
+            means = self.task.dynamics.spec.observe(torch.stack([each.mean for each in found]))
+            seen = means.reshape(*seen.shape[:-1], -1)
         with torch.no_grad():
-            actions = self.policy.act(torch.as_tensor(np.asarray(observation)).double())
+            actions = self.policy.act(seen)
+        if found:
+            taken = zip(found, torch.atleast_2d(actions), strict=True)
+            state = tuple(each._replace(action=action) for each, action in taken)
         return actions.numpy().astype(np.float32), state
 
     def _random_states(self, task: Task) -> Tensor:

@@ -78,9 +78,12 @@ class TaskAgent(ABC):
         self.episode_length()
         before, task = RandomState.capture(), self.ready_task()
         seen = torch.from_numpy(observations.astype(np.float64))
-        task.dynamics.spec.check_observations(seen)
+        task.observed.check_observations(seen)
         # Of a single state much would look right that is not.
-        twice = task.dynamics.spec.decode(seen).repeat(2, 1)
+        if task.sensors is None:
+            twice = task.dynamics.spec.decode(seen).repeat(2, 1)
+        else:
+            twice = task.draw_initial_states(2)
         middle = torch.from_numpy((action_space.low + action_space.high) / 2).double()
         task.try_functions(twice, middle.expand(len(twice), -1))
         before.restore()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from gpadjust.checks import check_kind, checked_bounds, checked_number
 from gpadjust.control.constraints import margins
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
+from gpadjust.control.state_filter import Estimate, StateFilter
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
@@ -50,6 +52,8 @@ class Planned(NamedTuple):
         next_states: Those to which the actions ahead lead, ``T x state_dim``.
         violation: As of the newest :class:`Plan`.
         before: The last action that was made, ``action_dim``; None where an episode begins.
+        estimate: The state as sensors have shown it, and the action that was taken there; None of a
+            task without sensors.
     """
 
     actions: Tensor
@@ -60,10 +64,13 @@ class Planned(NamedTuple):
     next_states: Tensor = torch.zeros(0)
     violation: float = 0.0
     before: Tensor | None = None
+    estimate: Estimate | None = None
 
 
 PlanState = tuple[Planned, ...]
 """What is planned of each episode."""
+
+Kept = TypeVar("Kept")
 
 
 class MPC:
@@ -87,6 +94,8 @@ class MPC:
             step, on average), the rest is planned as when it began. None for never.
         seed: Of the searches of deterministic actions, which are the same for the same observation
             and plan.
+        state_filter: Of a task with sensors, by which observations are states. Default: that before
+            there are data.
 
     Raises:
         TypeError: If a planner is none.
@@ -116,6 +125,7 @@ class MPC:
         first: Planner | None = None,
         tolerance: float | None = 0.25,
         seed: int = 0,
+        state_filter: StateFilter | None = None,
     ) -> None:
         for name, planner in (("each_step", each_step), ("first", first)):
             check_kind(name, planner, Planner | None, "a Planner(...)")
@@ -145,6 +155,9 @@ class MPC:
         self.first = first
         self.tolerance = tolerance
         self.seed = seed
+        if task.sensors is not None and state_filter is None:
+            state_filter = StateFilter.guessed(task, self.action_bounds)
+        self.filter = state_filter
 
     def predict(
         self,
@@ -158,16 +171,20 @@ class MPC:
         The state is the plan. Without one all episodes begin. If ``deterministic``, the search is
         always the same.
         """
-        spec = self.task.dynamics.spec
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
-        states = spec.decode(rows)
-        episodes: list[Planned | None] = [None] * len(states)
-        if state is not None:
-            begins = np.zeros(len(states), dtype=bool) if episode_start is None else episode_start
-            pairs = zip(state, np.atleast_1d(begins), strict=True)
-            episodes = [None if new else earlier for earlier, new in pairs]
+        episodes = going_on(state, episode_start, len(rows))
+        known: Sequence[Estimate | None] = [None] * len(rows)
+        if self.filter is None:
+            states = [*self.task.dynamics.spec.decode(rows)]
+        else:
+            before = [None if each is None else each.estimate for each in episodes]
+            found = known = self.filter.follow(self.task, rows, before)
+            states = [each.mean for each in found]
         with seeded(self.seed if deterministic else None):
-            plans = [self.plan(*pair) for pair in zip(states, episodes, strict=True)]
+            plans = [
+                self.plan(at, earlier, None if seen is None else seen.covariance)
+                for at, earlier, seen in zip(states, episodes, known, strict=True)
+            ]
         actions = torch.stack([plan.actions[0] for plan in plans]).numpy().astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), tuple(
             plan._replace(
@@ -175,8 +192,9 @@ class MPC:
                 next_states=plan.next_states[1:],
                 steps_done=plan.steps_done + 1,
                 before=plan.actions[0],
+                estimate=None if seen is None else seen._replace(action=plan.actions[0]),
             )
-            for plan in plans
+            for plan, seen in zip(plans, known, strict=True)
         )
 
     def plan(
@@ -255,3 +273,11 @@ class MPC:
             return False
         loss = (promised - plan.rewards[: len(promised)]).mean()
         return bool(loss > self.tolerance * (earlier.promised.max() - earlier.promised.min()))
+
+
+def going_on(state: Sequence[Kept] | None, episode_start: Any, n: int) -> list[Kept | None]:
+    """What a policy kept of each of ``n`` episodes, its state; None of those that begin."""
+    if state is None:
+        return [None] * n
+    begins = np.zeros(n, dtype=bool) if episode_start is None else np.atleast_1d(episode_start)
+    return [None if new else kept for kept, new in zip(state, begins, strict=True)]

@@ -157,9 +157,15 @@ class RecordedEpisodes:
 
 
 def learn_dynamics(
-    task: Task, new: RecordedEpisodes, recorded: RecordedEpisodes, horizons: tuple[int, ...]
+    task: Task,
+    new: RecordedEpisodes,
+    recorded: RecordedEpisodes,
+    horizons: tuple[int, ...],
 ) -> dict[str, float]:
     """Score the dynamics of a task on new episodes, and update them with these.
+
+    With sensors they forget what they have learnt, and learn all episodes again, as the states
+    behind all of them are estimated better by now.
 
     PyTorch's generator is left as it is by the scores. Scores that are not defined (densities of
     dynamics without variances, horizons longer than the episodes) are left out.
@@ -183,9 +189,22 @@ def learn_dynamics(
         before = time.perf_counter()
         found = _scores(task, learnable, recorded, horizons)
         found["score_seconds"] = time.perf_counter() - before
-    task.dynamics.update(*learnable)
+    if task.sensors is None:
+        task.dynamics.update(*learnable)
+    else:
+        _learn_again(task.dynamics, recorded.learnable(task.dynamics))
     found["fit_seconds"] = time.perf_counter() - start - found.get("score_seconds", 0.0)
     return {name: value for name, value in found.items() if not math.isnan(value)}
+
+
+def _learn_again(dynamics: Dynamics, data: Trajectories) -> None:
+    before = dynamics.state_dict()
+    dynamics.load_state_dict({})
+    try:
+        dynamics.update(*data)
+    except BaseException:
+        dynamics.load_state_dict(before)
+        raise
 
 
 def _scores(

@@ -14,6 +14,7 @@ from gpadjust.checks import check_kind, checked_number, checked_whole
 from gpadjust.control.action_rate import ActionRate
 from gpadjust.dynamics import Dynamics
 from gpadjust.dynamics.particles import step_or_nan
+from gpadjust.states import Sensors, StateSpec
 
 Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Rewards ``N`` of states, actions and next states, ``N`` rows each."""
@@ -68,6 +69,8 @@ class Task:
         state_bounds: Lower and upper bounds of the states, ``2 x state_dim``, beyond which the
             model is not followed; infinite where there is none. Default: far beyond all that was
             seen, of an agent that has seen some; else none.
+        sensors: What is measured of the states, of which observations then are; it takes
+            ``initial_states``. Default: all of the states.
         constraints: Numbers ``N x c``, in PyTorch's functions, of states ``N x state_dim`` and the
             actions ``N x action_dim`` that led to them: each constraint holds where its number is
             at most 0, such as ``states[:, :1] - 0.5`` before a wall at 0.5. A planner looks for
@@ -80,7 +83,8 @@ class Task:
 
     Raises:
         TypeError: If something is of another kind, or a function takes other arguments.
-        ValueError: If a number or the bounds are out of range.
+        ValueError: If a number or the bounds are out of range, or there are sensors of no such
+            states, or without ``initial_states``.
 
     Example:
         >>> import torch
@@ -97,6 +101,7 @@ class Task:
     initial_states: InitialStates | None = None
     episode_length: int | None = None
     state_bounds: Tensor | None = None
+    sensors: Sensors | None = None
     constraints: Constraints | None = None
     probability: float | None = 0.95
     action_rate: ActionRate | float | Sequence[float] | None = None
@@ -120,10 +125,24 @@ class Task:
         if self.state_bounds is not None:
             bounds = _checked_bounds(self.state_bounds, self.dynamics.spec.state_dim)
             object.__setattr__(self, "state_bounds", bounds)
+        check_kind("sensors", self.sensors, Sensors | None, 'Sensors(["x", "theta"]), say')
+        if self.sensors is not None:
+            self.sensors.spec(self.dynamics.spec)  # checks the names
+            if self.initial_states is None:
+                raise ValueError(
+                    "Of hidden states it must be known where episodes start; pass initial_states, "
+                    "or start of a System, as well as sensors."
+                )
         if self.probability is not None:
             checked_number("probability", self.probability, above=0, below=1)
         if self.rate is not None:
             self.rate.check(self.dynamics.spec.action_dim)
+
+    @property
+    def observed(self) -> StateSpec:
+        """What is observed, as a spec: the states, or the outputs of the sensors."""
+        spec = self.dynamics.spec
+        return spec if self.sensors is None else self.sensors.spec(spec)
 
     @property
     def rate(self) -> ActionRate | None:
@@ -144,21 +163,23 @@ class Task:
         """
         if self.initial_states is not None:
             self.draw_initial_states(len(states))
+        if self.sensors is not None:
+            self.sensors.measure(self.dynamics.spec, states)
         self.rewards(states, actions, states)
         self.terminations(states)
         self.constraint_values(states, actions)
         self.dynamics.try_physics(states, actions)
 
     def check_spaces(self, observation_space: Any, action_space: Any) -> None:
-        """Raise a ValueError unless the spaces are boxes of the spec's observations and actions."""
-        spec = self.dynamics.spec
+        """Raise a ValueError unless the spaces are boxes of what is observed and of actions."""
+        spec, whose = self.observed, "dynamics" if self.sensors is None else "sensors"
         for name, space, size in (
             ("observation", observation_space, spec.observation_dim),
             ("action", action_space, spec.action_dim),
         ):
             if not hasattr(space, "high") or space.shape != (size,):
                 raise ValueError(
-                    f"The spec of the dynamics says that the {name} has {size} entries, so a Box "
+                    f"The spec of the {whose} says that the {name} has {size} entries, so a Box "
                     f"of shape ({size},) is expected; found {space}. States: {tuple(spec.states)}, "
                     f"of which angles (seen as sine and cosine): {tuple(spec.angles)}; actions: "
                     f"{tuple(spec.actions)}."
@@ -286,6 +307,7 @@ class Task:
             "initial_states": self.initial_states is not None,
             "episode_length": self.episode_length,
             "state_bounds": None if bounds is None else bounds.tolist(),
+            "sensors": None if self.sensors is None else self.sensors.describe(),
             "constraints": self.constraints is not None,
             "probability": self.probability,
             "action_rate": None if self.action_rate is None else repr(self.action_rate),

@@ -10,7 +10,7 @@ import torch
 
 from gpadjust.dynamics.targets import check_next_values
 from gpadjust.physics import Physics, PhysicsError
-from gpadjust.records.kalman import Array, Link, Smoothed
+from gpadjust.records.kalman import Array, Link, Smoothed, expected_squares
 from gpadjust.records.record import Stretch
 from gpadjust.states import StateSpec
 
@@ -142,7 +142,10 @@ class Chain:
         offsets = onward - np.einsum("tij,tj->ti", matrices, here)
         cuts = np.cumsum([len(m) - 1 for m in path.measured])[:-1]
         parts = zip(np.split(matrices, cuts), np.split(offsets, cuts), path.measured, strict=True)
-        return [Link(*part) for part in parts]
+        return [
+            Link(matrix, offset, np.tile(np.eye(d, d + p), (len(m), 1, 1)), m)
+            for matrix, offset, m in parts
+        ]
 
     def towards(
         self, path: Path, found: Sequence[Smoothed], noise: Array, process_noise: Array
@@ -170,23 +173,10 @@ class Chain:
         self, links: Sequence[Link], found: Sequence[Smoothed]
     ) -> tuple[Array, Array]:
         """Variances of noise and process_noise, most likely given the states' distribution."""
-        d = len(self.spread)
-        errors, added = [], []
-        for link, (states, crossed) in zip(links, found, strict=True):
-            means, spread = states.means[:, :d], states.covariances[:, :d, :d]
-            own = (link.measured - means) ** 2 + np.diagonal(spread, axis1=1, axis2=2)
-            errors.append(own)
-            lead = link.matrices[:, :d]
-            step = means[1:] - np.einsum("tij,tj->ti", lead, states.means[:-1])
-            step = step - link.offsets[:, :d]
-            of_both = np.einsum("tij,tij->ti", crossed[:, :d], lead)
-            of_first = np.einsum("tij,tjk,tik->ti", lead, states.covariances[:-1], lead)
-            of_last = np.diagonal(spread[1:], axis1=1, axis2=2)
-            added.append(step**2 + (of_last - 2 * of_both + of_first).clip(0))
-        measured = np.concatenate(errors)
+        measured, added = expected_squares(links, found, len(self.spread))
         columns = zip(self._columns(measured), self.spread, strict=True)
         noise = [np.nanmean(c) if ok else size**2 for (c, ok), size in columns]  # or any number
-        return np.array(noise), np.concatenate(added).mean(0)
+        return np.array(noise), added.mean(0)
 
     def cost(self, path: Path, noise: Array, process_noise: Array) -> float:
         """Twice the negative log density of a path, but for a constant; NaN where f_p fails."""

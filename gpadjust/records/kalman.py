@@ -17,7 +17,8 @@ class Link(NamedTuple):
 
     matrices: Array  # T x D x D
     offsets: Array  # T x D
-    measured: Array  # of the first entries of the states, T + 1 x d; NaN where there is nothing
+    outputs: Array  # which are measured of the states, outputs[t] x[t]; T + 1 x m x D
+    measured: Array  # T + 1 x m; NaN where there is nothing
 
 
 class Moments(NamedTuple):
@@ -48,13 +49,13 @@ def smooth_chain(
 
     The last entries of a state, beyond those that a stretch starts again with, are constants that
     all stretches share. Starts are means and variances ``d`` of the first state of each stretch, of
-    the first one of all ``D`` entries; noises are variances ``d``.
+    the first one of all ``D`` entries; the noise is variances ``m``, the process noise ``d``.
 
     Returns:
         What is known of each stretch, and the log density of what was measured.
     """
     (mean, variance), log_density, filtered = starts[0], 0.0, []
-    covariance, d = np.diag(variance), len(noise)
+    covariance, d = np.diag(variance), len(process_noise)
     for link, (first, spread) in zip(links, starts, strict=True):
         mean = np.concatenate([first[:d], mean[d:]])
         shared, covariance = covariance[d:, d:], np.zeros_like(covariance)
@@ -98,11 +99,59 @@ def draw_paths(
     return paths
 
 
+def measure(
+    mean: Array, covariance: Array, outputs: Array, measured: Array, noise: Array
+) -> tuple[Array, Array, float]:
+    """A state by outputs of it, ``m x D`` times the state, that were measured (Kalman 1960).
+
+    What was not measured is NaN; the noise is variances ``m`` of independent errors.
+
+    Returns:
+        Mean and covariance of the state, and the log density of what was measured.
+
+    Raises:
+        LinAlgError: If a variance is no positive number.
+    """
+    log_density = 0.0
+    for i in np.flatnonzero(~np.isnan(measured)):  # one by one, as their errors are independent
+        spread = covariance @ outputs[i]
+        variance, error = outputs[i] @ spread + noise[i], measured[i] - outputs[i] @ mean
+        if not 0 < variance < math.inf:
+            raise np.linalg.LinAlgError("a variance is no positive number")
+        mean = mean + spread / variance * error
+        covariance = covariance - np.outer(spread, spread) / variance
+        log_density -= 0.5 * (error**2 / variance + math.log(2 * math.pi * variance))
+    return mean, (covariance + covariance.T) / 2, float(log_density)
+
+
+def expected_squares(
+    links: Sequence[Link], found: Sequence[Smoothed], d: int
+) -> tuple[Array, Array]:
+    """Squares of errors as they are expected given what is known of the states.
+
+    Returns:
+        Those of the measurements, ``sum (T + 1) x m``, and of the first ``d`` entries of what the
+        steps added, ``sum T x d``.
+    """
+    errors, added = [], []
+    for link, (states, crossed) in zip(links, found, strict=True):
+        outputs, means, spread = link.outputs, states.means, states.covariances
+        off = link.measured - np.einsum("tij,tj->ti", outputs, means)
+        errors.append(off**2 + np.einsum("tij,tjk,tik->ti", outputs, spread, outputs))
+        lead = link.matrices[:, :d]
+        step = means[1:, :d] - np.einsum("tij,tj->ti", lead, means[:-1]) - link.offsets[:, :d]
+        of_both = np.einsum("tij,tij->ti", crossed[:, :d], lead)
+        of_first = np.einsum("tij,tjk,tik->ti", lead, spread[:-1], lead)
+        of_last = np.diagonal(spread[1:, :d, :d], axis1=1, axis2=2)
+        added.append(step**2 + (of_last - 2 * of_both + of_first).clip(0))
+    return np.concatenate(errors), np.concatenate(added)
+
+
 def _filter(
     link: Link, mean: Array, covariance: Array, noise: Array, process_noise: Array
 ) -> tuple[Filtered, float]:
     """Kalman's filter of a stretch, and the log density of what was measured in it."""
-    D, d, log_density = len(mean), len(noise), 0.0
+    D, d, log_density = len(mean), len(process_noise), 0.0
     shape = len(link.measured), D
     ahead, known = (Moments(np.empty(shape), np.empty((*shape, D))) for _ in range(2))
     added = np.zeros((D, D))
@@ -113,14 +162,8 @@ def _filter(
             mean = matrix @ mean + link.offsets[t - 1]
             covariance = matrix @ covariance @ matrix.T + added
         ahead.means[t], ahead.covariances[t] = mean, covariance
-        for i in np.flatnonzero(~np.isnan(measured)):  # one by one, as their errors are independent
-            variance, error = covariance[i, i] + noise[i], measured[i] - mean[i]
-            if not 0 < variance < math.inf:
-                raise np.linalg.LinAlgError("a variance is no positive number")
-            gain = covariance[i] / variance
-            mean, covariance = mean + gain * error, covariance - np.outer(gain, covariance[i])
-            log_density -= 0.5 * (error**2 / variance + math.log(2 * math.pi * variance))
-        covariance = (covariance + covariance.T) / 2
+        mean, covariance, gained = measure(mean, covariance, link.outputs[t], measured, noise)
+        log_density += gained
         known.means[t], known.covariances[t] = mean, covariance
     return Filtered(ahead, known), float(log_density)
 

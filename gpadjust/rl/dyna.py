@@ -423,6 +423,8 @@ class Dyna(TaskAgent, OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         if self.task is not None:
+            way_out = "MPCAgent and PolicySearchAgent can"
+            self.task.refuse(type(self).__name__, "sensors", way_out)
             self.task.check_spaces(self.observation_space, self.action_space)
         self.replay_buffer_kwargs |= {
             "real_fraction": self.options.real_fraction,

@@ -89,6 +89,7 @@ class ModelVecEnv(VecEnv):
         worst_reward: float = np.inf,
     ) -> None:
         spec = task.dynamics.spec
+        task.refuse("ModelVecEnv", "sensors", "MPCAgent and PolicySearchAgent can")
         task.check_spaces(observation_space, action_space)
         if not task.dynamics.is_fitted:
             raise RuntimeError(

@@ -1,5 +1,6 @@
-"""Names and kinds of the entries of state and action, for dynamics and systems."""
+"""Names and kinds of the entries of state and action, and what is measured of them."""
 
+from gpadjust.states.sensors import Sensors
 from gpadjust.states.state_spec import StateSpec
 
-__all__ = ["StateSpec"]
+__all__ = ["Sensors", "StateSpec"]

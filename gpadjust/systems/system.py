@@ -10,7 +10,7 @@ import gymnasium as gym
 from torch import Tensor
 
 from gpadjust.physics import Physics, Unknown, as_physics
-from gpadjust.states import StateSpec
+from gpadjust.states import Sensors, StateSpec
 from gpadjust.systems.wrappers import NoisySensors
 
 if TYPE_CHECKING:
@@ -41,8 +41,10 @@ class System:
         action_rate: As of a :class:`~gpadjust.control.Task`.
         physics_error: As of :class:`~gpadjust.dynamics.LearnedDynamics`, of the dynamics that
             :meth:`task` makes.
-        noise: Standard deviations of the sensors' noise, by the name of the state, which
+        noise: Standard deviations of the sensors' noise, by the name of the state or output, which
             :class:`NoisySensors` adds to what the environment observes.
+        sensors: What is measured of the states, as of a :class:`~gpadjust.control.Task`; the
+            environment observes nothing else. Default: all of the states.
 
     Raises:
         TypeError: If ``env``, ``physics`` or ``reward`` is not callable, or ``spec`` no
@@ -70,6 +72,7 @@ class System:
     action_rate: Any = None
     physics_error: Mapping[str, float] | None = None
     noise: Mapping[str, float] | None = None
+    sensors: Sensors | None = None
 
     def __post_init__(self) -> None:
         """Check the parts that a task does not check."""
@@ -105,7 +108,9 @@ class System:
             )
         if self.episode_length not in (None, limit):
             env = gym.wrappers.TimeLimit(env, self.episode_length)
-        return NoisySensors(env, self.spec, self.noise) if self.noise else env
+        if not self.noise and self.sensors is None:
+            return env
+        return NoisySensors(env, self.spec, self.noise or {}, self.sensors)
 
     def task(self, dynamics: Dynamics | None = None) -> Task:
         """The task that agents and planners take.
@@ -131,6 +136,7 @@ class System:
             initial_states=self.start,
             episode_length=self.episode_length,
             state_bounds=self.state_bounds,
+            sensors=self.sensors,
             constraints=self.constraints,
             probability=self.probability,
             action_rate=self.action_rate,

@@ -1,4 +1,4 @@
-"""Environments seen otherwise: with the previous action, through noisy sensors."""
+"""Environments seen otherwise: with the previous action, through sensors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from gpadjust.checks import checked_number
-from gpadjust.states import StateSpec
+from gpadjust.states import Sensors, StateSpec
 
 Array = NDArray[np.float32]
 
@@ -91,16 +91,17 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
 
 
 class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.RecordConstructorArgs):
-    """Adds normal noise to the states that an environment observes; rewards are of the true state.
+    """Shows what sensors measure of the states, with normal noise; rewards are of the true state.
 
     Args:
         env: The environment, which observes the states of the spec.
         spec: What they are; an angle gets its noise before its sine and cosine are taken.
-        sd: Standard deviations by the name of the state; the others have no noise.
+        sd: Standard deviations by the name of the state or output; the others have no noise.
+        sensors: What is measured. Default: all of the states.
 
     Raises:
         TypeError: If a standard deviation is no number.
-        ValueError: If one is negative, or there is no such state.
+        ValueError: If one is negative, or there is no such state or output.
 
     Example:
         >>> from gpadjust import systems
@@ -109,22 +110,37 @@ class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.Record
     """
 
     def __init__(
-        self, env: gym.Env[Array, Array], spec: StateSpec, sd: Mapping[str, float]
+        self,
+        env: gym.Env[Array, Array],
+        spec: StateSpec,
+        sd: Mapping[str, float],
+        sensors: Sensors | None = None,
     ) -> None:
-        gym.utils.RecordConstructorArgs.__init__(self, spec=spec, sd=dict(sd))
+        gym.utils.RecordConstructorArgs.__init__(self, spec=spec, sd=dict(sd), sensors=sensors)
         gym.ObservationWrapper.__init__(self, env)
         self.spec_of_states = spec
+        self.sensors = Sensors(spec.states) if sensors is None else sensors
+        self._seen = self.sensors.spec(spec)
         for name, value in sd.items():
             checked_number(f"The noise of {name!r}", value, least=0)
-            if name not in spec.states:
-                raise ValueError(f"There is no state {name!r}; the states are {spec.states}.")
-        self._columns = [i for i, name in enumerate(spec.states) if name in sd]
-        self._sd = np.array([sd[spec.states[i]] for i in self._columns])
+            if name not in self.sensors.outputs:
+                what = "state" if sensors is None else "output"
+                raise ValueError(
+                    f"There is no {what} {name!r}; the {what}s are {self.sensors.outputs}."
+                )
+        each = [sd.get(name, 0.0) for name in self.sensors.outputs]
+        self._sd = torch.tensor(each, dtype=torch.float64)
+        if sensors is not None:
+            dtype: Any = env.observation_space.dtype
+            shape = (self._seen.observation_dim,)
+            self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape, dtype)
 
     def observation(self, observation: Array) -> Array:
-        """Add the noise, by the environment's generator."""
-        spec = self.spec_of_states
-        state = spec.decode(torch.from_numpy(observation.astype(np.float64)))
-        noise = self._sd * self.unwrapped.np_random.normal(size=len(self._sd))
-        state[self._columns] += torch.from_numpy(noise)
-        return spec.observe(state).numpy().astype(observation.dtype)
+        """Measure, and add the noise by the environment's generator."""
+        states = self.spec_of_states.decode(torch.from_numpy(observation.astype(np.float64)))
+        values = self.sensors.measure(self.spec_of_states, states.unsqueeze(0)).squeeze(0)
+        noisy = self._sd > 0
+        noise = torch.from_numpy(self.unwrapped.np_random.normal(size=int(noisy.sum())))
+        values = values.clone()
+        values[noisy] += self._sd[noisy] * noise
+        return self._seen.observe(values).numpy().astype(observation.dtype)

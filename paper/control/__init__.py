@@ -77,3 +77,47 @@ class Known(Experiment):
     def describe(self, *kind: Any) -> dict[str, Any]:
         """The settings, and how far plans look."""
         return {**asdict(self.settings), "horizon": HORIZONS[kind[0]]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class HiddenSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p"""
+    noise: float = 0.01
+    """standard deviation of the sensors' noise, in m and rad"""
+    sequences: int = 64
+    """that are planned, in each round of the cross-entropy method"""
+    rounds: int = 1
+    """of these after the first"""
+    first_rounds: int = 8
+    """of these when a trial begins, with all its steps"""
+    elites: int = 8
+    """of these"""
+    fit: Literal["map", "bayes"] = "map"
+    """of the learnt models, as of `gpadjust.fit`"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hidden(Experiment):
+    """Systems of which positions and angles alone are measured, with noise."""
+
+    runs: int = 5
+    out: Path = Path("results/hidden")
+    settings: HiddenSettings = field(default_factory=HiddenSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {"cart_pole": "cart-pole", "furuta": "Furuta pendulum"},
+        "learner": {
+            "full": "all states, without noise",
+            "filter": "positions and angles, by the filter",
+            "quotient": "positions and angles, by difference quotients",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )

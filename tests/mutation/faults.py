@@ -164,7 +164,7 @@ FAULTS = (
         "The stretches of a drawn path have constants of their own.",
     ),
     Fault(
-        "gpadjust/records/chain.py",
+        "gpadjust/records/kalman.py",
         "added.append(step**2 + (of_last - 2 * of_both + of_first).clip(0))",
         "added.append(step**2)",
         "The process noise is that of the most likely path: too small.",

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import block_diag
 
 from gpadjust.dynamics import StateSpec
 from gpadjust.physics import FunctionPhysics, ODEPhysics, PhysicsError, Unknown
@@ -55,14 +56,15 @@ def inside(truth, interval):
 
 @pytest.fixture
 def chain():
-    """Two short stretches of two states and a constant, some of it not measured."""
+    """Two short stretches of two states and a constant; some of two outputs is not measured."""
     rng = np.random.default_rng(0)
     links = []
     for steps in (3, 2):
         matrices = np.tile(np.eye(3), (steps, 1, 1))
         matrices[:, :2] = rng.normal(size=(steps, 2, 3)) / 2
         offsets = np.concatenate([rng.normal(size=(steps, 2)), np.zeros((steps, 1))], axis=1)
-        links.append(Link(matrices, offsets, rng.normal(size=(steps + 1, 2))))
+        outputs = rng.normal(size=(steps + 1, 2, 3))
+        links.append(Link(matrices, offsets, outputs, rng.normal(size=(steps + 1, 2))))
     links[0].measured[1, 0] = links[1].measured[0] = np.nan
     starts = [(rng.normal(size=3), rng.uniform(0.5, 2, size=3)) for _ in links]
     return links, starts, np.array([0.3, 0.1]), np.array([0.2, 0.05])
@@ -89,16 +91,17 @@ def dense(links, starts, noise, scatter):
                 root[there + i, next(free)] += math.sqrt(scatter[i])
     prior = root @ root.T
     assert prior.shape == shape
-    values = np.concatenate([np.pad(k.measured, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
-                             for k in links])  # fmt: skip
+    values = np.concatenate([link.measured.ravel() for link in links])
     seen = np.flatnonzero(~np.isnan(values))
-    errors = np.tile([*noise, 0.0], rows[-1] // 3)[seen]
-    spread = prior[np.ix_(seen, seen)] + np.diag(errors)
-    gain = np.linalg.solve(spread, prior[seen]).T
-    off = values[seen] - mean[seen]
+    outputs = block_diag(*(each for link in links for each in link.outputs))[seen]
+    errors = np.tile(noise, rows[-1] // 3)[seen]
+    spread = outputs @ prior @ outputs.T + np.diag(errors)
+    gain = np.linalg.solve(spread, outputs @ prior).T
+    off = values[seen] - outputs @ mean
     normal = torch.distributions.MultivariateNormal(torch.zeros(len(seen)).double(),
                                                     torch.from_numpy(spread))  # fmt: skip
-    return mean + gain @ off, prior - gain @ prior[seen], float(normal.log_prob(torch.tensor(off)))
+    log_density = float(normal.log_prob(torch.tensor(off)))
+    return mean + gain @ off, prior - gain @ outputs @ prior, log_density
 
 
 def test_the_smoother_is_the_conditional_distribution_of_all_states(chain):

@@ -1,0 +1,101 @@
+"""What is measured of a state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpadjust.checks import checked_number
+from gpadjust.states.spec_checks import checked_names
+from gpadjust.states.state_spec import StateSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Sensors:
+    """The outputs of a state that are measured, with noise; the rest of the state is hidden.
+
+    Args:
+        outputs: The names of the states that are measured, angles as their sine and cosine; or
+            those of what ``function`` returns.
+        function: Outputs ``N x len(outputs)`` of states ``N x state_dim``, in PyTorch. Default: the
+            states of these names.
+        noise: First guesses of the standard deviations of the noise, by the name of the output,
+            each as good as a few measurements. Default: a tenth of what an output changes by in a
+            step.
+
+    Raises:
+        TypeError: If names are not strings, or ``function`` is none.
+        ValueError: If there is no output, or a guess is of no output or not positive.
+
+    Example:
+        >>> import torch
+        >>> from gpadjust.states import Sensors, StateSpec
+        >>> spec = StateSpec(["theta", "theta_dot"], ["torque"], angles=["theta"])
+        >>> encoder = Sensors(["theta"])
+        >>> values = encoder.measure(spec, torch.tensor([[0.5, 2.0]]))
+        >>> encoder.spec(spec).observe(values)
+        tensor([[0.4794, 0.8776]])
+        >>> camera = Sensors(["height"], lambda states: states[:, :1].cos())
+        >>> camera.measure(spec, torch.tensor([[0.5, 2.0]]))
+        tensor([[0.8776]])
+    """
+
+    outputs: Sequence[str]
+    function: Callable[[Tensor], Tensor] | None = None
+    _: KW_ONLY
+    noise: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check names and guesses."""
+        object.__setattr__(self, "outputs", checked_names(self.outputs, "outputs"))
+        if not self.outputs:
+            raise ValueError("outputs must be one or more different names; found none.")
+        if self.function is not None and not callable(self.function):
+            raise TypeError(f"function must be a function of states; found {self.function!r}.")
+        object.__setattr__(self, "noise", dict(self.noise))
+        for name, guess in self.noise.items():
+            checked_number(f"The noise of {name!r}", guess, above=0)
+            if name not in self.outputs:
+                raise ValueError(f"There is no output {name!r}; the outputs are {self.outputs}.")
+
+    def spec(self, spec: StateSpec) -> StateSpec:
+        """The outputs as a spec, which says how they are observed.
+
+        Raises:
+            ValueError: If an output is none of the states of ``spec``, and there is no function.
+        """
+        if self.function is not None:
+            return StateSpec(self.outputs, spec.actions)
+        unknown = [name for name in self.outputs if name not in spec.states]
+        if unknown:
+            raise ValueError(
+                f"Sensors: there is no state {unknown[0]!r}; the states are {spec.states}. Of "
+                "other outputs say the function, Sensors(names, function)."
+            )
+        angles = [name for name in self.outputs if name in spec.angles]
+        return StateSpec(self.outputs, spec.actions, angles=angles)
+
+    def measure(self, spec: StateSpec, states: Tensor) -> Tensor:
+        """Outputs ``N x len(outputs)`` of states ``N x state_dim``, without noise.
+
+        Raises:
+            ValueError: If the function returns another shape.
+        """
+        if self.function is None:
+            return states[:, [spec.states.index(name) for name in self.outputs]]
+        found: Any = self.function(states)
+        if not isinstance(found, Tensor) or found.shape != (len(states), len(self.outputs)):
+            raise ValueError(
+                f"Sensors: function must return a tensor of shape {len(states)} x "
+                f"{len(self.outputs)}, the outputs {self.outputs} of each state; found "
+                f"{tuple(torch.as_tensor(found).shape)}."
+            )
+        return found
+
+    def describe(self) -> dict[str, Any]:
+        """Return the sensors in plain values: of the function, whether there is one."""
+        return {"outputs": [*self.outputs], "function": self.function is not None}

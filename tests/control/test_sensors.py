@@ -1,0 +1,227 @@
+"""Hidden states: the filter by a dense Gaussian, the smoother by what was simulated, agents."""
+
+from dataclasses import replace
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from gpadjust.control import (
+    MPC,
+    CrossEntropy,
+    EpisodeCheckpoint,
+    Estimate,
+    MPCAgent,
+    Planner,
+    PolicySearch,
+    PolicySearchAgent,
+    StateFilter,
+    Task,
+    linear_policy,
+    resume,
+)
+from gpadjust.control.smoothed_episodes import Seen, smooth_episodes
+from gpadjust.dynamics import LearnedDynamics, PhysicsDynamics
+from gpadjust.models import ZeroMeanGP
+from gpadjust.states import Sensors, StateSpec
+from gpadjust.systems import NoisySensors, System
+
+SPEC = StateSpec(["x", "v"], ["force"])
+STEP, LENGTH, NOISE = 0.2, 8, 0.02
+PLAN = Planner(search=CrossEntropy(1), horizon=3, num_random=32)
+SEARCH = PolicySearch(updates=4, num_starts=4, num_functions=2)
+
+
+def glide(X, drag=0.0):
+    x, v, force = X.unbind(-1)
+    new = v + STEP * (force - drag * v)
+    return torch.stack([x + STEP * (v + new) / 2, new], dim=-1)
+
+
+def start(n):
+    return torch.tensor([1.0, 0.0]).double() + 0.1 * torch.randn(n, 2, dtype=torch.float64)
+
+
+def near_zero(states, actions, next_states):
+    return -next_states[:, 0].square()
+
+
+class Glider(gym.Env):
+    """A mass with a drag of which the physics knows nothing."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.array([1.0, 0.0]) + 0.1 * self.np_random.normal(size=2)
+        self.history = [self.state]
+        return self.state.copy(), {}
+
+    def step(self, action):
+        row = torch.tensor([[*self.state, action[0]]]).double()
+        self.state = glide(row, drag=0.5)[0].numpy()
+        self.history.append(self.state)
+        return self.state.copy(), -(self.state[0] ** 2), False, False, {}
+
+
+def glider(**given):
+    dynamics = LearnedDynamics(
+        SPEC, glide, fit_options={"method": "map", "num_starts": 1, "num_screened": 0}
+    )
+    parts = {"sensors": Sensors(["x"]), "noise": {"x": NOISE}, "episode_length": LENGTH}
+    wide = torch.tensor([[-50.0, -50.0], [50.0, 50.0]])
+    parts |= {"start": start, "state_bounds": wide, **given}
+    system = System(Glider, SPEC, glide, near_zero, **parts)
+    return system.make(), system.task(dynamics)
+
+
+def make_agent(kind, env, task, **given):
+    how = {MPCAgent: {"each_step": PLAN, "first": PLAN},
+           PolicySearchAgent: {"policy": linear_policy, "search": SEARCH}}  # fmt: skip
+    return kind(env, task, **how[kind], score_horizons=(), seed=0, **given)
+
+
+def task_of(sensors, physics=glide, spec=SPEC):
+    dynamics = PhysicsDynamics(spec, physics)
+    return Task(dynamics, near_zero, initial_states=start, episode_length=5, sensors=sensors)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "row"),
+    [(Sensors(["x"]), [1.0, 0.0]), (Sensors(["sum"], lambda s: s.sum(-1, keepdim=True)), [1, 1])],
+)
+def test_the_filter_is_the_conditional_distribution_of_a_linear_system(sensors, row):
+    task = task_of(sensors)
+    noise, added = torch.tensor([0.3]).double(), torch.tensor([0.1, 0.2]).double()
+    first = Estimate(
+        torch.tensor([1.0, 0.0]).double(), torch.diag(torch.tensor([0.5, 2.0])).double()
+    )
+    known = StateFilter(first, noise, added)
+    forces, seen = [0.5, -1.0], torch.tensor([[1.2], [0.9], [1.5]]).double()
+    # Dense: states of all times by independent normal numbers.
+    A = torch.tensor([[1.0, STEP], [0.0, 1.0]]).double()
+    B = torch.tensor([STEP**2 / 2, STEP]).double()
+    mean, root = [first.mean], [torch.zeros(2, 6).double()]
+    root[0][:, :2] = first.covariance.sqrt()
+    for t, force in enumerate(forces):
+        mean.append(A @ mean[-1] + B * force)
+        new = A @ root[-1]
+        new[:, 2 + 2 * t : 4 + 2 * t] += torch.diag(added)
+        root.append(new)
+    H = torch.tensor(row).double()
+    outputs = torch.stack([H @ each for each in root])
+    gain = root[-1] @ outputs.T @ torch.linalg.inv(outputs @ outputs.T + noise**2 * torch.eye(3))
+    off = seen[:, 0] - torch.stack([H @ each for each in mean])
+    estimate, steps = None, [*forces, 0.0]
+    for value, force in zip(seen, steps, strict=True):
+        (estimate,) = known.follow(task, value[None], [estimate])
+        estimate = estimate._replace(action=torch.tensor([force]).double())
+    torch.testing.assert_close(estimate.mean, mean[-1] + gain @ off)
+    torch.testing.assert_close(estimate.covariance, (root[-1] - gain @ outputs) @ root[-1].T)
+
+
+def test_angles_go_the_shortest_way():
+    spec = StateSpec(["x", "v"], ["force"], angles=["x"])
+    task = task_of(Sensors(["x"]), spec=spec)
+    first = Estimate(torch.tensor([3.1, 0.0]).double(), torch.eye(2).double())
+    known = StateFilter(first, torch.tensor([1.0]).double(), torch.zeros(2).double())
+    (found,) = known.follow(task, spec.observe(torch.tensor([[-3.1, 0.0]]).double())[:, :2], [None])
+    assert abs(abs(found.mean[0]) - torch.pi) < 1e-9
+
+
+def test_noises_and_hidden_states_are_found():
+    task, rng = task_of(Sensors(["x"])), np.random.default_rng(0)
+    known = StateFilter.guessed(task, torch.tensor([[-1.0], [1.0]]).double())
+    episodes, truth = [], []
+    for _ in range(6):
+        state, states = start(1)[0], []
+        forces = torch.from_numpy(rng.choice([-1.0, 1.0], size=(40, 1)))
+        for force in [*forces, None]:
+            states.append(state)
+            if force is not None:
+                state = glide(torch.cat([state, force])[None])[0]
+                state = state + torch.tensor([0.0, 0.1]) * torch.from_numpy(rng.normal(size=2))
+        truth.append(torch.stack(states))
+        seen = truth[-1][:, :1] + 0.05 * torch.from_numpy(rng.normal(size=(41, 1)))
+        episodes.append(Seen(seen, forces))
+    learnt, paths = smooth_episodes(task, known, episodes, seed=0)
+    assert abs(learnt.noise.item() / 0.05 - 1) < 0.15
+    assert abs(learnt.process_noise[1].item() / 0.1 - 1) < 0.4
+    error = torch.cat(paths) - torch.cat(truth)
+    assert error[:, 1].square().mean().sqrt() < 0.2
+    rough = torch.cat([(path[1:, 1] - path[:-1, 1]).abs() for path in paths]) - STEP
+    assert rough.square().mean().sqrt() > 0.05  # as the machine's; the most likely path is smooth
+
+
+@pytest.mark.parametrize("kind", [MPCAgent, PolicySearchAgent])
+def test_agents_learn_from_positions_alone(kind, tmp_path):
+    torch.manual_seed(0)
+    agent = make_agent(kind, *glider())
+    checkpoint = EpisodeCheckpoint(tmp_path / "run")
+    agent.learn(2 * LENGTH, checkpoint)
+    recorded = agent.recorded_episodes()
+    assert recorded.states.shape == (2 * LENGTH, 2)
+    assert agent.task.dynamics.num_transitions == 2 * LENGTH
+    true = torch.from_numpy(np.stack(agent.env.unwrapped.history))
+    off = recorded.states[-LENGTH:] - true[:-1]
+    assert off[:, 0].abs().max() < 0.1
+    assert off[:, 1].abs().max() < 0.3
+    assert 0.2 < agent.filter.noise.item() / NOISE < 3
+    assert agent.recorded_episodes(newest=3).states.equal(recorded.states[-3:])
+    whole = agent.learn(LENGTH).recorded_episodes()
+    resumed = resume(tmp_path / "run", *glider()).learn(LENGTH).recorded_episodes()
+    assert resumed.states.equal(whole.states)
+
+
+def test_a_policy_keeps_its_estimates_and_forgets_them_where_an_episode_begins():
+    _, task = glider()
+    task = replace(task, dynamics=PhysicsDynamics(SPEC, glide))
+    mpc = MPC(task, torch.tensor([[-1.0], [1.0]]).double(), PLAN, first=PLAN)
+    _, state = mpc.predict(np.array([[1.0], [0.5]]))
+    before = [each.estimate for each in state]
+    assert before[0].covariance[0, 0] < before[0].covariance[1, 1]
+    _, state = mpc.predict(np.array([[1.0], [0.5]]), state, np.array([False, True]))
+    assert not torch.equal(state[0].estimate.covariance, before[0].covariance)
+    torch.testing.assert_close(state[1].estimate.covariance, before[1].covariance)
+
+
+def test_an_environment_shows_what_sensors_measure():
+    env, task = glider(sensors=Sensors(["both"], lambda s: s.sum(-1, keepdim=True)), noise=None)
+    assert env.observation_space.shape == (1,)
+    seen, _ = env.reset(seed=0)
+    assert seen.item() == pytest.approx(env.unwrapped.state.sum())
+    assert task.observed.states == ("both",)
+    assert task.describe()["sensors"] == {"outputs": ["both"], "function": True}
+    with pytest.raises(ValueError, match=r"no output 'x'; the outputs are \('both',\)"):
+        NoisySensors(Glider(), SPEC, {"x": 1.0}, task.sensors)
+
+
+def test_what_cannot_be_done_with_sensors_is_refused_before_a_real_step():
+    env, task = glider()
+    with pytest.raises(ValueError, match="known where episodes start"):
+        replace(task, initial_states=None)
+    with pytest.raises(TypeError, match="sensors"):
+        replace(task, sensors=["x"])
+    with pytest.raises(ValueError, match="spec of the sensors says"):
+        MPCAgent(Glider(), task)
+    nothing = replace(task, dynamics=LearnedDynamics(SPEC, model=ZeroMeanGP))
+    noisy = partial(np.zeros, 1)
+    for given, message in (((nothing, None), "give the dynamics a physics"),
+                           ((task, noisy), "leave action_noise out")):  # fmt: skip
+        agent = make_agent(MPCAgent, env, given[0], action_noise=given[1])
+        with pytest.raises(ValueError, match=message):
+            agent.learn(LENGTH)
+        assert agent.num_timesteps == 0
+
+
+def test_learners_of_stable_baselines_refuse_sensors():
+    from gpadjust.rl import DynaSAC, ModelVecEnv
+
+    env, task = glider()
+    with pytest.raises(ValueError, match="DynaSAC cannot learn a task with sensors; MPCAgent"):
+        DynaSAC("MlpPolicy", env, task)
+    with pytest.raises(ValueError, match="ModelVecEnv cannot learn a task with sensors"):
+        ModelVecEnv(task, 1, env.observation_space, env.action_space)

@@ -1,0 +1,50 @@
+"""What is measured of a state."""
+
+import math
+
+import pytest
+import torch
+
+from gpadjust.states import Sensors, StateSpec
+
+SPEC = StateSpec(["x", "theta", "omega"], ["force"], angles=["theta"])
+STATE = torch.tensor([[1.0, 0.5, 2.0]]).double()
+
+
+def test_states_are_measured_by_name_and_in_the_order_of_the_sensors():
+    sensors = Sensors(["theta", "x"])
+    values = sensors.measure(SPEC, STATE)
+    assert values.tolist() == [[0.5, 1.0]]
+    seen = sensors.spec(SPEC)
+    assert seen.observation_dim == 3
+    torch.testing.assert_close(
+        seen.observe(values), torch.tensor([[math.sin(0.5), math.cos(0.5), 1.0]]).double()
+    )
+
+
+def test_outputs_are_any_function():
+    sensors = Sensors(["height"], lambda states: states[:, 1:2].cos())
+    assert sensors.measure(SPEC, STATE).item() == pytest.approx(math.cos(0.5))
+    assert sensors.spec(SPEC).angles == ()
+    assert sensors.describe() == {"outputs": ["height"], "function": True}
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Sensors([]), ValueError, "one or more"),
+        (lambda: Sensors("x"), TypeError, "sequence of names"),
+        (lambda: Sensors(["x"], 3), TypeError, "function of states; found 3"),
+        (lambda: Sensors(["x"], noise={"v": 1.0}), ValueError, "no output 'v'"),
+        (lambda: Sensors(["x"], noise={"x": 0.0}), ValueError, "above 0"),
+        (lambda: Sensors(["height"]).spec(SPEC), ValueError, r"no state 'height'.*Sensors\(names"),
+        (
+            lambda: Sensors(["a", "b"], lambda states: states[:, 0]).measure(SPEC, STATE),
+            ValueError,
+            r"shape 1 x 2.*found \(1,\)",
+        ),
+    ],
+)
+def test_bad_sensors_are_told(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
