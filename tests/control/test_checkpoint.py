@@ -114,7 +114,7 @@ SCRIPT = """
     if path.exists():
         agent = resume(path, env, task)
     else:
-        plan = Planner(search=CrossEntropy(1), horizon=4, num_random=16)
+        plan = Planner(search=CrossEntropy(1), horizon=0.4, num_random=16)
         agent = MPCAgent(env, task, plan, first=plan, score_horizons=(), seed=0)
     tells = lambda agent, event, values: event == "episode" and print("written", flush=True)
     agent.learn(100 - agent.num_timesteps, [EpisodeCheckpoint(path), tells])
