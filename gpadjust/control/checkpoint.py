@@ -20,13 +20,14 @@ import cloudpickle
 import numpy as np
 import torch
 from filelock import AcquireReturnProxy, FileLock, Timeout
+from torch import Tensor
 
 from gpadjust.checks import check_kind, checked_whole
 from gpadjust.control.recorded_episodes import RecordedEpisodes
 from gpadjust.control.task import Task
 from gpadjust.files import sync_folder
 
-_FORMAT = "gpadjust episode checkpoint, version 4"
+_FORMAT = "gpadjust episode checkpoint, version 5"
 
 
 class TaskAgent(ABC):
@@ -39,6 +40,8 @@ class TaskAgent(ABC):
 
     task: Any
     env: Any
+    num_episodes: int
+    num_timesteps: int
     wall_time: dict[str, float]
     _random_state: RandomState | None = None  # of a run that goes on, until `learn`
 
@@ -52,7 +55,13 @@ class TaskAgent(ABC):
         Raises:
             ValueError: If nobody says how long an episode is.
         """
-        return self.recorded_episodes().complete(self.ready_task(), self.episode_length())
+        return self.recorded_episodes().complete(
+            self.ready_task(), self.episode_length(), self.action_bounds()
+        )
+
+    @abstractmethod
+    def action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the actions, ``2 x action_dim``."""
 
     def episode_length(self) -> int:
         """Steps of an episode: those of the task, or else the time limit of the environment.
@@ -97,6 +106,20 @@ class TaskAgent(ABC):
         finally:
             self.wall_time[part] += time.perf_counter() - start
 
+    def __repr__(self) -> str:
+        """Name the agent, its environment and dynamics, what it has done, and its last reward."""
+        env = "no environment" if self.env is None else layer_names(self.env)[-1]
+        if self.task is None:
+            return f"{type(self).__name__}({env}, no task)"
+        recorded, last = self.recorded_episodes(), ""
+        if recorded.num_transitions:
+            newest = recorded.rewards[recorded.episode == recorded.episode.max()]
+            last = f", last reward {newest.mean():.3g} a step"
+        return (
+            f"{type(self).__name__}({env}, {type(self.task.dynamics).__name__}, "
+            f"{self.num_episodes} episodes learnt, {self.num_timesteps} steps{last})"
+        )
+
     @abstractmethod
     def recorded_episodes(self, newest: int | None = None) -> RecordedEpisodes:
         """The real steps; or the newest of them only."""
@@ -106,9 +129,9 @@ class TaskAgent(ABC):
         """An attribute of the environment or of one that it wraps."""
 
     @classmethod
+    @abstractmethod
     def wrapped(cls, env: Any) -> Any:
         """The user's environment as the agent holds it."""
-        return env
 
     @classmethod
     def described(cls, env: Any) -> dict[str, Any]:
@@ -220,9 +243,14 @@ class EpisodeCheckpoint:
                 os.fsync(file.fileno())
             os.replace(temporary, self.path)
             sync_folder(self.path.parent)
-        except BaseException:
+        except OSError as error:  # a full disk
+            raise OSError(
+                error.errno,
+                f"{error.strerror}; the checkpoint is not written, and {self.path} is what it was. "
+                "Make room and call `learn` or `save` again; the agent has lost nothing",
+            ) from error
+        finally:
             temporary.unlink(missing_ok=True)
-            raise
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from gpadjust.control.constraints import margins
 from gpadjust.control.planner import Plan, Planner
 from gpadjust.control.search import CrossEntropy
 from gpadjust.control.state_filter import Estimate, StateFilter
+from gpadjust.control.step_guard import check_observation
 from gpadjust.control.task import Task
 from gpadjust.models.sampled_functions import seeded
 
@@ -175,6 +176,7 @@ class MPC:
         The state is the plan. Without one all episodes begin. If ``deterministic``, the search is
         always the same.
         """
+        check_observation(observation)
         rows = torch.as_tensor(np.atleast_2d(observation), dtype=torch.float64)
         episodes = going_on(state, episode_start, len(rows))
         known: Sequence[Estimate | None] = [None] * len(rows)
@@ -217,10 +219,11 @@ class MPC:
         left = None if length is None else max(length - steps_done, 1)
         where = self.task, state, self.action_bounds, left
         before = None if earlier is None else earlier.before
+        how: dict[str, Any] = {"before": before, "steps_done": steps_done}
         if earlier is not None and len(earlier.actions):
             horizon = self.each_step.steps_ahead(self.task.dynamics.spec)
             tight = self._margins(state, earlier.actions[:horizon], earlier, covariance)
-            how: dict[str, Any] = {"before": before, "margins": tight}
+            how["margins"] = tight
             known = earlier.actions
             plan = self._in_time(self.each_step, begun).plan(*where, known=known, **how)
             k = len(plan.actions)
@@ -240,11 +243,12 @@ class MPC:
                 if len(plan.actions) < len(kept.actions):
                     return kept
                 return self._begun(plan, earlier, before)
-        plan = self.first.plan(*where, before=before)
+        how["margins"] = None
+        plan = self.first.plan(*where, **how)
         if self.task.constraints is not None:
             # The margins are those of a plan that has none yet.
-            tight = self._margins(state, plan.actions, plan, covariance)
-            plan = self.first.plan(*where, known=plan.actions, before=before, margins=tight)
+            how["margins"] = self._margins(state, plan.actions, plan, covariance)
+            plan = self.first.plan(*where, known=plan.actions, **how)
         return self._begun(plan, earlier, before)
 
     def _in_time(self, planner: Planner, begun: float) -> Planner:

@@ -152,6 +152,7 @@ class Planner:
         num_steps: int | None = None,
         *,
         known: Tensor | None = None,
+        steps_done: int = 0,
         before: Tensor | None = None,
         margins: Tensor | None = None,
     ) -> Plan:
@@ -165,6 +166,7 @@ class Planner:
             num_steps: How many steps are ahead; the plan is of these or of the horizon, ``T``.
                 Default: the episode length of the task.
             known: An earlier plan, ``t x action_dim``; its last action is held where it is shorter.
+            steps_done: How many steps the episode has made by then.
             before: The last action that was made, from which the next one may differ by the task's
                 ``action_rate`` alone. Default: none, where an episode begins.
             margins: Those of the constraints, ``T x c``; see
@@ -188,7 +190,7 @@ class Planner:
         def scored(sequences: Tensor) -> Tensor:
             if best and not rollouts.has_time(num_steps):
                 raise _TimeIsUp
-            rollout = rollouts.follow(state, sequences)
+            rollout = rollouts.follow(state, sequences, steps_done)
             if best and rollout.made.shape[-1] < num_steps:
                 raise _TimeIsUp
             scores = self._checked_scores(score(rollout), len(sequences))
@@ -209,7 +211,8 @@ class Planner:
                     search(None)
                 segment = in_steps("segment", self.segment, spec)
                 if segment is not None and segment < num_steps:
-                    search(self._in_segments(task, state, action_bounds, num_steps, before=before))
+                    where = task, state, action_bounds, num_steps
+                    search(self._in_segments(*where, before, steps_done))
         return best[-1]
 
     def _in_segments(
@@ -218,14 +221,16 @@ class Planner:
         state: Tensor,
         action_bounds: Tensor,
         num_steps: int,
-        *,
         before: Tensor | None,
+        steps_done: int,
     ) -> Tensor:
         """Actions ``num_steps x action_dim`` of segments, each begun in the middle of the last."""
         ahead = replace(self, horizon=self.segment, segment=None, restarts=1)
         actions, known = action_bounds[:0], None
         while (left := num_steps - len(actions)) > 0:
-            plan = ahead.plan(task, state, action_bounds, left, known=known, before=before)
+            done = steps_done + len(actions)
+            how: dict[str, Any] = {"known": known, "before": before, "steps_done": done}
+            plan = ahead.plan(task, state, action_bounds, left, **how)
             k = left if len(plan.actions) == left else -(-len(plan.actions) // 2)
             actions, known = torch.cat([actions, plan.actions[:k]]), plan.actions[k:]
             state, before = plan.next_states[k - 1], plan.actions[k - 1]

@@ -11,6 +11,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from gpadjust.control.delay import find_delay
+from gpadjust.control.reach import reach
 from gpadjust.control.task import Task
 from gpadjust.dynamics import Dynamics, LearnedDynamics, Trajectories
 from gpadjust.dynamics.free_run import typical_change
@@ -19,7 +21,9 @@ from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 from gpadjust.validation.trust import trust
 
+_NEAR = 0.05  # of half the width between bounds: a state that is so near may be held by them
 _REACH = 10.0  # half ranges of the recorded states, from their middle to the bounds
+_ROUNDING = 1e-5  # of set-points, in single precision
 _WINDOWS = 4  # of which trajectories are scored: some half second for a model of an episode
 _FAR = ("nlpd", "coverage", "energy")
 
@@ -70,28 +74,79 @@ class RecordedEpisodes:
         starts = self.states[self.begins]
         return starts[torch.randint(len(starts), (n,))]
 
-    def bounds(self) -> Tensor | None:
+    @property
+    def steps(self) -> Tensor:
+        """The number of each step in its episode, from 1; 0 where its beginning is lost."""
+        rows = torch.arange(self.num_transitions)
+        first = torch.where(self.begins, rows, -1).cummax(0).values
+        lost = (first < 0) | (self.episode[first] != self.episode)
+        return (rows - first + 1).masked_fill(lost, 0)
+
+    def with_still_set_points(self) -> Self:
+        """These episodes, but the exogenous states of a step stay as they were before it."""
+        next_states, still = self.next_states.clone(), self.spec.exogenous_columns
+        next_states[:, still] = self.states[:, still]
+        return replace(self, next_states=next_states)
+
+    def bounds(self, reached: Tensor | None = None) -> Tensor | None:
         """Bounds ``2 x state_dim`` far beyond the states of episodes that have ended.
 
         They are infinite for angles, constants and previous values; None if no episode has ended.
+
+        Args:
+            reached: Least and greatest states that the physics reaches, which the bounds leave by
+                half of its range or more.
         """
         if not self.whole.any():
             return None
         seen = torch.cat([self.states[self.whole], self.next_states[self.whole]])
         low, high = seen.amin(0), seen.amax(0)
-        reach = _REACH * (high - low) / 2
-        reach[high == low] = torch.inf  # that it has not moved yet tells nothing
+        room = _REACH * (high - low) / 2
+        room[high == low] = torch.inf  # that it has not moved yet tells nothing
         for i, name in enumerate(self.spec.states):
             if name in (*self.spec.angles, *self.spec.exogenous, *self.spec.previous):
-                reach[i] = torch.inf
-        return torch.stack([(low + high) / 2 - reach, (low + high) / 2 + reach])
+                room[i] = torch.inf
+        bounds = torch.stack([(low + high) / 2 - room, (low + high) / 2 + room])
+        if reached is not None:
+            room = (reached[1] - reached[0]) / 2
+            bounds[0] = torch.minimum(bounds[0], reached[0] - room)
+            bounds[1] = torch.maximum(bounds[1], reached[1] + room)
+        return bounds
 
-    def complete(self, task: Task, episode_length: int) -> Task:
-        """The task with length, starts and bounds of these episodes where it has none."""
+    def complete(self, task: Task, episode_length: int, action_bounds: Tensor) -> Task:
+        """The task with length, starts and bounds of these episodes where it has none.
+
+        The bounds are beyond what was seen and what the physics reaches within an episode from
+        where these started, by actions within their bounds ``2 x action_dim``.
+        """
         found: dict[str, Any] = {"episode_length": episode_length}
         if self.num_transitions:
-            found |= {"initial_states": self.draw_starts, "state_bounds": self.bounds()}
+            found["initial_states"] = self.draw_starts
+        if self.whole.any() and task.state_bounds is None:
+            physics, starts = task.dynamics.physics_alone(), self.states[self.begins]
+            length = task.episode_length or episode_length
+            reached = (
+                reach(physics, starts, action_bounds, length) if physics and len(starts) else None
+            )
+            found["state_bounds"] = self.bounds(reached)
         return replace(task, **{k: v for k, v in found.items() if getattr(task, k) is None})
+
+    def warn_of_bounds(self, bounds: Tensor) -> None:
+        """Warn if states came to bounds ``2 x state_dim`` that nobody gave."""
+        near = _NEAR * (bounds[1] - bounds[0]) / 2
+        for bound, sign in zip(bounds, (-1, 1), strict=True):
+            come = (sign * (bound - self.next_states) < near).any(0) & bound.isfinite()
+            for i in come.nonzero().flatten().tolist():
+                found = self.next_states[:, i]
+                found = found.amax() if sign > 0 else found.amin()
+                warnings.warn(
+                    f"An episode came to {self.spec.states[i]} = {float(found):.3g}, where the "
+                    f"model was not followed beyond {float(bound):.3g}: a bound of what had been "
+                    "seen and what the physics reaches, which may have held it there. Give the "
+                    "task state_bounds that leave room for where it is to go.",
+                    UserWarning,
+                    stacklevel=5,
+                )
 
     def learnable(self, dynamics: Dynamics) -> Trajectories:
         """All steps but those at which the physics fails.
@@ -127,6 +182,7 @@ class RecordedEpisodes:
         Raises:
             ValueError: If they differ; it shows the worst transition.
         """
+        self._check_reference(task)
         rewards = task.rewards(self.states, self.actions, self.next_states).double()
         error = (rewards - self.rewards).abs()
         if (error > tolerance * self.rewards.abs().max().clamp_min(1e-6)).any():
@@ -149,6 +205,23 @@ class RecordedEpisodes:
                 f"terminated(states) is not the environment's: transition {i} was recorded with "
                 f"terminated={bool(self.terminated[i])}, but {given} {bool(says[i])}; "
                 f"{self._row(i)}. Pass the termination that the environment has."
+            )
+
+    def _check_reference(self, task: Task) -> None:
+        """Compare the reference of a task with the exogenous states that were recorded."""
+        known = self.steps > 0
+        said = task.set_points(self.states[known], self.steps[known])
+        if said is None:
+            return
+        found = self.next_states[known][:, self.spec.exogenous_columns]
+        off = ((said - found).abs() > _ROUNDING * found.abs().clamp_min(1.0)).any(1).nonzero()
+        if len(off):
+            i = int(off[0])
+            raise ValueError(
+                "reference(states, steps) is not the environment's: after step "
+                f"{int(self.steps[known][i])} of an episode it says {said[i].tolist()} for "
+                f"{tuple(self.spec.exogenous)}, but {found[i].tolist()} was observed. Number the "
+                "steps from 1, for the state after the first."
             )
 
     def _row(self, i: int) -> str:
@@ -184,6 +257,8 @@ def learn_dynamics(
         ``energy_15`` of a horizon of 15; ``score_seconds``, ``fit_seconds``.
     """
     start, found = time.perf_counter(), {}
+    if task.reference is not None:  # set-points stay as they are in the dynamics
+        new, recorded = (each.with_still_set_points() for each in (new, recorded))
     learnable = new.learnable(task.dynamics)
     if task.dynamics.is_fitted:
         before = time.perf_counter()
@@ -193,6 +268,7 @@ def learn_dynamics(
         task.dynamics.update(*learnable)
     else:
         _learn_again(task.dynamics, recorded.learnable(task.dynamics))
+    _warn_of_delay(task.dynamics, new, recorded)
     found["fit_seconds"] = time.perf_counter() - start - found.get("score_seconds", 0.0)
     return {name: value for name, value in found.items() if not math.isnan(value)}
 
@@ -205,6 +281,17 @@ def _learn_again(dynamics: Dynamics, data: Trajectories) -> None:
     except BaseException:
         dynamics.load_state_dict(before)
         raise
+
+
+def _warn_of_delay(dynamics: Dynamics, new: RecordedEpisodes, recorded: RecordedEpisodes) -> None:
+    """Warn of a delay that was not told, after the episode that has shown it first."""
+    physics = dynamics.physics_alone()
+    if physics is None:
+        return
+    found = find_delay(physics, recorded.trajectories)
+    earlier = recorded.some(recorded.episode < new.episode.min()).trajectories
+    if found is not None and find_delay(physics, earlier) is None:
+        warnings.warn(str(found), UserWarning, stacklevel=4)
 
 
 def _scores(

@@ -90,18 +90,21 @@ class Rollouts:
             self.num_functions = num_functions
             self.functions = task.dynamics.sample_functions(num_functions)
 
-    def follow(self, state: Tensor, sequences: Tensor) -> Rollout:
+    def follow(self, state: Tensor, sequences: Tensor, steps_done: int = 0) -> Rollout:
         """Take given actions, whatever happens, as fast as they may change.
 
         Args:
             state: Where the episodes start, ``state_dim``.
             sequences: ``n x T x action_dim``.
+            steps_done: How many steps the episode has made by then.
         """
         n, num_steps = sequences.shape[:2]
         if self.task.rate is not None:
             sequences = self.task.rate.limited(sequences, self.before)
         every = sequences.expand(self.num_functions, *sequences.shape)
-        return self._run(state.expand(n, -1), num_steps, lambda t, states: every[:, :, t])
+        return self._run(
+            state.expand(n, -1), num_steps, lambda t, states: every[:, :, t], steps_done
+        )
 
     def act(self, states: Tensor, policy: Policy, num_steps: int) -> Rollout:
         """Let a policy act.
@@ -123,7 +126,11 @@ class Rollouts:
         return time.perf_counter() + num_steps * self._slowest < self.deadline
 
     def _run(
-        self, starts: Tensor, num_steps: int, choose: Callable[[int, Tensor], Tensor]
+        self,
+        starts: Tensor,
+        num_steps: int,
+        choose: Callable[[int, Tensor], Tensor],
+        steps_done: int = 0,
     ) -> Rollout:
         """Run episodes of actions that are chosen by the number of the step and the states."""
         task = self.task.widened(starts.flatten(0, -2))
@@ -140,7 +147,8 @@ class Rollouts:
             # Where the episodes start the physics has to work; later, all may have come to where
             # it does not.
             at, taken = (_tamed_gradient(part.flatten(0, 1)) for part in (states, actions))
-            step = task.step(at, taken, self._move, some_must_succeed=t == 0)
+            ahead = task.set_points(at, steps_done + t + 1)
+            step = task.step(at, taken, self._move, set_points=ahead, some_must_succeed=t == 0)
             parts = (part.unflatten(0, running.shape) for part in step)
             following, rewards, ended, lost, beyond = parts
             made = running & ~lost

@@ -22,6 +22,8 @@ Reward = Callable[[Tensor, Tensor, Tensor], Tensor]
 Termination = Callable[[Tensor], Tensor]
 """Whether states ``N x state_dim`` end an episode, ``N`` booleans."""
 
+Reference = Callable[[Tensor, Tensor], Tensor]
+"""Values of the exogenous states after a step, of the states before it and its number, from 1."""
 Constraints = Callable[[Tensor, Tensor], Tensor]
 """Numbers ``N x c`` of states and actions that led to them, ``N`` rows each; 0 or less is right."""
 
@@ -71,6 +73,11 @@ class Task:
             seen, of an agent that has seen some; else none.
         sensors: What is measured of the states, of which observations then are; it takes
             ``initial_states``. Default: all of the states.
+        reference: Set-points that move during an episode, such as
+            ``lambda states, steps: torch.sin(0.1 * steps).unsqueeze(-1)``: the values of the
+            exogenous states, ``N x len(spec.exogenous)``, after ``steps`` steps of an episode,
+            ``N``, of which the last was made at ``states``, ``N x state_dim``. The environment
+            observes them; plans know them beforehand. Default: they stay as they are.
         constraints: Numbers ``N x c``, in PyTorch's functions, of states ``N x state_dim`` and the
             actions ``N x action_dim`` that led to them: each constraint holds where its number is
             at most 0, such as ``states[:, :1] - 0.5`` before a wall at 0.5. A planner looks for
@@ -102,6 +109,7 @@ class Task:
     episode_length: int | None = None
     state_bounds: Tensor | None = None
     sensors: Sensors | None = None
+    reference: Reference | None = None
     constraints: Constraints | None = None
     probability: float | None = 0.95
     action_rate: ActionRate | float | Sequence[float] | None = None
@@ -117,9 +125,15 @@ class Task:
             ("reward", 3),
             ("terminated", 1),
             ("initial_states", 1),
+            ("reference", 2),
             ("constraints", 2),
         ):
             _check_function(getattr(self, name), name, arguments)
+        if self.reference is not None and not self.dynamics.spec.exogenous:
+            raise ValueError(
+                "reference says the values of exogenous states, but the spec has none; name the "
+                "set-points among `exogenous`, and let the environment observe them."
+            )
         if self.episode_length is not None:
             checked_whole("episode_length", self.episode_length, 1)
         if self.state_bounds is not None:
@@ -167,6 +181,7 @@ class Task:
             self.sensors.measure(self.dynamics.spec, states)
         self.rewards(states, actions, states)
         self.terminations(states)
+        self.set_points(states, torch.ones(len(states), dtype=torch.long))
         self.constraint_values(states, actions)
         self.dynamics.try_physics(states, actions)
 
@@ -229,6 +244,29 @@ class Task:
             return torch.zeros(len(states), dtype=torch.bool)
         return per_row(self.terminated(states.detach()), len(states), "terminated").bool()
 
+    def set_points(self, states: Tensor, steps: Tensor | int) -> Tensor | None:
+        """Return the exogenous states after a step, ``N x len(spec.exogenous)``, checked.
+
+        Args:
+            states: Those before the step, ``N x state_dim``.
+            steps: The number of the step, from 1, ``N`` or one for all.
+
+        Returns:
+            Their values; None without a ``reference``, as they stay.
+        """
+        if self.reference is None:
+            return None
+        numbers = torch.as_tensor(steps).expand(len(states))
+        found = torch.as_tensor(self.reference(states.detach(), numbers), dtype=torch.float64)
+        shape = (len(states), len(self.dynamics.spec.exogenous))
+        if found.shape != shape or not found.isfinite().all():
+            raise ValueError(
+                f"reference(states, steps) must return finite values of shape {shape}, a column "
+                f"for each of {tuple(self.dynamics.spec.exogenous)}; found "
+                f"{tuple(found.shape) if found.shape != shape else found.tolist()}."
+            )
+        return found
+
     def constraint_values(self, states: Tensor, actions: Tensor) -> Tensor:
         """The values of the constraints, checked: ``N x c`` with their gradient, ``N x 0`` of none.
 
@@ -253,6 +291,7 @@ class Task:
         actions: Tensor,
         move: Callable[[Tensor, Tensor], Tensor] | None = None,
         *,
+        set_points: Tensor | None = None,
         some_must_succeed: bool = False,
     ) -> Step:
         """Take actions ``N x action_dim`` at states ``N x state_dim`` of the model.
@@ -261,6 +300,7 @@ class Task:
             states: The states.
             actions: The actions.
             move: Next states of these. Default: drawn from the dynamics, row by row.
+            set_points: The exogenous states afterwards, see :meth:`set_points`. Default: as before.
             some_must_succeed: Whether it is an error that the physics fails for all rows.
 
         Raises:
@@ -269,6 +309,9 @@ class Task:
         """
         move = self.dynamics.sample if move is None else move
         following = step_or_nan(move, states, actions, some_must_succeed=some_must_succeed)
+        if set_points is not None:
+            following = following.clone()
+            following[:, self.dynamics.spec.exogenous_columns] = set_points
         left = ~following.isfinite().all(-1)
         overshoot = following.new_zeros(len(following))
         if self.state_bounds is not None:
@@ -308,6 +351,7 @@ class Task:
             "episode_length": self.episode_length,
             "state_bounds": None if bounds is None else bounds.tolist(),
             "sensors": None if self.sensors is None else self.sensors.describe(),
+            "reference": self.reference is not None,
             "constraints": self.constraints is not None,
             "probability": self.probability,
             "action_rate": None if self.action_rate is None else repr(self.action_rate),

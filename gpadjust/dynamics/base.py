@@ -106,6 +106,13 @@ class Dynamics(ABC):
         """Dynamics to use before there are transitions; None if nothing is known of the system."""
         return self if self.is_fitted else None
 
+    def physics_alone(self) -> Dynamics | None:
+        """The physics by itself, whatever was learnt; None if there is none, or there are several.
+
+        Unless dynamics say something else, none.
+        """
+        return None
+
     def score(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Scores:
         r"""Judge the predictions by transitions that were not learnt from.
 

@@ -46,8 +46,8 @@ class LearnedDynamics(Dynamics):
     Args:
         spec: What the entries of states and actions are.
         physics: The next values of the states that are neither exogenous nor previous values,
-            from these and the actions: columns ``[states, actions]`` in the order of the spec,
-            angles in rad. Several: a list, or a dictionary with their names, as of
+            from the columns that the spec says (``physics_reads``), by default these states and
+            the actions; angles in rad. Several: a list, or a dictionary with their names, as of
             :class:`~gpadjust.CKA`. None for a model without physics.
         model: Makes the model from ``(X, Y, physics=...)``: :class:`~gpadjust.CKA`, another class
             of :mod:`gpadjust.models` (:class:`~gpadjust.ZeroMeanGP` is the one without physics),
@@ -213,8 +213,10 @@ class LearnedDynamics(Dynamics):
 
     def before_data(self) -> Dynamics | None:
         """Itself, once it has learnt; before that its physics, if that is a single one."""
-        if self.is_fitted:
-            return self
+        return self if self.is_fitted else self.physics_alone()
+
+    def physics_alone(self) -> Dynamics | None:
+        """The physics, with the guesses of unknown parameters; None unless it is a single one."""
         alone = self.physics is not None and len(self._recipe.parts) == 1
         if not (alone and self.physics):
             return None

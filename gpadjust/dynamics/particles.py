@@ -202,7 +202,7 @@ def varying_parameters(
 
         def change(states: Tensor, actions: Tensor) -> Tensor:
             actions = actions.expand(*states.shape[:-1], -1)
-            X = torch.cat([states[..., moving], actions], dim=-1)
+            X = spec.physics_inputs(states, actions)
             own = torch.minimum(sd * growth(actions), sd.clamp_min(_MOST))
             rows = X.flatten(0, -2).unsqueeze(1)  # each with parameters of its own
             ends = []

@@ -59,7 +59,8 @@ class PhysicsDynamics(Dynamics):
     Args:
         spec: What the entries of states and actions are.
         physics: The next values of the states that are neither exogenous nor previous values,
-            from these and the actions: columns ``[states, actions]`` in the order of the spec.
+            from the columns that the spec says (``physics_reads``): by default these states and
+            the actions.
         physics_error: Standard deviations of the error of a step of the physics, by the name of the
             state; until unknown parameters are fitted they are its noise. Default: none.
 
@@ -166,6 +167,10 @@ class PhysicsDynamics(Dynamics):
         noise = states.new_tensor(stated) if self._fitted is None else self._fitted.noise
         return noise.expand_as(states)
 
+    def physics_alone(self) -> Dynamics:
+        """These dynamics."""
+        return self
+
     def sample(self, states: Tensor, actions: Tensor) -> Tensor:
         """The next states, with the noise if there is any."""
         noisy = self._fitted is not None or self.physics_error
@@ -240,9 +245,8 @@ class PhysicsDynamics(Dynamics):
     def _step(self, states: Tensor, actions: Tensor, parameters: Tensor | None = None) -> Tensor:
         moving = self.spec.moving
         self._check_pair(states, actions)
-        actions = actions.expand(*states.shape[:-1], -1)
         following = states.clone()
-        inputs = torch.cat([states[..., moving], actions], dim=-1)
+        inputs = self.spec.physics_inputs(states, actions)
         Y = self.physics(inputs if inputs.dim() > 1 else inputs.unsqueeze(0), parameters)
         check_next_values(self.physics, Y, len(moving))
         following[..., moving] = Y
@@ -279,9 +283,8 @@ class _Steps(Misfit):
 
     def __init__(self, physics: Physics, spec: StateSpec, data: Trajectories) -> None:
         self.physics, self.spec, self.data = physics, spec, data
-        moving = spec.moving
-        self.inputs = torch.cat([data.states[:, moving], data.actions], dim=-1)
-        self.targets = spec.change(data.states, data.next_states)[:, moving].mT
+        self.inputs = spec.physics_inputs(data.states, data.actions)
+        self.targets = spec.change(data.states, data.next_states)[:, spec.moving].mT
         self.observed = ~self.targets.isnan()
 
     @property

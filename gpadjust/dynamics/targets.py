@@ -24,6 +24,7 @@ from gpadjust.physics import (
 )
 from gpadjust.physics.memo import RowMemo, row_keys
 from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import side_by_side
 
 Target = Literal["difference", "absolute"]
 _ALL = 2**62  # rows that a memo holds
@@ -44,19 +45,16 @@ class Targets:
         check_choice("target", target, get_args(Target))
         self.spec = spec
         self.target = target
-        moving = spec.moving
-        self.predicted = [moving.index(i) for i in spec.predicted]
-        read = [*moving, *[None] * spec.action_dim, *spec.previous_columns]
+        self.predicted = [spec.moving.index(i) for i in spec.predicted]
+        read = spec.model_columns
         self.angles = [place for place, i in enumerate(read) if i in spec.angle_columns]
+        self.of_physics = [read.index(i) for i in spec.physics_columns]
 
     @property
     def input_names(self) -> tuple[str, ...]:
         """The names of the columns of :meth:`inputs`."""
-        spec = self.spec
-        moving, previous = (
-            [spec.states[i] for i in c] for c in (spec.moving, spec.previous_columns)
-        )
-        return (*moving, *spec.actions, *previous)
+        names = (*self.spec.states, *self.spec.actions)
+        return tuple(names[i] for i in self.spec.model_columns)
 
     @property
     def output_names(self) -> tuple[str, ...]:
@@ -65,13 +63,8 @@ class Targets:
         return tuple(f"change of {n}" if self.target == "difference" else n for n in names)
 
     def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The raw inputs of a model, ``... x d``: states that move, actions, previous values.
-
-        The physics reads the first two only.
-        """
-        moving = states[..., self.spec.moving]
-        previous = states[..., self.spec.previous_columns]
-        return torch.cat([moving, actions.expand(*moving.shape[:-1], -1), previous], dim=-1)
+        """The raw inputs of a model, ``... x d``; see :attr:`StateSpec.model_columns`."""
+        return side_by_side(states, actions)[..., self.spec.model_columns]
 
     def encode(self, states: Tensor, next_states: Tensor) -> Tensor:
         """Targets ``... x m`` of transitions."""
@@ -109,7 +102,7 @@ class TargetPhysics(Physics):
         targets = self.targets
         num_states = len(targets.spec.moving)
         states = X[:, :num_states]
-        read = X[:, : num_states + targets.spec.action_dim]
+        read = X[:, targets.of_physics]
         try:
             following = ask(self.physics.read_rows(read, *parameters))
         except PhysicsError as error:

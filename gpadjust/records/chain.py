@@ -13,6 +13,7 @@ from gpadjust.physics import Physics, PhysicsError
 from gpadjust.records.kalman import Array, Link, Smoothed, expected_squares
 from gpadjust.records.record import Stretch
 from gpadjust.states import StateSpec
+from gpadjust.states.state_spec import side_by_side
 
 _STEP = 1e-4  # of differences, in standard deviations of a parameter or a state
 _WIDE = 10.0  # standard deviations of a state, by which the first one may be elsewhere
@@ -56,10 +57,12 @@ class Chain:
         self, physics: Physics, spec: StateSpec, stretches: Sequence[Stretch], known: Known
     ) -> None:
         self.physics, self.stretches, self.known = physics, tuple(stretches), known
+        self.spec = spec
         self.num_parameters = len(physics.unknowns)
         moving = spec.moving
         self.angles = [moving.index(i) for i in spec.angle_columns if i in moving]
-        self.actions = torch.cat([stretch.actions for stretch in stretches])
+        rows = [side_by_side(stretch.states[:-1], stretch.actions) for stretch in stretches]
+        self.recorded = torch.cat(rows)  # of which f_p reads what does not move
         self.measured = [
             self._unwrapped(stretch.states[:, moving].numpy()) for stretch in stretches
         ]
@@ -85,10 +88,10 @@ class Chain:
                 states[i][t] = now[i]
             onward = [i for i in going if lengths[i] > t + 1]
             if onward and not complete:
-                actions = self.actions[[bounds[i] + t for i in onward]]
-                now[onward] = self._following(now[onward], actions, parameters)
+                recorded = self.recorded[[bounds[i] + t for i in onward]]
+                now[onward] = self._following(now[onward], recorded, parameters)
         everything = np.concatenate([x[:-1] for x in states])
-        following = self._following(everything, self.actions, parameters)
+        following = self._following(everything, self.recorded, parameters)
         return Path(states, measured, parameters, following)
 
     def path(self, states: list[Array], parameters: Array) -> Path:
@@ -97,7 +100,7 @@ class Chain:
         for own, there in zip(measured, states, strict=True):
             own[:, self.angles] = _near(own, there, self.angles)
         rows = np.concatenate([x[:-1] for x in states])
-        return Path(states, measured, parameters, self.asked(rows, self.actions, parameters))
+        return Path(states, measured, parameters, self.asked(rows, self.recorded, parameters))
 
     def first_variances(self, path: Path) -> tuple[Array, Array]:
         """First variances of both noises, by f_p's errors in single steps."""
@@ -128,10 +131,8 @@ class Chain:
         states, N = np.concatenate([x[:-1] for x in path.states]), len(path.following)
         moves = np.vstack([np.diag(_STEP * self.spread), np.zeros((p, d))])
         turns = np.vstack([np.zeros((d, p)), _STEP * np.eye(p)])
-        ends = [
-            self.asked(states + sign * moves[:, None], self.actions, path.parameters + sign * turns)
-            for sign in (1.0, -1.0)
-        ]
+        beside = [(states + s * moves[:, None], path.parameters + s * turns) for s in (1.0, -1.0)]
+        ends = [self.asked(near, self.recorded, parameters) for near, parameters in beside]
         sizes = 2 * np.concatenate([_STEP * self.spread, _STEP * np.ones(p)])
         slope = (ends[0] - ends[1]) / sizes[:, None, None]
         matrices = np.zeros((N, d + p, d + p))
@@ -159,7 +160,7 @@ class Chain:
             states = [x + share * (y - x) for x, y in zip(path.states, ahead, strict=True)]
             moved = path.parameters + share * (parameters - path.parameters)
             rows = np.concatenate([x[:-1] for x in states])
-            following = self.asked(rows, self.actions, moved)
+            following = self.asked(rows, self.recorded, moved)
             other = Path(states, path.measured, moved, following)
             cost = self.cost(other, noise, process_noise)
             if cost <= before + _BETTER:  # false of NaN
@@ -190,24 +191,26 @@ class Chain:
         )
         return float(off.sum() + added.sum() + begins + (path.parameters**2).sum())
 
-    def _following(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
+    def _following(self, states: Array, recorded: torch.Tensor, parameters: Array) -> Array:
         """Next states by f_p, ``n x d``; an error where it fails."""
-        found = self.asked(states, actions, parameters)
+        found = self.asked(states, recorded, parameters)
         if not np.isfinite(found).all():
             failed = np.flatnonzero(~np.isfinite(found).all(1))
+            action = recorded[failed[0], self.spec.state_dim :].tolist()
             raise PhysicsError(
                 f"Physics {self.physics.name!r} fails at {len(failed)} of {len(found)} states "
                 f"where smoothing begins, the first of which is {states[failed[0]].tolist()} under "
-                f"the action {actions[failed[0]].tolist()}. They are measured ones, which may be "
+                f"the action {action}. They are measured ones, which may be "
                 "some noise beyond what is possible, or where the physics leads from `start` with "
                 "its guesses: let it go on smoothly beyond its limits, or say another start."
             )
         return found
 
-    def asked(self, states: Array, actions: torch.Tensor, parameters: Array) -> Array:
+    def asked(self, states: Array, recorded: torch.Tensor, parameters: Array) -> Array:
         """Next states ``... x n x d``, NaN where f_p fails, of angles near those of ``states``."""
-        rows = torch.from_numpy(np.ascontiguousarray(states))
-        X = torch.cat([rows, actions.expand(*rows.shape[:-1], -1)], dim=-1)
+        rows = recorded.expand(*states.shape[:-1], -1).clone()
+        rows[..., self.spec.moving] = torch.from_numpy(np.ascontiguousarray(states))
+        X = rows[..., self.spec.physics_columns]
         unknowns = self.physics.unknowns
         values = unknowns.at(torch.from_numpy(parameters)) if unknowns else None
         found: Array = self.physics.or_nan(X, values).numpy()

@@ -199,6 +199,7 @@ def smooth(
             stacklevel=2,
         )
         stretches = [stretch for stretch in stretches if len(stretch.actions)]
+    stretches = _known_inputs(stretches, spec)
     whole = _checked_physics(physics, records, stretches[0])
     variances = _variances(noise, "noise", spec), _variances(process_noise, "process_noise", spec)
     known = Known(*variances, _starts(start, spec))
@@ -264,6 +265,33 @@ def _checked_physics(
             f"records is {found:g}; pass step={whole.step:g}, or build it with step={found:g}."
         )
     return whole
+
+
+def _known_inputs(stretches: Sequence[Stretch], spec: StateSpec) -> list[Stretch]:
+    """Stretches from where all is known that the physics reads beside the states that move."""
+    beside = [i for i in spec.physics_columns if i < spec.state_dim and i not in spec.moving]
+    for name in (spec.states[i] for i in beside):
+        held = name
+        while held in spec.previous:
+            held = spec.previous[held]
+        if held != name and held in spec.states:
+            raise ValueError(
+                f"The physics reads {name!r}, an earlier value of the state {held!r}, which smooth "
+                "would have to find, too; it takes earlier actions only."
+            )
+    found = []
+    for stretch in stretches:
+        gap = stretch.states[:-1, beside].isnan().any(1)
+        first = int(gap.nonzero().max()) + 1 if gap.any() else 0
+        if first < len(stretch.actions):
+            parts = {
+                name: getattr(stretch, name)[first:] for name in ("states", "actions", "times")
+            }
+            found.append(stretch._replace(**parts))
+    if not found:
+        names = ", ".join(spec.states[i] for i in beside)
+        raise ValueError(f"Expected stretches with all of {names}, which the physics reads.")
+    return found
 
 
 def _variances(given: Tensor | None, name: str, spec: StateSpec) -> Array:

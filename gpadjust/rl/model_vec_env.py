@@ -149,7 +149,8 @@ class ModelVecEnv(VecEnv):
         """Step all particles, without a new start for those whose episode ended."""
         moves = torch.as_tensor(actions, dtype=torch.float64)
         self._is_followed = True
-        step = self._step(self._states, moves)
+        ahead = self.task.set_points(self._states, self._steps + 1)
+        step = self._step(self._states, moves, ahead)
         self._states = step.next_states
         self._steps += 1
         self.num_left_bounds += int(step.left_bounds.sum())
@@ -180,9 +181,14 @@ class ModelVecEnv(VecEnv):
             obs = torch.from_numpy(buffer.observations[rows, 0].astype(np.float64))
             scaled = buffer.actions[rows, 0].astype(np.float64)
             actions = torch.from_numpy(low + (scaled + 1) / 2 * (high - low))
-            states = self.task.dynamics.spec.decode(obs)
+            spec = self.task.dynamics.spec
+            states = spec.decode(obs)
             self.task = self.task.widened(states)
-            step = self._step(states, actions)
+            ahead = None
+            if self.task.reference is not None:  # the numbers of the steps are not in the buffer
+                after = torch.from_numpy(buffer.next_observations[rows, 0].astype(np.float64))
+                ahead = spec.decode(after)[:, spec.exogenous_columns]
+            step = self._step(states, actions, ahead)
             terminated = step.terminated.numpy()
             limits = buffer.timeouts[rows, 0].astype(bool) | step.left_bounds.numpy()
             timeouts = limits & ~terminated
@@ -191,9 +197,9 @@ class ModelVecEnv(VecEnv):
             buffer.dones[rows, 0] = terminated | timeouts
             buffer.timeouts[rows, 0] = timeouts
 
-    def _step(self, states: Tensor, actions: Tensor) -> Step:
+    def _step(self, states: Tensor, actions: Tensor, set_points: Tensor | None) -> Step:
         """A step of the task, in which leaving the bounds is the worst that can be."""
-        step = self.task.step(states, actions, self._move)
+        step = self.task.step(states, actions, self._move, set_points=set_points)
         self.worst_reward = min(self.worst_reward, float(step.rewards.min()))
         if not step.left_bounds.any():
             return step

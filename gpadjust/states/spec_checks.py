@@ -15,8 +15,9 @@ def check_exogenous(name: str, change: Tensor, rounding: Tensor) -> None:
         row = int(moved[0])
         raise ValueError(
             f"State {name!r} is said to be exogenous, which stays as it is during an episode, but "
-            f"it changes by {float(change[row]):.3g} in row {row}. Take it out of `exogenous`, so "
-            "that the model predicts it, or leave out transitions from one episode into the next."
+            f"it changes by {float(change[row]):.3g} in row {row}. Of a set-point that moves give "
+            "the task its `reference`; else take it out of `exogenous`, so that the model predicts "
+            "it, or leave out transitions from one episode into the next."
         )
 
 
@@ -51,6 +52,17 @@ def check_lags(
                     "at an action, or at a state that is not in `previous`."
                 )
             chain.append(held)
+
+
+def check_reads(reads: Sequence[str], states: Sequence[str], actions: Sequence[str]) -> None:
+    """Raise an error unless each name that the physics reads is one state's or action's."""
+    for name in reads:
+        if (name in states) == (name in actions):
+            raise ValueError(
+                f"physics_reads must name states and actions; found {name!r}, which is "
+                f"{'both' if name in states else 'neither'}: the states are {tuple(states)}, the "
+                f"actions are {tuple(actions)}."
+            )
 
 
 def check_previous(name: str, held: str, found: Tensor, before: Tensor, off: Tensor) -> None:

@@ -15,6 +15,7 @@ from gpadjust.states.spec_checks import (
     check_integrated,
     check_lags,
     check_previous,
+    check_reads,
     checked_mapping,
     checked_names,
 )
@@ -34,8 +35,9 @@ class StateSpec:
         actions: The names of the action's entries.
         angles: The states that are angles in rad. Policy and model see their sine and cosine, and
             changes are the shortest way round the circle.
-        exogenous: The states that stay as they are during an episode, such as a target. The policy
-            sees them; models and physics do not.
+        exogenous: The states that stay as they are during an episode, such as a target, or follow
+            the ``reference`` of a task. The policy sees them; models and physics do not, unless
+            ``physics_reads`` names them.
         integrated: For states that a model need not predict, the states that are their
             velocities: :math:`q' = q + h (v + v') / 2`.
         step: The time step :math:`h`, in the time unit of the velocities; needed by ``integrated``.
@@ -43,8 +45,12 @@ class StateSpec:
             action or state: ``{"last_force": "force"}``, or ``{"x_1": "x", "x_2": "x_1"}`` for two
             steps back. These are the lagged outputs and inputs of an autoregressive model (NARX).
             What a system does may depend on them, as where it follows its actions with a delay, or
-            where not all of its state is measured: policy and models see them, models need not
-            predict them, and the physics knows nothing of them. What holds an angle is an angle.
+            where not all of its state is measured: policy and models see them, and models need not
+            predict them. What holds an angle is an angle.
+        physics_reads: The columns of the physics: names of states and actions in its order, such
+            as ``["x", "v", "last_force"]`` of a system that follows its force a step late. What the
+            physics reads, models read. Default: the states that are neither exogenous nor
+            ``previous``, then the actions.
 
     Raises:
         TypeError: If names are not strings, ``integrated`` or ``previous`` is no mapping or
@@ -76,10 +82,11 @@ class StateSpec:
     integrated: Mapping[str, str] = field(default_factory=dict, hash=False)
     step: float | None = None
     previous: Mapping[str, str] = field(default_factory=dict, hash=False)
+    physics_reads: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         """Check the names."""
-        for name in ("states", "actions", "angles", "exogenous"):
+        for name in ("states", "actions", "angles", "exogenous", "physics_reads"):
             object.__setattr__(self, name, checked_names(getattr(self, name), name))
         for name, other, example in (
             ("integrated", "its velocity", {"x": "x_dot"}),
@@ -98,6 +105,7 @@ class StateSpec:
         if unknown:
             raise ValueError(f"There is no state {unknown[0]!r}; the states are {self.states}.")
         check_lags(self.previous, self.states, self.actions, self.angles)
+        check_reads(self.physics_reads, self.states, self.actions)
         fixed = (*self.exogenous, *self.integrated, *self.previous)
         twice = [name for name in fixed if fixed.count(name) > 1]
         twice += [name for name in self.integrated.values() if name in fixed]
@@ -132,7 +140,7 @@ class StateSpec:
 
     @property
     def moving(self) -> list[int]:
-        """The states that the physics reads, before the action, and says the next values of.
+        """The states that the physics says the next values of.
 
         They are those neither exogenous nor previous values.
         """
@@ -145,9 +153,35 @@ class StateSpec:
         return [i for i in self.moving if self.states[i] not in self.integrated]
 
     @property
+    def exogenous_columns(self) -> list[int]:
+        """The states that are exogenous."""
+        return [i for i, name in enumerate(self.states) if name in self.exogenous]
+
+    @property
     def previous_columns(self) -> list[int]:
         """The states that hold previous values, read by models beside moving ones and action."""
         return [i for i, name in enumerate(self.states) if name in self.previous]
+
+    @property
+    def physics_columns(self) -> list[int]:
+        """The columns that the physics reads, of states and actions side by side."""
+        if not self.physics_reads:
+            return [*self.moving, *range(self.state_dim, self.state_dim + self.action_dim)]
+        return [(*self.states, *self.actions).index(name) for name in self.physics_reads]
+
+    @property
+    def model_columns(self) -> list[int]:
+        """The columns that models read: moving states, actions, previous values.
+
+        Then those that the physics reads beside them, all of states and actions side by side.
+        """
+        read = [*self.moving, *range(self.state_dim, self.state_dim + self.action_dim)]
+        read += self.previous_columns
+        return read + [i for i in self.physics_columns if i not in read]
+
+    def physics_inputs(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The inputs of the physics at states ``... x state_dim``: ``... x d``."""
+        return side_by_side(states, actions)[..., self.physics_columns]
 
     @property
     def angle_columns(self) -> list[int]:
@@ -328,3 +362,8 @@ class StateSpec:
             assert self.step is not None, "checked at the start"
             full[..., i] = (self.step / 2) ** 2 * full[..., v]
         return full
+
+
+def side_by_side(states: Tensor, actions: Tensor) -> Tensor:
+    """States ``... x state_dim`` and their actions in one row; one action may be for all."""
+    return torch.cat([states, actions.expand(*states.shape[:-1], -1)], dim=-1)

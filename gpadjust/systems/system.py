@@ -27,7 +27,8 @@ class System:
             on.
         spec: What the entries of states and actions are.
         physics: f_p, the next values of the states that are neither exogenous nor previous values,
-            from these and the actions; possibly with unknown parameters.
+            from these and the actions, or from what ``spec.physics_reads`` names; possibly with
+            unknown parameters.
         reward: Known rewards ``N`` of states ``N x state_dim``, actions ``N x action_dim`` and next
             states ``N x state_dim``.
         start: Draws ``n`` states at which episodes start, ``n x state_dim``. Default: those at
@@ -36,6 +37,7 @@ class System:
         episode_length: Steps after which an episode is truncated; an environment's own time limit
             may only be longer. Default: the time limit of the environment.
         state_bounds: As of a :class:`~gpadjust.control.Task`.
+        reference: Set-points that move, as of a :class:`~gpadjust.control.Task`.
         constraints: As of a :class:`~gpadjust.control.Task`.
         probability: As of a :class:`~gpadjust.control.Task`.
         action_rate: As of a :class:`~gpadjust.control.Task`.
@@ -67,6 +69,7 @@ class System:
     terminated: Callable[[Tensor], Tensor] | None = None
     episode_length: int | None = None
     state_bounds: Tensor | None = None
+    reference: Callable[[Tensor, Tensor], Tensor] | None = None
     constraints: Callable[[Tensor, Tensor], Tensor] | None = None
     probability: float | None = 0.95
     action_rate: Any = None
@@ -137,6 +140,7 @@ class System:
             episode_length=self.episode_length,
             state_bounds=self.state_bounds,
             sensors=self.sensors,
+            reference=self.reference,
             constraints=self.constraints,
             probability=self.probability,
             action_rate=self.action_rate,

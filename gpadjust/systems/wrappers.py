@@ -1,4 +1,4 @@
-"""Environments seen otherwise: with the previous action, through sensors."""
+"""Environments seen otherwise: with previous actions, through sensors."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gpadjust.checks import checked_number
+from gpadjust.checks import checked_number, checked_whole
 from gpadjust.states import Sensors, StateSpec
 
 Array = NDArray[np.float32]
 
 
 class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordConstructorArgs):
-    """Appends the action that was taken last to the observation; zeros at the start of an episode.
+    """Appends the actions that were taken last to the observation, the newest first.
 
-    Where a system follows its actions with a delay that the observation does not show, such as the
-    activation of muscles, the next observation depends on earlier actions. The last one says much
-    of what is hidden. A :class:`~gpadjust.states.StateSpec` declares it in ``previous``. It is that
-    action alone: a spec that holds earlier ones, or earlier states, is of an environment that
-    observes them itself.
+    At the start of an episode they are zeros. Where a system follows its actions with a delay that
+    the observation does not show, such as the activation of muscles, the next observation depends
+    on earlier actions. A :class:`~gpadjust.states.StateSpec` declares them in ``previous``, such as
+    ``{"force_1": "force", "force_2": "force_1"}`` of two steps.
 
     What is appended is the action clipped to its space, as the environments of this library take
     it. Observations keep their data type, if that is floating-point.
@@ -31,9 +30,11 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
     Args:
         env: An environment whose observations and actions are boxes of one dimension; zero is an
             action.
+        steps: How many actions it remembers.
 
     Raises:
-        ValueError: If they are not.
+        TypeError: If ``steps`` is no whole number.
+        ValueError: If spaces or ``steps`` are others.
 
     Example:
         >>> import gymnasium
@@ -45,9 +46,10 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
         np.float32(3.0)
     """
 
-    def __init__(self, env: gym.Env[Array, Array]) -> None:
-        gym.utils.RecordConstructorArgs.__init__(self)
+    def __init__(self, env: gym.Env[Array, Array], *, steps: int = 1) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, steps=steps)
         gym.Wrapper.__init__(self, env)
+        self._steps = checked_whole("steps", steps, 1)
         seen, taken = env.observation_space, env.action_space
         for name, space in (("observation", seen), ("action", taken)):
             if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
@@ -58,8 +60,8 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
         assert isinstance(seen, gym.spaces.Box), "checked above"
         assert isinstance(taken, gym.spaces.Box), "checked above"
         self._taken = taken
-        self._start = np.zeros(taken.shape, dtype=taken.dtype)
-        if not taken.contains(self._start):
+        self._last = np.zeros((steps, *taken.shape), dtype=taken.dtype)
+        if not taken.contains(self._last[0]):
             raise ValueError(
                 f"RememberAction starts from the action zero, which is not in {taken}. Put "
                 "gymnasium.wrappers.RescaleAction inside."
@@ -68,8 +70,8 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
         # Integers could not hold the action.
         self._dtype = seen.dtype if floating else np.result_type(seen.dtype, taken.dtype)
         self.observation_space = gym.spaces.Box(
-            self._extended(seen.low, taken.low),
-            self._extended(seen.high, taken.high),
+            self._extended(seen.low, np.tile(taken.low, steps)),
+            self._extended(seen.high, np.tile(taken.high, steps)),
             dtype=self._dtype.type,
         )
 
@@ -78,16 +80,19 @@ class RememberAction(gym.Wrapper[Array, Array, Array, Array], gym.utils.RecordCo
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode; its first observation ends with zeros."""
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._extended(observation, self._start), info
+        self._last = np.zeros_like(self._last)
+        return self._extended(observation, self._last), info
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Take an action; the observation ends with it, clipped."""
+        """Take an action; the observation ends with it, clipped, and those before it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         taken = np.clip(action, self._taken.low, self._taken.high)
-        return self._extended(observation, taken), float(reward), terminated, truncated, info
+        self._last = np.concatenate([taken[None], self._last[:-1]]).astype(self._last.dtype)
+        extended = self._extended(observation, self._last)
+        return extended, float(reward), terminated, truncated, info
 
-    def _extended(self, observation: Array, action: Array) -> Array:
-        return np.concatenate([observation, action]).astype(self._dtype)
+    def _extended(self, observation: Array, actions: Array) -> Array:
+        return np.concatenate([observation, actions.ravel()]).astype(self._dtype)
 
 
 class NoisySensors(gym.ObservationWrapper[Array, Array, Array], gym.utils.RecordConstructorArgs):

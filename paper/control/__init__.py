@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -121,3 +122,136 @@ class Hidden(Experiment):
         "gpadjust.control.Planner",
         "gpadjust.control.CrossEntropy",
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallsSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 5
+    """real trials of a run, of which the first goes by f_p with its stated error"""
+    probability: float = 0.95
+    """of constraints holding through a trial"""
+    sequences: int = 40
+    """that are planned, in each round of the cross-entropy method"""
+    horizon: int = 8
+    """steps that are planned ahead at each step"""
+    rounds: int = 1
+    """of these after the first"""
+    first_sequences: int = 64
+    """that are planned when a trial begins, of all its steps"""
+    first_rounds: int = 4
+    """of these after the first"""
+    elites: int = 8
+    """of a round"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walls(Experiment):
+    """Systems near walls, with margins of the constraints and without."""
+
+    runs: int = 14
+    """seeds of the controllers that are judged; of the others a quarter"""
+    out: Path = Path("results/walls")
+    settings: WallsSettings = field(default_factory=WallsSettings)
+
+    axes: ClassVar[Axes] = {
+        "system": {"cart": "cart in gusts", "cart-pole": "cart-pole", "tanks": "two tanks"},
+        "controller": {
+            "margin": "CKA, probability 0.95",
+            "hard": "CKA, no margin",
+            "none": "CKA, no constraint",
+            "truth": "true model, no margin",
+        },
+    }
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Fewer seeds of the rivals."""
+        return self.seeds if kind[1] in ("margin", "truth") else self.seeds[: -(-self.runs // 4)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetpointsSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 2
+    """real trials of a run, of which the first goes by f_p"""
+    sequences: int = 48
+    """that are planned, in each round of the cross-entropy method"""
+    first_rounds: int = 4
+    """of these when a trial begins, with all its steps"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setpoints(Experiment):
+    """Two tanks whose set-point moves: from trial to trial, and within a trial."""
+
+    out: Path = Path("results/setpoints")
+    settings: SetpointsSettings = field(default_factory=SetpointsSettings)
+
+    axes: ClassVar[Axes] = {
+        ("moves", "plans"): {
+            ("between", "seen"): "bounds by what was seen alone",
+            ("between", "default"): "default bounds",
+            ("between", "wide"): "bounds given, far away",
+            ("between", "oracle"): "the true system, bounds far away",
+            ("within", "constant"): "believed to stay",
+            ("within", "known"): "reference given",
+            ("within", "oracle"): "the true system, reference given",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = (
+        "gpadjust.dynamics.LearnedDynamics",
+        "gpadjust.control.Planner",
+        "gpadjust.control.CrossEntropy",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelaysSettings:
+    """Settings that decide the numbers; found with seeds of 100 and more."""
+
+    trials: int = 3
+    """real trials of a run, of which the first goes by f_p"""
+    hint_trials: int = 1
+    """of the runs that only ask whether the delay is found, in which f_p alone plans"""
+    sequences: int = 64
+    """that are planned, in each round of the cross-entropy method"""
+    first_rounds: int = 8
+    """of these when a trial begins, with all its steps"""
+    dry: float = 0.5
+    """dry friction of the cart in the runs that only ask, in N, which f_p lacks"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delays(Experiment):
+    """The cart-pole that follows its force a step late: told or not, and found or not."""
+
+    out: Path = Path("results/delays")
+    settings: DelaysSettings = field(default_factory=DelaysSettings)
+    runs: int = 5
+
+    axes: ClassVar[Axes] = {
+        "told": {
+            "not": "late, not told",
+            "previous": "late, told to the model (previous)",
+            "physics": "late, told to f_p (physics_reads)",
+            "none": "not late",
+            "hint_late": "late",
+            "hint_dry": "not late, dry friction",
+            "hint_noisy": "not late, dry friction and noisy sensors",
+        },
+    }
+    packages: ClassVar[tuple[str, ...]] = (*Experiment.packages, "gymnasium")
+    calls: ClassVar[tuple[str, ...]] = Setpoints.calls
+
+    def seeds_of(self, *kind: Any) -> Sequence[int]:
+        """Four times as many of the runs that only ask whether the delay is found."""
+        more = 4 if str(kind[0]).startswith("hint") else 1
+        return range(self.seed, self.seed + more * self.runs)

@@ -13,6 +13,7 @@ from gpadjust.models import Prediction
 from gpadjust.physics import PhysicsError
 from tests.point import POINT_SPEC
 
+FORCES = torch.tensor([[-1.0], [1.0]]).double()
 SPEC = StateSpec(["x", "angle"], ["force"], angles=["angle"])
 
 
@@ -73,11 +74,36 @@ def test_bounds_are_far_beyond_what_was_seen(recorded):
 
 
 def test_a_task_is_completed_where_it_says_nothing(recorded):
-    whole = recorded(6).complete(task(), 3)
+    whole = recorded(6).complete(task(), 3, FORCES)
     assert whole.episode_length == 3
-    assert torch.equal(whole.state_bounds, recorded(6).bounds())
-    assert recorded(6).complete(replace(whole, episode_length=9), 3).episode_length == 9
-    assert recorded(0).complete(task(), 3).initial_states is None
+    assert torch.equal(whole.state_bounds, recorded(6).bounds())  # the physics stays where it is
+    assert recorded(6).complete(replace(whole, episode_length=9), 3, FORCES).episode_length == 9
+    assert recorded(0).complete(task(), 3, FORCES).initial_states is None
+
+
+def test_bounds_leave_room_for_what_the_physics_reaches(moved):
+    fast = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1] + 4 * X[:, 1:]), reward)
+    low, high = moved.complete(fast, 5, FORCES).state_bounds
+    # Two starts, at 1.0 and 1.2, go 20 either way in five steps; half of that range beside it.
+    middle, half = 1.1, 0.1 + 20.0
+    assert low.item() == pytest.approx(middle - 2 * half, abs=0.5)
+    assert high.item() == pytest.approx(middle + 2 * half, abs=0.5)
+    still = Task(PhysicsDynamics(POINT_SPEC, lambda X: X[:, :1]), reward)
+    assert torch.equal(moved.complete(still, 5, FORCES).state_bounds, moved.bounds())
+
+
+def test_a_physics_that_fails_everywhere_reaches_nothing(moved):
+    def fails(X):
+        raise PhysicsError("no", rows=[], partial=None)
+
+    task = Task(PhysicsDynamics(POINT_SPEC, fails), reward)
+    assert torch.equal(moved.complete(task, 5, FORCES).state_bounds, moved.bounds())
+
+
+def test_an_episode_that_a_bound_may_have_held_is_told(moved):
+    with pytest.warns(UserWarning, match=r"came to x = 1\.3, .*beyond 1\.31: .*state_bounds"):
+        moved.warn_of_bounds(torch.tensor([[-1.0], [1.31]]))
+    moved.warn_of_bounds(torch.tensor([[-3.0], [3.0]]))
 
 
 def test_the_environments_functions_pass(recorded):
@@ -143,7 +169,7 @@ class Stiff(Own):
 
 
 def scores(dynamics, moved, horizons=()):
-    known = moved.complete(Task(dynamics, reward), 5)
+    known = moved.complete(Task(dynamics, reward), 5, FORCES)
     return learn_dynamics(known, moved, moved, horizons)
 
 

@@ -103,3 +103,14 @@ def test_other_actions_are_refused(space, message):
     env.action_space = space
     with pytest.raises(ValueError, match=message):
         RememberAction(env)
+
+
+def test_several_actions_are_remembered_the_newest_first():
+    env = RememberAction(CartPoleSwingUpEnv(encode_angle=False), steps=3)
+    env.reset(seed=0)
+    for force in (1.0, 2.0, 3.0, 4.0):
+        observation, *_ = env.step(np.array([force], dtype=np.float32))
+    assert observation[-3:].tolist() == [4.0, 3.0, 2.0]
+    assert env.reset(seed=0)[0][-3:].tolist() == [0.0, 0.0, 0.0]
+    with pytest.raises(ValueError, match="steps must be"):
+        RememberAction(CartPoleSwingUpEnv(), steps=0)

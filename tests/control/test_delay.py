@@ -1,0 +1,58 @@
+"""Delays that nobody told."""
+
+import pytest
+import torch
+
+from gpadjust.control.delay import find_delay
+from gpadjust.dynamics import PhysicsDynamics, StateSpec, Trajectories
+
+PLAIN = StateSpec(["x", "v"], ["u"])
+TOLD = StateSpec(["x", "v", "u_1"], ["u"], previous={"u_1": "u"}, physics_reads=["x", "v", "u_1"])
+
+
+def motion(X):
+    x, v, u = X.unbind(-1)
+    return torch.stack([x + 0.1 * v, 0.9 * v + 0.1 * u], dim=-1)
+
+
+def episodes(spec, delay, seed=0, friction=0.0, noise=0.0, steps=15):
+    """Four episodes of random actions, held for two steps, of a cart with dry friction."""
+    torch.manual_seed(seed)
+    u = torch.randn(4, steps).double().repeat_interleave(2, 1)[:, :steps]
+    late = torch.cat([torch.zeros(4, delay).double(), u], dim=1)
+    parts = []
+    for given, taken in zip(u, late, strict=False):
+        states, state = [], torch.zeros(2).double()
+        for t in range(steps + 1):
+            previous = [given[t - 1] if t else torch.tensor(0.0).double()] * len(spec.previous)
+            states.append(torch.stack([*state, *previous]))
+            force = taken[min(t, steps - 1)] - friction * torch.sign(state[1])
+            state = motion(torch.stack([*state, force])[None])[0]
+        path = torch.stack(states)
+        path[:, :2] += noise * torch.randn(steps + 1, 2).double()
+        parts.append((path[:-1], given.unsqueeze(-1), path[1:]))
+    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
+    return Trajectories(*columns, torch.arange(4).repeat_interleave(steps))
+
+
+@pytest.mark.parametrize(("spec", "delay"), [(PLAIN, 1), (TOLD, 2)])
+@pytest.mark.parametrize("seed", range(3))
+def test_one_step_more_than_told_is_found(spec, delay, seed):
+    data = episodes(spec, delay, seed, friction=0.1, noise=0.01)
+    found = find_delay(PhysicsDynamics(spec, motion), data)
+    assert (found.action, found.steps) == ("u", delay)
+    assert "previous={'u_1': 'u'" in str(found)
+    assert f"steps={delay}" in str(found)
+
+
+@pytest.mark.parametrize(("spec", "delay"), [(PLAIN, 0), (TOLD, 1)])
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_there_is_no_false_alarm(spec, delay, seed, noise):
+    data = episodes(spec, delay, seed, friction=0.5, noise=noise)
+    assert find_delay(PhysicsDynamics(spec, motion), data) is None
+
+
+def test_few_steps_say_nothing():
+    data = episodes(PLAIN, 1, steps=6)
+    assert find_delay(PhysicsDynamics(PLAIN, motion), data) is None
