@@ -26,6 +26,7 @@ FLOORS = [
         "ax",
         "active",
         "dynamics",
+        "export",
         "records",
         "control",
         "systems",
