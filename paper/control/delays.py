@@ -80,7 +80,7 @@ def _agent(experiment: Delays, told: str, seed: int) -> tuple[MPCAgent, int]:
         env, system = RememberAction(env), _remembering(system, told == "physics")
     each_step = Planner(
         search=CrossEntropy(1, num_elites=12, correlation=0.5),
-        horizon=8,
+        horizon=8 * (system.spec.step or 1.0),
         num_random=settings.sequences,
         spread=0.15,
     )
