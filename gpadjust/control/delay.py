@@ -13,9 +13,9 @@ from gpadjust.dynamics.particles import step_or_nan
 from gpadjust.physics import PhysicsError
 from gpadjust.states import StateSpec
 
-_LEAST = 12  # transitions before which the action has changed
+_LEAST = 16  # transitions before which the action has changed
 _CLEAR = 3.0  # standard errors, by which a longer delay explains more
-_SHARE = 0.7  # of the squared errors, at most, that are left by then
+_SHARE = 0.4  # of the squared errors, at most, that are left by then
 
 
 class Delay(NamedTuple):
@@ -54,7 +54,7 @@ def find_delay(physics: Dynamics, data: Trajectories) -> Delay | None:
     The errors of the physics in one step are compared with those by the action of one step more
     before than is told, and by those between. The longer delay is found if it explains a state
     better than the best shorter one: the relative differences of the squares are on average above
-    three of their standard errors, and their means differ by 30 %.
+    three of their standard errors, and their mean is at most 40 % of that.
 
     Args:
         physics: The physics alone.
